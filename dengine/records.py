@@ -126,7 +126,7 @@ class Window:
 
     start, end : in seconds from the first sample, both included; with `along` in that channel's unit.
     low, high : that the samples there must keep, in their unit, both included; one may be infinite.
-    channel : theirs, from 0.  along : the channel that says where the tool is; None: time.
+    channel : theirs, from 0, or its name among the traces' columns.  along : of where the tool is, likewise; None: time.
     reject : what leaves it, or has no sample in the stretch, is rejected; else verified.
     """
 
@@ -134,20 +134,22 @@ class Window:
     end: float
     low: float = -math.inf
     high: float = math.inf
-    channel: int = 0
-    along: int | None = None
+    channel: int | str = 0
+    along: int | str | None = None
     reject: bool = False
 
     def __post_init__(self) -> None:
         numbers = all(map(is_number, (self.start, self.end, self.low, self.high)))
         held = numbers and -math.inf < self.start <= self.end < math.inf and self.low <= self.high
         held = held and (self.low, self.high) != (-math.inf, math.inf) and isinstance(self.reject, bool)
-        held = held and all(is_whole(each, 0, MOST) for each in (self.channel, self.along or 0))
-        expect(held, "a window with start <= end, low <= high, one of these finite, and channels from 0 on", self)
+        for each in (self.channel, 0 if self.along is None else self.along):
+            named = isinstance(each, str) and is_name(each) and not ({*" :="} & {*each} or each.isdecimal())  # in a text
+            held = held and (named or is_whole(each, 0, MOST))
+        expect(held, "a window with start <= end, low <= high, one of these finite, and channels from 0 on, or names", self)
 
     def __str__(self) -> str:
         said = [f"{repr(float(each)).removesuffix('.0')}" for each in (self.start, self.end, self.low, self.high)]
-        said += [f"channel={self.channel}"] * (self.channel > 0) + [f"along={self.along}"] * (self.along is not None)
+        said += [f"channel={self.channel}"] * (self.channel != 0) + [f"along={self.along}"] * (self.along is not None)
         return ":".join(["" if "inf" in each else each for each in said] + ["reject"] * self.reject)
 
     @classmethod
@@ -156,12 +158,13 @@ class Window:
         words = [word.partition("=") for word in text.split(":")]
         try:
             start, end, low, high = (word for word, _, _ in words[:4])
-            more: dict[str, Any] = {name: name == "reject" or int(value) for name, _, value in words[4:]}
+            more: dict[str, Any] = {name: int(each) if each.isdecimal() else each or True for name, _, each in words[4:]}
             return cls(float(start), float(end), float(low or "-inf"), float(high or "inf"), **more)
+        except SettingError:
+            raise
         except (TypeError, ValueError) as error:
             wanted = "windows as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
-            why = f": {error}" if isinstance(error, SettingError) else "."
-            raise SettingError(f"Expected {wanted}, got {shortened(text)}{why}") from error
+            raise SettingError(f"Expected {wanted}, got {shortened(text)}.") from error
 
 
 def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
@@ -186,14 +189,14 @@ class Decision:
     """What the engine decided on one trace, and on what evidence.
 
     id : the decision's key in the store.  action : what to do.  reason : why.
-    predicted : what the model alone would have done; differs from `action` in an audit only.
+    predicted : what the model alone would have done: not `action` in an audit, and VERIFY where a window rejects.
     lower, upper : bound on the success probability in the ball around the trace; under the pooled guarantee what sorts it:
         of conv and rocket the mean probability by their heads, twice, else an interval at alpha 0.5.
     n_success, n_failure : labels counted in that ball.
     embedding : (K, d) nested tuples, scaled; None where no model embedded the trace.
     model_version : of the model that answered; 0 before the first retrain.
     audit : verified although the model was certain.
-    propensity : probability with which this decision is verified: 1 for an uncertain one, else the audit rate.
+    propensity : probability with which it is verified: of a certain one the audit rate, where a window rejects 0, else 1.
     part : the number of the part, where it was given.
     """
 
@@ -213,7 +216,7 @@ class Decision:
 
     def __repr__(self) -> str:
         bound = f"bound {self.lower:.3f} to {self.upper:.3f}, {self.n_success} good, {self.n_failure} bad labels around it"
-        alone = "" if self.predicted is self.action else f", alone the model would {self.predicted.value}"
+        alone = f", alone the model would {self.predicted.value}" if self.audit else ""
         what = f"{self.action.value}, {self.reason.value}: {bound}{alone}"
         return f"<Decision {what}, version {self.model_version}, id {self.id}>"
 

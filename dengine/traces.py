@@ -211,17 +211,21 @@ class WindowGate(nn.Module):
 
     def __init__(self, windows: Sequence[Window], spec: TraceSpec) -> None:
         super().__init__()
+        time = torch.tensor([[i / spec.rate_hz for i in range(spec.samples)]])
+        known: dict[Any, int] = {None: spec.channels}  # time stands behind the channels
+        known |= {name: i for names in (range(spec.channels), spec.columns) for i, name in enumerate(names)}
+        form = f"{spec.channels} x {spec.samples} samples at {spec.rate_hz:g} Hz {listed(spec.columns)}".rstrip()
         for each in windows:
-            there = each.along is not None or (each.end >= 0.0 and each.start <= (spec.samples - 1) / spec.rate_hz)
-            there = there and max(each.channel, each.along or 0) < spec.channels
-            expect(there, f"a window within {spec.channels} x {spec.samples} samples at {spec.rate_hz:g} Hz", str(each))
+            start, end = torch.tensor([each.start, each.end])  # between two samples nothing would pass
+            there = each.along is not None or bool(((time >= start) & (time <= end)).any())
+            expect(there and {each.channel, each.along} <= known.keys(), f"a window on some of {form}", str(each))
         self.watches = len(windows) > 0
         rows = [(each.start, each.end, each.low, each.high) for each in windows]
-        pairs = [(each.channel, spec.channels if each.along is None else each.along) for each in windows]
+        pairs = [(known[each.channel], known[each.along]) for each in windows]
         self.register_buffer("limits", torch.tensor(rows, dtype=torch.float32).reshape(-1, 4, 1))
         self.register_buffer("channels", torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2))
         self.register_buffer("action", torch.tensor([1 + each.reject for each in windows], dtype=torch.int64))
-        self.register_buffer("time", torch.tensor([[i / spec.rate_hz for i in range(spec.samples)]]))  # a channel more
+        self.register_buffer("time", time)  # (1, T)
 
     def forward(self, x: Tensor) -> int:
         """(C, T) float32 -> 0 within every window, 1 outside of one, 2 outside of one that rejects."""

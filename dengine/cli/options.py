@@ -197,10 +197,8 @@ _PRICES = "Of a check, a bad part accepted and a good one rejected, in one unit,
 _STOPS = "Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good."
 _AUDITS = "Share of what the model is certain of that is verified all the same; rejects are known by it alone."
 _NOVELTY = "Verify a trace so many times less like the learned ones than these are like each other; 0: off."
-_WINDOWS = (
-    "Verify what leaves limits between two times, in s; LOW or HIGH may be empty; :reject rejects. Several; '' for none."
-)
-_WINDOW = "START:END:LOW:HIGH[:reject][:channel=1][:along=2]"
+_WINDOWS = "Verify what leaves limits between two times, in s; LOW or HIGH may be empty; :reject rejects; '' for none."
+_WINDOW = "START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]"
 _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
 _windows: Callable[..., Any] = lambda context, option, said: tuple(filter(None, said)) if said else None  # noqa: E731
 POLICY = {

@@ -91,7 +91,7 @@ class DecisionMaker:
             model_version=version,
             reason=Reason.AUDIT if audit else said.reason,
             audit=audit,
-            propensity=rate if certain else 1.0,
+            propensity=rate if certain else float(outside != 2),
             part=part,
         )
         hash_ = content if number is None else number

@@ -25,6 +25,7 @@ log = logging.getLogger("dengine")
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 # What counts for any model.
 LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate", "stops", "windows")
+NO_WINDOWS = "none"
 MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set, as the store has them
 
 
@@ -137,12 +138,13 @@ class EngineSettings:
         if unknown:
             raise SettingError(f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not.")
         wished = {} if recipe is None else flat(chosen_recipe(reducer, recipe, {}))
-        wished |= given | ({} if policy is None else asdict(policy)) | ({"reducer": reducer} if reducer is not None else {})
+        wished |= given | ({} if policy is None else of_policy(policy))
+        wished |= {} if reducer is None else {"reducer": reducer}
         if not isinstance(wished.get("reducer"), str):  # an object was compared when the store was opened
             wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
         # A program's settings are the same in the shadow mode, which a person begins and ends.
         counts = LOOP if self.model is not None else [name for name in have if name != "shadow"]
-        if not wished.get("windows"):  # these are an operator's, too
+        if wished.get("windows") == NO_WINDOWS:  # these are an operator's, too
             wished.pop("windows", None)
         other = sorted(name for name in wished if name in counts and wished[name] != have[name])
         if other:
@@ -210,9 +212,12 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
 
 def flat(recipe: Recipe) -> dict[str, Any]:
     """Every setting of a recipe by its name, the policy's among them."""
-    plain = {f.name: getattr(recipe, f.name) for f in fields(recipe)}
-    policy: Policy = plain.pop("policy")
-    return plain | asdict(policy)
+    return {f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name != "policy"} | of_policy(recipe.policy)
+
+
+def of_policy(policy: Policy) -> dict[str, Any]:
+    """Every setting of a policy by its name, windows as their text."""
+    return asdict(policy) | {"windows": " ".join(map(str, policy.windows)) or NO_WINDOWS}
 
 
 class SettingsInForce:

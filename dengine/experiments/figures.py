@@ -164,7 +164,7 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     precision, false_positive : of the accepted parts in the windows of all replays together.
     false_negative : of the rejected parts, likewise.  All three NaN where these are fewer than `fewest`.
     """
-    certain = sliding_mean(np.stack([~r.verified for r in replays]), window)
+    certain = sliding_mean(np.stack([r.accepted | r.rejected for r in replays]), window)
 
     def share(wrong: str, decided: str) -> Floats:
         bad, of = (sliding_sum(sum(getattr(r, name).astype(int) for r in replays), window) for name in (wrong, decided))

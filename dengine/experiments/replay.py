@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 EVIDENCE: dict[str, Any] = dict.fromkeys(("action", "reason"), np.str_)  # of a decision, and how it is kept
 EVIDENCE |= dict.fromkeys(("lower", "upper"), np.float64) | dict.fromkeys(("n_success", "n_failure"), np.int64)
-COUNTED = ("verified", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode")
+COUNTED = ("verified", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode", "outside")
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ class Replay:
 
     @property
     def rejected(self) -> Bools:
-        """(n,) the part went back to the bin without a check."""
-        return np.asarray(self.action == Action.REJECT)
+        """(n,) the model sent the part back to the bin, without a check."""
+        return np.asarray((self.action == Action.REJECT) & ~self.outside)
 
     @property
     def false_positive(self) -> Bools:
@@ -161,9 +161,14 @@ class Replay:
         return np.asarray(self.reason == Reason.NOVEL)
 
     @property
+    def outside(self) -> Bools:
+        """(n,) left an operator's window, and was verified or rejected for it: no decision of the model."""
+        return np.asarray(self.reason == Reason.OUTSIDE)
+
+    @property
     def finished(self) -> Bools:
         """(n,) a good part was passed on, as far as the truth is known."""
-        return np.asarray(~self.rejected & (self.truth == 1.0))
+        return np.asarray((self.action != Action.REJECT) & (self.truth == 1.0))
 
     def to_frame(self) -> "pd.DataFrame":
         """A row a cycle, numbered from 1, and a column each field of (n,); the position's are embedding_1, embedding_2 …"""
@@ -213,7 +218,7 @@ class Replay:
             "seed": self.seed,
             "cycles": len(self),
             "certain": certain,
-            "first_certain": float(np.argmin(self.verified) + 1) if certain else nan,  # counted from 1
+            "first_certain": float(np.argmax(self.accepted | self.rejected) + 1) if certain else nan,  # counted from 1
             **{name: counts[name] for name in COUNTED[1:]},
             "precision": 1.0 - wrong[0] / accepted if accepted else nan,
             "npv": 1.0 - wrong[1] / rejected if rejected else nan,

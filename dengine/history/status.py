@@ -60,7 +60,7 @@ class Span:
     first, last : times of the oldest and the newest; None where there is none.
     outside : left an operator's window, and were verified or rejected without the model.
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
-    accepted, rejected : went on without a check.  stops : of the accepted, those known to be bad.
+    accepted, rejected : by the model, without a check.  stops : of the accepted, those known to be bad.
     bad_accepts : parts that it let pass or would have, by the policy's alpha.
     would_accept, would_reject : by audits alone, in the shadow mode every part; at 95 %, whatever the policy's alpha.
     unlabelled : verified, of which no result was reported.
@@ -161,6 +161,7 @@ class Status:
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
             (accepts.verdict == "broken", broken),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
+            (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),
             (failing, f"No retrain was accepted yet, so nothing is decided; the last was {failing}."),
         )
@@ -224,7 +225,7 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         errors=reasons[Reason.MODEL_ERROR],
         quarantined=tally.by("quarantined")[True],
         accepted=outcomes.accepted,
-        rejected=tally.by("action")[Action.REJECT],
+        rejected=outcomes.rejected,
         stops=outcomes.stops,
         would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0]),
         would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy.tolerances[1]),

@@ -151,9 +151,9 @@ def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: floa
     columns = (*DECISION.c["cell_id", "id", "time", "action", "reason", "part"], number.label("number"))
     every = sa.select(*columns).where(DECISION.c.cell_id == cell_id).subquery("every")
     of = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)
-    accepted = every.c.action == Action.ACCEPT.value
-    verified, novel = every.c.action == Action.VERIFY.value, every.c.reason == Reason.NOVEL.value
-    which = (verified, novel, accepted, accepted & (SAID == 0))
+    verified, accepted, rejected = (every.c.action == action.value for action in Action)
+    novel, outside = (every.c.reason == reason.value for reason in (Reason.NOVEL, Reason.OUTSIDE))
+    which = (verified, novel, accepted, accepted & (SAID == 0), rejected & ~outside, outside)
     counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
     query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
     part: Any = every.c.part

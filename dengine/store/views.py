@@ -144,7 +144,7 @@ class Tally:
 class Stretch:
     """Consecutive decisions, or those of a batch.  n : of them.  last : time of the newest.  batch : its name.
 
-    verified, novel : decided so.  accepted, bad : went on without a check, and of these are known to be bad.
+    verified, novel, outside : decided so.  accepted, rejected : by the model, without a check.  bad : accepted, known so.
     """
 
     n: int
@@ -153,4 +153,6 @@ class Stretch:
     novel: int
     accepted: int
     bad: int
+    rejected: int
+    outside: int
     batch: str | None = None

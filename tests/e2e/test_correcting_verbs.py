@@ -104,6 +104,8 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path, tmp_path: P
     assert "alpha 0.2, lower bound 0.8" in said("status", store)
     assert "windows none -> 0.05:0.1:-5:60:reject. Event" in said("policy", store, "--window", "0.05:0.1:-5:60:reject")
     assert document("policy", store, "--window", "")["policy"]["windows"] == []
+    wrong = dengine("policy", store, "--window", "0.05:0.1:-5::channel=4")
+    assert "got '0.05:0.1:-5::channel=4'" in " ".join(wrong.stderr.split())  # and not as an option of the command
     shown = said("policy", store)
     assert all(words in shown for words in ("alpha 0.2", "audit rate 10.0 %", "stops all"))
     assert "interval wilson -> jeffreys. Event 4, by" in said("policy", store, "--interval", "jeffreys")

@@ -24,6 +24,8 @@ KINDS = (  # action, predicted, reason, audit
     (Action.VERIFY, Action.REJECT, Reason.AUDIT, True),
     (Action.ACCEPT, Action.ACCEPT, Reason.CERTAIN, False),
     (Action.REJECT, Action.REJECT, Reason.CERTAIN, False),
+    (Action.REJECT, Action.VERIFY, Reason.OUTSIDE, False),
+    (Action.VERIFY, Action.VERIFY, Reason.OUTSIDE, False),
 )
 KIND = ("action", "predicted", "reason", "audit")
 N = 60
@@ -129,8 +131,10 @@ def test_counts_of_a_store_are_those_of_its_history(store: SqlStore) -> None:
 def counted(some: list[StoredDecision]) -> Stretch:
     actions = [past.decision.action for past in some]
     bad = sum(past.success is False and past.decision.action is Action.ACCEPT for past in some)
-    novel = sum(past.decision.reason is Reason.NOVEL for past in some)
-    return Stretch(len(some), some[-1].time, actions.count(Action.VERIFY), novel, actions.count(Action.ACCEPT), bad)
+    novel, outside = (sum(past.decision.reason is each for past in some) for each in (Reason.NOVEL, Reason.OUTSIDE))
+    own = sum((past.decision.action, past.decision.reason) == (Action.REJECT, Reason.CERTAIN) for past in some)
+    verified, accepted = (actions.count(each) for each in (Action.VERIFY, Action.ACCEPT))
+    return Stretch(len(some), some[-1].time, verified, novel, accepted, bad, own, outside)
 
 
 @pytest.mark.parametrize("n", [1, 7, 60, 500])

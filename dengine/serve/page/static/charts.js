@@ -47,10 +47,11 @@ function axis(side, given = {}) {
 // Traces, and over them the operator's windows: the limits where they hold, in the stretch where they do
 
 function windowsOf(found, channel) {
-  const { rate_hz } = found.spec;
-  return found.windows.filter((each) => each.channel === channel).map((each) => {
+  const { rate_hz, columns } = found.spec;
+  const at = (named) => (typeof named === "string" ? columns.indexOf(named) : named);
+  return found.windows.filter((each) => at(each.channel) === channel).map((each) => {
     if (each.along === null) return { ...each, from: each.start, to: each.end };
-    const there = found.trace[each.along].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [i / rate_hz] : []));
+    const there = found.trace[at(each.along)].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [i / rate_hz] : []));
     return { ...each, from: there[0], to: there.at(-1) };
   }).filter((each) => each.from !== undefined);
 }

@@ -196,10 +196,10 @@ async function trend(get, asked, parts) {
   const { stretches } = await get(`course?${by === "batch" ? `batch=${encodeURIComponent("-_/. ")}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
   const begun = (last) => start + Math.floor((last - start) / (3600 * HOURS[by])) * 3600 * HOURS[by];
   const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch || "no batch" : el("time", {}, moment(begun(each.last)).slice(5, 16)), number(each.n),
-    percent(1 - each.verified / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad)]);
+    percent((each.accepted + each.rejected) / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad), number(each.outside)]);
   const ways = [...Object.keys(HOURS), ...(batch ? ["batch"] : [])].map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
   return card("trend", "The trend", el("ul", { class: "chips" }, ways), rows.length === 0 ? small("It begins with the first part.")
-    : table([[by === "batch" ? "Batch" : "From"], ["Parts", "num"], ["Certain", "num more"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"]], rows));
+    : table([[by === "batch" ? "Batch" : "From"], ["Parts", "num"], ["Certain", "num more"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"], ["Outside a window", "num more"]], rows));
 }
 
 async function overview(get, query, doing) {
