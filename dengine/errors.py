@@ -4,7 +4,8 @@ import math
 import re
 import reprlib
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 HIDDEN = "***"
@@ -13,7 +14,7 @@ URL = re.compile(r"(\w[\w+.-]*:/{1,2}[^\s:/@'\"]*):(\S*|[^\n'\"]*)@")
 NAMED = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)  # in a URL's query, or of libpq
 QUOTES = ("'", '"')
 OPTIONS = "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic"
-OPTION = re.compile(rf"\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))")
+OPTION = re.compile(rf"(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))")
 SHORT = reprlib.Repr()
 SHORT.maxstring = SHORT.maxother = SHORT.maxlong = 60
 
@@ -96,6 +97,18 @@ def expect(held: bool, wanted: str, got: Any, do: str = "", error: type[DengineE
     """An error that says what was expected, what came and what to do, unless it held."""
     if not held:
         raise error(f"Expected {wanted}, got {shortened(got)}{'; ' if do else ''}{do}.")
+
+
+@contextmanager
+def instead(error: type[DengineError], said: str, *of: type[Exception], do: str = "") -> Iterator[None]:
+    """An error of this kind in the place of others, with what these say; one of its own kind passes as it is."""
+    try:
+        yield
+    except error:
+        raise
+    except of as raised:
+        why = " ".join(str(getattr(raised, "strerror", None) or raised)[:300].split()) or type(raised).__name__
+        raise error(f"{said}: {why.rstrip('.')}{'; ' if do else ''}{do}.") from raised
 
 
 class StoreError(DengineError, RuntimeError):

@@ -9,8 +9,8 @@ import stat
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Iterable
+from contextlib import AbstractContextManager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DataError, DengineError, OutputError, expect
+from .errors import DataError, DengineError, OutputError, expect, instead
 
 MOST = 8 * 2**30  # bytes
 # All that zipfile, zlib, lzma and NumPy were seen to raise on damaged files.
@@ -32,11 +32,8 @@ SHORTEST_KEY = 16  # bytes
 
 def read_key(path: str | os.PathLike[str], error: type[DengineError]) -> bytes:
     """The secret in a key's file; an error of this kind for what cannot be read, or is too short to be one."""
-    try:
+    with instead(error, f"The key's file {path} cannot be read", OSError, do="dengine export --make-key writes one"):
         secret = Path(path).read_bytes().rstrip(b"\r\n")
-    except OSError as raised:
-        said = f"The key's file {path} cannot be read: {raised.strerror}; dengine export --make-key writes one."
-        raise error(said) from raised
     wanted = f"a key of {SHORTEST_KEY} bytes or more in {path}"
     expect(len(secret) >= SHORTEST_KEY, wanted, len(secret), "use dengine export --make-key", error)
     return secret
@@ -49,29 +46,20 @@ def must_fit(size: float, what: object) -> None:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         most = min(MOST, memory // 2) if memory > 0 else MOST
     if size > most:
-        raise DataError(
-            f"Expected at most {_size(most)} of arrays in {what}, got {_size(size)}; split it, or read it where there is "
-            "more memory."
-        )
+        do = "split it, or read it where there is more memory"
+        raise DataError(f"Expected at most {_size(most)} of arrays in {what}, got {_size(size)}; {do}.")
 
 
-@contextmanager
 def reading(
     what: object, kind: str, package: str = "", extra: str = "", also: tuple[type[Exception], ...] = ()
-) -> Iterator[None]:
+) -> AbstractContextManager[None]:
     """DataError for whatever a library raises on a file that is damaged, or is not of its kind, and where it is missing.
 
     package, extra : what reads such files, and the extra of dengine that installs it.  also : other errors of its own.
     """
     if package and find_spec(package) is None:
         raise DataError(f'Expected {package} for {kind}, it is not installed: pip install "dengine[{extra}]".')
-    try:
-        yield
-    except DataError:
-        raise
-    except (*UNREADABLE, *also) as error:
-        said = " ".join(str(error)[:200].split()) or type(error).__name__
-        raise DataError(f"Cannot read {what} as {kind}: {said}.") from error
+    return instead(DataError, f"Cannot read {what} as {kind}", *UNREADABLE, *also)
 
 
 def _size(n_bytes: float) -> str:
@@ -161,12 +149,7 @@ def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> 
     return write_output(target, (json.dumps({"sha256": sums}, indent=2) + "\n").encode(), force)
 
 
-@contextmanager
-def _told(target: Path) -> Iterator[None]:
+def _told(target: Path) -> AbstractContextManager[None]:
     """What the system says, as an OutputError that says what to do."""
-    try:
-        yield
-    except (OSError, ValueError) as error:  # the latter for a name with a NUL
-        said = getattr(error, "strerror", None) or error
-        do = "choose a folder that exists, is writable and has room"
-        raise OutputError(f"Cannot write {target}: {said}; {do}.") from error
+    do = "choose a folder that exists, is writable and has room"
+    return instead(OutputError, f"Cannot write {target}", OSError, ValueError, do=do)  # the latter for a name with a NUL

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from .decision.policy import Policy, check_radius
-from .errors import SettingError, expect, listed
+from .errors import SettingError, expect, instead, listed
 from .records import is_number, is_whole
 
 Params = Mapping[str, bool | int | float | str]
@@ -80,8 +80,8 @@ class Recipe:
         for name, value in self.params.items():
             held = (value is None or isinstance(value, PLAIN)) and BARE.fullmatch(str(name)) is not None
             expect(held, "params of plain names and values", {name: value}, "hand an object in")
-        named = isinstance(self.reducer, str) or callable(getattr(self.reducer, "fit", None))
-        expect(named, "a reducer's name, or a scikit-learn transformer", self.reducer)
+        named = isinstance(self.reducer, str) or all(hasattr(self.reducer, each) for each in ("fit", "get_params"))
+        expect(named, "a reducer's name, or a scikit-learn transformer with fit and get_params", self.reducer)
         expect(isinstance(self.policy, Policy), "policy to be a Policy", self.policy)
         check_radius(self.radius)  # or every retrain would fail, one by one
 
@@ -105,8 +105,8 @@ class Recipe:
         if isinstance(recipe, Recipe):
             return recipe
         if not isinstance(recipe, str | os.PathLike):
-            if not callable(getattr(recipe, "fit", None)) or isinstance(recipe, type):
-                raise SettingError(f"Expected a recipe, its name, or a scikit-learn transformer, got {recipe!r}.")
+            fits = callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type)
+            expect(fits, "a recipe, its name, or a scikit-learn transformer", recipe)
             # A reducer of ours keeps the radius of its own recipe: it means something else in each.
             base = RECIPES.get(type(recipe).__module__.removeprefix("dengine.reducers."), cls())
             return replace(base, reducer=recipe, params={})
@@ -117,18 +117,14 @@ class Recipe:
             return cls.from_toml(text, where=str(recipe))
         if OWN.fullmatch(str(recipe)) or str(recipe) in NAMED:
             return cls(str(recipe))
-        raise SettingError(
-            f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer; "
-            f"{str(recipe)[:200]} is none."
-        )
+        wanted = f"a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer"
+        raise SettingError(f"Expected {wanted}; {str(recipe)[:200]} is none.")
 
     @classmethod
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
         """Parse `to_toml`'s form; SettingError names an unknown key or a value out of range."""
-        try:
+        with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):  # the former of huge integers, too
             table = tomllib.loads(text)
-        except (ValueError, RecursionError) as error:  # the former of an integer with thousands of digits, too
-            raise SettingError(f"{where} is not TOML: {error}.") from error
         _must_be_known(table, cls, where)
         reducer, policy = table.get("reducer", "conv"), table.pop("policy", {})
         expect(isinstance(reducer, str), f"in {where} reducer to be a name, or module:Class", reducer)

@@ -1,7 +1,5 @@
 """Frozen records that travel between the layers, the values that they may hold, and their plain JSON."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping
@@ -11,21 +9,11 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from .errors import (
-    DataError,
-    ReportConflictError,
-    ReportError,
-    SettingError,
-    StoreError,
-    expect,
-    shortened,
-    without_password,
-)
+from .errors import ReportConflictError, ReportError, SettingError, StoreError, expect, instead, shortened, without_password
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
@@ -115,10 +103,8 @@ class TraceSpec:
     columns: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        try:
+        with instead(SettingError, f"Expected the names of columns, got {shortened(self.columns)}", TypeError):
             columns = (self.columns,) if isinstance(self.columns, str) else tuple(self.columns)
-        except TypeError as error:
-            raise SettingError(f"Expected the names of columns, got {shortened(self.columns)}.") from error
         object.__setattr__(self, "columns", columns)
         rated = is_number(self.rate_hz) and 0 < self.rate_hz < float("inf")
         form = (self.samples, self.channels, self.rate_hz)
@@ -140,7 +126,7 @@ class Window:
 
     start, end : in seconds from the first sample, both included; with `along` in that channel's unit.
     low, high : that the samples there must keep, in their unit, both included; one may be infinite.
-    channel : theirs, from 0.  along : the channel that says where the tool is; None: time.
+    channel : theirs, from 0, or its name among the traces' columns.  along : of where the tool is, likewise; None: time.
     reject : what leaves it, or has no sample in the stretch, is rejected; else verified.
     """
 
@@ -148,44 +134,46 @@ class Window:
     end: float
     low: float = -math.inf
     high: float = math.inf
-    channel: int = 0
-    along: int | None = None
+    channel: int | str = 0
+    along: int | str | None = None
     reject: bool = False
 
     def __post_init__(self) -> None:
         numbers = all(map(is_number, (self.start, self.end, self.low, self.high)))
         held = numbers and -math.inf < self.start <= self.end < math.inf and self.low <= self.high
         held = held and (self.low, self.high) != (-math.inf, math.inf) and isinstance(self.reject, bool)
-        held = held and all(is_whole(each, 0, MOST) for each in (self.channel, self.along or 0))
-        expect(held, "a window with start <= end, low <= high, one of these finite, and channels from 0 on", self)
+        for each in (self.channel, 0 if self.along is None else self.along):
+            named = isinstance(each, str) and is_name(each) and not ({*" :="} & {*each} or each.isdecimal())  # in a text
+            held = held and (named or is_whole(each, 0, MOST))
+        expect(held, "a window with start <= end, low <= high, one of these finite, and channels from 0 on, or names", self)
 
     def __str__(self) -> str:
         said = [f"{repr(float(each)).removesuffix('.0')}" for each in (self.start, self.end, self.low, self.high)]
-        said += [f"channel={self.channel}"] * (self.channel > 0) + [f"along={self.along}"] * (self.along is not None)
+        said += [f"channel={self.channel}"] * (self.channel != 0) + [f"along={self.along}"] * (self.along is not None)
         return ":".join(["" if "inf" in each else each for each in said] + ["reject"] * self.reject)
 
     @classmethod
-    def parse(cls, text: str) -> Window:
+    def parse(cls, text: str) -> Self:
         """The window of a text; SettingError for one that is none."""
         words = [word.partition("=") for word in text.split(":")]
         try:
             start, end, low, high = (word for word, _, _ in words[:4])
-            more: dict[str, Any] = {name: name == "reject" or int(value) for name, _, value in words[4:]}
+            more: dict[str, Any] = {name: int(each) if each.isdecimal() else each or True for name, _, each in words[4:]}
             return cls(float(start), float(end), float(low or "-inf"), float(high or "inf"), **more)
+        except SettingError:
+            raise
         except (TypeError, ValueError) as error:
             wanted = "windows as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
-            raise SettingError(f"Expected {wanted}, got {shortened(text)}: {error}") from error
+            raise SettingError(f"Expected {wanted}, got {shortened(text)}.") from error
 
 
 def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
     """The traces' contract among a store's settings; None before the first trace. StoreError for what is none."""
     if "trace" not in known:
         return None
-    try:
+    said = f"Expected a trace's contract in the settings, got {shortened(known['trace'])}"
+    with instead(StoreError, said, ValueError, TypeError, RecursionError, do="restore the store"):
         return TraceSpec(**json.loads(known["trace"]))
-    except (ValueError, TypeError, RecursionError) as error:
-        got = shortened(known["trace"])
-        raise StoreError(f"Expected a trace's contract in the settings, got {got}: {error}; restore the store.") from error
 
 
 def in_html(record: Any) -> str:
@@ -201,14 +189,14 @@ class Decision:
     """What the engine decided on one trace, and on what evidence.
 
     id : the decision's key in the store.  action : what to do.  reason : why.
-    predicted : what the model alone would have done; differs from `action` in an audit only.
+    predicted : what the model alone would have done: not `action` in an audit, and VERIFY where a window rejects.
     lower, upper : bound on the success probability in the ball around the trace; under the pooled guarantee what sorts it:
         of conv and rocket the mean probability by their heads, twice, else an interval at alpha 0.5.
     n_success, n_failure : labels counted in that ball.
     embedding : (K, d) nested tuples, scaled; None where no model embedded the trace.
     model_version : of the model that answered; 0 before the first retrain.
     audit : verified although the model was certain.
-    propensity : probability with which this decision is verified: 1 for an uncertain one, else the audit rate.
+    propensity : probability with which it is verified: of a certain one the audit rate, where a window rejects 0, else 1.
     part : the number of the part, where it was given.
     """
 
@@ -228,7 +216,7 @@ class Decision:
 
     def __repr__(self) -> str:
         bound = f"bound {self.lower:.3f} to {self.upper:.3f}, {self.n_success} good, {self.n_failure} bad labels around it"
-        alone = "" if self.predicted is self.action else f", alone the model would {self.predicted.value}"
+        alone = f", alone the model would {self.predicted.value}" if self.audit else ""
         what = f"{self.action.value}, {self.reason.value}: {bound}{alone}"
         return f"<Decision {what}, version {self.model_version}, id {self.id}>"
 
@@ -290,29 +278,16 @@ def as_success(value: Any, of: str = "") -> bool:
     plain = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(plain, bool | np.bool_ | Real) and (plain == 0 or plain == 1):
         return bool(plain)
-    raise ReportError(
-        f"Expected a label, True (success) or False (failure), or exactly 1 or 0,{of and f' of {of},'} got "
-        f"{shortened(value)}; nothing was stored: turn it into one of these first, as in success=(answer == 'OK')."
-    )
-
-
-def as_labels(y: ArrayLike) -> NDArray[np.int64]:
-    """Labels (n,) as 1 (success) and 0 (failure); DataError where there is anything else among them."""
-    labels = np.asarray(y)
-    if not np.isin(labels, (0, 1)).all():
-        raise DataError("Expected labels 1 (success) and 0 (failure), got others; turn them into these before they count.")
-    return labels.astype(np.int64)
+    wanted = f"a label, True (success) or False (failure), or exactly 1 or 0,{of and f' of {of},'}"
+    do = "nothing was stored: turn it into one of these first, as in success=(answer == 'OK')"
+    raise ReportError(f"Expected {wanted} got {shortened(value)}; {do}.")
 
 
 def as_outcome(value: Any, of: str = "") -> Outcome:
     """What a cell's `proceed` returned, as an `Outcome`; ReportError for anything else, which would pass for silence."""
-    try:
+    said = f"Expected an Outcome, {', '.join(Outcome)},{of and f' of {of},'} got {shortened(value)}"
+    with instead(ReportError, said, ValueError, TypeError, do="return Outcome.UNKNOWN where nothing is known"):
         return Outcome(value)
-    except (ValueError, TypeError) as error:
-        raise ReportError(
-            f"Expected an Outcome, {', '.join(Outcome)},{of and f' of {of},'} got {shortened(value)}; return "
-            "Outcome.UNKNOWN from proceed() where nothing is known."
-        ) from error
 
 
 def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
@@ -331,11 +306,8 @@ def is_name(value: Any) -> bool:
 
 def as_id(value: Any) -> str:
     """A decision's id; ReportError for what is none."""
-    if not is_name(value):
-        raise ReportError(
-            f"Expected the id of a decision, a text of 1 to {LONGEST} characters that print, got {shortened(value)}; "
-            "report the `Decision.id` that `decide` returned."
-        )
+    wanted = f"the id of a decision, a text of 1 to {LONGEST} characters that print"
+    expect(is_name(value), wanted, value, "report the `Decision.id` that `decide` returned", ReportError)
     return str(value)
 
 
@@ -374,10 +346,9 @@ def _told(kind: type) -> tuple[tuple[str, bool], ...]:
 def find_class(where: str) -> type:
     """The class that `module:Class` names; SettingError where there is none."""
     module, _, name = where.partition(":")
-    try:
+    said = f"Expected module:Class that can be imported here, got {shortened(where)}"
+    with instead(SettingError, said, Exception):  # whatever a module of the user's raises while it is imported
         found = getattr(import_module(module), name)
-    except Exception as error:  # whatever a module of the user's raises while it is imported
-        raise SettingError(f"Expected module:Class that can be imported here, got {shortened(where)}: {error}.") from error
     if not isinstance(found, type):
         raise SettingError(f"Expected module:Class, {shortened(where)} is a {type(found).__name__} and no class.")
     return found

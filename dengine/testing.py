@@ -88,9 +88,7 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
         if uses_labels(reducer):
             raise
         clone(reducer).fit(X if isinstance(reducer, Reducer) else X[:, 0], y)  # what it raises then has another reason
-        raise AssertionError(
-            f"its fit works with labels alone, and was given none; set uses_labels = True ({error})"
-        ) from error
+        raise AssertionError(f"its fit works with labels alone, got none; set uses_labels = True ({error})") from error
 
 
 def fit_starts_afresh(reducer: Any) -> None:

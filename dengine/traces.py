@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from .errors import TraceError, expect, listed
+from .errors import DataError, TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
 from .records import FITS, REASONS, Reason, TraceSpec, Window
 
@@ -34,15 +34,12 @@ def as_trace(trace: Any, spec: TraceSpec | None) -> NDArray[np.float32]:
     if spec is not None:
         x = _as_agreed(x, spec)
     elif len(x) > x.shape[1] and _is_frame(trace):
-        raise TraceError(
-            f"Expected a DataFrame of one trace, a row a sample, a column a channel, got {x.shape[1]} rows of {len(x)} "
-            "columns; pass one row, as a Series, if each is a trace."
-        )
+        got = f"{x.shape[1]} rows of {len(x)} columns; pass one row, as a Series, if each is a trace"
+        raise TraceError(f"Expected a DataFrame of one trace, a row a sample, a column a channel, got {got}.")
     elif len(x) > x.shape[1]:
-        raise TraceError(
-            f"Expected (channels, samples), got {len(x)} channels of {x.shape[1]} samples, which looks transposed; "
-            f"turn it, trace.T, or agree on TraceSpec(samples={x.shape[1]}, channels={len(x)}) first if it is meant."
-        )
+        got = f"{len(x)} channels of {x.shape[1]} samples, which looks transposed"
+        do = f"turn it, trace.T, or agree on TraceSpec(samples={x.shape[1]}, channels={len(x)}) first if it is meant"
+        raise TraceError(f"Expected (channels, samples), got {got}; {do}.")
     x = np.ascontiguousarray(x)
     return x if x.flags.writeable else x.copy()  # torch warns of what it could write to, a memory-mapped array for one
 
@@ -59,6 +56,14 @@ def as_traces(X: ArrayLike, spec: TraceSpec | None = None) -> NDArray[np.float32
     if spec is not None:
         x = _as_agreed(x, spec)
     return np.ascontiguousarray(x)
+
+
+def as_labels(y: ArrayLike) -> NDArray[np.int64]:
+    """Labels (n,) as 1 (success) and 0 (failure); DataError where there is anything else among them."""
+    labels = np.asarray(y)
+    if not np.isin(labels, (0, 1)).all():
+        raise DataError("Expected labels 1 (success) and 0 (failure), got others; turn them into these before they count.")
+    return labels.astype(np.int64)
 
 
 def spec_of(x: NDArray[np.float32], trace: Any = None) -> TraceSpec:
@@ -120,10 +125,8 @@ def _without_frame(trace: Any, spec: TraceSpec | None) -> Any:
     names = _channels(trace)
     if not names or (spec is not None and len(names) != spec.channels):
         wanted = "at least one channel" if spec is None else f"{spec.channels} channel(s)"
-        raise TraceError(
-            f"Expected a DataFrame with {wanted}, a column each, got the columns {listed(have)}; "
-            "pass the right ones, or name them, TraceSpec(columns=...)."
-        )
+        do = "pass the right ones, or name them, TraceSpec(columns=...)"
+        raise TraceError(f"Expected a DataFrame with {wanted}, a column each, got the columns {listed(have)}; {do}.")
     return trace[names].to_numpy().T
 
 
@@ -155,11 +158,9 @@ def _as_agreed(x: NDArray[np.float32], spec: TraceSpec) -> NDArray[np.float32]:
     if samples == spec.samples:
         return x
     if spec.fit == "strict":
-        seconds = spec.samples / spec.rate_hz
-        raise TraceError(
-            f"Expected {spec.samples} samples, got {samples}; resample the trace to {spec.rate_hz:g} Hz x {seconds:g} s, "
-            f"or start a new store with TraceSpec(samples={spec.samples}, fit='pad')."
-        )
+        form = f"{spec.rate_hz:g} Hz x {spec.samples / spec.rate_hz:g} s"
+        do = f"resample the trace to {form}, or start a new store with TraceSpec(samples={spec.samples}, fit='pad')"
+        raise TraceError(f"Expected {spec.samples} samples, got {samples}; {do}.")
     return np.asarray(fitted(torch.from_numpy(np.array(x, order="C")), spec.samples, FITS.index(spec.fit)))
 
 
@@ -210,17 +211,21 @@ class WindowGate(nn.Module):
 
     def __init__(self, windows: Sequence[Window], spec: TraceSpec) -> None:
         super().__init__()
+        time = torch.tensor([[i / spec.rate_hz for i in range(spec.samples)]])
+        known: dict[Any, int] = {None: spec.channels}  # time stands behind the channels
+        known |= {name: i for names in (range(spec.channels), spec.columns) for i, name in enumerate(names)}
+        form = f"{spec.channels} x {spec.samples} samples at {spec.rate_hz:g} Hz {listed(spec.columns)}".rstrip()
         for each in windows:
-            there = each.along is not None or (each.end >= 0.0 and each.start <= (spec.samples - 1) / spec.rate_hz)
-            there = there and max(each.channel, each.along or 0) < spec.channels
-            expect(there, f"a window within {spec.channels} x {spec.samples} samples at {spec.rate_hz:g} Hz", str(each))
+            start, end = torch.tensor([each.start, each.end])  # between two samples nothing would pass
+            there = each.along is not None or bool(((time >= start) & (time <= end)).any())
+            expect(there and {each.channel, each.along} <= known.keys(), f"a window on some of {form}", str(each))
         self.watches = len(windows) > 0
         rows = [(each.start, each.end, each.low, each.high) for each in windows]
-        pairs = [(each.channel, spec.channels if each.along is None else each.along) for each in windows]
+        pairs = [(known[each.channel], known[each.along]) for each in windows]
         self.register_buffer("limits", torch.tensor(rows, dtype=torch.float32).reshape(-1, 4, 1))
         self.register_buffer("channels", torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2))
         self.register_buffer("action", torch.tensor([1 + each.reject for each in windows], dtype=torch.int64))
-        self.register_buffer("time", torch.tensor([[i / spec.rate_hz for i in range(spec.samples)]]))  # a channel more
+        self.register_buffer("time", time)  # (1, T)
 
     def forward(self, x: Tensor) -> int:
         """(C, T) float32 -> 0 within every window, 1 outside of one, 2 outside of one that rejects."""
@@ -243,10 +248,9 @@ def as_agreed(trace: Any, spec: TraceSpec | None, may_start_over: bool) -> NDArr
     except TraceError as error:
         if not may_start_over or spec is None:
             raise
-        raise TraceError(
-            f"{error} The contract, {spec.channels} x {spec.samples}, was set by the first trace, and nothing was learned "
-            f"by it yet: if that trace was the wrong one, start over with a new store and {_contract(trace)}."
-        ) from error
+        form = f"{error} The contract, {spec.channels} x {spec.samples}, was set by the first trace"
+        do = f"if that trace was the wrong one, start over with a new store and {_contract(trace)}"
+        raise TraceError(f"{form}, and nothing was learned by it yet: {do}.") from error
 
 
 def _contract(trace: Any) -> str:
@@ -262,8 +266,7 @@ def first_contract(x: NDArray[np.float32], trace: Any) -> tuple[TraceSpec, bool]
     """
     spec = spec_of(x, trace)
     if spec.samples < LEAST:
-        raise TraceError(
-            f"Expected a first trace of {LEAST} samples or more, for it sets the contract of all that follow, got "
-            f"{spec.channels} x {spec.samples}; record longer, or start with {_contract(x)} if it is meant."
-        )
+        wanted = f"a first trace of {LEAST} samples or more, for it sets the contract of all that follow"
+        do = f"record longer, or start with {_contract(x)} if it is meant"
+        raise TraceError(f"Expected {wanted}, got {spec.channels} x {spec.samples}; {do}.")
     return spec, TraceGate(spec)(torch.from_numpy(x))[0] == 0

@@ -5,8 +5,6 @@
 Only click is imported before a verb is known, so that `--help` answers at once.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`dengine data`, `simulate` and `train`: what a data set is; a simulated one; and a store that has learned from one."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -49,7 +47,7 @@ def data(source: DataChoice, out: Out | None) -> None:
     )
 
 
-def _drift(one: Drift) -> tuple[str, str, str]:
+def _drift(one: "Drift") -> tuple[str, str, str]:
     means = " ".join(f"{x:.2g}" for x in one.tenths)
     if math.isnan(one.rho):
         return one.name, means, "never changes"

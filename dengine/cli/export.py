@@ -1,7 +1,5 @@
 """`dengine export`: an engine's decision for a controller, with what the controller needs beside it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

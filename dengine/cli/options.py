@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..records import TraceSpec
 
 Command = Callable[..., Any]
+Option = Callable[[Command], Command]
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(1)
@@ -95,9 +96,7 @@ class Listed(click.ParamType[Any]):
         return tuple(self.of.convert(part, param, ctx) for part in parts)
 
 
-def gathered(
-    into: str, make: Callable[..., Any], options: Mapping[str, Callable[[Command], Command]]
-) -> Callable[[Command], Command]:
+def gathered(into: str, make: Callable[..., Any], options: Mapping[str, Option]) -> Option:
     """Options, by the names of their values, which `make` takes; what it makes is handed on as `into`."""
 
     def decorate(command: Command) -> Command:
@@ -131,7 +130,7 @@ _WHOSE = "Whose rows of the store, where it holds several cells; `dengine status
 _PRODUCT = "What the cell makes: cells of one product share labels and versions.  [default: as the store says]"
 
 
-def a_store(store: Callable[[Command], Command]) -> Callable[[Command], Command]:
+def a_store(store: Option) -> Option:
     """A store that is there, and whose rows of it are meant."""
     whose = click.option("--cell", "--cell-id", "cell_id", metavar="NAME", help=_WHOSE)
     return gathered("store", _address, {"store": store, "cell_id": whose})
@@ -140,9 +139,9 @@ def a_store(store: Callable[[Command], Command]) -> Callable[[Command], Command]
 store_argument = a_store(click.argument("store", metavar="STORE"))
 
 
-def store_option(text: str, *cell: str, required: bool = False) -> Callable[[Command], Command]:
+def store_option(text: str, *cell: str, required: bool = False) -> Option:
     """`--store`, which may be made, with its cell's id, by `--cell-id` and other names, and product."""
-    options: dict[str, Callable[[Command], Command]] = {
+    options: dict[str, Option] = {
         "store": click.option("--store", required=required, metavar="FILE|URL", help=text),
         "cell_id": click.option(*cell, "--cell-id", "cell_id", metavar="NAME", help=_WHOSE),
         "product": click.option("--product", metavar="NAME", help=_PRODUCT),
@@ -198,10 +197,8 @@ _PRICES = "Of a check, a bad part accepted and a good one rejected, in one unit,
 _STOPS = "Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good."
 _AUDITS = "Share of what the model is certain of that is verified all the same; rejects are known by it alone."
 _NOVELTY = "Verify a trace so many times less like the learned ones than these are like each other; 0: off."
-_WINDOWS = (
-    "Verify what leaves limits between two times, in s; LOW or HIGH may be empty; :reject rejects. Several; '' for none."
-)
-_WINDOW = "START:END:LOW:HIGH[:reject][:channel=1][:along=2]"
+_WINDOWS = "Verify what leaves limits between two times, in s; LOW or HIGH may be empty; :reject rejects; '' for none."
+_WINDOW = "START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]"
 _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
 _windows: Callable[..., Any] = lambda context, option, said: tuple(filter(None, said)) if said else None  # noqa: E731
 POLICY = {
@@ -287,7 +284,7 @@ DATA = TRACE | {
 }
 
 
-def data_options(default: str | None = "insertion", argument: bool = False) -> Callable[[Command], Command]:
+def data_options(default: str | None = "insertion", argument: bool = False) -> Option:
     """`--data`, or DATA, and how it is read, handed on as one `DataChoice`, `source`."""
     metavar, shown = "NAME|FILE|FOLDER", {"default": default, "show_default": True}
     option = click.option("--data", metavar=metavar, help=_DATA, **({"required": True} if default is None else shown))
@@ -313,7 +310,7 @@ def trace_of(how: Mapping[str, Any]) -> TraceSpec | None:
     return TraceSpec(**asked, channels=n, columns=names if names != (str(n),) else ()) if asked else None
 
 
-def n_jobs_option(default: int, text: str) -> Callable[[Command], Command]:
+def n_jobs_option(default: int, text: str) -> Option:
     """`--n-jobs`, processes as joblib counts them; 0, which it does not know, is one a core too."""
     one_a_core = lambda context, option, n_jobs: n_jobs or -1  # noqa: E731
     return click.option("--n-jobs", type=int, default=default, show_default=True, callback=one_a_core, help=text)
@@ -333,7 +330,7 @@ allow_import_option = click.option("--allow-import", is_flag=True, help=_ALLOW)
 force_option = click.option("--force", is_flag=True, help="Replace the files that are there; a store never is.")
 
 
-def _out_option(kind: click.Path, text: str) -> Callable[[Command], Command]:
+def _out_option(kind: click.Path, text: str) -> Option:
     options = {"out": click.option("--out", type=kind, help=text), "force": force_option}
     return gathered("out", lambda out, force: None if out is None else Out(out, force), options)
 

@@ -1,7 +1,5 @@
 """What a verb shows: one JSON document, or lines and tables on stdout, a progress bar on stderr; its files; and Ctrl-C."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -62,17 +60,15 @@ class Out:
         from matplotlib.figure import Figure
 
         from ..experiments.figures import save
-        from ..experiments.tables import write_csv
         from ..files import write_manifest, write_output
 
         files = []
         for name, each in made.items():
             if isinstance(each, Figure):
                 files.append(save(each, self.path / name, force=self.force))
-            elif isinstance(each, str):
-                files.append(write_output(self.path / name, each.encode("utf-8"), self.force, make_folder=True))
             else:
-                files.append(write_csv(each, self.path / name, self.force))
+                text = each if isinstance(each, str) else each.to_csv(index=False, lineterminator="\n")
+                files.append(write_output(self.path / name, text.encode("utf-8"), self.force, make_folder=True))
         return files if "" in made else [*files, write_manifest(self.path, files, self.force)]
 
 
@@ -117,7 +113,7 @@ def show(*parts: Any) -> None:
         screen.print(part, highlight=False, markup=False, soft_wrap=isinstance(part, str))
 
 
-def facts(title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")) -> Table:
+def facts(title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")) -> "Table":
     """A table of named facts, a row each: its name, and its values under `columns`; passwords are masked."""
     from rich.table import Table
 
@@ -137,7 +133,7 @@ def rows_of(record: Any, *left_out: str) -> Iterator[tuple[str, str]]:
             yield heading(each.name), written(each.name, value)
 
 
-def listed(title: str, records: Iterable[Any], *names: str) -> Table:
+def listed(title: str, records: Iterable[Any], *names: str) -> "Table":
     """A table of records, a row each, of these fields."""
     rows = [[written(name, getattr(one, name)) for name in names] for one in records]
     return facts(title, rows, list(map(heading, names)))
@@ -200,7 +196,7 @@ UNITS: dict[str, Callable[[float], str]] = {  # by the ending of a field's name
 }
 
 
-def certificate_record(certificate: Certificate) -> dict[str, Any]:
+def certificate_record(certificate: "Certificate") -> dict[str, Any]:
     """A certificate as JSON has it: its numbers, and what they say in words."""
     said = {name: getattr(certificate, name) for name in ("kept", "sentence", "sentence_on_rejects")}
     return asdict(certificate) | said

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ..experiments.replay import Contender, Replay
 
 FEEDBACKS = {"stops": False, "confirmed": True}
+VARIED = ("interval", "alpha", "lower_bound")  # in a grid, as the paper's
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ def _replay(who: Sequence[Contender], grid: Mapping[str, Any], source: DataChoic
     by_name = _grouped(replays, lambda each: each.name)
     title = _title(dataset.name, by_name, not stream.shuffle)
     # The paper's findings are of a grid under one guarantee and one feedback.
-    found = findings(frame) if _is_grid(frame) and not _varies(frame, "guarantee", "stops", "confirm") else []
+    found = findings(frame) if _varies(frame, *VARIED) and not _varies(frame, "guarantee", "stops", "confirm") else []
     record = {"data": dataset.name, "in_order": not stream.shuffle, "faults": dataset.faults, "rows": rows}
     record |= {"interrupted": bool(finished.interrupted), "findings": found, "costs": finished.costs}
     lines = [tables.pooled_table(rows, title, explained(tables.LEGEND)), *tables.promise_lines(rows)]
@@ -233,10 +234,6 @@ def _varies(frame: pd.DataFrame, *names: str) -> bool:
     return any(len(frame[name].unique()) > 1 for name in names)
 
 
-def _is_grid(frame: pd.DataFrame) -> bool:
-    return _varies(frame, "interval", "alpha", "lower_bound")
-
-
 def _made(frame: pd.DataFrame, replays: Sequence[Replay], title: str) -> Iterator[tuple[str, Any]]:
     import numpy as np
 
@@ -244,7 +241,7 @@ def _made(frame: pd.DataFrame, replays: Sequence[Replay], title: str) -> Iterato
     from ..experiments.paper import grid_lines
 
     yield "replays.csv", frame
-    if _is_grid(frame):
+    if _varies(frame, *VARIED):
         yield "tables.md", "\n".join(grid_lines(frame)) + "\n"
         for name, some in _grouped(replays, lambda each: _row_name(each, frame, "interval")).items():
             yield _file_name(f"grid_{name}"), grid_figure(some, name)

@@ -172,8 +172,7 @@ def host_and_port(address: str) -> tuple[str, int]:
     from ..cells.ur.protocol import PORT
 
     host, _, port = address.partition(":")
-    if port and not port.isdecimal():
-        raise SettingError(f"Expected a host, or host:port, got {address!r}.")
+    expect(not port or port.isdecimal(), "a host, or host:port", address)
     return host, int(port) if port else PORT
 
 
@@ -181,10 +180,10 @@ CELLS: dict[str, Callable[..., Driven]] = {"simulated": _simulated, "replay": _r
 CAPTION = (
     "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
     "cell tells the truth about parts that were not verified. novel: parts verified for being unlike all known ones; safe: "
-    "cycles of safe mode; good/h: good parts passed on an hour."
+    "cycles of safe mode; outside: parts that left a window, verified or rejected; good/h: good parts passed on an hour."
 )
 COLUMNS = {"accepted": "accepted", "FP": "false_positive", "stops": "stops", "rejected": "rejected"}
-COLUMNS |= {"FN": "false_negative", "novel": "novel", "safe": "safe_mode"}
+COLUMNS |= {"FN": "false_negative", "novel": "novel", "safe": "safe_mode", "outside": "outside"}
 
 
 def _report(log: Replay, said: dict[str, Any], cell: Any, out: Out | None) -> None:
@@ -199,7 +198,7 @@ def _report(log: Replay, said: dict[str, Any], cell: Any, out: Out | None) -> No
     for row in (*stretches, total):
         between = f"{row['first_cycle']} to {row['last_cycle']}"
         cells = {"cycles": between, "verified": percent(row["verified_share"], ".0f")}
-        cells |= {title: str(row[name]) for title, name in COLUMNS.items()}
+        cells |= {title: str(row[name]) for title, name in COLUMNS.items() if name != "outside" or total[name]}
         if total["parts_per_hour"] is not None:
             cells["good/h"] = written("", row["parts_per_hour"])
         rows.append(cells)

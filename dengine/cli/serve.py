@@ -1,7 +1,5 @@
 """`dengine serve`: one engine behind HTTP, XML-RPC and a page."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -107,7 +105,7 @@ def serve(
         serve_cell(make, store, click.echo, **how)
 
 
-def _opened(store: str, seed: int | None, shadow: bool, executor: Executor, **how: Any) -> DataEngine:
+def _opened(store: str, seed: int | None, shadow: bool, executor: "Executor", **how: Any) -> "DataEngine":
     from ..engine.engine import DataEngine
     from ..serve.server import tell_safe_mode
 

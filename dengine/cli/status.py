@@ -1,7 +1,5 @@
 """`dengine status`: how an engine is doing by its store, what the store holds, and who shares it."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any
@@ -11,7 +9,7 @@ import click
 from ..errors import percent
 from . import options
 from .options import verb
-from .output import certificate_record, facts, heading, listed, rows_of, tell, when, written
+from .output import certificate_record, duration, facts, heading, listed, rows_of, tell, when, written
 
 if TYPE_CHECKING:
     from ..history.status import Judged, Span, Status
@@ -26,7 +24,8 @@ LAST = "The newest so many decisions, looked at apart."
 @verb("dengine status engine.db --last 500")
 @options.store_argument
 @click.option("--last", type=options.COUNT, default=500, show_default=True, help=LAST)
-def status(store: str, last: int) -> None:
+@options.check_option
+def status(store: str, last: int, check_seconds: float) -> None:
     """Say how an engine is doing, and what its store holds.
 
     STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`. Where it holds
@@ -48,11 +47,14 @@ def status(store: str, last: int) -> None:
         store = address(store, first.cell_id)
     with closing(open_store(store, must_exist=True)) as opened:
         found = status_of(opened, last, watching=True)
+    n, checked = found.ever.would_accept.n + found.ever.would_reject.n, found.ever.verified
+    saved = f"{duration(n * check_seconds)} of checks at {duration(check_seconds)}"
+    would = [f"It would have decided {n:,} of the {checked:,} parts that were verified: {saved}."] if n else []
     record = {"store": store} | plain(found) | {"certificate": certificate_record(found.certificate)}
-    tell(record, *_tables(store, found))
+    tell(record, *_tables(store, found), *would)
 
 
-def _tables(store: str, found: Status) -> list[Any]:
+def _tables(store: str, found: "Status") -> list[Any]:
     """A column each for the newest decisions and for all; and what is of now."""
     columns, both = ("", f"last {found.newest.decisions:,}", "since birth"), (found.newest, found.ever)
     names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "stops")  # what is bad comes first
@@ -70,14 +72,14 @@ def _tables(store: str, found: Status) -> list[Any]:
     return [facts(f"{store}: overview", spans, columns), facts("What it is", now)]
 
 
-def _of_span(name: str, span: Span) -> str:
+def _of_span(name: str, span: "Span") -> str:
     value = getattr(span, name)
     if name in ("first", "last"):
         return when(value)
     return _held(value, span.stops if name == "bad_accepts" else 0) if hasattr(value, "verdict") else written(name, value)
 
 
-def _held(said: Judged, stops: int) -> str:
+def _held(said: "Judged", stops: int) -> str:
     """An interval of the share of wrong ones, held against what is tolerated; first the stops that no share tells."""
     first = f"{stops:,} stop{'s' * (stops > 1)}; " if stops and said.by != "every outcome" else ""
     if not said.known and said.verdict == "open":

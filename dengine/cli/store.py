@@ -41,6 +41,11 @@ interval_option = click.option("--interval", type=Known("interval"), help="The c
 author_option = click.option("--author", default=_login, help="Who says so, for the record.  [default: the login name]")
 
 
+def on_store(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Which store's engine is changed, by whom, and whether what it names may be imported."""
+    return options.store_argument(options.allow_import_option(author_option(command)))
+
+
 def _changed(store: str, author: str, allow_import: bool, change: Callable[[DataEngine], Changed]) -> None:
     """Open the store's engine, change something, and say what happened."""
     from ..engine.engine import DataEngine
@@ -55,11 +60,9 @@ def _changed(store: str, author: str, allow_import: bool, change: Callable[[Data
 
 
 @verb("dengine report engine.db import-d684ff7e4dbab839-0 bad")
-@options.store_argument
+@on_store
 @click.argument("part", metavar="PART|ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
-@options.allow_import_option
-@author_option
 def report(store: str, part: str, label: str, author: str, allow_import: bool) -> None:
     """Report what became of a part.
 
@@ -81,11 +84,9 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
 
 
 @verb("dengine correct engine.db import-d684ff7e4dbab839-0 bad")
-@options.store_argument
+@on_store
 @click.argument("decision", metavar="ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
-@options.allow_import_option
-@author_option
 def correct(store: str, decision: str, label: str, author: str, allow_import: bool) -> None:
     """Say that a label was wrong: the part was good, or bad.
 
@@ -96,11 +97,9 @@ def correct(store: str, decision: str, label: str, author: str, allow_import: bo
 
 
 @verb("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")
-@options.store_argument
+@on_store
 @click.argument("decisions", metavar="ID...", nargs=-1, required=True)
 @click.option("--reason", default="", help="Why, for the record.")
-@options.allow_import_option
-@author_option
 def forget(store: str, decisions: tuple[str, ...], reason: str, author: str, allow_import: bool) -> None:
     """Leave labels out of all that is learned and counted.
 
@@ -111,10 +110,8 @@ def forget(store: str, decisions: tuple[str, ...], reason: str, author: str, all
 
 
 @verb("dengine rollback engine.db 1")
-@options.store_argument
+@on_store
 @click.argument("version", metavar="VERSION", type=int)
-@options.allow_import_option
-@author_option
 def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
     """Let an earlier model version answer again, as a new one.
 
@@ -124,10 +121,8 @@ def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
 
 
 @verb("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
-@options.store_argument
+@on_store
 @options.gathered("settings", options.given, POLICY | {"interval": interval_option, "shadow": shadow_option})
-@options.allow_import_option
-@author_option
 def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool) -> None:
     """Show the policy in force, or decide by another one.
 
@@ -146,9 +141,7 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 
 
 @verb("dengine retrain engine.db")
-@options.store_argument
-@options.allow_import_option
-@author_option
+@on_store
 def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels as they count.
 

@@ -5,8 +5,6 @@
 >>> load_dataset("cell_3/", channel="FZ_Base,FX_Base") # a CSV file an insertion, its label in its name
 """
 
-from __future__ import annotations
-
 from .dataset import Dataset, Fault, make_dataset
 from .loading import BUNDLED, load_dataset
 

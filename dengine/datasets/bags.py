@@ -4,8 +4,6 @@ The force is a topic of geometry_msgs/WrenchStamped or Wrench; its times are the
 the log. Labels are a topic, of which the first message after an insertion has begun counts, or a file of them by number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -70,7 +68,7 @@ def axis_of(name: str) -> int:
 
 
 @contextmanager
-def _reader(path: Path) -> Iterator[McapReader]:
+def _reader(path: Path) -> "Iterator[McapReader]":
     """A file's reader; DataError for whatever its libraries raise on a file that is damaged, or is something else."""
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
@@ -160,7 +158,7 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     else:
         raise DataError("Expected the labels' topic (label='/height_check/ok'), or a file of them (labels='labels.csv').")
 
-    def read(cut: Insertion) -> Timed:
+    def read(cut: "Insertion") -> Timed:
         if cut.fault:
             raise UnreadableError(cut.fault)
         return cut.trace, None if asked.rate_hz else rate
@@ -168,7 +166,7 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     return as_dataset(labels.collect(insertions, read, told, Collected(name, channels)), asked)
 
 
-def _told(asked: Asked, messages: Messages, cuts: Sequence[Insertion], names: Sequence[str]) -> labels.Labels:
+def _told(asked: Asked, messages: Messages, cuts: "Sequence[Insertion]", names: Sequence[str]) -> labels.Labels:
     """Labels from a topic: of each insertion the value that was told next, if it was before another one began."""
     topic = str(asked.label)
     words, begins = dict[str, Any](), messages.logged[[cut.first for cut in cuts]]

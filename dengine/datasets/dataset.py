@@ -3,8 +3,6 @@
 Recordings of whatever length become one block of traces honestly: what cannot be fitted is a fault, not made up.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections import Counter
@@ -106,7 +104,7 @@ class Dataset:
         n_channels = 1 if self.X.ndim == 2 else self.X.shape[1]
         return TraceSpec(self.X.shape[-1], self.rate_hz, n_channels, self.unit, fit=self.fit, columns=self.channels)
 
-    def to_frame(self) -> pd.DataFrame:
+    def to_frame(self) -> "pd.DataFrame":
         """A row a trace: `label`, `part` and `cause` where known, and `FZ_0 ...`, a column a sample of each channel.
 
         `data.to_frame().to_parquet("data.parquet")` writes what `load_dataset` reads.
@@ -120,7 +118,7 @@ class Dataset:
         about = pd.DataFrame({name: values for name, values in known.items() if values is not None})
         return pd.concat([about, pd.DataFrame(X.reshape(len(X), -1), columns=names)], axis=1)
 
-    def cut(self, samples: int) -> Dataset:
+    def cut(self, samples: int) -> "Dataset":
         """The first `samples` samples of every trace: an earlier, harder moment to decide at."""
         have = self.X.shape[-1]
         must(1 <= samples <= have, f"1 to {have} samples of {self.name}", samples)

@@ -6,8 +6,6 @@
 A trace is imported once: its id comes from its content. Traces that a cell recorded itself have other ids.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections import Counter
@@ -34,13 +32,14 @@ from . import Dataset, load_dataset
 from .loading import TABLES
 
 if TYPE_CHECKING:
+    from ..store.opening import StoreLike
     from ..store.sql import SqlStore
 
 CHUNK = 500  # traces committed together
 RATE = 0.02  # as near as rates that are measured from timestamps come to each other
 
 
-def form_in(store: str | os.PathLike[str] | SqlStore, source: Any) -> dict[str, Any]:
+def form_in(store: "StoreLike", source: Any) -> dict[str, Any]:
     """The `samples` and `fit` that give recordings the form of those in a store; empty for a new store, or other sources.
 
     Files that are added change the median that lengths are padded to: all others would come out changed, and count again.
@@ -90,7 +89,7 @@ class ImportReport:
 
 
 def import_labelled(
-    store: str | os.PathLike[str] | SqlStore,
+    store: "StoreLike",
     dataset: Any,
     recipe: Recipe | str | None = None,
     seed: int | None = None,
@@ -121,11 +120,11 @@ def import_labelled(
 
 
 def import_parts(
-    store: SqlStore,
+    store: "SqlStore",
     parts: Sequence[tuple[Decision, NDArray[np.float32], bool | None]],
     spec: TraceSpec,
     policy: Policy,
-    on_traces: Callable[[int], None] | None,
+    on_traces: Callable[[int], None] | None = None,
 ) -> ImportReport:
     """Put parts, each with its decision, its trace (C, T) and its label, None where nothing was heard of it, into a store.
 

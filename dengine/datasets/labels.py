@@ -4,8 +4,6 @@ Words, in any case: true ok pass passed good success successful yes io gut 1; fa
 schlecht 0; and a word of the first kind after a not, as in `run_7_not_ok.csv`.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections import Counter, defaultdict
@@ -14,7 +12,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-from ..errors import DataError
+from ..errors import DataError, instead
 from .dataset import Collected, Fault, Recorded, UnknownWordError, UnreadableError, must
 from .text import Timed, read_table
 
@@ -25,7 +23,7 @@ LAST = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # words without a number, at 
 NOT = r"((?:not|non|no|nicht)[_\-. ]*)?"
 WORD = re.compile(f"{NOT}({'|'.join(GOOD + BAD)})", re.IGNORECASE)
 IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
-GERMAN = ("ergebnis", "bewertung")
+GERMAN = ("ergebnis", "bewertung", "urteil")
 LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome", *GERMAN)
 FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source", "insertion", "datei", "dateiname")
 
@@ -72,12 +70,9 @@ def named(pattern: str | None = None, words: Words = NONE) -> Labels:
     words : as of `label_of`.
     DataError for a pattern that is no regular expression with one group.
     """
-    try:
+    with instead(DataError, f"Expected a regular expression for the label, got {pattern!r}", re.error):
         expression = None if pattern is None else re.compile(pattern)
-    except re.error as error:
-        raise DataError(f"Expected a regular expression for the label, got {pattern!r}: {error}.") from error
-    if expression is not None and expression.groups != 1:
-        raise DataError(f"Expected one group in the label's pattern, as in '_(OK|NOK)_', got {pattern!r}.")
+    must(expression is None or expression.groups == 1, "one group in the label's pattern, as in '_(OK|NOK)_'", pattern)
 
     def find(name: str) -> Known:
         if expression is None:
@@ -127,13 +122,17 @@ def listed(path: str | os.PathLike[str], part: str, names: Sequence[str], words:
 
     A recording is listed by its path, its end, or longer by a folder; without suffix, in any case.
     part : the column of parts' numbers.  names : of all recordings.  words : as of `label_of`.
-    A file without a header, which names a .csv in its first line, has files, labels in this order.
+    A file without a header, which names a .csv in its first line, has files, labels in this order. A column of files that
+    is called otherwise is known by the recordings' names in it.
     """
-    source, (rows, faults) = Path(path).name, _rows(path, part)
+    source, (rows, faults) = Path(path).name, _rows(path, part, names)
     ends = defaultdict[str, list[_Row]](list)  # by the file's name alone
     for row in rows:
         ends[row.words[0]].append(row)
-    alike = {name: [row for row in ends[_words(name)[0]] if _alike(row.words, _words(name))] for name in names}
+    alike = {
+        name: [row for row in ends[_words(name)[0]] if all(a == b for a, b in zip(row.words, _words(name), strict=False))]
+        for name in names
+    }
     times = Counter(row for each in alike.values() for row in each)
     lost = [row for row in rows if not times[row]]
     faults += [Fault(source, row.line, f"Expected the name of a recording, found no file {row.file}") for row in lost]
@@ -164,7 +163,7 @@ def in_order(path: str | os.PathLike[str], part: str) -> list[str]:
     return [row.label for row in rows]
 
 
-def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fault]]:
+def _rows(path: str | os.PathLike[str], part: str, names: Sequence[str] = ()) -> tuple[list[_Row], list[Fault]]:
     try:
         table, faults = read_table(Path(path))
     except (OSError, UnreadableError) as error:
@@ -172,7 +171,9 @@ def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fau
     header, cells = list(table.columns), dict(zip(table.index, table.to_numpy().tolist(), strict=True))
     if header[0].lower().endswith(".csv"):
         header, cells = ["file", "label", *header[2:]], {1: header, **cells}
-    of_file, of_label = _columns(header, path)
+    ends = {_words(name)[0] for name in names}
+    named = [i for i in range(len(header)) if any(_words(row[i])[0] in ends for row in cells.values())]
+    of_file, of_label = _columns(header, path, named)
     if part != "part" and part not in header:
         raise DataError(f"Expected a column {part} of parts' numbers in {path}, got {', '.join(header)}.")
     rows: dict[tuple[str, ...], _Row] = {}
@@ -190,19 +191,16 @@ def _words(path: str) -> tuple[str, ...]:
     return words.pop().removesuffix(".csv"), *reversed(words)
 
 
-def _alike(one: Sequence[str], other: Sequence[str]) -> bool:
-    return all(a == b for a, b in zip(one, other, strict=False))
-
-
 def column_among(header: Sequence[str], known: Sequence[str]) -> int | None:
     """Where the first of some known names stands in a header, in any case; None where none does."""
     lower = [name.lower() for name in header]
     return next((lower.index(name) for name in known if name in lower), None)
 
 
-def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Where the files and where the labels are; of two columns, the first and the second, or the one that is left."""
+def _columns(header: Sequence[str], path: str | os.PathLike[str], named: Sequence[int]) -> tuple[int, int]:
+    """Where files and labels are; of two columns the first and the second, or the other.  named : those with recordings."""
     of_file, of_label = column_among(header, FILE_COLUMNS), column_among(header, LABEL_COLUMNS)
+    of_file = named[0] if of_file is None and len(named) == 1 else of_file
     if len(header) == 2:
         of_file = of_file if of_file is not None else 0 if of_label is None else 1 - of_label
         of_label = 1 - of_file

@@ -1,7 +1,5 @@
 """One door for all that holds labelled traces, `load_dataset`; and what is read from arrays."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError, listed
+from ..errors import DataError, instead, listed
 from ..files import is_database, read_archive, reading
 from ..records import trace_in
 from ..traces import as_trace, spec_of
@@ -257,12 +255,10 @@ def _labels(y: Any, asked: Asked) -> Any:
             found.unknown[str(word)] += 1
             return 0
 
-    try:
+    with instead(DataError, "Expected a label for each trace, 1 (success) or 0 (failure)", ValueError, TypeError):
         words = np.asarray(y)
         given = words.dtype.kind in "OUS" or asked.words
         told = np.array([meant(each) for each in words.tolist()]) if given else words
-    except (ValueError, TypeError) as error:
-        raise DataError(f"Expected a label for each trace, 1 (success) or 0 (failure): {error}.") from error
     found.must_mean_something()
     return told
 

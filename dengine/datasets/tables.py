@@ -23,7 +23,7 @@ from ..files import reading
 from ..traces import is_time
 from . import labels
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import NUMBER, Timed, cells_of, decoded, floats, numbers, read_recording, read_table, recording_of
+from .text import NOTHING, Timed, cells_of, decoded, floats, numbers, read_recording, read_table, recording_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -122,9 +122,6 @@ def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
             frame, faults = read_table(path, found.encodings) if path.suffix.lower() == ".csv" else _parquet(path)
         except UnreadableError as error:
             raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
-        odd = [word for word in frame.columns if NUMBER.fullmatch(word) and not word.isdecimal()]
-        if path.suffix.lower() == ".csv" and 2 * len(odd) > len(frame.columns) > 2:
-            raise DataError(f"Expected a header in {path}, its first line is of numbers; call it FZ_0, FZ_1, ..., label.")
         if frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
         found.faults += [replace(fault, source=source) for fault in faults]
@@ -238,14 +235,13 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
         return recording_of(rows.sort_values(time, kind="stable"), places, asked.rate_hz is None, time)
 
     def find(part: str) -> labels.Known:
-        words = parts[part][label].dropna().unique().tolist()
+        words = [word for word in parts[part][label].unique().tolist() if str(word).strip().lower() not in NOTHING]
         if len(words) != 1:
             raise UnreadableError(f"Expected one label in column {label}, got {listed(words) or 'none'}")
         return labels.label_of(words[0], asked.words), None
 
-    if asked.labels is None:
-        told = labels.Labels(find, "name the column of labels (label)")
-    else:
+    told = labels.Labels(find, "name the column of labels (label)")
+    if asked.labels is not None:
         told = labels.listed(asked.labels, "part", list(parts), asked.words)
     return as_dataset(labels.collect(parts, read, told, found), asked)
 
@@ -263,7 +259,9 @@ def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.Dat
         raise DataError(f"Expected the channel to be named, as in channel={have[0]!r}; there are {told}.")
     picked = frame[frame[tags[0]].isin(asked.channels)]
     wide = picked.pivot(index=known, columns=tags[0], values=values[0])  # noqa: PD010 - pivot_table would average
-    return wide.reset_index().set_axis(range(1, len(wide) + 1))
+    came = {part: i for i, part in enumerate(picked[known[0]].unique())}  # a pivot sorts S10 before S9
+    wide = wide.reset_index().sort_values(known[0], key=lambda parts: parts.map(came), kind="stable")
+    return wide.set_axis(range(1, len(wide) + 1))
 
 
 def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
@@ -271,12 +269,13 @@ def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
     time = next((name for name in frame.columns if is_time(name)), None)
     if time is None or max(map(len, _numbered(frame.columns).values()), default=0) > 2:
         return ""
-    rows = frame.bfill()  # a label may stand in a part's last row alone
+    rows = frame.mask(frame == "").bfill()  # a label may stand in a part's last row alone
     changes = {name: int((rows[name] != rows[name].shift()).sum()) for name in frame.columns if name != time}
     few = [name for name, n in changes.items() if 2 <= n <= len(frame) / 5]
     if not few:
         return ""
-    part, label = max(few, key=changes.__getitem__), min(few, key=changes.__getitem__)
+    part = max(few, key=changes.__getitem__)
+    label = min(few, key=lambda name: (name.lower() not in labels.LABEL_COLUMNS, changes[name]))
     told = f"label={label!r}" if label != part else f"labels={beside!r}, a file of parts and labels"
     told = f" and time={time!r}" if asked.labels is not None else f", time={time!r} and {told}"
     return f"the columns that tell which part it is, when, and the label, as in part={part!r}{told}"
@@ -311,9 +310,8 @@ def _label_column(frame: pd.DataFrame, asked: Asked, found: Collected) -> str:
     several = {name for names in _numbered(frame.columns).values() if len(names) > 1 for _, name in names}
     left = [name for name in frame.columns if name not in several]
     if asked.time is None and len(left) == len(frame.columns) and any(is_time(name) for name in left):
-        raise DataError(
-            f"Expected a row an insertion, got {listed(left)}, as in one recording; give a folder of such CSV files."
-        )
+        do = "as in one recording; give a folder of such CSV files"
+        raise DataError(f"Expected a row an insertion, got {listed(left)}, {do}.")
     likely = min(left, key=lambda name: (frame[name].nunique() < 2, frame[name].nunique()), default="...")
     have = listed(left or frame.columns)
     raise DataError(f"Expected a column of labels, y or label, found {have}; name it: label={likely!r}.")

@@ -55,7 +55,7 @@ def _from_header(lines: list[int], rows: list[list[str]]) -> dict[int, list[str]
     """Line number -> cells from the header on, without what a recorder writes above it, and without a row of units.
 
     A row of data has numbers in most columns that have them in the last rows. A first line that may be the header is one,
-    if only one other line is above the data: that is damaged data.
+    if only one other line is above the data: that is damaged data. UnreadableError where there is none.
     """
     numbers: Callable[[list[str]], frozenset[int]]
     numbers = lambda row: frozenset(i for i, word in enumerate(row) if NUMBER.fullmatch(word))  # noqa: E731
@@ -65,6 +65,9 @@ def _from_header(lines: list[int], rows: list[list[str]]) -> dict[int, list[str]
     header = max(data - 1 - (data > 1 and units[-1]), 0)
     if header == 1 and len(rows[0]) >= len(rows[data]) and not units[0]:
         header = data = 0
+    for row in rows[header : header + 1]:  # whole numbers may be names
+        if 2 * len(numbers(row)) > len(row) and not all(row[i].isdecimal() for i in numbers(row)):
+            raise UnreadableError("Expected a header, its first line is of numbers; write one above, as in time,FZ", 1)
     return {i: rows[k] for k, i in enumerate(lines) if k == header or k >= max(data, 1)}
 
 

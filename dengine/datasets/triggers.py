@@ -4,8 +4,6 @@ A signal is a channel (`FZ_Base`), a field of the controller (`output_int_regist
 of a file. What a timestamp leaves out is a NaN at its place, so that whoever decides finds it: nothing is filled in.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The radius-neighbour classifier with a confidence bound, as a scikit-learn estimator over embeddings."""
 
-from __future__ import annotations
-
 from typing import Any, Self
 
 import numpy as np
@@ -130,8 +128,6 @@ def classes_of(y: ArrayLike) -> NDArray[Any]:
     check_classification_targets(y)
     classes = np.unique(np.asarray(y))
     if len(classes) > 2:
-        raise ValueError(
-            "Only binary classification is supported. The type of the target is multiclass: expected two classes, "
-            f"1 = success and 0 = failure, got {len(classes)}."
-        )
+        said = "Only binary classification is supported. The type of the target is multiclass"
+        raise ValueError(f"{said}: expected two classes, 1 = success and 0 = failure, got {len(classes)}.")
     return classes

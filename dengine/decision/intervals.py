@@ -9,8 +9,6 @@ All take integer arrays of one shape and return `(lower, upper)`, float64 of tha
 with `0 <= lower <= n_success / n <= upper <= 1`. Without neighbours nothing is known: (0, 1).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from statistics import NormalDist
 from typing import Any
@@ -18,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import SettingError
+from ..errors import expect
 
 SORTED = ("pooled", "cost")  # guarantees under which the interval around a trace only sorts
 SORTING = 0.5  # two-sided error level of an interval that only sorts: z = 0.67
@@ -34,8 +32,8 @@ def level_of(alpha: float, guarantee: str) -> float:
 
 def normal_quantile(alpha: float) -> float:
     """Z of a two-sided interval: the 1 - alpha/2 quantile of the standard normal distribution."""
-    if not 0.0 < alpha / 2.0 < 1.0 - alpha / 2.0 < 1.0:  # one that is too small to be told from 0 is none either
-        raise SettingError(f"Expected 0 < alpha < 1, got {alpha!r}; 0.05 asks for a 95 % interval.")
+    told = 0.0 < alpha / 2.0 < 1.0 - alpha / 2.0 < 1.0  # one that is too small to be told from 0 is none either
+    expect(told, "0 < alpha < 1", alpha, "0.05 asks for a 95 % interval")
     return NormalDist().inv_cdf(1.0 - alpha / 2.0)
 
 

@@ -79,19 +79,13 @@ class Policy:
         expect(is_whole(self.label_within, 1, 10**9), "label_within of at least one decision", self.label_within)
         listed = self.windows if isinstance(self.windows, tuple | list) else (None,)
         windows = tuple(Window.parse(each) if isinstance(each, str) else each for each in listed)
-        expect(
-            all(isinstance(each, Window) for each in windows), "a list of windows, each a Window, or its text", self.windows
-        )
+        known = all(isinstance(each, Window) for each in windows)
+        expect(known, "a list of windows, each a Window, or its text", self.windows)
         object.__setattr__(self, "windows", windows)
         known = isinstance(self.prices, tuple | list) and len(self.prices) == 3 and all(map(is_number, self.prices))
         prices = tuple(float(each) for each in self.prices) if known else (0.0, 0.0, 0.0)
         known = 0.0 < 2.0 * prices[0] < min(prices[1:]) and max(prices) < math.inf
-        expect(
-            known,
-            "prices of a check, an escape and a false reject, errors above two checks",
-            self.prices,
-            "as in 5,120,47.5",
-        )
+        expect(known, "prices of check, escape and false reject, errors above two checks", self.prices, "as in 5,120,47.5")
         object.__setattr__(self, "prices", prices)
         if self.guarantee in SORTED and self.stops == "some" and self.audited_share == 0.0:
             raise SettingError(

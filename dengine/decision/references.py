@@ -206,10 +206,8 @@ class RadiusIndex(nn.Module):
         z, y = np.array(points, dtype=np.float32), np.array(labels, dtype=np.float32)  # copies: torch needs writable ones
         k, own = (np.zeros(len(z), np.int64) if v is None else np.array(v, dtype=np.int64) for v in (spaces, parts))
         if z.ndim != 2 or z.shape[1] != self.dim or {y.shape, k.shape, own.shape} != {(len(z),)}:
-            raise ValueError(
-                f"Expected points (n, {self.dim}) with n labels, n spaces and n parts, "
-                f"got {z.shape}, {y.shape}, {k.shape} and {own.shape}."
-            )
+            got = f"{z.shape}, {y.shape}, {k.shape} and {own.shape}"
+            raise ValueError(f"Expected points (n, {self.dim}) with n labels, n spaces and n parts, got {got}.")
         total = int(self.total)
         keep = slice(max(0, len(z) - self.capacity), None)  # of more than fit, the newest
         slots = (total + np.arange(len(z))[keep]) % self.capacity

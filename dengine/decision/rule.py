@@ -45,7 +45,7 @@ the side that alarmed has done so, and after too many novel traces until these a
 import math
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -106,17 +106,10 @@ def binomial_bound(n_success: int, n_failure: int, z: float) -> tuple[float, flo
     return max(0.0, min(rate - half, rate)), min(1.0, max(rate + half, rate))
 
 
-@dataclass(frozen=True)
-class TableBound:
-    """Any of `INTERVALS` on two scalars, for those that need SciPy's special functions; it does not compile."""
-
-    interval: str
-    alpha: float
-
-    def __call__(self, n_success: int, n_failure: int, z: float) -> tuple[float, float]:
-        """(lower, upper); z is not used."""
-        lower, upper = INTERVALS[self.interval](n_success, n_failure, self.alpha)
-        return float(lower), float(upper)
+def table_bound(interval: str, alpha: float, n_success: int, n_failure: int, z: float) -> tuple[float, float]:
+    """Any of `INTERVALS` on two scalars, for those that need SciPy's special functions, without z; it does not compile."""
+    lower, upper = INTERVALS[interval](n_success, n_failure, alpha)
+    return float(lower), float(upper)
 
 
 Bound = Callable[[int, int, float], tuple[float, float]]
@@ -310,9 +303,7 @@ class DecisionRule(nn.Module):
     compiles = True
     sorts = False
 
-    def __init__(
-        self, alpha: float, lower_bound: float, interval: str = "wilson", evidence: Evidence | None = None
-    ) -> None:
+    def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson", evidence: Evidence | None = None):
         super().__init__()
         self.alpha = float(alpha)
         self.accept_at = float(lower_bound)
@@ -321,8 +312,9 @@ class DecisionRule(nn.Module):
         own = SORTING if self.sorts else float(alpha)
         self.z = float(normal_quantile(own))
         self.scriptable = self.compiles and interval in SCALAR_BOUNDS  # what an export needs
-        self.bound: Bound = SCALAR_BOUNDS.get(interval, TableBound(interval, own))
+        self.bound: Bound = SCALAR_BOUNDS.get(interval, partial(table_bound, interval, own))
         self.evidence = evidence
+        self.more: tuple[Any, ...] = ()  # that a rule of ours is made by, behind its interval
 
     def forward(self, n_success: int, n_failure: int) -> tuple[int, float, float]:
         """Counts in a ball -> action (0 verify, 1 accept, 2 reject), lower, upper."""
@@ -359,7 +351,7 @@ class DecisionRule(nn.Module):
     @torch.jit.unused
     def anew(self) -> "DecisionRule":
         """The same rule before it was told anything."""
-        return type(self)(self.alpha, self.accept_at, self.interval)
+        return type(self)(self.alpha, self.accept_at, self.interval, *self.more)
 
     @torch.jit.unused
     def begin_in(self, mode: int) -> None:
@@ -397,12 +389,7 @@ class PooledRule(DecisionRule):
         levels = [float(lower_bound) - i * step for i in range(int((lower_bound - LOWEST) / step + 1e-9) + 1)]
         evidence = Evidence(alpha, (tolerance, tolerance), [levels, levels], rate)
         super().__init__(alpha, lower_bound, interval, evidence)
-        self.rate = rate
-
-    @torch.jit.unused
-    def anew(self) -> DecisionRule:
-        """The same rule before it was told anything."""
-        return type(self)(self.alpha, self.accept_at, self.interval, self.rate)
+        self.rate, self.more = rate, (rate,)
 
 
 class PricedRule(DecisionRule):
@@ -417,12 +404,7 @@ class PricedRule(DecisionRule):
     def __init__(self, alpha: float, lower_bound: float, interval: str, tolerances: Pair, rate: float = 1.0) -> None:
         levels = [[1.0 - share * each for share in STRICTER] for each in tolerances]
         super().__init__(alpha, lower_bound, interval, Evidence(alpha, tolerances, levels, rate, rule="priced"))
-        self.tolerances, self.rate = tolerances, rate
-
-    @torch.jit.unused
-    def anew(self) -> DecisionRule:
-        """The same rule before it was told anything."""
-        return type(self)(self.alpha, self.accept_at, self.interval, self.tolerances, self.rate)
+        self.more = tolerances, rate
 
 
 class RadiusNeighbours(nn.Module):
@@ -470,10 +452,9 @@ def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Copy arrays into a module's parameters and buffers by name; StoreError where these have other names or sizes."""
     own = module.state_dict()  # shares its tensors with the module
     if {name: value.shape for name, value in arrays.items()} != {name: tuple(v.shape) for name, v in own.items()}:
-        raise StoreError(
-            f"Expected a model of this version of dengine, got one whose {type(module).__name__} has other sizes; its "
-            "labels are whole: learn from them anew, by `dengine train --data OLD.db --store NEW.db`."
-        )
+        got = f"one whose {type(module).__name__} has other sizes; its labels are whole"
+        do = "learn from them anew, by `dengine train --data OLD.db --store NEW.db`"
+        raise StoreError(f"Expected a model of this version of dengine, got {got}: {do}.")
     for name, value in arrays.items():
         own[name].copy_(torch.from_numpy(np.array(value)))
 

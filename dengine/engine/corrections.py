@@ -8,7 +8,7 @@ again as a new one, and what was decided stays as it was decided.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,12 +16,12 @@ import numpy as np
 from ..decision.intervals import SORTED
 from ..decision.policy import Policy
 from ..decision.rule import SAFE_MODE
-from ..errors import ReportError, SettingError, listed
+from ..errors import ReportError, SettingError, expect, listed
 from ..records import as_success
 from ..store.outbox import Outbox
 from ..store.records import Change, StoredDecision, nothing_to_correct, unknown_decision
 from .feedback import Feedback
-from .settings import EvidenceWindow, SettingsInForce
+from .settings import EvidenceWindow, SettingsInForce, of_policy
 from .trainer import HUNG
 from .versions import ModelVersions
 
@@ -118,25 +118,21 @@ class Corrections:
         accepted before, and of which nothing was heard, stays unobserved.
         In the shadow mode, `Policy(shadow=True)`, each part that the model is certain of is an audit:
         `Decision.predicted` says what it would have done, and all is learned from as ever. It lasts over restarts.
-        Raises SettingError for what is no policy, and for anything but audit_rate, stops and shadow of a model that was
-        handed in.
+        Raises SettingError for what is no policy, for windows that the traces cannot hold, and, of a model that was handed
+        in, for anything but audit_rate, stops, label_within, windows and shadow.
         """
-        if not isinstance(policy, Policy):
-            raise SettingError(f"Expected a Policy, got {policy!r}; for example Policy(alpha=0.05, lower_bound=0.95).")
+        expect(isinstance(policy, Policy), "a Policy", policy, "for example Policy(alpha=0.05, lower_bound=0.95)")
         now, versions = self._settings.now, self._versions
-        was, wished = (
-            asdict(each) | {"windows": " ".join(map(str, each.windows)) or "none"} for each in (now.recipe.policy, policy)
-        )
+        was, wished = of_policy(now.recipe.policy), of_policy(policy)
         new = {name: value for name, value in wished.items() if value != was[name]}
         if not new:
             return self._unchanged("policy", "The policy is in force already")
         own = now.model is not None  # a model that was handed in keeps its rule
         idle = sorted(set(new) - {"audit_rate", "stops", "shadow", "label_within", "windows"}) if own else []
         if idle:
-            raise SettingError(
-                f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would have no effect; "
-                "change only audit_rate, stops and windows."
-            )
+            said = f"so {', '.join(idle)} would have no effect"
+            do = "change only audit_rate, stops, label_within, windows and shadow"
+            raise SettingError(f"A model that was handed in decides by its own numbers, {said}; {do}.")
         self._make_ready()
         # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.
         asked = policy.guarantee in SORTED and policy.known_share != now.recipe.policy.known_share

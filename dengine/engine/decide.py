@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..decision.rule import script
-from ..errors import TraceConflictError, TraceError, shortened
+from ..errors import TraceConflictError, TraceError, expect
 from ..folds import audited, part_hash
 from ..model.base import EngineModel, Prediction
 from ..records import LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
@@ -91,7 +91,7 @@ class DecisionMaker:
             model_version=version,
             reason=Reason.AUDIT if audit else said.reason,
             audit=audit,
-            propensity=rate if certain else 1.0,
+            propensity=rate if certain else float(outside != 2),
             part=part,
         )
         hash_ = content if number is None else number
@@ -109,9 +109,8 @@ def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) ->
     """The decision that this id has already; TraceError where it was made on another trace."""
     x = as_agreed(trace, spec, False)
     if not np.array_equal(x, known.trace, equal_nan=True):
-        raise TraceConflictError(
-            f"Expected the trace that decision {known.decision.id!r} was made on, got another; give it an id of its own."
-        )
+        own = f"the trace that decision {known.decision.id!r} was made on"
+        raise TraceConflictError(f"Expected {own}, got another; give it an id of its own.")
     return known.decision
 
 
@@ -127,9 +126,6 @@ def as_part(part: Any) -> str | None:
         return None
     whole = isinstance(part, int | np.integer) and not isinstance(part, bool)
     text = str(part) if whole and abs(int(part)) < 10**LONGEST else part
-    if not is_name(text):
-        raise TraceError(
-            f"Expected a part's number, a whole number or a text of 1 to {LONGEST} characters that print, got "
-            f"{shortened(part)}; strip what a scanner added, or pass None."
-        )
+    wanted = f"a part's number, a whole number or a text of 1 to {LONGEST} characters that print"
+    expect(is_name(text), wanted, part, "strip what a scanner added, or pass None", TraceError)
     return str(text)

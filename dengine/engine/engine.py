@@ -613,8 +613,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             raise ExportError(f"Expected a store as it was written, to export from: {self._outbox.doubt}")
         own, policy = self._versions.newest.exported(trace or self.trace), self.policy
         coin: dict[str, Any] = {"audit_rate": policy.audited_share, "seed": self.seed, "stops_all": policy.stops == "all"}
-        coin["windows"] = policy.limits
-        about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml()}
+        about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml(), "windows": policy.limits}
         return replace(own, note=self._outbox.event, **about, **coin)
 
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:

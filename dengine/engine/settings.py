@@ -1,7 +1,5 @@
 """What an engine is, apart from what it has learned: the settings that it was made with, and that its store keeps."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Collection, Mapping
@@ -11,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 from .. import __version__
 from ..decision.policy import Policy
 from ..decision.rule import script
-from ..errors import ImportRefusedError, SettingError, StoreError, shortened
+from ..errors import ImportRefusedError, SettingError, StoreError, expect, shortened
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT, Recipe, described
@@ -27,6 +25,7 @@ log = logging.getLogger("dengine")
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 # What counts for any model.
 LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate", "stops", "windows")
+NO_WINDOWS = "none"
 MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set, as the store has them
 
 
@@ -60,10 +59,9 @@ class EngineSettings:
     evidence: EvidenceWindow = EvidenceWindow()
 
     def __post_init__(self) -> None:
-        if not is_whole(self.seed, 0, SEEDS):
-            raise SettingError(f"Expected a seed of 0 or more, an integer of at most {SEEDS}, got {shortened(self.seed)}.")
-        if not (self.trace is None or isinstance(self.trace, TraceSpec)):
-            raise SettingError(f"Expected a TraceSpec as trace, got {self.trace!r}; TraceSpec(samples=1000) for one.")
+        expect(is_whole(self.seed, 0, SEEDS), f"a seed of 0 or more, an integer of at most {SEEDS}", self.seed)
+        known = self.trace is None or isinstance(self.trace, TraceSpec)
+        expect(known, "a TraceSpec as trace", self.trace, "TraceSpec(samples=1000) for one")
         if self.trace is not None:
             WindowGate(self.recipe.policy.windows, self.trace)  # refused before it is in force
 
@@ -102,9 +100,8 @@ class EngineSettings:
             raise SettingError(f"The engine of {name} has its own model, {recipe.name}; leave model=... out.")
         if model is not None or recipe.name.startswith(OBJECT):
             if model is None and (reducer is None or isinstance(reducer, str)):
-                raise SettingError(
-                    f"The reducer of {name}, {recipe.reducer}, has no name in TOML: hand it in again, reducer=..."
-                )
+                unnamed = f"{recipe.reducer}, has no name in TOML"
+                raise SettingError(f"The reducer of {name}, {unnamed}: hand it in again, reducer=...")
             given = described(reducer) if model is None else as_engine_model(model).description
             if made_with is not None and given != made_with:
                 raise SettingError(f"{name} was made with {made_with}, got {given}: its labels were counted by that one.")
@@ -112,16 +109,12 @@ class EngineSettings:
         elif reducer is not None and not isinstance(reducer, str):
             again = Recipe.from_toml(Recipe(reducer).to_toml())
             if (again.reducer, again.params) != (recipe.reducer, recipe.params):
-                raise SettingError(
-                    f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
-                )
+                raise SettingError(f"Expected reducer {recipe.name} of {name}, got {described(reducer)}; leave it out.")
         must_allow(recipe, name, allow_import is True or {*(allow_import or ()), *classes_of(reducer)})
         inferred = "inferred" in known
         seed = known.get("seed", "0")
-        if not (seed.isdecimal() and seed.isascii() and len(seed) < 100):
-            raise StoreError(
-                f"Expected a seed in the store's settings, got {shortened(seed)}; restore the store from a copy."
-            )
+        sound = seed.isdecimal() and seed.isascii() and len(seed) < 100
+        expect(sound, "a seed in the store's settings", seed, "restore the store from a copy", StoreError)
         policy_since, *evidence = (int(known.get(name, "0")) for name in MARKS)
         own, trace = known.get("model"), trace_in(known)
         return cls(recipe, int(seed), own, made_with, trace, inferred, policy_since, EvidenceWindow(*evidence))
@@ -145,19 +138,18 @@ class EngineSettings:
         if unknown:
             raise SettingError(f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not.")
         wished = {} if recipe is None else flat(chosen_recipe(reducer, recipe, {}))
-        wished |= given | ({} if policy is None else asdict(policy)) | ({"reducer": reducer} if reducer is not None else {})
+        wished |= given | ({} if policy is None else of_policy(policy))
+        wished |= {} if reducer is None else {"reducer": reducer}
         if not isinstance(wished.get("reducer"), str):  # an object was compared when the store was opened
             wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
         # A program's settings are the same in the shadow mode, which a person begins and ends.
         counts = LOOP if self.model is not None else [name for name in have if name != "shadow"]
-        if not wished.get("windows"):  # these are an operator's, too
+        if wished.get("windows") == NO_WINDOWS:  # these are an operator's, too
             wished.pop("windows", None)
         other = sorted(name for name in wished if name in counts and wished[name] != have[name])
         if other:
             stored, got = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished))
-            raise SettingError(
-                f"Expected the store's own settings ({stored}), got {got}; leave them out or name a new store."
-            )
+            raise SettingError(f"Expected the store's own settings ({stored}), got {got}; leave them out, or name another.")
 
 
 def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recipe:
@@ -181,19 +173,18 @@ def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str])
     """
     refused = [] if allow_import is True else [name for name in recipe.own_classes if name not in (allow_import or ())]
     if refused:
-        raise ImportRefusedError(
-            f"Expected leave to import {shortened(refused[0])}, which {store} names: name it again "
-            "(reducer=, recipe=, policy=; --reducer, --guarantee), or allow it, where you "
-            "trust the store (allow_import=True; --allow-import)."
-        )
+        again = "name it again (reducer=, recipe=, policy=; --reducer, --guarantee)"
+        allow = "allow it, where you trust the store (allow_import=True; --allow-import)"
+        got = f"{shortened(refused[0])}, which {store} names"
+        raise ImportRefusedError(f"Expected leave to import {got}: {again}, or {allow}.")
 
 
-def peers_trace(store: SqlStore) -> TraceSpec | None:
+def peers_trace(store: "SqlStore") -> TraceSpec | None:
     """The contract of traces that a product's cells have agreed on; None where there is none, or no product."""
     return next(filter(None, map(trace_in, store.peers_settings().values())), None)
 
 
-def as_peers(asked: Mapping[str, Any], store: SqlStore, allow_import: bool | Collection[str]) -> dict[str, Any]:
+def as_peers(asked: Mapping[str, Any], store: "SqlStore", allow_import: bool | Collection[str]) -> dict[str, Any]:
     """What a new engine is asked for; what was left open, as a peer has it if there is one, where `must_allow` lets it."""
     known = next(iter(store.peers_settings().values()), {})
     filled = dict(asked)
@@ -214,17 +205,19 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
     counting = {"audit_rate": 0.0, "stops": "some", "shadow": False, "windows": ()}
     idle += [] if policy is None or replace(policy, **counting) == Policy() else ["policy"]
     if idle:
-        raise SettingError(
-            f"A model that is handed in decides by its own rule, so {', '.join(idle)} would have no effect; "
-            "set it on the model, or leave it out (of a policy audit_rate, stops and windows alone count)."
-        )
+        do = "set it on the model, or leave it out (of a policy audit_rate, stops and windows alone count)"
+        what = f"so {', '.join(idle)} would have no effect"
+        raise SettingError(f"A model that is handed in decides by its own rule, {what}; {do}.")
 
 
 def flat(recipe: Recipe) -> dict[str, Any]:
     """Every setting of a recipe by its name, the policy's among them."""
-    plain = {f.name: getattr(recipe, f.name) for f in fields(recipe)}
-    policy: Policy = plain.pop("policy")
-    return plain | asdict(policy)
+    return {f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name != "policy"} | of_policy(recipe.policy)
+
+
+def of_policy(policy: Policy) -> dict[str, Any]:
+    """Every setting of a policy by its name, windows as their text."""
+    return asdict(policy) | {"windows": " ".join(map(str, policy.windows)) or NO_WINDOWS}
 
 
 class SettingsInForce:

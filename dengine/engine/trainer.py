@@ -3,14 +3,12 @@
 The window that it sees: the newest labelled traces, in memory.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -103,7 +101,7 @@ class TrainedOn:
         return {"trained_on": self.seq} | numbers
 
     @classmethod
-    def from_state(cls, state: Mapping[str, NDArray[Any]]) -> TrainedOn:
+    def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
         """What `to_state` gave."""
         return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]))
 

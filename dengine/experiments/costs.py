@@ -13,8 +13,6 @@ shuffle plays the same parts. The interval is a little too narrow for a policy p
 are a clean test.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass
@@ -121,12 +119,10 @@ class CostCurve:
         if self.verdict == "pays":
             return said
         bad, worst = (percent(share, ".3g") for share in (row.bad.upper, self.costs.worst_accept))
-        return (
-            f"{said} Not certainly: of the accepted parts up to {bad} may be bad, and accepting pays up to {worst}. "
-            "More recordings narrow that; in production audits and stops do."
-        )
+        but = f"of the accepted parts up to {bad} may be bad, and accepting pays up to {worst}"
+        return f"{said} Not certainly: {but}. More recordings narrow that; in production audits and stops do."
 
-    def to_frame(self) -> pd.DataFrame:
+    def to_frame(self) -> "pd.DataFrame":
         """A row a policy; shares from 0 to 1, costs in the user's unit."""
         import pandas as pd
 

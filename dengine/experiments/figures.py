@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datasets import Dataset
-from ..errors import OutputError
+from ..errors import OutputError, instead
 from ..files import write_output
 from ..history.explain import Bound, Explanation
 from ..records import Action
@@ -105,10 +105,8 @@ def note(axes: Axes, text: str, colour: str = BLACK) -> None:
 def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) -> Path:
     """Write a figure as its suffix says; makes the folder. OutputError where a file is there, without `force`."""
     buffer = BytesIO()
-    try:
+    with instead(OutputError, f"Cannot draw {path}", ValueError, do="name it .png, .pdf or .svg"):
         figure.savefig(buffer, dpi=dpi, format=Path(path).suffix.removeprefix(".") or "png")
-    except ValueError as error:
-        raise OutputError(f"Cannot draw {path}: {error}; name it .png, .pdf or .svg.") from error
     return write_output(path, buffer.getvalue(), force, make_folder=True)
 
 
@@ -166,7 +164,7 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     precision, false_positive : of the accepted parts in the windows of all replays together.
     false_negative : of the rejected parts, likewise.  All three NaN where these are fewer than `fewest`.
     """
-    certain = sliding_mean(np.stack([~r.verified for r in replays]), window)
+    certain = sliding_mean(np.stack([r.accepted | r.rejected for r in replays]), window)
 
     def share(wrong: str, decided: str) -> Floats:
         bad, of = (sliding_sum(sum(getattr(r, name).astype(int) for r in replays), window) for name in (wrong, decided))
@@ -296,9 +294,8 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     asked = [row for row in curve.rows if row.policy.guarantee != "cost"]
     priced = [row for row in curve.rows if row.policy.guarantee == "cost"]
     bounds = sorted({row.policy.lower_bound for row in asked})
-    groups = {
-        f"alpha {row.policy.alpha:g}": [each for each in asked if each.policy.alpha == row.policy.alpha] for row in asked
-    }
+    alphas = dict.fromkeys(row.policy.alpha for row in asked)
+    groups = {f"alpha {alpha:g}": [row for row in asked if row.policy.alpha == alpha] for alpha in alphas}
     if priced:
         groups["by cost"] = priced
     top.axhline(curve.baseline, label="verify everything", **LIMIT)

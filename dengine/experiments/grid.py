@@ -7,8 +7,6 @@ Finished replays are kept on disk under a hash of all that their decisions depen
 seed, dengine's own source, and the libraries that compute. Nothing is unpickled; an unreadable file is no replay.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -74,10 +72,9 @@ class KeptReplays:
         try:  # a transformer with all that it holds: arrays and functions too, which its description only names
             said = self._digest((self._of_data, _digest_of_source(), [_source_of(part) for part in parts], how))
         except (PicklingError, TypeError, AttributeError) as error:
-            raise SettingError(
-                f"Expected a reducer that can be told apart from others, to keep its replays; {who.name} holds what has no "
-                f"name in a module, as a lambda ({error}); define it in a module, or leave keep out."
-            ) from error
+            got = f"{who.name} holds what has no name in a module, as a lambda ({error})"
+            wanted = "a reducer that can be told apart from others, to keep its replays"
+            raise SettingError(f"Expected {wanted}; {got}: define it there, or leave keep out.") from error
         return self.folder / f"{said}.npz"
 
     def get(self, task: Task) -> Replay | None:
@@ -187,7 +184,7 @@ def run_grid(
     *,
     cycles: int | None = None,
     keep: Folder | None = None,
-) -> pd.DataFrame:
+) -> "pd.DataFrame":
     """A row a replay (see `Replay.summary`), over recipes x intervals x alphas x lower_bounds x seeds from 0 on.
 
     recipes : a name, or a list of what `replay` takes, rivals too.  keep : folder by which an interrupted grid goes on.

@@ -8,8 +8,6 @@ Source: Duan, Krüger, Heredia, Iversen and Hagelskjær, section "Experiments", 
 score": mean false positives / mean certain predictions of 30 shuffles of 1503 insertions.
 """
 
-from __future__ import annotations
-
 import math
 from typing import TYPE_CHECKING
 
@@ -36,7 +34,7 @@ BUDGET_S = 0.45  # the paper's cycle budget of a retrain
 ANSWERS = 0.1  # certain predictions that vary by more than this share of their mean, over the grid, answer to it
 
 
-def paper_table(frame: pd.DataFrame, recipe: str, interval: str) -> str:
+def paper_table(frame: "pd.DataFrame", recipe: str, interval: str) -> str:
     """One of the paper's two tables as Markdown: a row an alpha, a column an LB, `false positives / certain`.
 
     Ours with the standard deviation over the shuffles; below, in brackets, what the paper published, on other parts.
@@ -57,7 +55,7 @@ def paper_table(frame: pd.DataFrame, recipe: str, interval: str) -> str:
     return "\n".join(lines)
 
 
-def findings(frame: pd.DataFrame) -> list[str]:
+def findings(frame: "pd.DataFrame") -> list[str]:
     """Which of the paper's findings the replays of a grid bear out: a line a finding, recipe and interval.
 
     Those that they say nothing of are left out: of rivals, which decide by rules of their own, what the intervals do.
@@ -94,7 +92,7 @@ def findings(frame: pd.DataFrame) -> list[str]:
     return lines
 
 
-def grid_lines(frame: pd.DataFrame) -> list[str]:
+def grid_lines(frame: "pd.DataFrame") -> list[str]:
     """Tables and findings as the lines of a Markdown page, for each guarantee and feedback that was played."""
     told = "false positives / certain, mean ± standard deviation over the shuffles [the paper's, on its own parts]"
     lines = []

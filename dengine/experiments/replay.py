@@ -4,8 +4,6 @@
 >>> watch(DataEngine(), SimulatedCell(cycles=600), cycles=600).stretches(6)
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,7 +32,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 EVIDENCE: dict[str, Any] = dict.fromkeys(("action", "reason"), np.str_)  # of a decision, and how it is kept
 EVIDENCE |= dict.fromkeys(("lower", "upper"), np.float64) | dict.fromkeys(("n_success", "n_failure"), np.int64)
-COUNTED = ("verified", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode")
+COUNTED = ("verified", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode", "outside")
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class Contender:
     params: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def load(cls, asked: Any) -> Contender:
+    def load(cls, asked: Any) -> "Contender":
         """A contender itself, a rival's name (its chosen settings), or what `Recipe.load` takes; SettingError for else."""
         if isinstance(asked, Contender):
             return asked
@@ -65,7 +63,7 @@ class Contender:
         by_name = isinstance(asked, str | os.PathLike) and (str(asked) in RECIPES or Path(asked).is_file())
         return cls(Path(asked).stem if by_name else recipe.name, recipe)
 
-    def with_policy(self, **changes: Any) -> Contender:
+    def with_policy(self, **changes: Any) -> "Contender":
         """The same with another alpha, lower_bound, interval, guarantee or stops."""
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
@@ -144,8 +142,8 @@ class Replay:
 
     @property
     def rejected(self) -> Bools:
-        """(n,) the part went back to the bin without a check."""
-        return np.asarray(self.action == Action.REJECT)
+        """(n,) the model sent the part back to the bin, without a check."""
+        return np.asarray((self.action == Action.REJECT) & ~self.outside)
 
     @property
     def false_positive(self) -> Bools:
@@ -163,19 +161,22 @@ class Replay:
         return np.asarray(self.reason == Reason.NOVEL)
 
     @property
+    def outside(self) -> Bools:
+        """(n,) left an operator's window, and was verified or rejected for it: no decision of the model."""
+        return np.asarray(self.reason == Reason.OUTSIDE)
+
+    @property
     def finished(self) -> Bools:
         """(n,) a good part was passed on, as far as the truth is known."""
-        return np.asarray(~self.rejected & (self.truth == 1.0))
+        return np.asarray((self.action != Action.REJECT) & (self.truth == 1.0))
 
-    def to_frame(self) -> pd.DataFrame:
+    def to_frame(self) -> "pd.DataFrame":
         """A row a cycle, numbered from 1, and a column each field of (n,); the position's are embedding_1, embedding_2 …"""
         import pandas as pd
 
         known = {each.name: getattr(self, each.name) for each in fields(self)}
         one_a_cycle = (len(self),)  # a live run has no index of its parts
-        columns = {
-            name: value for name, value in known.items() if isinstance(value, np.ndarray) and value.shape == one_a_cycle
-        }
+        columns = {name: x for name, x in known.items() if isinstance(x, np.ndarray) and x.shape == one_a_cycle}
         columns |= {f"embedding_{d + 1}": self.position[:, d] for d in range(self.position.shape[1])}
         return pd.DataFrame(columns, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
 
@@ -217,7 +218,7 @@ class Replay:
             "seed": self.seed,
             "cycles": len(self),
             "certain": certain,
-            "first_certain": float(np.argmin(self.verified) + 1) if certain else nan,  # counted from 1
+            "first_certain": float(np.argmax(self.accepted | self.rejected) + 1) if certain else nan,  # counted from 1
             **{name: counts[name] for name in COUNTED[1:]},
             "precision": 1.0 - wrong[0] / accepted if accepted else nan,
             "npv": 1.0 - wrong[1] / rejected if rejected else nan,

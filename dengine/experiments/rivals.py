@@ -471,18 +471,15 @@ def make_rival(name: str, policy: Policy, seed: int = 0, **params: Any) -> Rival
     SettingError for an unknown name, an unknown parameter, a value out of range, or a library that is missing.
     """
     require(name)
-    allowed = [each.name for each in fields(RIVALS[name]) if each.kw_only]
-    if unknown := sorted(set(params) - set(allowed)):
-        raise SettingError(
-            f"The rival {name} has no parameter {', '.join(unknown)}; it has {', '.join(allowed) or 'none'}."
-        )
+    known = [each.name for each in fields(RIVALS[name]) if each.kw_only]
+    if unknown := sorted(set(params) - set(known)):
+        raise SettingError(f"The rival {name} has no parameter {', '.join(unknown)}; it has {', '.join(known) or 'none'}.")
     return RIVALS[name](policy, seed, **params)
 
 
 def require(name: str) -> None:
     """SettingError where there is no rival of this name, or the library that it is made with is missing."""
-    if name not in RIVALS:
-        raise SettingError(f"Expected a rival among {', '.join(RIVALS)}, got {name!r}.")
+    expect(name in RIVALS, f"a rival among {', '.join(RIVALS)}", name)
     needs = RIVALS[name].needs
     if needs and find_spec(needs) is None:
         raise SettingError(f'The rival {name} needs {needs}, which is missing; pip install "dengine[rivals]".')

@@ -28,7 +28,7 @@ import torch
 from .. import __version__
 from ..decision.policy import RULES
 from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS, DecisionRule
-from ..errors import ExportError
+from ..errors import ExportError, instead
 from ..files import UNREADABLE, check_output, read_key, write_output
 from ..model.base import Exportable
 from ..records import Action, Reason, TraceSpec
@@ -211,13 +211,10 @@ def _read(path: Path, most: int = -1) -> bytes:
 
 def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
     """What the content of a TorchScript file says of itself."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            name = next((n for n in archive.namelist() if n.endswith(f"extra/{METADATA}")), METADATA)
-            metadata = json.loads(archive.read(name))
-    except UNREADABLE as error:
-        raise ExportError(f"{path} is not a dengine export: it holds no {METADATA}.") from error
-    return checked_schema(metadata, path)
+    said = f"{path} is not a dengine export, it holds no {METADATA}"
+    with instead(ExportError, said, *UNREADABLE), zipfile.ZipFile(io.BytesIO(content)) as archive:
+        name = next((n for n in archive.namelist() if n.endswith(f"extra/{METADATA}")), METADATA)
+        return checked_schema(json.loads(archive.read(name)), path)
 
 
 def checked_schema(metadata: Any, path: Path) -> dict[str, Any]:

@@ -12,12 +12,10 @@ was being written when the program was killed: it is left out, and `cut` says so
 DataError that names the line.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,14 +25,14 @@ from numpy.typing import NDArray
 
 from ..datasets.dataset import must
 from ..datasets.importing import ImportReport, import_parts
-from ..errors import DataError, StoreError
+from ..errors import DataError, StoreError, instead
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceSpec, trace_in
 from ..store.opening import opening
 from ..traces import as_trace
 
 if TYPE_CHECKING:
-    from ..store.sql import SqlStore
+    from ..store.opening import StoreLike
 
 log = logging.getLogger("dengine")
 FORM = 4
@@ -92,10 +90,8 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
         said, _, sum_ = raw.rpartition(b",")
         crc = zlib.crc32(said, crc)
         if f"{crc:08x}".encode() != sum_:
-            aside = (
-                f"The checksum of {where} does not follow from the lines before it: it was changed, or one is missing, "
-                f"doubled or moved. It and what follows were set aside, {len(whole) - number + 1} lines."
-            )
+            why = f"The checksum of {where} does not follow from the lines before it: it was changed, or one is missing"
+            aside = f"{why}, doubled or moved. It and what follows were set aside, {len(whole) - number + 1} lines."
             break
         crcs.append(crc)
         kind, *words = _words(said, where)
@@ -132,10 +128,8 @@ def _missing_at_end(path: str | os.PathLike[str], crcs: list[int]) -> str:
 
 
 def _words(said: bytes, where: str) -> list[str]:
-    try:
+    with instead(DataError, f"Expected UTF-8 in {where}, it is damaged, or no journal", UnicodeDecodeError):
         words = said.decode("utf-8").split(",")
-    except UnicodeDecodeError as error:
-        raise DataError(f"Expected UTF-8 in {where}, got other bytes: it is damaged, or no journal.") from error
     must(words[0] in ("part", "label"), f"a line that begins with part or label in {where}", words[0])
     return words
 
@@ -151,11 +145,9 @@ def _labelled(words: list[str], parts: Mapping[str, JournalLine], where: str) ->
 
 def _part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
     id_, label, part, *decided = (*words[:10], *[""] * (10 - len(words)))
-    try:
+    with instead(DataError, f"The decision in {where} cannot be read", ValueError):
         action, predicted, reason = Action(decided[0]), Action(decided[1]), Reason(decided[2])
         bound = float(decided[3]), float(decided[4]), int(decided[5]), int(decided[6])
-    except ValueError as error:
-        raise DataError(f"The decision in {where} cannot be read: {error}.") from error
     held = 0.0 <= bound[0] <= bound[1] <= 1.0 and 0 <= min(bound[2:]) <= max(bound[2:]) < LARGEST_COUNT
     must(held, f"bounds between 0 and 1 and counts in {where}", ",".join(decided[3:7]))
     rejected = action is Action.REJECT
@@ -170,20 +162,12 @@ def _trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]
     expected = spec.channels * spec.samples
     held = len(words) == expected or (spec.fit != "strict" and len(words) > 0 and len(words) % spec.channels == 0)
     must(held, f"{expected} samples in {where}", len(words), "it is damaged, or of another cell")
-    try:
-        with np.errstate(over="ignore"):
-            values = np.array([float(word) for word in words]).astype(np.float32)
-    except ValueError as error:
-        raise DataError(f"The samples in {where} are no row of numbers: {error}.") from error
+    with instead(DataError, f"The samples in {where} are no row of numbers", ValueError), np.errstate(over="ignore"):
+        values = np.array([float(word) for word in words]).astype(np.float32)
     return as_trace(values.reshape(spec.channels, -1), spec)
 
 
-def import_journal(
-    store: str | os.PathLike[str] | SqlStore,
-    path: str | os.PathLike[str],
-    on_traces: Callable[[int], None] | None = None,
-    any_model: bool = False,
-) -> ImportReport:
+def import_journal(store: "StoreLike", path: str | os.PathLike[str], any_model: bool = False) -> ImportReport:
     """Put what a cell learned into the store of its engine, each part once, however often its journal is imported.
 
     Rule and certificate count the parts as the engine's own. The report counts labels. Of a journal that lacks a line, what
@@ -206,7 +190,7 @@ def import_journal(
             do = "name the store that it came from, or say --any-model if it is right"
             raise DataError(f"Expected a journal of a model that was exported from this store, {of}; {do}.")
         parts = [(line.decision, line.trace, line.label) for line in _with_known_outcomes(journal, policy.stops)]
-        report = import_parts(opened, parts, spec, policy, on_traces)
+        report = import_parts(opened, parts, spec, policy)
     opened.close()
     return replace(report, cut=journal.cut, aside=journal.aside)
 

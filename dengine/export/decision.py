@@ -99,7 +99,7 @@ class DecisionModule(nn.Module):
                 z, alone = self.look(x, part, fault, content)
                 looked = self.looked(z[0], alone)
                 self.count(z[2], z[3], z[1] == self.novel_reason, z[6], own, success, alone, looked)
-        return self.predictor.n_references()
+        return self.n_references()
 
     @torch.jit.export
     def stop(self, trace: Tensor, part: int = 0) -> int:
@@ -143,12 +143,12 @@ class DecisionModule(nn.Module):
     @torch.jit.export
     def safe_mode(self) -> int:
         """Why everything is verified at present: the position in `SAFE_MODE`, 0 where it is not."""
-        return self.predictor.safe_mode()
+        return self.predictor.neighbours.rule.safe_mode()
 
     @torch.jit.export
     def n_references(self) -> int:
         """References held."""
-        return self.predictor.n_references()
+        return self.predictor.neighbours.ring.size()
 
     def take(self, success: bool) -> None:
         """What became of the part that was decided last."""
@@ -166,9 +166,10 @@ class DecisionModule(nn.Module):
         self, lower: float, upper: float, novel: bool, z: Tensor, own: int, success: bool, alone: int, looked: float
     ) -> None:
         """Tell the rule of a part, and make it a reference."""
-        self.predictor.tell(lower, upper, success, self.silent, novel, alone, looked)
-        space = self.toss(own) % self.n_spaces
-        self.predictor.add(z[space], 1.0 if success else 0.0, space, own)
+        around, space = self.predictor.neighbours, self.toss(own) % self.n_spaces
+        around.rule.observe(self.silent, novel)
+        around.rule.tell(lower, upper, success, alone, looked)
+        around.ring.put(z[space], 1.0 if success else 0.0, space, own)
         self.silent = 0
 
     def as_trace(self, trace: Tensor) -> Tensor:

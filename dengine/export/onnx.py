@@ -8,8 +8,6 @@ carry: references that grow and rules that learn, so nothing is learned in the c
 votes of parts that came again, and a reference that is asked about itself counts itself.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -26,7 +24,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from ..decision.rule import CERTAIN, UNCERTAIN, DecisionRule
-from ..errors import ExportError
+from ..errors import ExportError, instead
 from ..model.base import Exportable
 from ..model.neighbours import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
@@ -72,7 +70,7 @@ def export_onnx(
     return write_export(path, content, force, key, source)
 
 
-def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> OnnxModel:
+def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> "OnnxModel":
     """Check the sum, load into onnxruntime on one thread, warm up; ExportError for what must not be used.
 
     key : the key's file that it was signed with; it is checked first. None: no signature is asked for.
@@ -80,11 +78,10 @@ def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> On
     onnx = _package("onnx")
     target = Path(path)
     content = checked_bytes(target, key)
-    try:
+    said = f"{target} is not a dengine export in ONNX, it holds no {METADATA}"
+    with instead(ExportError, said, Exception):  # protobuf's own errors have no common base
         properties = {p.key: p.value for p in onnx.load_from_string(content).metadata_props}
         metadata = json.loads(properties[METADATA])
-    except Exception as error:  # protobuf's own errors have no common base
-        raise ExportError(f"{target} is not a dengine export in ONNX: it holds no {METADATA}.") from error
     return OnnxModel(content, checked_schema(metadata, target))
 
 
@@ -94,9 +91,8 @@ def _refuse_what_changes(source: Exportable) -> None:
     learns = f"{rule.__name__}, a rule that learns; export torchscript, or set guarantee = 'local' and stops = 'some'"
     audits = "audits, its integers are not the content hash's; export torchscript, or set audit_rate = 0"
     votes = f"votes: {repeats} of the references are of parts that were there already; export torchscript"
-    windows = "an operator's windows; export torchscript"
     kept = (source.audit_rate > 0.0, rule is not DecisionRule, repeats > 0, len(source.windows) > 0)
-    for what, held in zip((audits, learns, votes, windows), kept, strict=True):
+    for what, held in zip((audits, learns, votes, "an operator's windows; export torchscript"), kept, strict=True):
         if held:
             raise ExportError(f"ONNX carries no {what}.")
 

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import __version__
 from ..decision.rule import SAFE_MODE, script
 from ..engine.decide import as_part
-from ..errors import ExportError
+from ..errors import ExportError, instead
 from ..folds import part_hash
 from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec, as_success
 from ..traces import as_trace, as_traces
@@ -40,13 +40,11 @@ TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another 
 def export_sources(folder: str | os.PathLike[str]) -> Path:
     """Write the sources into a new or an empty folder, and return it; ExportError for one that cannot be written."""
     target = Path(folder)
-    try:
+    with instead(ExportError, f"Cannot write {target}", OSError, do="choose a folder that is writable"):
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             raise ExportError(f"Expected a new or an empty folder for the sources, {target} holds something; name another.")
         shutil.copytree(Path(__file__).parent / "cpp", target, dirs_exist_ok=True)
         (target / "VERSION").write_text(f"{__version__}\n", encoding="utf-8")
-    except OSError as error:
-        raise ExportError(f"Cannot write {target}: {error}; choose a folder that is writable.") from error
     return target
 
 
@@ -68,10 +66,8 @@ def export_torchscript(
     OutputError where `path` cannot be written: what was there is then as it was.
     """
     source, module = prepared(engine_or_model, trace, path, force)
-    try:
+    with instead(ExportError, "The decision does not compile to TorchScript", RuntimeError):
         frozen = torch.jit.freeze(script(module.eval()), preserved_attrs=list(METHODS))
-    except RuntimeError as error:
-        raise ExportError(f"The decision does not compile to TorchScript: {str(error).splitlines()[0]}") from error
     x = golden_trace(source.trace)
     with torch.inference_mode():
         embedding = copy.deepcopy(frozen).decide(torch.from_numpy(x))[6]  # a copy: it would wait for its label
@@ -171,18 +167,13 @@ def load_exported(path: str | os.PathLike[str], *, key: KeyFile | None = None) -
     content = checked_bytes(target, key)
     metadata = metadata_of(content, target)
     torch.set_num_threads(1)
-    try:
+    with instead(ExportError, f"{target} has its checksum but is no loadable TorchScript", RuntimeError):
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()  # type: ignore[no-untyped-call]
-    except RuntimeError as error:
-        raise ExportError(
-            f"{target} has its checksum but is no loadable TorchScript: {str(error).splitlines()[0]}."
-        ) from error
-    try:
+    said = f"{target} is not a dengine export: its description does not fit its module"
+    with instead(ExportError, said, AttributeError, KeyError, TypeError, ValueError):
         # A copy runs the same compiled code, and this module must not learn of the golden trace.
         _check_golden(ExportedModel(copy.deepcopy(module), dict(metadata)), target)
         return ExportedModel(module, metadata)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ExportError(f"{target} is not a dengine export: its description does not fit its module: {error}.") from error
 
 
 def _check_golden(model: ExportedModel, path: Path) -> None:

@@ -334,10 +334,9 @@ def _verdict(past: StoredDecision, bound: Bound | None, found: Circumstances) ->
 
 def _audit(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
     (coin,) = toss(content_hash(trace[None]), audit_salt(found.seed)).tolist()
-    return (
-        f" as an audit: the model alone would have {DID[made.predicted]} it. The audits' coin fell on "
-        f"{coin / 2**COIN_BITS:.4f}, below the audit rate {made.propensity:g}; it is a function of the trace and the seed."
-    )
+    coin_fell = f"The audits' coin fell on {coin / 2**COIN_BITS:.4f}, below the audit rate {made.propensity:g}"
+    alone = f" as an audit: the model alone would have {DID[made.predicted]} it"
+    return f"{alone}. {coin_fell}; it is a function of the trace and the seed."
 
 
 def _saturated(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
@@ -579,10 +578,9 @@ def _notes(past: StoredDecision, around: Ball | None, bound: Bound | None, found
         recorded, again = (made.n_success, made.n_failure), (around.n_success, around.n_failure)
         yield f"Neighbours: the references of version {made.model_version}, which answered, as they stood then."
         if made.reason not in (Reason.NOVEL, Reason.OUTSIDE) and again != recorded:
-            yield (
-                f"Counted again, the ball holds {again[0]} successes and {again[1]} failures; recorded were {recorded[0]} "
-                f"and {recorded[1]}: a label was corrected since, or came while this part was being decided on."
-            )
+            held = f"{again[0]} successes and {again[1]} failures; recorded were {recorded[0]} and {recorded[1]}"
+            why = "a label was corrected since, or came while this part was being decided on"
+            yield f"Counted again, the ball holds {held}: {why}."
     if bound is not None and found.model is None and not is_score(policy, made):
         given = policy.bound(made.n_success, made.n_failure)
         if not np.allclose(given, (made.lower, made.upper), atol=1e-6):

@@ -1,7 +1,5 @@
 """Where the known and the newest parts lie for the model that answers, for a picture."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -52,7 +50,7 @@ class PartMap:
     probability: bool
 
 
-def part_map(store: SqlStore, recipe: Recipe, version: int) -> PartMap:
+def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     """Read the map of a version."""
     recent = [past.decision for past in store.decisions(HistoryFilter(), NAMED)]
     newest = list(_newest(store, [made.id for made in recent[-NEWEST:] if made.model_version == version]))
@@ -61,14 +59,14 @@ def part_map(store: SqlStore, recipe: Recipe, version: int) -> PartMap:
     return PartMap(version, (*known, *newest), recipe.radius if newest else None, has_own_unit(recipe))
 
 
-def _newest(store: SqlStore, ids: list[str]) -> Iterator[Mark]:
+def _newest(store: "SqlStore", ids: list[str]) -> Iterator[Mark]:
     for past in filter(None, map(store.get_decision, ids)):
         made = past.decision
         if made.embedding is not None:
             yield Mark(made.id, made.part, *_plane(np.mean(made.embedding, axis=0)), past.success, made.action)
 
 
-def _known(store: SqlStore, recipe: Recipe, version: int, parts: dict[str, str | None]) -> list[Mark]:
+def _known(store: "SqlStore", recipe: Recipe, version: int, parts: dict[str, str | None]) -> list[Mark]:
     """The newest parts behind a version's references, oldest first."""
     answering = as_it_stood(store, version, recipe, None)
     if answering is None:

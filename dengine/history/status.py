@@ -18,7 +18,7 @@ from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, expect, shortened
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, TraceSpec, trace_in
+from ..records import Action, Decision, Reason, TraceSpec, in_html, trace_in
 from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Outcomes, StoredDecision, StoredVersion
 from ..store.views import HistoryFilter, Stretch, Tally
 
@@ -60,7 +60,7 @@ class Span:
     first, last : times of the oldest and the newest; None where there is none.
     outside : left an operator's window, and were verified or rejected without the model.
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
-    accepted, rejected : went on without a check.  stops : of the accepted, those known to be bad.
+    accepted, rejected : by the model, without a check.  stops : of the accepted, those known to be bad.
     bad_accepts : parts that it let pass or would have, by the policy's alpha.
     would_accept, would_reject : by audits alone, in the shadow mode every part; at 95 %, whatever the policy's alpha.
     unlabelled : verified, of which no result was reported.
@@ -99,7 +99,7 @@ class Watch:
     novelty: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Status:
     """How an engine is doing; times in seconds since 1970.
 
@@ -144,19 +144,24 @@ class Status:
     retraining: bool = False
     store_lag: float = 0.0
 
+    _repr_html_ = in_html
+
+    def __repr__(self) -> str:
+        n, at = self.ever, f"{self.cell}: version {self.version}, {self.ever.decisions} decisions"
+        return f"<Status of {at}, {n.verified} verified, {n.accepted} accepted, {n.stops} known bad, {n.rejected} rejected>"
+
     @property
     def alarm(self) -> str:
         """What somebody should look at, the worst first; "" where there is nothing."""
         accepts, errors = self.newest.bad_accepts, self.newest.errors
         failing = "" if self.version or len(self.retrains) < FAILING else self.retrains[-1].report.reason
+        broken = f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
-            (
-                accepts.verdict == "broken",
-                f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows.",
-            ),
+            (accepts.verdict == "broken", broken),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
+            (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),
             (failing, f"No retrain was accepted yet, so nothing is decided; the last was {failing}."),
         )
@@ -220,7 +225,7 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         errors=reasons[Reason.MODEL_ERROR],
         quarantined=tally.by("quarantined")[True],
         accepted=outcomes.accepted,
-        rejected=tally.by("action")[Action.REJECT],
+        rejected=outcomes.rejected,
         stops=outcomes.stops,
         would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0]),
         would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy.tolerances[1]),
@@ -233,13 +238,11 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
     )
 
 
-def _judged(
-    known: int, wrong: int, tolerance: float, alpha: float = 0.05, n: int | None = None, by: str = "audits"
-) -> Judged:
+def _judged(known: int, wrong: int, most: float, alpha: float = 0.05, n: int | None = None, by: str = "audits") -> Judged:
     low, high = wilson_interval(known - wrong, wrong, alpha)
     lower, upper = 1.0 - high, 1.0 - low
     by = by if known else ""
-    return Judged(known if n is None else n, known, wrong, by, lower, upper, tolerance, _verdict(lower, upper, tolerance))
+    return Judged(known if n is None else n, known, wrong, by, lower, upper, most, _verdict(lower, upper, most))
 
 
 def _verdict(lower: float, upper: float, tolerance: float) -> str:
@@ -330,16 +333,15 @@ def of_part(store: SqlStore, part: str) -> str:
 
     UnknownDecisionError where there is none, ReportConflictError where there are several.
     """
-    found = [each for each in store.decisions(HistoryFilter(part=part), 20) if each.decision.action is not Action.REJECT]
+    known = store.decisions(HistoryFilter(part=part), 20)
+    found = [each for each in known if each.decision.action is not Action.REJECT]
     found = found or [each for each in [store.get_decision(part, trace=False)] if each is not None]
     if not found:
-        got = f"{shortened(part)}, which is unknown"
+        got = f"{shortened(part)}, which {'went back to the bin' if known else 'is unknown'}"
         raise UnknownDecisionError(f"Expected the number of a part that was decided on and not rejected, got {got}.")
     if len(found) > 1:
         ids = ", ".join(each.decision.id for each in reversed(found))
-        raise ReportConflictError(
-            f"Expected one decision of that part to report on, there are {len(found)}; name its id: {ids}."
-        )
+        raise ReportConflictError(f"Expected one decision of that part, there are {len(found)}; name its id: {ids}.")
     return found[0].decision.id
 
 

@@ -29,10 +29,10 @@ from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, part, res
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
-from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_labels, as_success
+from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
 from ..reducers import make_reducer, reducer_of
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, space_scale
-from ..traces import TraceGate, as_traces
+from ..traces import TraceGate, as_labels, as_traces
 from .base import Embedding, EngineModel, Exportable, Gate, Looked, Prediction
 
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
@@ -70,29 +70,6 @@ class Predictor(nn.Module):
         """(C, T) one trace -> (K, d), scaled."""
         z: Tensor = self.encoder(x.unsqueeze(0))[0]
         return z / self.scale if self.scaled else z
-
-    @torch.jit.export
-    def add(self, point: Tensor, label: float, space: int, part: int) -> None:
-        """Make one labelled point (d,) of a part a reference of `space`."""
-        self.neighbours.ring.put(point, label, space, part)
-
-    @torch.jit.export
-    def n_references(self) -> int:
-        """References held."""
-        return self.neighbours.ring.size()
-
-    @torch.jit.export
-    def tell(
-        self, lower: float, upper: float, success: bool, silent: int, novel: bool, predicted: int, looked: float
-    ) -> None:
-        """Tell the rule what became of a part."""
-        self.neighbours.rule.observe(silent, novel)
-        self.neighbours.rule.tell(lower, upper, success, predicted, looked)
-
-    @torch.jit.export
-    def safe_mode(self) -> int:
-        """Position in `SAFE_MODE` of the rule."""
-        return int(self.neighbours.rule.safe_mode())
 
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
         """(C, T) one trace -> action, reason, lower, upper, n_success, n_failure, scaled embedding (K, d).

@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, Any
 import lazy_loader
 import numpy as np
 
-from ..errors import SettingError, expect, shortened
+from ..errors import SettingError, expect
 from ..recipe import NAMED, Recipe
 from ..records import find_class, is_number, is_whole
 
 if TYPE_CHECKING:
-    from .base import CrossFitted, Reducer
-    from .conv import ConvReducer
-    from .pca import PcaReducer
-    from .rocket import RocketReducer
-    from .umap import UmapReducer
+    from .base import CrossFitted as CrossFitted
+    from .base import Reducer as Reducer
+    from .conv import ConvReducer as ConvReducer
+    from .pca import PcaReducer as PcaReducer
+    from .rocket import RocketReducer as RocketReducer
+    from .umap import UmapReducer as UmapReducer
 
 # The lazy table: a module is imported where its class is asked for, since UMAP alone takes seconds.
 _NAMED = {name: f"{name.capitalize()}Reducer" for name in NAMED}
@@ -25,28 +26,13 @@ _LAZY = {"base": ["Reducer", "CrossFitted"]} | {module: [name] for module, name 
 
 MOST = 2**31 - 1  # of a parameter that is an integer
 
-__all__ = [
-    "REDUCERS",
-    "ConvReducer",
-    "CrossFitted",
-    "PcaReducer",
-    "Reducer",
-    "RocketReducer",
-    "UmapReducer",
-    "make_reducer",
-    "reducer_class",
-]
-
 
 def reducer_class(name: str) -> type:
     """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for."""
-    if name not in _NAMED and ":" not in name:
-        raise SettingError(
-            f"Expected a reducer among {', '.join(_NAMED)}, or module:Class of your own, got {shortened(name)}."
-        )
+    expect(name in _NAMED or ":" in name, f"a reducer among {', '.join(_NAMED)}, or module:Class of your own", name)
     found: type = __getattr__(_NAMED[name]) if name in _NAMED else find_class(name)
-    if not (callable(getattr(found, "fit", None)) and callable(getattr(found, "transform", None))):
-        raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has not both fit and transform.")
+    if missing := [each for each in ("fit", "transform", "get_params") if not callable(getattr(found, each, None))]:
+        raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has no {' and no '.join(missing)}.")
     return found
 
 

@@ -10,8 +10,6 @@ Embeddings have K spaces: a label may be counted for a query only in a space tha
 references live in space k, which was fitted without fold k's labels. A reducer that uses no labels has one space.
 """
 
-from __future__ import annotations
-
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -124,7 +122,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """(n, C, T) -> (n, d), row i in space folds[i]."""
         return own_places(self.embed(X), folds)
 
-    def module(self) -> nn.Module | None:
+    def module(self) -> "nn.Module | None":
         """The embedding as a module that TorchScript compiles, (B, C, T) -> (B, K, d); None: it stays in Python."""
         return None
 
@@ -226,9 +224,7 @@ def one_class_outside(fold: int, n: int, classes: int) -> SettingError:
     """What is said where clone or head `fold` would learn from n traces of fewer than two classes."""
     got = f"{n} traces of {classes} class; collect more labels before the first fit."
     if n == 0:
-        got = (
-            "0 traces: all share one fold, as they are the same to 1/65536 of their unit; look at the sensor, or the unit."
-        )
+        got = "0 traces: all share one fold, the same to 1/65536 of their unit; look at the sensor, or the unit."
     return SettingError(f"Expected both classes outside fold {fold}, got {got}")
 
 

@@ -325,8 +325,7 @@ class FeatureReducer(Reducer):
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
         """Fit the heads from their present weights, on features that the first training set; see `Reducer.train`."""
-        if len(X) < MIN_TRACES:
-            raise SettingError(f"Expected at least {MIN_TRACES} traces, got {len(X)}; verify more parts first.")
+        expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first")
         raw = self.raw_features(self._begun(X), numbers)
         self._fit_heads(raw, binary_labels(y, len(X), type(self).__name__), folds, stop, numbers)
         with torch.inference_mode():

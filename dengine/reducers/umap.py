@@ -35,10 +35,8 @@ class UmapReducer(Reducer):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Fit on traces (n, T) or (n, C, T); labels are ignored. SettingError for fewer than n_neighbors + 1 traces."""
         traces = self.check_traces(X, reset=True)
-        if len(traces) <= self.n_neighbors:
-            raise SettingError(
-                f"UMAP needs more than n_neighbors = {self.n_neighbors} traces, got n_samples = {len(traces)}."
-            )
+        if (n := len(traces)) <= self.n_neighbors:
+            raise SettingError(f"UMAP needs more than n_neighbors = {self.n_neighbors} traces, got n_samples = {n}.")
         from umap import UMAP
 
         with _contained():

@@ -4,8 +4,6 @@ Whoever is on this machine may ask without a token, but for web pages of others:
 They are known by the name that they call the server by (`Host`), and by what the browser says of where they come from.
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import hmac
@@ -26,7 +24,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..errors import SettingError
+from ..errors import SettingError, instead
 from .api import Refusal, problem
 
 log = logging.getLogger("dengine")
@@ -100,25 +98,18 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
 
     A line is a token; or that, `viewer` or `operator`, and the name of who has it.
     """
-    try:
-        with file.open("rb") as opened:
-            mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(1 << 16)
-    except OSError as error:
-        raise SettingError(f"Cannot read the token's file {file}: {error.strerror}.") from error
+    with instead(SettingError, f"Cannot read the token's file {file}", OSError), file.open("rb") as opened:
+        mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(1 << 16)
     # systemd, from 254 on, hands a credential to the service's user by an ACL, which shows as a right of the group.
     credentials = os.environ.get("CREDENTIALS_DIRECTORY", "")
     if mode & (0o037 if credentials and file.absolute().parent == Path(credentials) else 0o077):
         raise SettingError(f"Expected {file} to be its owner's alone, others may use it ({mode:o}): chmod 600 {file}")
     lines = [line.split() for line in text.decode("utf-8", "replace").splitlines() if line.strip()]
     tokens = tuple(Token(line[0], line[1:2] != ["viewer"], " ".join(line[2:])) for line in lines)
-    wrong = [
-        each for each in tokens if len(each.secret) < SHORTEST or not (each.secret.isascii() and each.secret.isprintable())
-    ]
-    if wrong or not tokens or len({each.secret for each in tokens}) < len(tokens):
-        raise SettingError(
-            f"Expected tokens of at least {SHORTEST} characters of ASCII in {file}, each once, one a line; "
-            f"make one: (umask 077; openssl rand -hex 24 > {file})"
-        )
+    secrets = {each.secret for each in tokens if each.secret.isascii() and each.secret.isprintable()}
+    if not tokens or len(secrets) < len(tokens) or min(map(len, secrets)) < SHORTEST:
+        wanted = f"tokens of at least {SHORTEST} characters of ASCII in {file}, each once, one a line"
+        raise SettingError(f"Expected {wanted}; make one: (umask 077; openssl rand -hex 24 > {file})")
     if any(line[1:2] not in ([], ["viewer"], ["operator"]) for line in lines):
         raise SettingError(f"Expected viewer or operator behind each token of {file}, then a name; or the token alone.")
     return tokens

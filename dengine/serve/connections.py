@@ -6,8 +6,6 @@ takes too long (of a body's time `auth.Guard` takes care), 400 to what is no HTT
 which no more comes.
 """
 
-from __future__ import annotations
-
 import asyncio
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
@@ -32,7 +30,7 @@ class Places:
         self.most, self.of_address, self.head_seconds = connections, max(FEWEST, connections // 2), head_seconds
         self.taken: list[Connection] = []  # oldest first
 
-    def take(self, new: Connection) -> bool:
+    def take(self, new: "Connection") -> bool:
         """Whether there is a place for a connection; where there is none, one over which nobody was let in gives way."""
         same = [each for each in self.taken if each.address == new.address]
         if len(same) >= self.of_address or len(self.taken) >= self.most:
@@ -44,7 +42,7 @@ class Places:
         self.taken.append(new)
         return True
 
-    def connection(self, **options: Any) -> Connection:
+    def connection(self, **options: Any) -> "Connection":
         """A protocol for one connection, made as uvicorn makes its own."""
         return Connection(self, **options)
 

@@ -1,7 +1,5 @@
 """A cell without a robot: the bundled recordings, decided on through the service as a robot's program would."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import uuid

@@ -22,7 +22,6 @@ import numpy as np
 from msgspec import Meta
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import Request
 from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -218,11 +217,11 @@ class HttpApi:
         """Why a decision came out as it did, with its trace, the band of good parts, and some bad ones."""
         return await self.service.look(lambda store: _explained(store, id_))
 
-    async def course(self, hours: Hours = 0.0, start: Hours = 0.0, batch: Annotated[int, Meta(ge=0, le=200)] = 0) -> Json:
+    async def course(self, hours: Hours = 0.0, start: Hours = 0.0, batch: Annotated[str, Meta(max_length=9)] = "") -> Json:
         """How decisions went from the first to the newest, in stretches, and the retrains and safe modes meanwhile.
 
         hours : of a shift, which is a stretch then, the newest of them; start : when one begins, in hours since 1970.
-        batch : likewise what parts' numbers begin with, so many characters.
+        batch : likewise what parts' numbers begin with: so many characters, or up to the last of these, "-/".
         """
         recipe, by = self.service.engine.recipe, {"seconds": 3600.0 * hours, "start": 3600.0 * start, "batch": batch}
         by = by if hours or batch else {}
@@ -322,10 +321,6 @@ def _packed(source: Exportable) -> bytes:
         return Path(make_archive(f"{folder}/packed", "zip", f"{folder}/model")).read_bytes()
 
 
-async def _page(request: Request) -> Response:
-    return FileResponse(STATIC / "index.html")
-
-
 def create_app(
     service: CellService,
     access: Access | None = None,
@@ -345,7 +340,7 @@ def create_app(
     every: list[BaseRoute] = [Route(each.path, each.serve, methods=[each.method]) for each in HttpApi(service).operations]
     every += [Mount("/page/static", StaticFiles(directory=STATIC))]  # of /docs too
     every += xmlrpc_routes(service, recorder) if xmlrpc else []
-    every += [Route(path, _page) for path in VIEWS] if page else []
+    every += [Route(path, lambda request: FileResponse(STATIC / "index.html")) for path in VIEWS] if page else []
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:

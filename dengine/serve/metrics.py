@@ -1,7 +1,5 @@
 """What Prometheus reads: how many decisions of which kind, how long they took, and how the engine stands."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 from prometheus_client import CollectorRegistry, Histogram

@@ -8,8 +8,6 @@ text that stay as they are (`VARIABLES`). The variables follow the store, at mos
 an alarm are events of the Server object as well.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import logging
@@ -75,7 +73,7 @@ VARIABLES: Mapping[str, tuple[VariantType, str, str]] = {  # its type, its name 
     "Decisions": (VariantType.UInt32, "decisions", "decisions since the cell's birth"),
     "VerifiedShare": (VariantType.Double, "verified_share", "verified share of the newest 500 decisions, 0 to 1"),
     "Accepted": (VariantType.UInt32, "accepted", "parts accepted without a check"),
-    "Rejected": (VariantType.UInt32, "rejected", "parts rejected without a check"),
+    "Rejected": (VariantType.UInt32, "rejected", "parts that the model rejected"),
     "Bad": (VariantType.UInt32, "bad", "accepted parts that are known to have been bad"),
     "ModelVersion": (VariantType.UInt32, "version", "of the model that answers; 0 before the first retrain"),
     "SafeMode": (VariantType.Boolean, "safe_mode", "everything is verified, by the engine's own choice"),

@@ -9,8 +9,6 @@ What is the world's fault (a full line, a recording that did not come, a store t
 False: a fault ends a robot's program. What is the caller's bug (a wrong type, another trace under a known id) is a fault.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import uuid
@@ -21,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import BusyError, DengineError, SettingError, StoreError, TraceError, UnknownDecisionError, shortened
+from ..errors import BusyError, DengineError, SettingError, StoreError, TraceError, UnknownDecisionError, expect, shortened
 from ..records import ACTIONS, Action, Decision, as_id
 from .api import as_samples
 from .service import CellService
@@ -87,8 +85,7 @@ class RobotCalls:
         if piece.ndim != 1:
             raise TraceError("Expected a piece of one channel, a list of numbers; use decide for several channels.")
         n = sum(map(len, pieces)) + len(piece)
-        if n > SAMPLES:
-            raise TraceError(f"Expected at most {SAMPLES} samples of a part, got more.")
+        expect(n <= SAMPLES, f"at most {SAMPLES} samples of a part", n, error=TraceError)
         pieces.append(piece)
         return n
 

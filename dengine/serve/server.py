@@ -1,7 +1,5 @@
 """One process in front of one cell: the port, TLS, the engine, the signals, its log, and how it all ends in order."""
 
-from __future__ import annotations
-
 import json
 import logging
 import signal
@@ -21,7 +19,7 @@ from typing import Any, TextIO
 import uvicorn
 
 from ..engine.engine import DataEngine, frozen_objects
-from ..errors import SettingError, without_password
+from ..errors import SettingError, instead, without_password
 from .auth import Access, in_url, is_loopback, read_tokens
 from .connections import Places
 from .http import Beside, create_app
@@ -177,12 +175,10 @@ def quick_switches() -> Iterator[None]:
 @contextmanager
 def bound(host: str, port: int) -> Iterator[socket.socket]:
     """A socket that listens there; SettingError, in one line, where it cannot."""
-    try:
+    said, do = f"Cannot listen at {host}, port {port}", "name another with --port or --host"
+    with instead(SettingError, said, OSError, OverflowError, UnicodeError, do=do):
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         listening = socket.create_server(address[:2], family=family, backlog=128)
-    except (OSError, OverflowError, UnicodeError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise SettingError(f"Cannot listen at {host}, port {port}: {why}; name another with --port or --host.") from error
     with listening:
         # Its connections inherit it: else an answer's second piece waits 40 ms for word that its first has come.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -199,10 +195,8 @@ def _tls(cert: Path | None, key: Path | None) -> dict[str, str]:
     def no_password() -> str:
         raise SettingError(f"Expected a key without a password, {key} has one; protect the file instead: chmod 600 {key}")
 
-    try:
+    with instead(SettingError, f"Cannot use {cert} and {key} for TLS", OSError):  # ssl.SSLError too
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, no_password)
-    except OSError as error:  # ssl.SSLError too
-        raise SettingError(f"Cannot use {cert} and {key} for TLS: {error.strerror or error}.") from error
     return {"ssl_certfile": str(cert), "ssl_keyfile": str(key)}
 
 

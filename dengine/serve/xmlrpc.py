@@ -4,8 +4,6 @@ The calls are those of `RobotCalls`. Every answer is HTTP's 200 with a value or 
 no XML-RPC at all is a 405 or 415. The XML is read by defusedxml: no document type, no entity, nothing from outside.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import xmlrpc.client

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
-from ..errors import DengineError, StoreError, shortened
+from ..errors import DengineError, StoreError, expect
 from .journal import Record, forked, owned_by, owner, sqlite_file
 from .ledger import LedgerEntry, chain_writes, doubt_of, ledger_key, must_have_key, newest_entry
 from .queries import WITH_LABELS, WITH_TRACES, Scope, counted, join_product
@@ -37,21 +37,15 @@ def make_engine(url: str | None) -> sa.Engine:
     if url is None:
         one = {"poolclass": sa.pool.StaticPool, "connect_args": {"check_same_thread": False}}
         return _sqlite(sa.create_engine("sqlite://", **one))
-    if as_text(url) != url:
-        raise StoreError(
-            f"Expected a file or a database URL of UTF-8 characters without a NUL, got {shortened(url)}; rename it."
-        )
+    expect(as_text(url) == url, "a file or a database URL of UTF-8 without a NUL", url, "rename it", StoreError)
     try:
         parsed = sa.make_url(url) if "://" in url else sa.URL.create("sqlite", database=str(Path(url)))
         if parsed.drivername in ("postgres", "postgresql"):
             parsed = parsed.set(drivername="postgresql+psycopg")
         backend = parsed.get_backend_name()
-        forgets = backend == "sqlite" and parsed.database in (None, "", ":memory:")
-        if forgets or backend not in ("sqlite", "postgresql"):
-            raise StoreError(
-                f"Expected a file, an SQLite file URL or a PostgreSQL URL, got {parsed.render_as_string()}; "
-                "for a store that forgets use store=None."
-            )
+        keeps = backend == "postgresql" or (backend == "sqlite" and parsed.database not in (None, "", ":memory:"))
+        wanted, do = "a file, an SQLite file URL or a PostgreSQL URL", "for a store that forgets use store=None"
+        expect(keeps, wanted, parsed.render_as_string(), do, StoreError)
         if backend == "postgresql":
             return sa.create_engine(parsed, pool_pre_ping=True, connect_args=PATIENCE)
         return _sqlite(sa.create_engine(parsed, connect_args={"timeout": BUSY}))
@@ -68,10 +62,8 @@ def _sqlite(engine: sa.Engine) -> sa.Engine:
 
 
 def _unusable(url: str, said: str) -> StoreError:
-    return StoreError(
-        f"Expected a file or a database URL that can be used here, got {url.split('@')[-1]!r}: {said}. "
-        "For PostgreSQL: pip install 'dengine[postgres]'."
-    )
+    got = f"{url.split('@')[-1]!r}: {said}. For PostgreSQL: pip install 'dengine[postgres]'"
+    return StoreError(f"Expected a file or a database URL that can be used here, got {got}.")
 
 
 def _set_pragmas(connection: Any, record: Any) -> None:
@@ -126,10 +118,8 @@ def reading(url: str) -> Iterator[sa.Connection]:
     try:
         file = str(engine.url.database)
         if sqlite and not (Path(file).is_file() or file.startswith("file:")):  # the latter is an URI of SQLite's own
-            raise StoreError(
-                f"Expected a store that an engine has used, found no file {file}; "
-                "make a DataEngine with it, or let `dengine train` or `dengine run` make one."
-            )
+            do = "make a DataEngine with it, or let `dengine train` or `dengine run` make one"
+            raise StoreError(f"Expected a store that an engine has used, found no file {file}; {do}.")
         with _told("read", name), engine.connect() as connection:  # rolled back at its end: there is nothing to commit
             connection.execution_options(**options)
             if sqlite:  # a text of which a byte was damaged is read too, so that it can be named

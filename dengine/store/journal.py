@@ -16,12 +16,12 @@ import urllib.parse
 import weakref
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from ..errors import StoreError
+from ..errors import StoreError, instead
 from ..records import Decision
 from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
@@ -51,7 +51,9 @@ def to_bytes(record: Record) -> bytes:
 
 def from_bytes(blob: bytes) -> Record:
     """Read what `to_bytes` wrote; StoreError for anything else."""
-    try:
+    do = "open the store with the dengine that wrote it"
+    kinds = (struct.error, ValueError, KeyError, TypeError, AttributeError)
+    with instead(StoreError, "Expected a record of a journal, got what cannot be read", *kinds, do=do):
         (length,) = LENGTH.unpack_from(blob)
         rest = blob[LENGTH.size + length :]
         kind, row = json.loads(blob[LENGTH.size : LENGTH.size + length])
@@ -61,11 +63,6 @@ def from_bytes(blob: bytes) -> Record:
         if kind == NewLabel.__name__:
             return from_row(NewLabel, row, point=unpack(rest) if rest else None)
         return from_row(Event, row)
-    except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StoreError(
-            f"Expected a record of a journal, got what cannot be read ({error}); "
-            "open the store with the dengine that wrote it."
-        ) from error
 
 
 class Journal:
@@ -116,9 +113,7 @@ class Journal:
             self._put(framed, self.end)
             SYNC(self._fd)
         if not self._in_place():
-            raise LostJournalError(
-                f"The journal {self.path} was deleted, moved or replaced while it was open; leave it where it is."
-            )
+            raise LostJournalError(f"The journal {self.path} was deleted, moved or replaced while it was open; leave it.")
         self.end, self._digest = self.end + len(framed), digest
         return offsets
 
@@ -267,13 +262,9 @@ def _digest(before: bytes, record: bytes) -> bytes:
     return blake2b(before + record, digest_size=16).digest()
 
 
-@contextmanager
-def _using(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        do = "free some space there, or make its folder writable"
-        raise StoreError(f"Could not use the journal {path}: {error}; {do}.") from error
+def _using(path: Path) -> AbstractContextManager[None]:
+    do = "free some space there, or make its folder writable"
+    return instead(StoreError, f"Could not use the journal {path}", OSError, do=do)
 
 
 def _locked(path: Path) -> int:
@@ -343,10 +334,8 @@ def _known(head: bytes) -> tuple[int, tuple[int, str] | None, str]:
 
 def forked(pid: int, name: str) -> StoreError:
     """Return the error for a fork of the process that opened what this names."""
-    return StoreError(
-        f"Expected the process that opened {name}, {pid}, got its fork {os.getpid()}; "
-        "open it after the fork, in the process that uses it."
-    )
+    got, do = f"its fork {os.getpid()}", "open it after the fork, in the process that uses it"
+    return StoreError(f"Expected the process that opened {name}, {pid}, got {got}; {do}.")
 
 
 def owner() -> str:
@@ -356,7 +345,5 @@ def owner() -> str:
 
 def owned_by(holder: str, name: str) -> StoreError:
     """Return the error for a second engine on a cell."""
-    return StoreError(
-        f"Expected a cell that no other engine runs on, but {holder} owns {name}; "
-        "close that engine first, or give this one a cell_id of its own."
-    )
+    do = "close that engine first, ask its page or its HTTP where it is served, or give this one a cell_id of its own"
+    return StoreError(f"Expected a cell that no other engine runs on, but {holder} owns {name}; {do}.")

@@ -95,10 +95,9 @@ def must_have_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bo
         connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": LEDGER_KEY, "value": tag})
     elif held != tag:
         begun = "without a key" if held is None else "with a key" if tag is None else "with another key"
-        raise StoreError(
-            f"Expected a ledger of cell {cell_id!r} by the key that {KEY_VARIABLE} names{'' if key else ', none'}; it "
-            f"was begun, or made anew, {begun}: have it name the file of the ledger's own key, or none."
-        )
+        wanted = f"a ledger of cell {cell_id!r} by the key that {KEY_VARIABLE} names{'' if key else ', none'}"
+        do = "have it name the file of the ledger's own key, or none"
+        raise StoreError(f"Expected {wanted}; it was begun, or made anew, {begun}: {do}.")
 
 
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:

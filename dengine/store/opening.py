@@ -12,18 +12,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from ..errors import StoreError
+from ..errors import StoreError, expect
 from .records import CellAddress
 
 if TYPE_CHECKING:
     from .sql import SqlStore
 
+    StoreLike = str | os.PathLike[str] | SqlStore
+
 UNHURRIED = 10.0  # seconds to wait for a store where no cell waits, as its wait
 
 
-def open_store(
-    store: str | os.PathLike[str] | SqlStore | None, *, must_exist: bool = False, wait: float | None = None
-) -> SqlStore:
+def open_store(store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None) -> SqlStore:
     """Return the store that a user named: nothing (memory), a file or URL (database), or a store as it is.
 
     A file or URL may say whose rows it means, and what that cell makes: `address`.
@@ -35,8 +35,8 @@ def open_store(
 
     if isinstance(store, SqlStore):
         return store
-    if store is not None and not isinstance(store, str | os.PathLike):
-        raise StoreError(f"Expected None, a file, a URL or an SqlStore, got {type(store).__name__}.")
+    named = store is None or isinstance(store, str | os.PathLike)
+    expect(named, "None, a file, a URL or an SqlStore", store, error=StoreError)
     if store is None:
         return SqlStore()
     cell_id, product = (store.cell_id, store.product) if isinstance(store, CellAddress) else ("cell", None)
@@ -46,9 +46,7 @@ def open_store(
 
 
 @contextmanager
-def opening(
-    store: str | os.PathLike[str] | SqlStore | None, *, must_exist: bool = False, wait: float | None = None
-) -> Iterator[SqlStore]:
+def opening(store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None) -> Iterator[SqlStore]:
     """`open_store`; where what follows fails, a store that was opened here is closed again."""
     opened = open_store(store, must_exist=must_exist, wait=wait)
     try:

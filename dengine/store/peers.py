@@ -42,10 +42,9 @@ def must_agree(mine: Mapping[str, str], peer: Mapping[str, str], name: str, prod
     other = [key for key in have if key not in either and have[key] != asked[key]]
     if other:
         stored, got = (", ".join(f"{key} {values[key]}" for key in other) for values in (have, asked))
-        raise SettingError(
-            f"Expected the settings of product {product!r}, as cell {name!r} has them ({stored}), got {got}; "
-            "cells that share labels share what embeds them: give the same, or name another product."
-        )
+        do = "cells that share labels share what embeds them: give the same, or name another product"
+        wanted = f"the settings of product {product!r}, as cell {name!r} has them ({stored})"
+        raise SettingError(f"Expected {wanted}, got {got}; {do}.")
 
 
 def _embedding(settings: Mapping[str, str]) -> dict[str, Any]:

@@ -1,12 +1,12 @@
 """Whose rows a query is about, a cell's own or those of all cells of its product, and what several queries are made of."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any
 
 import sqlalchemy as sa
 
-from ..errors import StoreError
+from ..errors import StoreError, expect
 from ..records import ACTIONS, Action, Reason
 from .records import FORGOTTEN
 from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT, PRODUCT_KEY, RESERVED, SETTING, TRACE, VERSION, hold
@@ -83,19 +83,13 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     held: str | None = connection.execute(query).scalar()
     if product is None or held == product:
         return held
-    if held is not None:
-        raise StoreError(
-            f"Expected product {held!r} of cell {cell_id!r}, got {product!r}; leave it out, or name another cell."
-        )
-    if not product.strip() or not product.isprintable():
-        raise StoreError(f"Expected a product's name of printable characters, got {product!r}.")
+    expect(held is None, f"product {held!r} of cell {cell_id!r}", product, "leave it out, or name another cell", StoreError)
+    named = bool(product.strip()) and product.isprintable()
+    expect(named, "a product's name of printable characters", product, error=StoreError)
     settings = connection.execute(sa.select(SETTING.c.key).where(mine, SETTING.c.key.not_in(RESERVED))).first()
     label = connection.execute(sa.select(LABEL.c.seq).where(LABEL.c.cell_id == cell_id).limit(1)).first()
-    if settings is not None or label is not None:
-        raise StoreError(
-            f"Expected a new cell for product {product!r}, got {cell_id!r}, which has worked without a product; "
-            "name a new cell, and bring its labels over by an import."
-        )
+    do = "it has worked without a product: name a new cell, and bring its labels over by an import"
+    expect(settings is None and label is None, f"a new cell for product {product!r}", cell_id, do, StoreError)
     hold(connection, PRODUCT, product)
     connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": PRODUCT_KEY, "value": product})
     return product
@@ -148,20 +142,22 @@ def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
     return sa.select(sa.func.max(every.c.number)).where(every.c.cell_id == cell_id).scalar_subquery()
 
 
-def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: int = 0) -> sa.Select[Any]:
+def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: str = "") -> sa.Select[Any]:
     """All decisions counted in stretches of one length, oldest first; the columns of `Stretch`.
 
-    batch : by so many first characters of the parts' numbers instead; seconds : or by so many of time, from `start` on.
+    batch : by the beginnings of parts' numbers instead, "5" characters, or up to the last of "-/".  seconds : or of time.
     """
     number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
     columns = (*DECISION.c["cell_id", "id", "time", "action", "reason", "part"], number.label("number"))
     every = sa.select(*columns).where(DECISION.c.cell_id == cell_id).subquery("every")
     of = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)
-    accepted = every.c.action == Action.ACCEPT.value
-    verified, novel = every.c.action == Action.VERIFY.value, every.c.reason == Reason.NOVEL.value
-    which = (verified, novel, accepted, accepted & (SAID == 0))
+    verified, accepted, rejected = (every.c.action == action.value for action in Action)
+    novel, outside = (every.c.reason == reason.value for reason in (Reason.NOVEL, Reason.OUTSIDE))
+    which = (verified, novel, accepted, accepted & (SAID == 0), rejected & ~outside, outside)
     counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
     query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
-    name = sa.func.substr(every.c.part, 1, batch) if batch else sa.null()
+    part: Any = every.c.part
+    others = reduce(lambda text, each: sa.func.replace(text, each, ""), batch, part)
+    name = sa.func.substr(part, 1, int(batch)) if batch.isdecimal() else sa.func.rtrim(part, others) if batch else sa.null()
     timed = sa.func.floor((every.c.time - start) / seconds) if seconds else every.c.number - every.c.number % length
     return query.add_columns(name).group_by(name if batch else timed).order_by(sa.func.max(every.c.number))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision.certificate import Outcomes as Outcomes  # counted by every store
-from ..errors import DataError, ReportConflictError, ReportError, StoreError, UnknownDecisionError, shortened
+from ..errors import DataError, ReportConflictError, ReportError, StoreError, UnknownDecisionError, instead, shortened
 from ..files import read_archive
 from ..records import Decision, RetrainReport, Source
 
@@ -39,10 +39,9 @@ def _when(record: Any) -> datetime:
 
 def unknown_decision(decision_id: str) -> ReportError:
     """Return the error for a report on a decision that the store does not hold."""
-    return UnknownDecisionError(
-        f"Expected the id of a stored decision, got {shortened(decision_id)}, which this cell's store does not hold; "
-        f"report the `Decision.id` that `decide` returned, to the same store and cell_id."
-    )
+    got = f"{shortened(decision_id)}, which this cell's store does not hold"
+    do = "report the `Decision.id` that `decide` returned, to the same store and cell_id"
+    return UnknownDecisionError(f"Expected the id of a stored decision, got {got}; {do}.")
 
 
 def already_reported(decision_id: str, first: tuple[bool, Source], second: tuple[bool, Source]) -> ReportError:
@@ -50,28 +49,20 @@ def already_reported(decision_id: str, first: tuple[bool, Source], second: tuple
     said, says = (f"{'success' if success else 'failure'} from {source.value}" for success, source in (first, second))
     same = first[0] == second[0]
     advice = "nothing more needs reporting" if same else "if the first was wrong, look at how the part was checked"
-    return ReportConflictError(
-        f"Expected one report a decision, got a second on {decision_id!r}: {said} was reported first and stands, "
-        f"now came {says}; {advice}."
-    )
+    both = f"{said} was reported first and stands, now came {says}"
+    return ReportConflictError(f"Expected one report a decision, got a second on {decision_id!r}: {both}; {advice}.")
 
 
 def nothing_to_correct(decision_id: str) -> ReportError:
     """Return the error for a correction of a decision that was never reported."""
-    return ReportError(
-        f"Expected a decision with a label, got {decision_id!r}, of which nothing was reported yet; "
-        "there is nothing to correct: report its label."
-    )
+    got = f"{decision_id!r}, of which nothing was reported yet"
+    return ReportError(f"Expected a decision with a label, got {got}; there is nothing to correct: report its label.")
 
 
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return an event's data as it comes back from JSON; a StoreError for what JSON has not."""
-    try:
+    with instead(StoreError, "Expected an event's data as JSON has it", TypeError, ValueError, do="give numbers and text"):
         return None if data is None else dict(json.loads(json.dumps(dict(data), allow_nan=False)))
-    except (TypeError, ValueError) as error:
-        raise StoreError(
-            f"Expected an event's data as JSON has it, got {data!r}: {error}; give numbers and text."
-        ) from error
 
 
 def as_text(text: str) -> str:
@@ -314,10 +305,8 @@ def from_row(kind: Callable[..., T], row: Mapping[str, Any], **given: Any) -> T:
     try:
         return kind(**{name: _read(row[name], each) for name, each in wanted.items()}, **given)
     except (ValueError, TypeError) as error:
-        raise StoreError(
-            f"Expected a row of {getattr(kind, '__name__', kind)} as it was written, got another: {error}; "
-            "see `dengine verify`, and restore the store from a copy."
-        ) from error
+        name, do = getattr(kind, "__name__", kind), "see `dengine verify`, and restore the store from a copy"
+        raise StoreError(f"Expected a row of {name} as it was written, got another: {error}; {do}.") from error
 
 
 def _written(value: Any, kind: type) -> Any:
@@ -382,10 +371,8 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
 
 def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
     """What `to_npz` wrote; a pickle in it is refused."""
-    try:
+    with instead(StoreError, "Expected a version of plain arrays", DataError, do=f"restore {name} from a copy"):
         return read_archive(blob, name=f"a version in {name}")[0]
-    except DataError as error:
-        raise StoreError(f"{error} It is no version of plain arrays: restore {name} from a copy.") from error
 
 
 class VersionError(StoreError):

@@ -31,16 +31,11 @@ KINDS: dict[type, Any] = {
 
 def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
     """Columns of a record's fields, of all or of these; key : the one that is of the primary key."""
+    known = {name: each for name, each in columns(record).items() if not names or name in names}
+    kinds = {name: sa.String if issubclass(kind, StrEnum) else KINDS[kind] for name, (kind, _) in known.items()}
     return [
-        sa.Column(
-            name,
-            sa.String if issubclass(kind, StrEnum) else KINDS[kind],
-            nullable=optional,
-            primary_key=name == key,
-            autoincrement=False,
-        )
-        for name, (kind, optional) in columns(record).items()
-        if not names or name in names
+        sa.Column(name, kinds[name], nullable=optional, primary_key=name == key, autoincrement=False)
+        for name, (_, optional) in known.items()
     ]
 
 
@@ -148,10 +143,8 @@ def check_schema(connection: sa.Connection, name: str) -> None:
         query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()  # the one query over all cells
         held = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
     if held != f"schema {SCHEMA}":
-        raise StoreError(
-            f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; "
-            "open it with the dengine that wrote it, or name a new file or database."
-        )
+        do = "open it with the dengine that wrote it, or name a new file or database"
+        raise StoreError(f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; {do}.")
     for table in METADATA.tables.values():
         if missing := set(table.c.keys()) - found.get(table.name, set()):
             raise StoreError(f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it from a copy.")

@@ -7,8 +7,6 @@ What a returned call promises, given a disk that keeps what it synced: all that 
 what it decides: that goes into a journal first, and from there, by `take`, into the database.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import time
@@ -21,7 +19,7 @@ import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from ..errors import StoreError, listed, shortened
+from ..errors import StoreError, expect, instead, listed, shortened
 from ..records import Action, Reason, RetrainReport, Source
 from .connections import Database
 from .journal import Journal, Record, journal_path
@@ -108,13 +106,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         wait: float | None = None,
         keep_versions: int | None = KEEP,
     ) -> None:
-        if not cell_id:
-            raise StoreError("Expected a cell_id that names the cell, got an empty one; use for example 'cell'.")
+        expect(bool(cell_id), "a cell_id that names the cell", cell_id, "use for example 'cell'", StoreError)
         self.cell_id = cell_id
-        if keep_versions is not None and (type(keep_versions) is not int or keep_versions < 2):
-            raise StoreError(
-                f"Expected keep_versions of 2 or more, or None for all, got {keep_versions!r}; leave it at {KEEP}."
-            )
+        whole = keep_versions is None or (type(keep_versions) is int and keep_versions >= 2)
+        expect(whole, "keep_versions of 2 or more, or None for all", keep_versions, f"leave it at {KEEP}", StoreError)
         self.keep_versions = keep_versions
         self.wait = None if url is None else _checked_wait(wait)
         self.clock = clock
@@ -179,10 +174,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         if not rows:
             return None
         if trace and not is_sound(TRACE.name, dict(zip(TRACE.c.keys(), rows[0][-len(TRACE.c) :], strict=True))):
-            raise StoreError(
-                f"Expected the trace of decision {decision_id!r} as it was stored in {self.database.name}, its bytes "
-                "have changed; see `dengine verify`, and restore the store from a copy."
-            )
+            where = f"as it was stored in {self.database.name}, its bytes have changed"
+            do = "see `dengine verify`, and restore the store from a copy"
+            raise StoreError(f"Expected the trace of decision {decision_id!r} {where}; {do}.")
         return read_decision(rows[0])
 
     def decision_ids(self) -> Iterator[Sequence[str]]:
@@ -259,9 +253,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
                 traces = np.empty((len(rows), *shape), dtype=np.float32)
             if shape != traces.shape[1:]:
                 shapes = sorted({traces.shape[1:], shape})
-                raise StoreError(
-                    f"Expected one shape in a cell's store, found {shapes}; give each kind a cell_id of its own."
-                )
+                raise StoreError(f"Expected one shape in a cell's store, found {shapes}; give each kind its own cell_id.")
             traces[at[seq]], kept[at[seq]] = unpack(row["data"]).reshape(shape), True
         labels = [row.success for row in rows]
         if not all(label in (0, 1) for label in labels):
@@ -405,9 +397,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         held = {row.version: row.retrain for row in reversed(self._read(self._accepted())) if row.kept}
         if version not in held:
             others = ", ".join(map(str, held)) or "none"
-            raise VersionError(
-                f"Expected a version whose state is held, got {version}, which is not kept; load one of these: {others}."
-            )
+            raise VersionError(f"Expected a held version, got {version}, which is not kept; load one of these: {others}.")
         return self._loaded(held[version])
 
     def _loaded(self, retrain: int) -> ModelVersion:
@@ -415,14 +405,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         mine = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
         row = self._read(query.where(mine))[0]
         if row.state is None or (row.state_sum is not None and state_sum(row.state) != row.state_sum):
-            raise VersionError(
-                f"Expected the state of version {row.version} as it was stored in {self.database.name}, "
-                "its bytes have changed; restore the store from a copy."
-            )
-        try:
+            where = f"as it was stored in {self.database.name}, its bytes have changed"
+            raise VersionError(f"Expected the state of version {row.version} {where}; restore the store from a copy.")
+        with instead(VersionError, f"Version {row.version} cannot be read", StoreError):
             state = from_npz(row.state, self.database.name)
-        except StoreError as error:
-            raise VersionError(str(error)) from error
         if row.cell_id != self.cell_id:  # what a peer's parts taught its rule says nothing certain of this cell
             state = without_rule(state) | {"told_to": np.array(0)}
         return ModelVersion(row.version, row.last_seq, state)
@@ -477,10 +463,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             if change.decisions:
                 self._correct(connection, change, {"author": author, "event": number, "time": now})
             if version is not None and (stored := self._add_version(connection, version)) != version["version"]:
-                raise StoreError(
-                    f"Expected version {version['version']} to be the next, a sister of the product stored {stored - 1} "
-                    "meanwhile; try it again."
-                )
+                wanted = f"version {version['version']} to be the next"
+                raise StoreError(f"Expected {wanted}, a peer of the product stored {stored - 1} meanwhile; try it again.")
             if change.settings is not None:
                 self._settle(connection, change.settings)
             return number

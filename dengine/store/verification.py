@@ -172,9 +172,7 @@ class CellCheck:
         held, previous = set[int](), {START}
         for row in sorted(self._raw(LEDGER.name), key=lambda row: _integer(row["number"])):
             number = _integer(row["number"])
-            mine = {
-                table: each[slice(*np.searchsorted(each["entry"], (number, number + 1)))] for table, each in sums.items()
-            }
+            mine = {t: each[slice(*np.searchsorted(each["entry"], (number, number + 1)))] for t, each in sums.items()}
             head = {name: value for name, value in row.items() if name != "digest"}
             stored, now = ({t: each[of].tolist() for t, each in mine.items() if len(each)} for of in ("stored", "now"))
             # After an entry that was changed the chain goes on from what it said, or from what it should have said.

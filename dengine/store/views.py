@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SettingError, shortened
+from ..errors import SettingError, expect, shortened
 from ..records import Action, Reason, Source
 from .records import Outcomes
 
@@ -42,8 +42,7 @@ class HistoryFilter:
             except ValueError:
                 known = ", ".join(kind)
                 raise SettingError(f"Expected {name} to be one of {known}, got {shortened(value)}.") from None
-        if self.label is not None and self.label not in LABELS:
-            raise SettingError(f"Expected label to be one of {', '.join(LABELS)}, got {shortened(self.label)}.")
+        expect(self.label is None or self.label in LABELS, f"label to be one of {', '.join(LABELS)}", self.label)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +144,7 @@ class Tally:
 class Stretch:
     """Consecutive decisions, or those of a batch.  n : of them.  last : time of the newest.  batch : its name.
 
-    verified, novel : decided so.  accepted, bad : went on without a check, and of these are known to be bad.
+    verified, novel, outside : decided so.  accepted, rejected : by the model, without a check.  bad : accepted, known so.
     """
 
     n: int
@@ -154,4 +153,6 @@ class Stretch:
     novel: int
     accepted: int
     bad: int
+    rejected: int
+    outside: int
     batch: str | None = None

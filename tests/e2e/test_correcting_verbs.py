@@ -3,6 +3,7 @@
 import getpass
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,12 @@ def test_a_label_is_corrected_and_the_line_says_what_it_was(store: Path) -> None
 def test_a_part_is_found_and_reported_by_its_number(store: Path, make_data) -> None:
     with DataEngine.open(store) as engine:
         engine.decide(np.roll(make_data(1).X[0], 7), "P-7")
-    assert said("report", store, "P-7", "bad", "--author", "kim").endswith(" was bad. Event 1, by kim.")
+        engine.set_policy(replace(engine.policy, windows=("0:0:1000::reject",)))
+        engine.decide(np.roll(make_data(1).X[0], 9), "P-8")
+        assert "or its HTTP where it is served" in dengine("report", store, "P-7", "bad").stderr  # while it runs
+    assert "'P-8', which went back to the bin" in dengine("report", store, "P-8", "good").stderr
+    assert "'P-9', which is unknown" in dengine("report", store, "P-9", "good").stderr
+    assert said("report", store, "P-7", "bad", "--author", "kim").endswith(" was bad. Event 2, by kim.")
     (found,) = document("history", store, "--part", "P-7")["decisions"]
     assert (found["part"], found["label"]) == ("P-7", "bad")
 
@@ -98,6 +104,8 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path, tmp_path: P
     assert "alpha 0.2, lower bound 0.8" in said("status", store)
     assert "windows none -> 0.05:0.1:-5:60:reject. Event" in said("policy", store, "--window", "0.05:0.1:-5:60:reject")
     assert document("policy", store, "--window", "")["policy"]["windows"] == []
+    wrong = dengine("policy", store, "--window", "0.05:0.1:-5::channel=4")
+    assert "got '0.05:0.1:-5::channel=4'" in " ".join(wrong.stderr.split())  # and not as an option of the command
     shown = said("policy", store)
     assert all(words in shown for words in ("alpha 0.2", "audit rate 10.0 %", "stops all"))
     assert "interval wilson -> jeffreys. Event 4, by" in said("policy", store, "--interval", "jeffreys")

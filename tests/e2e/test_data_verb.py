@@ -93,6 +93,11 @@ def long(X: np.ndarray, good: np.ndarray) -> pd.DataFrame:
     return pd.DataFrame(rows | {"force": X.ravel().astype(float), "verdict": np.repeat(np.where(good, "OK", "NOK"), 40)})
 
 
+def at_last(table: pd.DataFrame) -> pd.DataFrame:
+    """With a verdict in the last row of each part alone."""
+    return table.assign(verdict=table["verdict"].where(~table["serial"].duplicated(keep="last")))
+
+
 def wide(X: np.ndarray, good: np.ndarray, name: str = "s{:03d}_fz") -> pd.DataFrame:
     return pd.DataFrame(X.astype(float), columns=[name.format(i) for i in range(40)]).assign(day=1, Urteil=good)
 
@@ -100,6 +105,11 @@ def wide(X: np.ndarray, good: np.ndarray, name: str = "s{:03d}_fz") -> pd.DataFr
 FORMS: dict[str, Callable[..., Any]] = {  # what writes a day's file
     "long.parquet": lambda X, good, path: long(X, good).to_parquet(path),
     "long.csv": lambda X, good, path: long(X, good).to_csv(path, index=False),
+    "last.csv": lambda X, good, path: at_last(long(X, good)).to_csv(path, index=False),
+    "last.parquet": lambda X, good, path: at_last(long(X, good)).to_parquet(path),
+    "tags.csv": lambda X, good, path: pd.concat(
+        [long(each, good).assign(tag=tag) for tag, each in (("FZ", X), ("MX", -X))]
+    ).to_csv(path, index=False),
     "wide.parquet": lambda X, good, path: wide(X, good).to_parquet(path),
     "wide.csv": lambda X, good, path: wide(X, good, "FZ [{}]").to_csv(path, index=False),
     "plain.npz": lambda X, good, path: np.savez(path, X=X, y=good, rate_hz=100.0),

@@ -17,6 +17,7 @@ pytest.importorskip("uvicorn", reason="needs the extra serve: pip install 'dengi
 
 from dengine.cli import main
 from dengine.errors import SettingError
+from dengine.records import Action, Reason
 from dengine.serve.auth import read_tokens
 from dengine.serve.metrics import Metrics
 from tests.support.serving import a_service, started
@@ -131,6 +132,8 @@ def test_dashboard_and_alerts_ask_for_metrics_that_there_are_and_for_their_label
         r"expr: (?:>-)?\s*(.+?)\n +(?:for|annotations|labels):", (DEPLOY / "alerts.yml").read_text(), flags=re.S
     )
     assert {re.sub("_(count|bucket)$", "", name) for name in re.findall(r"dengine_\w+", " ".join(asked))} <= known
+    said = re.findall(r'(?:action|reason)="(\w+)"', " ".join(asked))
+    assert {"accept", "novel", "outside"} <= set(said) <= {each.value for each in (*Action, *Reason)}
     assert set(re.findall(r'(\w+)=~?"', " ".join(asked))) == {"instance", "action", "repeated", "reason", "accepted", "job"}
 
 

@@ -178,4 +178,6 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     accept, certified = told["ever"]["would_accept"], told["certificate"]
     assert (accept["n"] > 50, accept["verdict"], certified["accepted"]["shadowed"]) == (True, "kept", True)
     assert f"Of {accept['n']} parts that the model would accept, each of which was checked," in certified["sentence"]
+    n, words = len(certain), said("status", store, "--check-seconds", "60")
+    assert f"It would have decided {n} of the {told['ever']['verified']} parts that were verified: {60 * n} s of" in words
     assert "shadow yes" in said("status", store)

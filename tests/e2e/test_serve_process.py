@@ -2,7 +2,9 @@
 
 import http.client
 import queue
+import re
 import signal
+import socket
 import threading
 import time
 import xmlrpc.client
@@ -16,9 +18,10 @@ import pytest
 
 pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
 
-from dengine import DataEngine, Dataset, Recipe
+from dengine import Action, DataEngine, Dataset, Recipe
 from dengine.cells import FakeController
-from tests.support.serving import WAIT, started
+from tests.support.exports import trained
+from tests.support.serving import REPO, WAIT, started
 
 SAMPLES = 80
 NAMES = "action", "reason", "lower"
@@ -187,3 +190,29 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
             assert process.end() == 0
     assert "no recording of" in process.said
     assert "Traceback" not in process.said
+
+
+def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(tmp_path: Path, make_data) -> None:
+    page, data, token = (REPO / "docs/howto/plc_and_robot.md").read_text("utf-8"), make_data(200, samples=1000), "t" * 24
+    (head,) = re.findall(r"```text\n(POST /decide.+?\n\n)```", page, flags=re.DOTALL)
+    (node,) = re.findall(r"```python\n(from http.+?)```", page, flags=re.DOTALL)
+    (tmp_path / "token").write_text(token)
+    (tmp_path / "token").chmod(0o400)
+    with trained(data, tmp_path / "cell.db") as engine:
+        x = next(x for x in data.X if engine.decide(x).action is Action.ACCEPT).astype("<f4")
+    pieces = [f"{line}\r\n".encode() for line in head.replace("TOKEN", token).splitlines()]
+    pieces += [x[i : i + 250].tobytes() for i in range(0, 1000, 250)]
+    with started(tmp_path, "--token-file", "token") as server, socket.socket() as robot:
+        robot.settimeout(WAIT)
+        robot.connect(("127.0.0.1", server.port))
+        for piece in pieces:
+            robot.sendall(piece)
+        answer = b""
+        while not (action := re.search(rb'"action":"(\w+)"', answer)):
+            answer += robot.recv(100)
+        scope: dict[str, Any] = {}
+        exec(node, scope)
+        url = f"http://127.0.0.1:{server.port}"
+        asked = (url, token), (url, "another"), ("http://127.0.0.1:1", token)
+        assert [scope["decide"](x, "P-1", *each) for each in asked] == ["accept", "verify", "verify"]
+        assert action[1] == b"accept"

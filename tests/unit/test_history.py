@@ -24,6 +24,8 @@ KINDS = (  # action, predicted, reason, audit
     (Action.VERIFY, Action.REJECT, Reason.AUDIT, True),
     (Action.ACCEPT, Action.ACCEPT, Reason.CERTAIN, False),
     (Action.REJECT, Action.REJECT, Reason.CERTAIN, False),
+    (Action.REJECT, Action.VERIFY, Reason.OUTSIDE, False),
+    (Action.VERIFY, Action.VERIFY, Reason.OUTSIDE, False),
 )
 KIND = ("action", "predicted", "reason", "audit")
 N = 60
@@ -38,7 +40,7 @@ def store(store: SqlStore) -> SqlStore:
     for i in range(N):
         action, predicted, reason, audit = KINDS[int(rng.integers(len(KINDS)))]
         decision = Decision(
-            f"d{i:03d}", action, predicted, 0.2, 0.9, i, 1, ((0.1, 0.2),), i // 10, reason, audit, 0.1, f"p{i}"
+            f"d{i:03d}", action, predicted, 0.2, 0.9, i, 1, ((0.1, 0.2),), i // 10, reason, audit, 0.1, f"LOT/{i // 5}-{i}"
         )
         put_decision(store, decision, np.full((1, 5), i, np.float32), i, quarantined=i % 13 == 5)
         if action is not Action.REJECT and rng.random() < 0.6:
@@ -129,8 +131,10 @@ def test_counts_of_a_store_are_those_of_its_history(store: SqlStore) -> None:
 def counted(some: list[StoredDecision]) -> Stretch:
     actions = [past.decision.action for past in some]
     bad = sum(past.success is False and past.decision.action is Action.ACCEPT for past in some)
-    novel = sum(past.decision.reason is Reason.NOVEL for past in some)
-    return Stretch(len(some), some[-1].time, actions.count(Action.VERIFY), novel, actions.count(Action.ACCEPT), bad)
+    novel, outside = (sum(past.decision.reason is each for past in some) for each in (Reason.NOVEL, Reason.OUTSIDE))
+    own = sum((past.decision.action, past.decision.reason) == (Action.REJECT, Reason.CERTAIN) for past in some)
+    verified, accepted = (actions.count(each) for each in (Action.VERIFY, Action.ACCEPT))
+    return Stretch(len(some), some[-1].time, verified, novel, accepted, bad, own, outside)
 
 
 @pytest.mark.parametrize("n", [1, 7, 60, 500])
@@ -141,8 +145,9 @@ def test_stretches_are_consecutive_and_hold_everything(store: SqlStore, n: int) 
     assert store.stretches(n) == expected
     shifts = [[each for each in whole if each.time // (10.0 * n) == k] for k in range(N)]
     assert store.stretches(seconds=10.0 * n) == [counted(each) for each in shifts if each]
-    batches = {(each.decision.part or "")[:2]: each for each in whole}
-    assert {each.batch or "" for each in store.stretches(batch=2)} == set(batches)
+    for batch, name in (("5", lambda part: part[:5]), ("-/", lambda part: part[: part.rindex("-") + 1])):
+        sizes = Counter(name(each.decision.part) for each in whole)
+        assert {each.batch: each.n for each in store.stretches(batch=batch)} == sizes
 
 
 def test_an_empty_store_has_no_past() -> None:

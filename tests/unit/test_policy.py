@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dengine import Action, DataEngine, Policy, Reason, Recipe, TraceSpec
 from dengine.errors import SettingError
 from dengine.traces import WindowGate
-from tests.support.exports import SAMPLES, trained
+from tests.support.exports import SAMPLES, recipe, trained
 
 policies = st.builds(Policy, alpha=st.floats(0.001, 0.9), lower_bound=st.floats(0.501, 0.999))
 
@@ -49,6 +49,9 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n
         ({"audit_rate": -0.1}, "audit_rate"),
         ({"windows": ["0.2:0.1:0:"]}, "start <= end"),
         ({"windows": ["0.1:0.2::1:canal=2"]}, r"START:END:LOW:HIGH, .*canal"),
+        ({"windows": ["0.1:0.2:30"]}, r"behind it, got '0.1:0.2:30'\.$"),
+        ({"windows": ["0.1:0.2::1:reject=no"]}, "a window with .*reject='no'"),
+        ({"windows": ["0.1:0.2:1::channel=F Z"]}, "or names"),
     ],
 )
 def test_a_setting_out_of_range_is_named_with_what_was_expected(settings: dict[str, object], message: str) -> None:
@@ -60,19 +63,23 @@ HELD = {  # by seconds, or by channel 1, of samples 0 to 5 ten a second, and of 
     "0.2:0.4:2:4": 0,  # its ends and its limits are within
     "0.2:0.4::3.9": 1,
     "0.2:0.4:2.1::reject": 2,
-    "0.31:0.39:0:": 1,  # no sample lies there
+    "5.1:5.9:0::along=0": 1,  # no sample lies there
     "-5:-3::5:along=1": 0,
     "-5:-3::4.9:along=1:reject": 2,
     "-7:-6:-6.5::channel=1:along=0": 1,
+    "-5:-3::5:along=Z": 0,
+    "3:3:-3:-3:channel=Z:along=F:reject": 0,
+    "3:3:3:3:channel=Z:along=F:reject": 2,
 }
 
 
 @pytest.mark.parametrize(("window", "said"), HELD.items())
 def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits(window: str, said: int) -> None:
-    x, recipe = torch.arange(6, dtype=torch.float32), Recipe(policy=Policy(windows=(window,)))
-    assert WindowGate(recipe.policy.windows, TraceSpec(6, rate_hz=10.0, channels=2))(torch.stack([x, -x])) == said
-    assert Recipe.from_toml(recipe.to_toml()) == recipe
-    assert str(*recipe.policy.windows) == window
+    x, held = torch.arange(6, dtype=torch.float32), recipe(windows=(window,))
+    spec = TraceSpec(6, rate_hz=10.0, channels=2, columns=("F", "Z"))
+    assert WindowGate(held.policy.windows, spec)(torch.stack([x, -x])) == said
+    assert Recipe.from_toml(held.to_toml()) == held
+    assert str(*held.policy.windows) == window
 
 
 def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts_it(make_data, tmp_path: Path) -> None:
@@ -82,11 +89,17 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
         engine.set_policy(replace(engine.policy, windows=(f"0:0.1::{x[:50].max() - 0.1}:reject",)))
         made = engine.decide(x)
         assert (made.action, made.predicted, made.reason) == (Action.REJECT, Action.VERIFY, Reason.OUTSIDE)
+        assert (made.propensity, "alone the model" in repr(made)) == (0.0, False)
         engine.set_shadow(True)
         assert engine.decide(x).action is Action.VERIFY
-        with pytest.raises(SettingError, match="within 1 x 100 samples"):
-            engine.set_policy(Policy(windows=("0.3:0.4:0:",)))
+        for nowhere in ("0.3:0.4:0:", "0.1001:0.1019:0:", "0:1:0::channel=1", "0:1:0::along=FZ"):
+            with pytest.raises(SettingError, match="on some of 1 x 100 samples"):  # beyond the last, and between two
+                engine.set_policy(Policy(windows=(nowhere,)))
     with DataEngine.open(tmp_path / "cell.db") as engine:
         status = engine.status()
-        assert (status.newest.outside, status.certificate.rejected.n, status.certificate.accepted.n) == (2, 0, 0)
+        assert (status.newest.outside, status.newest.rejected, status.actions["reject"]) == (2, 0, 1)
+        assert (status.certificate.rejected.n, status.certificate.accepted.n) == (0, 0)
         assert "leaves an operator's window, 0:0.1::" in engine.explain(made.id).said[0]
+        assert engine.status(last=3).alarm == "2 of the newest parts leave a window."
+    with pytest.raises(SettingError, match=r"\(windows 0:0\.1::.*:reject\), got windows 0:0\.2:0:;"):
+        DataEngine.open_or_create(tmp_path / "cell.db", recipe=recipe(windows=["0:0.2:0:"]))

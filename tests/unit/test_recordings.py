@@ -192,6 +192,7 @@ NAMED = [f"{file},{'nok' if i % 2 else 'ok'}" for i, file in enumerate(PATHS)]
 LISTS = {
     "a header": ["note,path,verdict", *(f'"a, b",{row}' for row in NAMED)],
     "no header": NAMED,
+    "names of its own": ["Prüfer,Seriennummer,Urteil", *(f"Kim,{row}" for row in NAMED)],
     "one known name": ["verdict,Datei", *(f"{'nok' if i % 2 else 'ok'},run_{i}" for i in range(6))],
 }
 
@@ -365,6 +366,10 @@ REFUSED: dict[str, tuple[Callable[[Dataset, Path], Any], str]] = {
     "no header": (
         lambda data, tmp: written(tmp / "bare.csv", lambda path: wide(data).to_csv(path, index=False, header=False)),
         "its first line is of numbers",
+    ),
+    "recordings without a header": (
+        lambda data, tmp: write_folder(tmp / "bare", Dataset(data.X[:3], data.y[:3]), header=False).parent / "bare",
+        "found none of 3.*its first line is of numbers",
     ),
     "one recording": (
         lambda data, tmp: write_csv(tmp / "one_True.csv", data.X[0]),

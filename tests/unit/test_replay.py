@@ -90,12 +90,26 @@ def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(playe
     np.testing.assert_array_equal(frame[["embedding_1", "embedding_2"]].to_numpy(), played.position)
 
 
+def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(data: Dataset, played: Replay) -> None:
+    highest = data.X.max(axis=1)
+    window = f"0:1:-1e9:{np.quantile(highest, 0.8)}:reject"
+    log, wide = (replay(data, RECIPE.with_policy(windows=[each]), seed=1) for each in (window, "0:1:-1e9:"))
+    same(wide, played, "recipe")
+    out = highest[log.index] > np.quantile(highest, 0.8)
+    np.testing.assert_array_equal(log.outside, out)
+    assert set(log.action[out]) == {"reject"}
+    row = log.summary()
+    assert row["certain"] == row["accepted"] + row["rejected"] == (log.action[~out] != "verify").sum() > 20
+    assert (row["outside"], row["false_negative"]) == (out.sum(), (log.truth & (log.action == "reject"))[~out].sum())
+    assert not log.finished[out].any()
+
+
 def test_a_notebook_sees_short_records_the_status_and_times_as_datetimes(data: Dataset, played: Replay) -> None:
     engine = DataEngine("pca")
     decision = [cycle.decision for cycle in engine.run(ReplayCell(data), 80)][-1]
     frame = engine.history_frame(last=5)
     assert (frame["time"].dt.tz is not None, frame.index[-1], engine.status().ever.decisions) == (True, decision.id, 80)
-    for each in (engine, decision, data, played, engine.explain(decision.id)):
+    for each in (engine, decision, data, played, engine.explain(decision.id), engine.status()):
         assert len(repr(each)) < 240
         assert each._repr_html_().startswith("<table>")
 

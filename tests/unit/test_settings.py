@@ -43,6 +43,16 @@ def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
     assert engine.store.settings()["recipe"] == expected.to_toml()
 
 
+class Halves:
+    """Looks like a transformer, and cannot be copied as one."""
+
+    def fit(self, X: np.ndarray, y: None = None) -> "Halves":
+        return self
+
+    def transform(self, X: np.ndarray) -> np.ndarray:
+        return X[:, 0, :2]
+
+
 REFUSED = [  # settings, and the words that say why not
     ({"reducer": "conv", "recipe": "pca"}, "The recipe names its reducer, pca; got reducer 'conv' beside it"),
     *(({"model": Counting(), **given}, f"decides by its own rule, so {next(iter(given))} would have no effect")
@@ -50,7 +60,9 @@ REFUSED = [  # settings, and the words that say why not
     *(({"model": model}, "Expected a model with fit, add, count") for model in (PCA(2), ModelPrediction, 3)),
     *(({"reducer": "pca", "seed": seed}, "seed of 0 or more") for seed in ("x", 1.5, -1, True)),
     ({"reducer": "nowhere:Reducer"}, "can be imported here"),
-    ({"reducer": "dengine.recipe:Recipe"}, "has not both fit and transform"),
+    ({"reducer": "dengine.recipe:Recipe"}, "has no fit and no transform"),
+    ({"reducer": f"{__name__}:Halves"}, "has no get_params"),
+    ({"reducer": Halves()}, "a scikit-learn transformer with fit and get_params, got"),
     ({"reducer": "numpy:pi"}, "is a float and no class"),
     ({"recipe": Recipe("pca", {"dims": 3})}, "dims"),
 ]  # fmt: skip

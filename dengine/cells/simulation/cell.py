@@ -127,11 +127,7 @@ class SimulatedCell:
     """
 
     def __init__(
-        self,
-        parameters: CellParameters | None = None,
-        scenario: str = "nominal",
-        seed: int = 0,
-        cycles: int = 600,
+        self, parameters: CellParameters | None = None, scenario: str = "nominal", seed: int = 0, cycles: int = 600
     ) -> None:
         expect(cycles >= 1, "cycles of at least 1", cycles, "give the length of the run")
         self.parameters = parameters or CellParameters()

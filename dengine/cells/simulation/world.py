@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DengineError, SettingError, expect
+from ...errors import DengineError, SettingError, expect, instead
 from .conditions import RATE_HZ, SAMPLES, Conditions
 
 TIME_STEP_S = 0.0005
@@ -43,20 +43,13 @@ class Push:
 
 def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     """Lower the gripper at its speed until the target or the force limit holds it; record at 500 Hz for 2 s."""
-    try:
+    with instead(DengineError, "Expected MuJoCo for the simulated cell", ImportError, do="pip install dengine[sim]"):
         import mujoco
-    except ImportError as error:
-        raise DengineError("Expected MuJoCo for the simulated cell, found none: pip install dengine[sim]") from error
     steps = round(1 / RATE_HZ / time_step_s)
     divides = math.isclose(steps * time_step_s, 1 / RATE_HZ)
     expect(divides, "a time step in seconds that divides 2 ms", time_step_s, "take 0.0005 or half of it")
-    try:
+    with instead(SettingError, "Expected sizes, masses and springs above zero, MuJoCo refuses these", ValueError):
         model = mujoco.MjModel.from_xml_string(fixture_xml(conditions, time_step_s))
-    except ValueError as error:
-        got = f"a world that MuJoCo refuses ({error})"
-        raise SettingError(
-            f"Expected sizes, masses and springs above zero, got {got}; raise the one that is zero."
-        ) from error
     data = mujoco.MjData(model)
     force = _drive(mujoco, model, data, conditions, steps)
     if conditions.fault == "missed_grasp":

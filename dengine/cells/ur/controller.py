@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets import load_dataset
-from ...errors import CellError, SettingError
+from ...errors import CellError, expect
 from .cell import ANSWER, ORDER, PHASE, RUNTIME, Answer, Runtime, Verb, word
 from .protocol import CHANNELS, IN_USE, NOT_FOUND, VERSION, Kind, Package, Packages, Recipe
 
@@ -142,8 +142,8 @@ class Trouble:
     cycles: int = 1
 
     def __post_init__(self) -> None:
-        if self.kind not in TROUBLES or self.cycles < 1:
-            raise SettingError(f"Expected a trouble among {', '.join(TROUBLES)} of 1 or more cycles, got {self}.")
+        known = self.kind in TROUBLES and self.cycles >= 1
+        expect(known, f"a trouble among {', '.join(TROUBLES)} of 1 or more cycles", self)
 
 
 class Client:

@@ -12,7 +12,7 @@ from enum import IntEnum
 from functools import cached_property
 from typing import NamedTuple
 
-from ...errors import CellError
+from ...errors import CellError, expect
 
 PORT = 30004
 VERSION = 2
@@ -117,8 +117,7 @@ class Recipe:
 def recipe_of(payload: bytes, names: Sequence[str], what: str) -> Recipe:
     """What the controller answered to a set-up; CellError names the fields that it does not have, or that others hold."""
     types = tuple(payload[1:].decode("ascii", errors="replace").split(",")) if payload else ()
-    if len(types) != len(names):
-        raise CellError(f"Expected the types of {len(names)} {what} fields, got {len(types)}: {', '.join(types)[:80]}.")
+    expect(len(types) == len(names), f"the types of {len(names)} {what} fields", types, error=CellError)
     named = dict(zip(names, types, strict=True))
     if unknown := [name for name, kind in named.items() if kind not in (*TYPES, IN_USE)]:
         do = "name others, or bring its software up to date (registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.triggers import Start, StartFinder, Trigger, as_trigger, place
-from ...errors import CellError, SettingError
+from ...errors import CellError, expect
 from ...records import TraceSpec
 from .protocol import CHANNELS, PORT
 from .stream import Row, RtdeStream, StreamReport
@@ -60,8 +60,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         also: Sequence[str] = (),
         inputs: Sequence[str] = (),
     ) -> None:
-        if not 0 <= before < samples:
-            raise SettingError(f"Expected 0 to {samples - 1} samples from before the trigger, got {before}.")
+        expect(0 <= before < samples, f"0 to {samples - 1} samples from before the trigger", before)
         self.trigger = as_trigger(trigger)
         self.channels = (channels,) if isinstance(channels, str) else tuple(channels)
         self._columns = [CHANNELS.get(name, name) for name in self.channels]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 
-from ...errors import CellError, SettingError
+from ...errors import CellError, SettingError, instead
 from .protocol import CHANNELS, PORT, VERSION, HeldError, Kind, Package, Packages, recipe_of
 
 PIECE = 65536  # bytes asked of the socket at once
@@ -39,12 +39,10 @@ class RtdeClient:
         self.where = f"{host}:{port}"
         self._why = ""  # the controller's last text message, as an error ends with it
         outputs = tuple(dict.fromkeys(("timestamp", *(column.partition("[")[0] for column in columns))))
-        try:
+        do = "turn the robot on, and enable RTDE under Settings, Security, Services"
+        with instead(CellError, f"Expected an RTDE controller at {self.where}, it cannot be reached", OSError, do=do):
             self._socket = socket.create_connection((host, port), timeout)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        except OSError as error:
-            do = "is the robot on, and RTDE enabled under Settings, Security, Services?"
-            raise CellError(f"Expected an RTDE controller at {self.where}, it cannot be reached: {error}; {do}") from error
         self._incoming = self._received()
         try:
             if self._ask(Kind.VERSION, struct.pack(">H", VERSION))[:1] != b"\1":
@@ -87,10 +85,8 @@ class RtdeClient:
         return package.payload
 
     def _send(self, data: bytes) -> None:
-        try:
+        with instead(CellError, f"Expected {self.where} to take what it is sent, the connection is lost", OSError):
             self._socket.sendall(data)
-        except OSError as error:
-            raise CellError(f"Expected {self.where} to take what it is sent, the connection is lost: {error}.") from error
 
     def _received(self) -> Iterator[Package]:
         packages = Packages()

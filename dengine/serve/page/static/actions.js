@@ -96,7 +96,7 @@ export const shadow = (on) => (on
   : { title: "Let the model decide again", what: "From the next part on the model decides again which parts need no check.", path: "policy", body: { shadow: false } });
 
 function windowText({ start, end, low, high, channel, along, reject }) {
-  const more = [channel > 0 && `channel=${channel}`, along !== null && `along=${along}`, reject && "reject"];
+  const more = [channel !== 0 && `channel=${channel}`, along !== null && `along=${along}`, reject && "reject"];
   return [start, end, low ?? "", high ?? "", ...more.filter(Boolean)].join(":");
 }
 

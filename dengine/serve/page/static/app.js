@@ -74,7 +74,7 @@ async function exchangeAll() {
 }
 
 function failed(problem) {
-  if (problem.status === 404) {
+  if (problem.status === 404 || problem.status === 422) { // there is no such thing, and asking again changes nothing
     exchange([el("section", { class: "card", id: "failed", "data-part": true }, el("h1", {}, "That cannot be shown"), el("p", {}, problem.message), el("p", {}, el("a", { href: "./" }, "Back to what happens now")))]);
     return;
   }

@@ -47,10 +47,11 @@ function axis(side, given = {}) {
 // Traces, and over them the operator's windows: the limits where they hold, in the stretch where they do
 
 function windowsOf(found, channel) {
-  const { rate_hz } = found.spec;
-  return found.windows.filter((each) => each.channel === channel).map((each) => {
+  const { rate_hz, columns } = found.spec;
+  const at = (named) => (typeof named === "string" ? columns.indexOf(named) : named);
+  return found.windows.filter((each) => at(each.channel) === channel).map((each) => {
     if (each.along === null) return { ...each, from: each.start, to: each.end };
-    const there = found.trace[each.along].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [i / rate_hz] : []));
+    const there = found.trace[at(each.along)].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [i / rate_hz] : []));
     return { ...each, from: there[0], to: there.at(-1) };
   }).filter((each) => each.from !== undefined);
 }
@@ -119,10 +120,11 @@ function traceWords(found, channel) {
   const { envelope, spec } = found;
   const values = found.trace[channel].filter((value) => value !== null);
   const [low, high] = values.length ? [Math.min(...values), Math.max(...values)] : [0, 0];
-  const of = found.trace.length > 1 ? `${spec.columns[channel] ?? `Channel ${channel + 1}`}: ` : "";
-  const said = `${of}Force over ${number(found.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${spec.unit}. ${windowsOf(found, channel).map(windowWords).join("")}`;
+  const several = found.trace.length > 1;
+  const what = several ? spec.columns[channel] ?? `Channel ${channel + 1}` : "Force";
+  const said = `${what} over ${number(found.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${spec.unit}. ${windowsOf(found, channel).map(windowWords).join("")}`;
   if (!envelope) return `${said}No band of good parts is drawn before 20 of them are known.`;
-  const outside = `${said}${percent(envelope.outside, 1)} of it lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
+  const outside = `${said}${percent(envelope.outside, 1)} of ${several ? "all channels" : "it"} lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
   const most = envelope.excesses.filter((each) => each.channel === channel).sort((a, b) => b.widths - a.widths)[0];
   if (!most) return outside;
   const [from, to] = [number(most.from_s, 2), number(most.to_s, 2)];

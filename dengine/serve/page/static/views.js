@@ -78,10 +78,10 @@ function badAccepts(doing) {
 }
 
 function wouldHave(doing) {
-  const { would_accept: accepts, would_reject: rejects, decisions } = doing.ever;
+  const { would_accept: accepts, would_reject: rejects, verified: checked } = doing.ever;
   const certain = accepts.n + rejects.n;
   return el("section", { class: "card tile wide", id: "would", "data-part": true }, el("h2", {}, "It would have decided"),
-    big(`${number(certain)} of ${number(decisions)} parts`),
+    big(`${number(certain)} of ${number(checked)} verified parts`),
     el("p", {}, `${number(accepts.n)} accepted, ${number(accepts.wrong)} of them bad; ${number(rejects.n)} rejected, ${number(rejects.wrong)} of them good; ${duration(certain * doing.check_seconds)} saved.`),
     judgedChart(accepts), small(`Bad among those it would have accepted: ${percent(accepts.lower, 1)} to ${percent(accepts.upper, 1)}; ${VERDICT[accepts.verdict].toLowerCase()} (${percent(accepts.tolerance, 1)}).`));
 }
@@ -190,16 +190,16 @@ const ROWS = 20; // of the trend
 
 async function trend(get, asked, parts) {
   // Shift by shift, by day, by hour, or by batch: what a part's number begins with, up to its last dash, slash, dot or blank.
-  const batch = (parts.find((each) => each.part !== null)?.part.match(/^.*[-_/. ]/)?.[0] ?? "").length;
+  const batch = parts.some((each) => /[-_/. ]/.test(each.part ?? ""));
   const by = asked in HOURS || (asked === "batch" && batch) ? asked : "shift";
   const start = new Date().setHours(by === "shift" ? SHIFT_BEGINS : 0, 0, 0, 0) / 1000;
-  const { stretches } = await get(`course?${by === "batch" ? `batch=${batch}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
+  const { stretches } = await get(`course?${by === "batch" ? `batch=${encodeURIComponent("-_/. ")}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
   const begun = (last) => start + Math.floor((last - start) / (3600 * HOURS[by])) * 3600 * HOURS[by];
-  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch ?? "no number" : el("time", {}, moment(begun(each.last)).slice(5, 16)), number(each.n),
-    percent(1 - each.verified / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad)]);
+  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch || "no batch" : el("time", {}, moment(begun(each.last)).slice(5, 16)), number(each.n),
+    percent((each.accepted + each.rejected) / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad), number(each.outside)]);
   const ways = [...Object.keys(HOURS), ...(batch ? ["batch"] : [])].map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
   return card("trend", "The trend", el("ul", { class: "chips" }, ways), rows.length === 0 ? small("It begins with the first part.")
-    : table([[by === "batch" ? "Batch" : "From"], ["Parts", "num"], ["Certain", "num more"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"]], rows));
+    : table([[by === "batch" ? "Batch" : "From"], ["Parts", "num"], ["Certain", "num more"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"], ["Outside a window", "num more"]], rows));
 }
 
 async function overview(get, query, doing) {
@@ -219,7 +219,7 @@ async function overview(get, query, doing) {
     doing.shadow && wouldHave(doing), badAccepts(doing), verified(doing), accepted(doing), pace(decisions), saved(doing),
     figure("novel", "Novel", big(percent(newest.novel_share, 1)), small(`Newest ${number(newest.decisions)} parts`), el("p", {}, `Audits: ${number(newest.audits)} · Outside a window: ${number(newest.outside)}`)),
     figure("drift", "Drift, on its way to an alarm", drift),
-    figure("model", "Model", big(`version ${doing.version}`), small(`${number(ever.retrains)} retrains, ${number(Object.values(ever.dropped).reduce((a, b) => a + b, 0))} dropped`),
+    figure("model", "Model", big(`version ${doing.version}`), small(`Retrains: ${number(ever.retrains)}, ${number(Object.values(ever.dropped).reduce((a, b) => a + b, 0))} dropped`),
       report && el("p", {}, `newest at ${clock(report.time)}, ${number(report.report.seconds, 2)} s`),
       el("p", {}, `Labels until the next retrain: ${number(doing.new_labels)} of ${number(doing.recipe.retrain_every)}`),
       Object.entries(ever.dropped).map(([reason, n]) => small(`Dropped ${number(n)}: ${reason}`))),
@@ -267,7 +267,7 @@ const FILTERS = [["action", "Decision", ACTIONS, capital], ["reason", "Reason", 
 const TIMES = [["since", "From"], ["until", "Until"]];
 
 async function history(get, query) {
-  const asked = new URLSearchParams([...query].filter(([, value]) => value !== ""));
+  const asked = new URLSearchParams([...query].map(([name, value]) => [name, value.trim()]).filter(([, value]) => value !== ""));
   const wanted = new URLSearchParams(asked);
   for (const [name] of TIMES) if (asked.has(name)) wanted.set(name, new Date(asked.get(name)).getTime() / 1000);
   wanted.set("limit", 50);
@@ -295,13 +295,14 @@ async function history(get, query) {
 }
 
 function asCsv(decisions) {
-  const names = Object.keys(decisions[0]).filter((name) => name !== "embedding");
+  const names = Object.keys(decisions[0]).filter((name) => name !== "embedding" && name !== "trace");
+  const shown = (name, value) => (/time$/.test(name) && value !== null ? new Date(1000 * value).toISOString() : value);
   const text = (value) => {
     const plain = value === null || value === undefined ? "" : String(value);
     const safe = typeof value === "string" && /^[=+\-@\t\r]/.test(plain) ? `'${plain}` : plain; // a spreadsheet takes these for formulas
     return /[",\n]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
   };
-  const lines = decisions.map((each) => names.map((name) => text(each[name])).join(","));
+  const lines = decisions.map((each) => names.map((name) => text(shown(name, each[name]))).join(","));
   return new Blob([[names.join(","), ...lines, ""].join("\n")], { type: "text/csv" });
 }
 
