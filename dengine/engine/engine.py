@@ -302,20 +302,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             return engine
 
     def decide(
-        self,
-        trace: ArrayLike,
-        part: str | int | None = None,
-        *,
-        decision_id: str | None = None,
-        late: bool = False,
-        swap: bool = True,
+        self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str | None = None, late: bool = False
     ) -> Decision:
         """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
         part : the part's number, where one is known: a part that comes again has one vote, and none on itself.
         decision_id : of the caller's: the same id and trace have the same decision for ever, on the disk when this returns.
         late : whoever asked waits no more and verifies: that is the decision, so that its label can be reported.
-        swap : also bring in, by a step, a version that an executor has trained.
         Raises TraceError for a wrong shape, a first trace of less than 10 samples, and the id of another trace; ReportError
         for what is no id. Whatever else fails becomes VERIFY; an id that cannot be looked up too, and that is not recorded.
         """
@@ -328,34 +321,43 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                         return decided_before(known, trace, self.trace)
                 except StoreError as error:
                     return self._unrecorded(id_, number, error)
-            if swap:
-                self._versions.collect()
-            x = self._as_trace(trace)
-            self._feedback.settle()
-            unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
-            known = self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_)
-            known = self._outbox.decided(known)
+            self._versions.collect()
+            known = self._decided(trace, number, late, id_)
+            self._feedback.announce()
             try:
                 if id_ is not None:
                     self._outbox.secure()
             except NotTakenError:
                 # A decision that lets a part go on unchecked has to outlive this process, or an id would have two answers.
                 if known.decision.action is not Action.VERIFY:
-                    known = self._outbox.amend(self._maker.decide(x, number, None, self.version, Reason.NO_STORE, id_))
+                    item = self._maker.decide(known.trace, number, None, self.version, Reason.NO_STORE, id_)
+                    known = self._outbox.amend(item)
             self._feedback.decided(known)
         return known.decision
 
     def decide_at_once(self, trace: ArrayLike, part: str | int | None = None) -> Decision | None:
         """As `decide`, in any thread while no other uses the engine; None, and nothing was done, where that might wait.
 
-        It waits for neither store nor disk, runs no code of the user's, and leaves a version on its way in where it is.
+        It waits for neither store nor disk, runs no code of the user's, nor umap's, and leaves to `settle` a version on its way in.
         """
-        with self._outbox.unless_held() as free:
-            own = self._versions.newest.keeps_references and not self.recipe.own_classes
-            if not (free and own) or self._unseen or self._settings.waiting or self._feedback.remedy:
+        self._outbox.check()
+        with self._outbox.unless_held() as free, self._alone:
+            ours = self._versions.newest.keeps_references and not self.recipe.own_classes
+            quick = ours and (self._versions.answering is None or self._versions.answering.is_compiled)
+            if not (free and quick) or self._unseen or self._settings.waiting or self._feedback.remedy:
                 return None
             torch.set_num_threads(1)  # each thread has its own
-            return self.decide(trace, part, swap=False)
+            known = self._decided(trace, as_part(part))
+            self._feedback.decided(known)
+            return known.decision
+
+    def _decided(self, trace: ArrayLike, part: str | None, late: bool = False, id_: str | None = None) -> StoredDecision:
+        """A new decision, recorded without waiting."""
+        x = self._as_trace(trace)
+        self._feedback.settle()
+        unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
+        made = self._maker.decide(x, part, self._versions.answering, self.version, unasked, id_)
+        return self._outbox.decided(made)
 
     def _unrecorded(self, decision_id: str, part: str | None, error: StoreError) -> Decision:
         """VERIFY for an id that may have a decision, which cannot be looked up: nothing of it is recorded."""
@@ -493,6 +495,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         with self._alone:
             self._versions.collect(to_the_end=not brief)
             self._versions.work(self.recipe)
+            self._feedback.announce()
             return self._versions.take_news()
 
     def close(self) -> None:

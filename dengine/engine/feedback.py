@@ -87,7 +87,6 @@ class Feedback:
                 self._unobserved += 1
         if len(self._waiting) >= 100:  # so many confirmed parts wait for a report
             self.store_waiting()
-        self.announce()
 
     def _count_overdue(self) -> None:
         """A check that was not reported in time counts as a wrong decision."""

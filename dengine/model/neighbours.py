@@ -262,6 +262,10 @@ class ModelPrediction(EngineModel):
         return Predictor(gate, encoder, scale, script(self.gate), script(around) if compiles else around).eval()
 
     @property
+    def is_compiled(self) -> bool:  # type: ignore[override]  # asked when there is a predictor
+        return isinstance(self._predictor, torch.jit.ScriptModule)
+
+    @property
     def predictor(self) -> Any:
         """The module that answers, built where it is not yet; ValueError where nothing was fitted."""
         if self._predictor is None:

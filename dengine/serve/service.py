@@ -16,9 +16,10 @@ import threading
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from numpy.typing import ArrayLike
@@ -110,6 +111,7 @@ class CellService:
         self.observers: list[Callable[[Answer | Told | RetrainReport], object]] = []  # told of each, in whatever thread
         self._jobs: queue.Queue[Job | None] = queue.Queue(most)
         self._using = threading.Lock()  # the engine, by its thread, or by the loop for what waits for nothing
+        self._late = ThreadPoolExecutor(most, "dengine-late")  # of their own: others may be reading a store that is away
         self._listeners: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
         self._closing = self._listening_ended = False
         self._beat = time.monotonic()
@@ -147,7 +149,8 @@ class CellService:
         if answer.done() or not future.cancel():
             decision = await answer
         else:
-            decision = await asyncio.to_thread(self.engine.decide_late, trace, part, decision_id=id_)
+            decide_late = partial(self.engine.decide_late, trace, part, decision_id=id_)
+            decision = await asyncio.get_running_loop().run_in_executor(self._late, decide_late)
             self.late += 1
         return self._heard(Answer(decision, time.monotonic() - begin))
 
@@ -244,6 +247,7 @@ class CellService:
             while True:
                 if (job := self._jobs.get_nowait()) is not None and job.future.set_running_or_notify_cancel():
                     job.future.set_exception(BusyError(CLOSING))  # it came while this began
+        self._late.shutdown()
         self.end_listening()
         if self.reading is not self.engine.store:
             self.reading.close()

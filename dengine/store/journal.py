@@ -156,12 +156,21 @@ class Journal:
                 os.close(fd)
 
     def clear(self) -> None:
-        """Forget all records; the store holds them now."""
+        """Forget all records; the store holds them now. `reserve` then makes room, on the disk, for others."""
         with _using(self.path):
             os.ftruncate(self._fd, HEADER)
             self.drained = self.end = HEADER
             self._digest, self.damaged = bytes(16), 0
-            self._begin()
+            os.pwrite(self._fd, self._header(), 0)
+
+    def reserve(self) -> None:
+        """Reserve room, and return once that is on the disk."""
+        with _using(self.path):
+            try:
+                os.posix_fallocate(self._fd, 0, HEADER + RESERVE)
+            except (AttributeError, OSError):  # no room, or no way to reserve it: then without, as far as it goes
+                os.ftruncate(self._fd, max(self.end, HEADER))
+            os.fsync(self._fd)
 
     def remake(self) -> None:
         """Make the lost file anew, with what is not drained where it was."""
@@ -202,11 +211,7 @@ class Journal:
     def _begin(self) -> None:
         """Write the header, and reserve room."""
         os.pwrite(self._fd, self._header(), 0)
-        try:
-            os.posix_fallocate(self._fd, 0, HEADER + RESERVE)
-        except (AttributeError, OSError):  # no room, or no way to reserve it: then without, as far as it goes
-            os.ftruncate(self._fd, max(self.end, HEADER))
-        os.fsync(self._fd)
+        self.reserve()
 
     def _scan(self) -> None:
         """Find the end, and what is damaged on the way; all from where the store has the records."""

@@ -135,6 +135,7 @@ class Outbox:
             if journal.damaged:
                 self._note("journal", f"{journal.damaged} records that are not as they were written were left out")
             journal.clear()
+            journal.reserve()
             self.store.database.on_entry = self._mark
             self._mark()
             check = threading.Thread(target=lambda: self._doubt_it(self.store.database.damage()), daemon=True)
@@ -489,8 +490,10 @@ class Outbox:
     def _write(self, journal: Journal, batch: Sequence[Record]) -> None:
         if journal.end > 8 << 20:
             with self._changed:  # a cell that never pauses would fill the disk
-                if self._changed.wait_for(lambda: journal.empty, LINGER):
+                if empty := self._changed.wait_for(lambda: journal.empty, LINGER):
                     journal.clear()
+            if empty:
+                journal.reserve()  # without the lock: a disk that hangs would hang the cell
         blobs = [to_bytes(record) for record in batch]
         try:
             offsets = journal.append(blobs)

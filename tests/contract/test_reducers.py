@@ -8,7 +8,7 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from dengine import REDUCERS, ModelPrediction, make_reducer, replay
+from dengine import REDUCERS, DataEngine, ModelPrediction, make_reducer, replay
 from dengine.errors import SettingError
 from dengine.reducers import Reducer
 from dengine.testing import REDUCER_CHECKS, check_reducer, toy_traces
@@ -46,6 +46,15 @@ def test_every_reducer_but_umap_can_be_exported_and_restored(name: str) -> None:
     fitted = new(name).fit(X, y)
     assert fitted.module() is not None
     assert fitted.get_state()
+
+
+@every_reducer
+def test_all_but_umap_decide_at_once(name: str) -> None:
+    engine = DataEngine(reducer=new(name))
+    for x, good in zip(*toy_traces(), strict=True):
+        engine.report(engine.decide(x).id, bool(good))
+    assert engine.retrain().accepted
+    assert (engine.decide_at_once(x) is None) == (name == "umap")
 
 
 @every_reducer

@@ -166,6 +166,18 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
     assert status["labels"] == status["actions"]["verify"] + outcomes.stops + outcomes.confirmed
 
 
+def test_a_decision_at_once_leaves_it_to_settle_to_say_that_safe_mode_begins(stream: Dataset) -> None:
+    heard: list[str] = []
+    engine = make(replace(LOCAL, audit_rate=0.5, label_within=5), on_safe_mode=heard.append)
+    play(engine, stream)
+    for x in spoiled(stream).X:  # audits are owed
+        engine.decide_at_once(x)
+    assert engine.safe_mode
+    assert not heard
+    engine.settle()
+    assert heard == [engine.safe_mode]
+
+
 @pytest.mark.parametrize("guarantee", ["local", "pooled"])
 def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_evidence_keeps_the_tolerance(
     stream: Dataset, make_data, guarantee: str
