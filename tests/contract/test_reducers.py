@@ -18,7 +18,6 @@ QUICK: dict[str, dict[str, Any]] = {
     "conv": {"folds": 2},
     "rocket": {"folds": 2},
 }
-EXPORTABLE = [name for name in REDUCERS if name != "umap"]
 
 every_reducer = pytest.mark.parametrize("name", REDUCERS)
 every_check = pytest.mark.parametrize("check", REDUCER_CHECKS, ids=lambda check: check.__name__)
@@ -40,21 +39,15 @@ def test_scikit_learns_transformers_keep_it_unchanged(reducer: Any, check: Any) 
     check(reducer)
 
 
-@pytest.mark.parametrize("name", EXPORTABLE)
-def test_every_reducer_but_umap_can_be_exported_and_restored(name: str) -> None:
-    X, y = toy_traces()
-    fitted = new(name).fit(X, y)
-    assert fitted.module() is not None
-    assert fitted.get_state()
-
-
 @every_reducer
-def test_all_but_umap_decide_at_once(name: str) -> None:
-    engine = DataEngine(reducer=new(name))
-    for x, good in zip(*toy_traces(), strict=True):
+def test_every_reducer_but_umap_is_exported_restored_and_decides_at_once(name: str) -> None:
+    X, y = toy_traces()
+    fitted, engine = new(name).fit(X, y), DataEngine(reducer=new(name))
+    for x, good in zip(X, y, strict=True):
         engine.report(engine.decide(x).id, bool(good))
     assert engine.retrain().accepted
-    assert (engine.decide_at_once(x) is None) == (name == "umap")
+    can = fitted.module() is not None, fitted.get_state() is not None, engine.decide_at_once(X[0]) is not None
+    assert can == 3 * (name != "umap",)
 
 
 @every_reducer

@@ -21,12 +21,10 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
     bad[7] = float("nan")
 
     async def cell(service: CellService) -> None:
-        begun, free = threading.Event(), threading.Event()
+        free = threading.Event()
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
+        read = asyncio.create_task(asyncio.to_thread(free.wait, WAIT))  # as a store that does not answer
         await service.decide(stream.X[0], "order-0")
-        read = asyncio.create_task(service.look(lambda store: begun.set() or free.wait(WAIT)))
-        while not begun.is_set():
-            await asyncio.sleep(0.01)
         service.deadline = 0.05
         with held(service):
             late = await service.decide(stream.X[1], "order-1", part="P1")
@@ -38,7 +36,7 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
             said = late.late, late.decision.action, late.decision.reason, broken.decision.reason
             assert said == (True, "verify", Reason.LATE, Reason.NOT_FINITE)
             free.set()
-            assert await read  # nobody who is late waits behind who reads
+            assert await read
             (tmp_path / "killed").mkdir()  # as a process that is killed now leaves it
             for file in tmp_path.glob("cell.db*"):
                 shutil.copy(file, tmp_path / "killed")

@@ -245,13 +245,11 @@ def _syncs(do: str) -> Iterator[None]:
 
 def _before_a_disk(outcome: Outcome, place: Place, full: bool = False) -> Cell:
     """A cell that waits as long as a robot's. full : its journal is to begin anew."""
-    cell = Cell(replace(place, wait=0.4), outcome)
+    cell, journal = Cell(replace(place, wait=0.4), outcome), Path(f"{place.url}.{place.cell}.journal")
     cell.play(60)
     cell.engine.flush()
-    (journal,) = Path(place.url).parent.glob(f"{Path(place.url).name}.*.journal")
     while full and journal.stat().st_size <= HEADER + RESERVE:
-        for x in stream().X[:500]:
-            cell.engine.decide(x)
+        list(map(cell.engine.decide, stream().X))
         cell.engine.flush()
     outcome.injected += 1
     return cell
@@ -270,9 +268,9 @@ def _unsynced(cell: Cell, i: int) -> Decision:
     return known
 
 
-def hung_disk(outcome: Outcome, place: Place, do: str = "hang", full: bool = False) -> None:
+def hung_disk(outcome: Outcome, place: Place, do: str = "hang") -> None:
     """A disk whose syncs hang: no call takes long, and what was not taken can be said again."""
-    cell, data = _before_a_disk(outcome, place, full), stream()
+    cell, data = _before_a_disk(outcome, place, full=do == "hang"), stream()
     with _syncs(do):
         told = {i: _unsynced(cell, i) for i in range(60, 63)}
         fault = cell.timed(lambda: cell.engine.store_fault)
@@ -291,11 +289,6 @@ def hung_disk(outcome: Outcome, place: Place, do: str = "hang", full: bool = Fal
 def failing_disk(outcome: Outcome, place: Place) -> None:
     """A disk whose syncs fail."""
     hung_disk(outcome, place, "fail")
-
-
-def hung_disk_and_a_full_journal(outcome: Outcome, place: Place) -> None:
-    """A disk whose syncs hang as a full journal begins anew."""
-    hung_disk(outcome, place, full=True)
 
 
 def run_over_a_hung_disk(outcome: Outcome, place: Place) -> None:
@@ -659,5 +652,5 @@ def forked(outcome: Outcome, place: Place) -> None:
 ON_SQLITE = (locked, moved, lost_file, put_back, changed, changed_long_ago, flipped_store, unstorable)
 ON_SQLITE += (lost_journal, second, unclosed, closed_while_away, killed_executor, hung_executor, interrupted, forked)
 ON_DISKS = (hung_disk, failing_disk, closed_while_hung, run_over_a_hung_disk, served_over_a_hung_disk)
-ON_DISKS += (hung_disk_and_a_full_journal, full_tmpfs, remade_on_a_full_disk, clock_set_back)
+ON_DISKS += (full_tmpfs, remade_on_a_full_disk, clock_set_back)
 ON_POSTGRES = (frozen, closed_while_away, killed_server, cut_off, lost_journal, second, asked_again)
