@@ -168,7 +168,7 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
 
 def test_a_decision_at_once_leaves_it_to_settle_to_say_that_safe_mode_begins(stream: Dataset) -> None:
     heard: list[str] = []
-    engine = make(replace(POOLED, stops="some", audit_rate=0.5, label_within=5), on_safe_mode=heard.append)
+    engine = make(replace(POOLED, stops="some", audit_rate=0.5, label_within=2), on_safe_mode=heard.append)
     play(engine, stream)
     assert all(engine.decide_at_once(x) for x in spoiled(stream).X)  # their audits are owed
     assert (bool(engine.safe_mode), heard) == (True, [])
