@@ -323,7 +323,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                     return self._unrecorded(id_, number, error)
             self._versions.collect()
             known = self._decided(trace, number, late, id_)
-            self._feedback.announce()
             try:
                 if id_ is not None:
                     self._outbox.secure()
@@ -333,6 +332,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                     item = self._maker.decide(known.trace, number, None, self.version, Reason.NO_STORE, id_)
                     known = self._outbox.amend(item)
             self._feedback.decided(known)
+            self._feedback.announce()
         return known.decision
 
     def decide_at_once(self, trace: ArrayLike, part: str | int | None = None) -> Decision | None:
