@@ -60,15 +60,17 @@ class Out:
         from matplotlib.figure import Figure
 
         from ..experiments.figures import save
+        from ..experiments.tables import write_csv
         from ..files import write_manifest, write_output
 
         files = []
         for name, each in made.items():
             if isinstance(each, Figure):
                 files.append(save(each, self.path / name, force=self.force))
+            elif isinstance(each, str):
+                files.append(write_output(self.path / name, each.encode("utf-8"), self.force, make_folder=True))
             else:
-                text = each if isinstance(each, str) else each.to_csv(index=False, lineterminator="\n")
-                files.append(write_output(self.path / name, text.encode("utf-8"), self.force, make_folder=True))
+                files.append(write_csv(each, self.path / name, self.force))
         return files if "" in made else [*files, write_manifest(self.path, files, self.force)]
 
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import percent
+from ..files import write_output
 from ..records import RetrainReport
 from .metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
 from .replay import Replay
@@ -151,3 +153,9 @@ def retrain_line(retrains: Sequence[RetrainReport]) -> str:
     worst, dropped = max(r.seconds for r in retrains), [r for r in retrains if not r.accepted]
     last = f"; {len(dropped)} dropped, the last for: {dropped[-1].reason.removeprefix('dropped: ')}" if dropped else ""
     return f"{len(retrains)} retrain{'s' * (len(retrains) > 1)}, the worst in {worst:.3f} s{last}."
+
+
+def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Path:
+    """The frame as CSV; makes the folder. OutputError where a file is there, without `force`."""
+    text = frame.to_csv(index=False, lineterminator="\n")
+    return write_output(path, text.encode("utf-8"), force, make_folder=True)
