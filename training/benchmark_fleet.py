@@ -140,8 +140,10 @@ def work(plan: Plan, data: Dataset, cell: int) -> Worked:
             seconds["settle, with news of peers"].append(wall_time(engine.settle)[0])
             time.sleep(plan.pause)
         until = time.monotonic() + BACK
-        while engine.flush() or (engine.store_fault and time.monotonic() < until):
+        engine.flush()
+        while engine.store_fault and time.monotonic() < until:
             time.sleep(0.1)
+            engine.flush()
         seen = engine.store.labelled().traces if plan.products else ()
         others = sum(plan.product(read_mark(x)[0]) != plan.product(cell) for x in seen)
         about = {"cell": cell, "version": engine.version, "certain": certain}

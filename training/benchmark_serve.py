@@ -31,6 +31,7 @@ RAW, JSON = "application/octet-stream", "application/json"
 NOISE = 0.01  # newtons, so that no trace comes twice
 PATIENCE = 120.0  # seconds for a server to start, and for a first version
 Ask = Callable[[np.ndarray, str], dict[str, Any]]
+Timed = tuple[dict[str, list[float]], list[float], int]
 
 
 class Server:
@@ -83,7 +84,7 @@ class Connection:
         return said
 
 
-def drive(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, name: str, pace: float) -> Any:
+def drive(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, name: str, pace: float) -> Timed:
     """Seconds of each decision by each way of asking, taken in turn; of each report; and versions that answered."""
     seconds: dict[str, list[float]] = {way: [] for way in asks}
     rng, order = np.random.default_rng(0), np.random.default_rng(0).permutation(len(data))
@@ -100,7 +101,7 @@ def drive(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, name: str, 
     return seconds, told, len(versions) - 1
 
 
-def timed(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, trained: Callable[[], bool], pace: float) -> Any:
+def timed(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, trained: Callable[[], bool], pace: float) -> Timed:
     """`drive` once the first version answers."""
     drive(data, 100, {"warm": next(iter(asks.values()))}, told_by, "warm", pace)
     until = time.monotonic() + PATIENCE

@@ -35,7 +35,7 @@ import dengine
 from dengine import Dataset, Replay, load_dataset
 from dengine.experiments.figures import RECIPES, blank, finish, save
 from dengine.experiments.grid import KeptReplays, Task, iterate_replays
-from dengine.experiments.paper import GRID, findings, paper_table
+from dengine.experiments.paper import ALPHAS, LOWER_BOUNDS, findings, paper_table
 from dengine.experiments.replay import Contender
 from dengine.experiments.tables import write_csv
 from dengine.files import write_output
@@ -149,7 +149,7 @@ def conditions(name: str, nth: int) -> Iterator[Contender]:
     """All that the nth shuffle of a set is played with, each once."""
     asked = [(who, "wilson", *cell) for (who, most), cell in product(SHUFFLES.items(), CELLS) if nth < most]
     if name == "insertion":
-        cells = list(product(GRID["alphas"], GRID["lower_bounds"]))
+        cells = list(product(ALPHAS, LOWER_BOUNDS))
         asked += [(*who, *cell) for (who, most), cell in product(GRIDS.items(), cells) if nth < most]
     conv = Contender.load("conv").recipe
     ramps = replace(conv, params={**conv.params, "groups": 0})  # one tower of the two

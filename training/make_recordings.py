@@ -49,7 +49,7 @@ def as_csv(values: NDArray[np.float64], start_s: float, rate_hz: float) -> str:
     """The text of a file: seconds since the controller was switched on, then the channels."""
     frame = pd.DataFrame(values, columns=CHANNELS)
     frame.insert(0, "Timestamp", start_s + np.arange(len(values)) / rate_hz)
-    return frame.to_csv(index=False, float_format="%.7g")
+    return str(frame.to_csv(index=False, float_format="%.7g"))
 
 
 def broken(values: NDArray[np.float64], start_s: float, rate_hz: float, kind: int) -> str:
@@ -122,7 +122,7 @@ def write_messages(path: Path, messages: Iterable[Message], stamped: bool = Fals
         schemas = {topic: writer.register_msgdef(*kind) for topic, kind in (TOPICS | {wrench: kind}).items()}
         for number, (time, topic, message) in enumerate(messages):
             writer.write_message(topic, schemas[topic], message, time, time, number)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # it has no types
     return path
 
 

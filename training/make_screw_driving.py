@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("screw_driving.npz"), help="the .npz file to write")
     args = parser.parse_args()
     arrays = convert(args.folder, args.samples)
-    np.savez_compressed(args.out, **arrays)
+    np.savez_compressed(args.out, **arrays)  # type: ignore[arg-type]  # its first keyword is a bool
     good, n = int(arrays["y"].sum()), len(arrays["y"])
     print(f"Wrote {args.out}: {n} runs of {len(set(arrays['workpiece']))} workpieces, {good} OK and {n - good} NOK.")
 

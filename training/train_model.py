@@ -25,8 +25,8 @@ AMOUNTS = (50, 120, 400, 1000)
 def learning(data: Dataset, recipe: Recipe, seed: int = 0) -> list[dict[str, Any]]:
     """A row an amount of labels, on one shuffle; at least a fifth of the traces are left to be judged on."""
     order, rows = np.random.default_rng(seed).permutation(len(data)), []
-    judges = {"accuracy": BinaryAccuracy(), "AUROC": BinaryAUROC(), "calibration error": BinaryCalibrationError()}
-    metrics = MetricCollection(judges)
+    judges = BinaryAccuracy(), BinaryAUROC(), BinaryCalibrationError()
+    metrics = MetricCollection(dict(zip(("accuracy", "AUROC", "calibration error"), judges, strict=True)))
     for n in (n for n in AMOUNTS if n <= 0.8 * len(data)):
         seen, left = order[:n], order[n:]
         model = ModelPrediction.from_recipe(recipe, seed)
