@@ -85,7 +85,8 @@ class Policy:
         known = isinstance(self.prices, tuple | list) and len(self.prices) == 3 and all(map(is_number, self.prices))
         prices = tuple(float(each) for each in self.prices) if known else (0.0, 0.0, 0.0)
         known = 0.0 < 2.0 * prices[0] < min(prices[1:]) and max(prices) < math.inf
-        expect(known, "prices of check, escape and false reject, errors above two checks", self.prices, "as in 5,120,47.5")
+        wanted = "prices of a check, an escape and a false reject, errors above two checks"
+        expect(known, wanted, self.prices, "as in 5,120,47.5")
         object.__setattr__(self, "prices", prices)
         if self.guarantee in SORTED and self.stops == "some" and self.audited_share == 0.0:
             raise SettingError(

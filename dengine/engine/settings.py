@@ -205,7 +205,7 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
     counting = {"audit_rate": 0.0, "stops": "some", "shadow": False, "windows": ()}
     idle += [] if policy is None or replace(policy, **counting) == Policy() else ["policy"]
     if idle:
-        do = "set it on the model, or leave it out (of a policy audit_rate, stops and windows alone count)"
+        do = "set it on the model, or leave it out (of a policy audit_rate, stops, shadow and windows alone count)"
         what = f"so {', '.join(idle)} would have no effect"
         raise SettingError(f"A model that is handed in decides by its own rule, {what}; {do}.")
 

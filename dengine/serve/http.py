@@ -22,6 +22,7 @@ import numpy as np
 from msgspec import Meta
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
+from starlette.requests import Request
 from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -321,6 +322,10 @@ def _packed(source: Exportable) -> bytes:
         return Path(make_archive(f"{folder}/packed", "zip", f"{folder}/model")).read_bytes()
 
 
+async def _page(request: Request) -> Response:
+    return FileResponse(STATIC / "index.html")
+
+
 def create_app(
     service: CellService,
     access: Access | None = None,
@@ -340,7 +345,7 @@ def create_app(
     every: list[BaseRoute] = [Route(each.path, each.serve, methods=[each.method]) for each in HttpApi(service).operations]
     every += [Mount("/page/static", StaticFiles(directory=STATIC))]  # of /docs too
     every += xmlrpc_routes(service, recorder) if xmlrpc else []
-    every += [Route(path, lambda request: FileResponse(STATIC / "index.html")) for path in VIEWS] if page else []
+    every += [Route(path, _page) for path in VIEWS] if page else []
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:

@@ -184,7 +184,7 @@ def test_after_an_alarm_costs_alone_let_nothing_pass_until_fresh_members_show_th
 
 @pytest.mark.parametrize("prices", [(5, 120), (0, 120, 47.5), (5, 9, 47.5), (5, 120, math.inf), ("5", 120, 47.5), 5])
 def test_prices_that_give_no_tolerance_below_one_half_are_refused(prices: object) -> None:
-    with pytest.raises(SettingError, match="prices of check, escape and false reject, errors above two checks"):
+    with pytest.raises(SettingError, match="prices of a check, an escape and a false reject, errors above two checks"):
         Policy(prices=prices)
 
 
