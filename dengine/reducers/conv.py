@@ -51,7 +51,8 @@ class ConvEncoder(Features):
     """
 
     taps: Tensor
-    pool: Tensor
+    even: Tensor
+    mix: Tensor
     kernel: Tensor
     threshold: Tensor
     rival: Tensor
@@ -75,10 +76,9 @@ class ConvEncoder(Features):
             both = np.concatenate([sparse, np.where(sparse < frames - 1, frames + sparse, 2 * frames - 1)])
             taps = np.concatenate([taps.ravel(), both.ravel()])
         self.register_buffer("taps", torch.from_numpy(taps.ravel()))
-        pool = torch.eye(regions).repeat_interleave(places // regions, 1) * (regions / places)
-        self.whole = WHOLE / places
-        # One a dilation, side by side: a product of 8 us, where spreading one takes 11.
-        self.register_buffer("pool", (pool + self.whole).T.repeat(self.n_dilations, 1, 1), persistent=False)
+        self.whole, self.length = WHOLE / regions, places // regions
+        self.register_buffer("even", torch.full((self.length,), 1.0 / self.length), persistent=False)
+        self.register_buffer("mix", torch.eye(regions) + self.whole, persistent=False)
         self.register_buffer("kernel", torch.zeros(self.n_dilations, kernels, channels * TAPS))
         self.register_buffer("threshold", torch.zeros(self.n_dilations, kernels, 1))
         self.register_buffer("rival", torch.zeros(2 * self.n_dilations, groups * RIVALS, channels * TAPS))
@@ -119,11 +119,11 @@ class ConvEncoder(Features):
     def ramps(self, windows: Tensor, b: int) -> Tensor:
         """(D, C*9, P*B) -> (B, D*F*R): how far each kernel is above its threshold, in the mean over each region."""
         h = torch.baddbmm(self.threshold, self.kernel, windows).clamp_(0.0, 1.0)  # (D, F, P*B)
-        if b == 1:
-            return torch.bmm(h, self.pool).view(1, -1)
-        length = self.n_places // self.n_regions
-        h = h.view(self.n_dilations, self.n_kernels, self.n_regions, length, b).sum(3)  # (D, F, R, B)
-        h = h / length + self.whole * h.sum(2, keepdim=True)  # as `pool` has it
+        if b == 1:  # a product with nearly as few columns as there are regions would take four times as long
+            means = torch.mv(h.view(-1, self.length), self.even).view(-1, self.n_regions)
+            return torch.mm(means, self.mix).view(1, -1)
+        h = h.view(self.n_dilations, self.n_kernels, self.n_regions, self.length, b).sum(3) / self.length  # (D, F, R, B)
+        h = h + self.whole * h.sum(2, keepdim=True)  # as `mix` has it
         return h.reshape(self.n_dilations * self.n_kernels * self.n_regions, b).t()
 
     def counts(self, windows: Tensor, b: int) -> Tensor:
