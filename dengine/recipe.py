@@ -53,7 +53,7 @@ class Recipe:
     budget : seconds of wall time that a retrain may take in a live engine.
     max_steps : optimiser steps of a retrain at most; None: the reducer's own. A replay stops on steps alone.
     window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
-    novelty : a trace is novel where its squared distance to the nearest learned one, in level, texture or distortion, is
+    novelty : a trace is novel where its squared distance to the nearest learned one, by any of four measures, is
         more than so many times that which 99.5 % of these have from one another; 0: nothing is novel.
     """
 

@@ -1,12 +1,13 @@
-"""Is this trace like those learned from? Distances to the nearest reference, in level, texture, distortion, and limits.
+"""Is this trace like those learned from? Distances to the nearest reference, by level, texture, distortion and gaps.
 
     >>> gate = fit_novelty(traces, margin=1.5)
     >>> gate(torch.from_numpy(traces[0]))
     False
 
-    x (C, T) -> S segments: minimum, maximum, logarithms of the roughness of samples and of steps  (P,) = (4*C*S,)
-             -> level (the first two), texture (the third), distortions (products of all)         (P + D,)
-             -> standardised, squared distance to the nearest reference over its limit, of each of these three  (3,)
+    x (C, T) -> S segments: minimum, maximum, logarithms of the roughness of samples and of steps  (C, 4*S)
+             -> roughness of the quietest and the loudest of all brief stretches: gaps and jumps   (P,) = (C*(4*S + 3),)
+             -> level (the first two), texture (the third), distortions (products of all), gaps    (P + D,)
+             -> standardised, squared distance to the nearest reference over its limit, of each of these four  (4,)
 
 Hotelling's T^2 (1947), taken from the nearest reference and not from the mean: parts that seat, jam and miss lie in clouds
 apart (He and Wang, 2007, IEEE Trans. Semicond. Manuf. 20). Each statistic has a limit of its own, and any alone tells: hum
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 SEGMENTS = 14
+BRIEF = 100  # of a trace: a gap of half a segment hardly changes the roughness of a segment
 WIDEST = 42  # segments of all channels together: many channels have fewer each
 REFERENCES = 500  # searched at each decision
 FEWEST = 20  # traces: fewer cannot say what is usual
@@ -52,41 +54,54 @@ class NoveltyGate(nn.Module):
         segments = max(1, min(SEGMENTS, WIDEST // channels, samples // 2))
         self.stride = samples // segments
         self.length = samples - (segments - 1) * self.stride  # overlapping a little: no sample is left out
-        n_plain = 4 * channels * segments  # P
+        self.brief = max(1, samples // BRIEF)
+        n_plain = channels * (4 * segments + 3)  # P
         n_features = n_plain + DISTORTIONS
-        self.register_buffer("quiet", torch.ones(channels, segments))
+        self.register_buffer("quiet", torch.ones(channels, 2 * segments + 3))
         self.register_buffer("distortions", torch.zeros(n_plain, DISTORTIONS))
-        # A row for the level, one for the texture and one for distortions, zero in the others' features.
-        self.register_buffer("offset", torch.zeros(3, n_features))
-        self.register_buffer("gain", torch.zeros(3, n_features))
+        # A row for the level, for the texture, for distortions and for gaps, zero in the others' features.
+        self.register_buffer("offset", torch.zeros(4, n_features))
+        self.register_buffer("gain", torch.zeros(4, n_features))
         self.register_buffer("points", torch.zeros(n_features, REFERENCES))
-        self.register_buffer("norms", torch.zeros(3, REFERENCES))
+        self.register_buffer("norms", torch.zeros(4, REFERENCES))
 
     def forward(self, x: Tensor) -> bool:
         """(C, T) float32, one trace, in the references' unit -> whether it is unlike all of them."""
         if self.asleep:
             return False
         far: list[float] = self.scores(x).tolist()
-        return not (far[0] <= 1.0 and far[1] <= 1.0 and far[2] <= 1.0)  # what overflowed to NaN is novel
+        return not (far[0] <= 1.0 and far[1] <= 1.0 and far[2] <= 1.0 and far[3] <= 1.0)  # what overflowed to NaN is novel
 
     @torch.jit.export
     def scores(self, x: Tensor) -> Tensor:
-        """(C, T) -> (3,) float32: squared distances over their limits, in level, texture, distortion."""
+        """(C, T) -> (4,) float32: squared distances over their limits, by level, texture, distortion, gaps."""
         plain = self.plain(x)
-        z = torch.addcmul(self.offset, torch.cat([plain, plain @ self.distortions]), self.gain)  # (3, P + D)
+        z = torch.addcmul(self.offset, torch.cat([plain, plain @ self.distortions]), self.gain)  # (4, P + D)
         nearest = torch.addmm(self.norms, z, self.points, alpha=-2.0).amin(1)
         return nearest + (z * z).sum(1)
 
     def plain(self, x: Tensor) -> Tensor:
-        """(..., C, T) -> (..., P): of each channel its segments' minima, maxima, logarithms of both roughnesses."""
+        """(..., C, T) -> (..., P): of each channel its segments' minima, maxima, logarithms of roughness; and gaps."""
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
         steps = x[..., 1:] - x[..., :-1]  # from sample to sample
         bends = steps[..., 1:] - steps[..., :-1]
-        rough = torch.linalg.vector_norm(steps.unfold(-1, self.length - 1, self.stride), dim=-1)
-        rougher = torch.linalg.vector_norm(bends.unfold(-1, max(0, self.length - 2), self.stride), dim=-1)
+        brief, half = self.rough(steps, 2 * self.brief, self.brief), self.rough(steps, self.brief, (self.brief + 1) // 2)
+        rough = [
+            self.rough(steps, self.length - 1, self.stride),
+            self.rough(bends, self.length - 2, self.stride),
+            brief.amin(-1, keepdim=True),
+            half.amin(-1, keepdim=True),
+            half.amax(-1, keepdim=True),
+        ]
         # One after the other: aminmax takes half as long again as both.
-        own = [pieces.amin(-1), pieces.amax(-1), rough.add_(self.quiet).log_(), rougher.add_(self.quiet).log_()]
+        own = [pieces.amin(-1), pieces.amax(-1), torch.cat(rough, -1).add_(self.quiet).log_()]
         return torch.cat(own, -1).flatten(-2)
+
+    def rough(self, x: Tensor, length: int, stride: int) -> Tensor:
+        """(..., T) -> (..., n): the norm of each stretch of so many, of all where these are fewer."""
+        stretches = x.unfold(-1, max(0, min(length, x.size(-1))), stride)
+        norms: Tensor = torch.linalg.vector_norm(stretches, dim=-1)
+        return norms
 
 
 def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None) -> NoveltyGate:
@@ -107,7 +122,9 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
     x = torch.from_numpy(traces[chosen])
     # Of each trace the middle one, (C,). A channel that never moved is silent at the least number: any sound is far away.
     steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values if samples > 1 else torch.zeros(channels)
-    gate.quiet.copy_((0.05 * (gate.length / samples) ** 0.5 * steps).clamp(min=1e-12)[:, None])
+    segments, brief = gate.quiet.size(1) // 2 - 1, gate.brief
+    lengths = torch.tensor([*2 * segments * [gate.length], 2 * brief, brief, brief])
+    gate.quiet.copy_((0.05 * (lengths / samples).sqrt() * steps[:, None]).clamp(min=1e-12))
     plain = gate.plain(x).double().nan_to_num()
     gate.distortions.copy_(_discriminants(gate, x, plain))
     features = torch.cat([plain, plain @ gate.distortions.double()], 1).nan_to_num()
@@ -116,13 +133,14 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
     sound = standard.abs().amax(1) < 1e15  # the square of a larger distance would overflow
     if not sound.all():
         standard, same = standard[sound], same[sound][:, sound]
-    of = torch.cat([torch.arange(4).repeat_interleave(gate.quiet.size(1)).repeat(channels), torch.full((DISTORTIONS,), 4)])
-    for i, group in enumerate((of < 2, of == 2, of == 4)):
+    of = torch.arange(5).repeat_interleave(torch.tensor([*4 * [segments], 3])).repeat(channels)
+    of = torch.cat([of, torch.full((DISTORTIONS,), 5)])
+    for i, group in enumerate((of < 2, of == 2, of == 5, of == 4)):
         points = standard[:, group]
         limit, reach = _limits(points, same)
         # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
         # And of fewer than REFERENCES the discriminants fit these too well.
-        limit = margin * max(1.0, (TAIL_TRACES if i < 2 else REFERENCES) / distinct) * limit
+        limit = margin * max(1.0, (REFERENCES if i == 2 else TAIL_TRACES) / distinct) * limit
         gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
         gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
         gate.points[group, : len(points)] = limit**-0.5 * points.t()

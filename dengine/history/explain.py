@@ -221,14 +221,16 @@ DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "ver
 
 @dataclass(frozen=True, slots=True)
 class Novelty:
-    """Squared distance to the nearest reference over its limit, in level, texture, distortion: above 1 it is novel."""
+    """Squared distance to the nearest reference over its limit, in level, texture, distortion, gaps: above 1 is novel."""
 
     level: float
     texture: float
     distortion: float
+    gaps: float
 
     def __str__(self) -> str:
-        return f"in level {self.level:.2f} times the limit, texture {self.texture:.2f}, distortion {self.distortion:.2f}"
+        rest = f"texture {self.texture:.2f}, distortion {self.distortion:.2f}, gaps {self.gaps:.2f}"
+        return f"in level {self.level:.2f} times the limit, {rest}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ from dengine.decision.rule import script
 from tests.slow.proof.garbage import KINDS
 
 Traces = NDArray[np.float32]
-LEARNED = 800
 
 
 def shuffled() -> Traces:
@@ -22,7 +21,7 @@ def shuffled() -> Traces:
 
 
 TRACES = shuffled()
-KNOWN, HELD_OUT = TRACES[:LEARNED], TRACES[LEARNED:]
+KNOWN, HELD_OUT = TRACES[:800], TRACES[800:]
 MEAN, SD = float(KNOWN.mean()), float(KNOWN.std())
 
 
@@ -55,6 +54,7 @@ GARBAGE: dict[str, Callable[[Traces, np.random.Generator], Traces]] = {
     "offset": lambda x, _: x + np.float32(SD),
     "drift": lambda x, _: x - np.linspace(0, SD, x.shape[2], dtype=np.float32),
     "late": lambda x, _: np.concatenate([np.repeat(x[..., :1], 270, 2), x[..., :-270]], 2),
+    "gap": lambda x, _: np.concatenate([x[..., :600], np.repeat(x[..., 600:601], 20, 2), x[..., 620:]], 2),
     "reversed": lambda x, _: x[..., ::-1],
     "silent": lambda x, _: np.zeros_like(x),
     "stuck": lambda x, _: np.full_like(x, MEAN),
@@ -137,7 +137,7 @@ def test_shapes_depend_on_channels_and_samples_alone(channels: int, samples: int
         traces = np.random.default_rng(n).normal(size=(n, channels, samples)).astype(np.float32)
         gate = fit_novelty(traces, 1.5)
         assert {name: t.shape for name, t in gate.state_dict().items()} == fresh
-        assert gate.scores(torch.from_numpy(traces[0])).shape == (3,)
+        assert gate.scores(torch.from_numpy(traces[0])).shape == (4,)
 
 
 @pytest.mark.parametrize("n", [4, 8, 40])
