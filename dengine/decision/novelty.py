@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 SEGMENTS = 14
 BRIEF = 100  # of a trace: a gap of half a segment hardly changes the roughness of a segment
+FACTORS = 1.0, 1.0, 1.0, 2.0  # on the limits: a gap lies so far away that clean parts need not pay for it
 WIDEST = 42  # segments of all channels together: many channels have fewer each
 REFERENCES = 500  # searched at each decision
 FEWEST = 20  # traces: fewer cannot say what is usual
@@ -126,21 +127,21 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
     lengths = torch.tensor([*2 * segments * [gate.length], 2 * brief, brief, brief])
     gate.quiet.copy_((0.05 * (lengths / samples).sqrt() * steps[:, None]).clamp(min=1e-12))
     plain = gate.plain(x).double().nan_to_num()
-    gate.distortions.copy_(_discriminants(gate, x, plain))
+    of = torch.arange(5).repeat_interleave(torch.tensor([*4 * [segments], 3])).repeat(channels)
+    gate.distortions.copy_(_discriminants(gate, x, plain, of < 4))
     features = torch.cat([plain, plain @ gate.distortions.double()], 1).nan_to_num()
     offset, gain = _standardising(features)
     standard = torch.addcmul(offset, features, gain).float()
     sound = standard.abs().amax(1) < 1e15  # the square of a larger distance would overflow
     if not sound.all():
         standard, same = standard[sound], same[sound][:, sound]
-    of = torch.arange(5).repeat_interleave(torch.tensor([*4 * [segments], 3])).repeat(channels)
     of = torch.cat([of, torch.full((DISTORTIONS,), 5)])
     for i, group in enumerate((of < 2, of == 2, of == 5, of == 4)):
         points = standard[:, group]
         limit, reach = _limits(points, same)
         # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
         # And of fewer than REFERENCES the discriminants fit these too well.
-        limit = margin * max(1.0, (REFERENCES if i == 2 else TAIL_TRACES) / distinct) * limit
+        limit = margin * FACTORS[i] * max(1.0, (REFERENCES if i == 2 else TAIL_TRACES) / distinct) * limit
         gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
         gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
         gate.points[group, : len(points)] = limit**-0.5 * points.t()
@@ -164,12 +165,15 @@ def _distorted(x: Tensor) -> list[Tensor]:
     return scaled + moved + timed
 
 
-def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor) -> Tensor:
-    """(P, D): Fisher's discriminants between traces x (n, C, T), of features plain (n, P) float64, and these distorted."""
-    offset, gain = _standardising(plain)
+def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, read: Tensor) -> Tensor:
+    """(P, D): Fisher's discriminants between traces x (n, C, T), of features plain (n, P) float64, and these distorted.
+
+    read : (P,) bool, the features that they read.
+    """
+    offset, gain = (read * each for each in _standardising(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
     # Of few traces the covariance is not known: it is drawn to one.
-    known = torch.cov(z.T) + (plain.size(1) / len(plain)) ** 2 * torch.eye(plain.size(1), dtype=z.dtype)
+    known = torch.cov(z.T) + (int(read.sum()) / len(plain)) ** 2 * torch.eye(plain.size(1), dtype=z.dtype)
     some = slice(None, None, max(1, len(plain) // DISTORTED))
     directions = []
     for traces in _distorted(x[some]):
