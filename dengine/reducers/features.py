@@ -482,6 +482,13 @@ class FeatureReducer(Reducer):
             list(pool.map(lambda piece: many(x[piece], out[piece]), pieces))
         return out
 
+    def __getstate__(self) -> dict[str, Any]:
+        state: dict[str, Any] = super().__getstate__()
+        return state | {"_raw": self._raw.numpy()} if "net_" in vars(self) else state  # megabytes: arrays travel at less cost
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state | {"_raw": torch.from_numpy(state["_raw"])} if "net_" in state else state)
+
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """A training changes the module in place; all else it binds anew, so that may be shared."""
         new = copy.copy(self)
