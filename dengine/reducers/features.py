@@ -484,7 +484,7 @@ class FeatureReducer(Reducer):
 
     def __getstate__(self) -> dict[str, Any]:
         state: dict[str, Any] = super().__getstate__()
-        return state | {"_raw": self._raw.numpy()} if "net_" in vars(self) else state  # megabytes: arrays travel at less cost
+        return state | {"_raw": self._raw.numpy()} if "net_" in vars(self) else state  # an array travels at less cost
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state | {"_raw": torch.from_numpy(state["_raw"])} if "net_" in state else state)

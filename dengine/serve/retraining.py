@@ -1,8 +1,8 @@
 """The process in which a served engine retrains: another one, so that no decision waits for Python's lock.
 
 torch sends each tensor through shared memory of its own: a hundred of them hold Python's lock for tens of milliseconds, in
-which nothing is answered. Here a call and its result go as plain bytes, pickled in the executor's own thread; their arrays, by
-far the most of it, through a file in memory, which is written and read without the lock.
+which nothing is answered. Here a call and its result go as plain bytes, pickled in the executor's own thread; arrays, the most of
+it by far, through a file in memory, which is written and read without the lock.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import weakref
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing.connection import wait
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -74,7 +75,7 @@ class _Plain:
 
 def _arrived(pickled: bytes, path: str, sizes: list[int]) -> Any:
     arrays = [np.empty(size, np.uint8) for size in sizes]
-    with open(path, "rb", buffering=0) as file:
+    with Path(path).open("rb", buffering=0) as file:
         for each in arrays:
             left = each.data
             while left:
