@@ -1,8 +1,8 @@
 """The process in which a served engine retrains: another one, so that no decision waits for Python's lock.
 
 torch sends each tensor through shared memory of its own: a hundred of them hold Python's lock for tens of milliseconds, in
-which nothing is answered. Here a call and its result go as plain bytes, pickled in the executor's own thread; arrays, by far
-the most of it, through a file in memory, which is written and read without the lock.
+which nothing is answered. Here a call and its result go as plain bytes, pickled in the executor's own thread; arrays, the
+most of it, through a file in memory, which is written and read without the lock.
 """
 
 from __future__ import annotations
