@@ -169,8 +169,11 @@ async function now(get, _, doing) {
   el("p", { class: "about" }, el("a", { href: partAddress(decision.id) }, name), ` at ${clock(decision.time)}`, decision.model_version > 0 && ` · model ${decision.model_version}`),
   el("p", { class: "came" }, icon(labelOf(decision.success)), CAME[labelOf(decision.success)]));
   const strip = el("section", { class: "recent", id: "recent", "data-part": true, "aria-label": "The newest parts, newest first" },
-    el("ol", {}, decisions.slice(0, RECENT).map((each) => el("li", {}, el("a", { class: each.action, href: partAddress(each.id) },
-      icon(each.action), el("span", {}, nameOf(each.part, each.id)), el("span", { class: "visually-hidden" }, `: ${capital(each.action)}`))))));
+    el("ol", {}, decisions.slice(0, RECENT).map((each) => {
+      const escaped = each.action === "accept" && each.success === false;
+      return el("li", {}, el("a", { class: escaped ? "escaped" : each.action, href: partAddress(each.id) }, icon(escaped ? labelOf(false) : each.action),
+        el("span", {}, nameOf(each.part, each.id)), el("span", { class: "visually-hidden" }, `: ${capital(each.action)}${escaped ? ", and bad" : ""}`)));
+    })));
   const bad = doing.ever.bad_accepts;
   const figures = [
     verified(doing), accepted(doing),
