@@ -75,11 +75,9 @@ class _Plain:
 
 def _arrived(pickled: bytes, path: str, sizes: list[int]) -> Any:
     arrays = [np.empty(size, np.uint8) for size in sizes]
-    with Path(path).open("rb", buffering=0) as file:
-        for each in arrays:
-            left = each.data
-            while left:
-                left = left[file.readinto(left) or len(left) :]
+    with Path(path).open("rb") as file:
+        if [file.readinto(each.data) for each in arrays] != sizes:
+            raise EOFError("Expected all arrays of a retrain, got fewer bytes.")
     return pickle.loads(pickled, buffers=arrays)
 
 
