@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 SEGMENTS = 14
 BRIEF = 100  # of a trace: a gap of half a segment hardly changes the roughness of a segment
-FACTORS = 1.0, 1.0, 1.0, 2.0  # on the limits: a gap lies so far away that clean parts need not pay for it
+FAR = 4.0  # squared deviations that a gap lies away at least: its three features lie dense, with some clean ones aside
 WIDEST = 42  # segments of all channels together: many channels have fewer each
 REFERENCES = 500  # searched at each decision
 FEWEST = 20  # traces: fewer cannot say what is usual
@@ -141,7 +141,8 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
         limit, reach = _limits(points, same)
         # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
         # And of fewer than REFERENCES the discriminants fit these too well.
-        limit = margin * FACTORS[i] * max(1.0, (REFERENCES if i == 2 else TAIL_TRACES) / distinct) * limit
+        limit = margin * max(1.0, (REFERENCES if i == 2 else TAIL_TRACES) / distinct) * limit
+        limit = max(limit, FAR) if i == 3 else limit
         gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
         gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
         gate.points[group, : len(points)] = limit**-0.5 * points.t()
