@@ -55,7 +55,7 @@ class NoveltyGate(nn.Module):
         segments = max(1, min(SEGMENTS, WIDEST // channels, samples // 2))
         self.stride = samples // segments
         self.length = samples - (segments - 1) * self.stride  # overlapping a little: no sample is left out
-        self.brief = max(1, samples // BRIEF)
+        self.segments, self.brief = segments, max(1, samples // BRIEF)
         n_plain = channels * (4 * segments + 3)  # P
         n_features = n_plain + DISTORTIONS
         self.register_buffer("quiet", torch.ones(channels, 2 * segments + 3))
@@ -86,19 +86,19 @@ class NoveltyGate(nn.Module):
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
         steps = x[..., 1:] - x[..., :-1]  # from sample to sample
         bends = steps[..., 1:] - steps[..., :-1]
-        brief, half = self.rough(steps, 2 * self.brief, self.brief), self.rough(steps, self.brief, (self.brief + 1) // 2)
+        brief = self.roughness(steps, self.brief, (self.brief + 1) // 2)
         rough = [
-            self.rough(steps, self.length - 1, self.stride),
-            self.rough(bends, self.length - 2, self.stride),
+            self.roughness(steps, self.length - 1, self.stride),
+            self.roughness(bends, self.length - 2, self.stride),
+            self.roughness(steps, 2 * self.brief, self.brief).amin(-1, keepdim=True),
             brief.amin(-1, keepdim=True),
-            half.amin(-1, keepdim=True),
-            half.amax(-1, keepdim=True),
+            brief.amax(-1, keepdim=True),
         ]
         # One after the other: aminmax takes half as long again as both.
         own = [pieces.amin(-1), pieces.amax(-1), torch.cat(rough, -1).add_(self.quiet).log_()]
         return torch.cat(own, -1).flatten(-2)
 
-    def rough(self, x: Tensor, length: int, stride: int) -> Tensor:
+    def roughness(self, x: Tensor, length: int, stride: int) -> Tensor:
         """(..., T) -> (..., n): the norm of each stretch of so many, of all where these are fewer."""
         stretches = x.unfold(-1, max(0, min(length, x.size(-1))), stride)
         norms: Tensor = torch.linalg.vector_norm(stretches, dim=-1)
@@ -123,7 +123,7 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
     x = torch.from_numpy(traces[chosen])
     # Of each trace the middle one, (C,). A channel that never moved is silent at the least number: any sound is far away.
     steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values if samples > 1 else torch.zeros(channels)
-    segments, brief = gate.quiet.size(1) // 2 - 1, gate.brief
+    segments, brief = gate.segments, gate.brief
     lengths = torch.tensor([*2 * segments * [gate.length], 2 * brief, brief, brief])
     gate.quiet.copy_((0.05 * (lengths / samples).sqrt() * steps[:, None]).clamp(min=1e-12))
     plain = gate.plain(x).double().nan_to_num()
@@ -136,13 +136,13 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
     if not sound.all():
         standard, same = standard[sound], same[sound][:, sound]
     of = torch.cat([of, torch.full((DISTORTIONS,), 5)])
-    for i, group in enumerate((of < 2, of == 2, of == 5, of == 4)):
+    # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
+    # And of fewer than REFERENCES the discriminants fit these too well.
+    level, texture, distortion = (of < 2, TAIL_TRACES, 0.0), (of == 2, TAIL_TRACES, 0.0), (of == 5, REFERENCES, 0.0)
+    for i, (group, enough, least) in enumerate((level, texture, distortion, (of == 4, TAIL_TRACES, FAR))):
         points = standard[:, group]
         limit, reach = _limits(points, same)
-        # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
-        # And of fewer than REFERENCES the discriminants fit these too well.
-        limit = margin * max(1.0, (REFERENCES if i == 2 else TAIL_TRACES) / distinct) * limit
-        limit = max(limit, FAR) if i == 3 else limit
+        limit = max(least, margin * max(1.0, enough / distinct) * limit)
         gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
         gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
         gate.points[group, : len(points)] = limit**-0.5 * points.t()

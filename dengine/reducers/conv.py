@@ -119,7 +119,7 @@ class ConvEncoder(Features):
     def ramps(self, windows: Tensor, b: int) -> Tensor:
         """(D, C*9, P*B) -> (B, D*F*R): how far each kernel is above its threshold, in the mean over each region."""
         h = torch.baddbmm(self.threshold, self.kernel, windows).clamp_(0.0, 1.0)  # (D, F, P*B)
-        if b == 1:  # a product with nearly as few columns as there are regions would take four times as long
+        if b == 1:  # one product whose columns are the regions takes four times as long
             means = torch.mv(h.view(-1, self.length), self.even).view(-1, self.n_regions)
             return torch.mm(means, self.mix).view(1, -1)
         h = h.view(self.n_dilations, self.n_kernels, self.n_regions, self.length, b).sum(3) / self.length  # (D, F, R, B)

@@ -81,7 +81,7 @@ def _arrived(pickled: bytes, path: str, sizes: list[int]) -> Any:
     return pickle.loads(pickled, buffers=arrays)
 
 
-_SENT: list[_Plain] = []  # the newest result
+_SENT: list[_Plain] = []  # the newest result: it lives until the next, and is read long before
 
 
 def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _Plain:

@@ -490,7 +490,7 @@ class Outbox:
     def _write(self, journal: Journal, batch: Sequence[Record]) -> None:
         if journal.end > 8 << 20:
             with self._changed:  # a cell that never pauses would fill the disk
-                self._to_drain = self._synced
+                self._to_drain = max(self._to_drain, self._synced)
                 self._changed.notify_all()
                 if empty := self._changed.wait_for(lambda: journal.empty, LINGER):
                     journal.clear()
