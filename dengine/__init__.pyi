@@ -37,6 +37,7 @@ from .reducers.base import Reducer as Reducer
 from .reducers.conv import ConvReducer as ConvReducer
 from .reducers.pca import PcaReducer as PcaReducer
 from .reducers.rocket import RocketReducer as RocketReducer
+from .reducers.torch_reducer import TorchReducer as TorchReducer
 from .reducers.umap import UmapReducer as UmapReducer
 from .store.opening import open_store as open_store
 from .store.sql import SqlStore as SqlStore

@@ -223,10 +223,11 @@ def _value(value: Any) -> str:
 
 
 RECIPES: dict[str, Recipe] = {
-    "conv": Recipe("conv", radius=0.07),  # radius of a probability: the encoder's own unit
+    # The radius of conv and rocket is that of a probability. Small retrains of conv often beat large ones seldom.
+    "conv": Recipe("conv", radius=0.07, retrain_every=10),
     "umap": Recipe("umap"),
     "pca": Recipe("pca", radius=0.2),
-    "rocket": Recipe("rocket", radius=0.05),
+    "rocket": Recipe("rocket", radius=0.07),
     # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored; it asks nothing else of a trace.
     "paper": Recipe("umap", policy=Policy(alpha=0.1, lower_bound=0.9), novelty=0.0),
 }

@@ -39,7 +39,7 @@ from dengine.experiments.paper import ALPHAS, LOWER_BOUNDS, findings, paper_tabl
 from dengine.experiments.replay import Contender
 from dengine.experiments.tables import write_csv
 from dengine.files import write_output
-from dengine.reducers import ConvReducer
+from dengine.reducers import RocketReducer
 
 ROOT, PAGE = Path(__file__).resolve().parents[1], Path("docs/explanation/evidence.md")
 CELLS = ((0.1, 0.9), (0.05, 0.95))  # alpha, LB
@@ -123,7 +123,7 @@ def recorded(name: str, screw: Path | None) -> Dataset:
     return data.cut(round(1.2 * data.rate_hz)) if "1.2 s" in name else data
 
 
-class DishonestReducer(ConvReducer):
+class DishonestReducer(RocketReducer):
     """conv with heads that are trained on every fold's labels, which are then counted in them: for comparison only."""
 
     def trained_on(self, folds: np.ndarray) -> np.ndarray:

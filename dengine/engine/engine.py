@@ -226,6 +226,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._feedback = Feedback(self._outbox, self._versions, self._settings, on_safe_mode)
         self._maker = DecisionMaker(self._settings, store.clock)
         self._corrections = Corrections(self._outbox, self._settings, self._versions, self._feedback)
+        if not reading:
+            threading.Thread(target=template.warm_up, name="dengine-warm-up").start()
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
@@ -495,7 +497,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         with self._alone:
             self._versions.collect(to_the_end=not brief)
-            self._versions.work(self.recipe)
+            self._versions.work(self.recipe, once=True)
             self._feedback.announce()
             return self._versions.take_news()
 

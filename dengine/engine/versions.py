@@ -112,6 +112,7 @@ class ModelVersions:
         self._provisional = itertools.count(-1, -1)
         self._news: RetrainReport | None = None
         self._candidate: Candidate | None = None
+        self._continues = True  # the last retrain was accepted
         self._ahead: Future[None] | None = None  # features of stored traces, which the next retrain waits for
 
     @property
@@ -167,6 +168,16 @@ class ModelVersions:
         pool = ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,))
         self._ahead = pool.submit(model.look_ahead_safely, labelled.traces, labelled.seq)
         pool.shutdown(wait=False)
+
+    @property
+    def training_left(self) -> bool:
+        """Whether the answering version lacks training steps, as after many labels were imported at once.
+
+        Not where the last retrain was dropped: its labels wait for the next one. Nor where cells share a product: each of
+        them would train the same version.
+        """
+        alone = self.fleet is None and self.answering is not None
+        return alone and self._continues and self.newest.report.n_steps_left > 0
 
     def take_over(self, model: EngineModel, number: int, trained_on: TrainedOn) -> None:
         """Let a peer's version answer."""
@@ -319,10 +330,15 @@ class ModelVersions:
         self._advance(to_the_end=True)
         return self._news or candidate.report  # it is stored, and waits for the labels since
 
-    def work(self, recipe: Recipe) -> RetrainReport | None:
-        """Do what is due between two cycles by a recipe: a retrain, where the store is there."""
+    def work(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
+        """Retrain where it is due by a recipe and the store is there.
+
+        once : do not continue a training that lacks steps where a retrain has ended since the news was taken.
+        """
         every = recipe.retrain_every
-        if not (self.new_labels >= every if self.fleet is None else self.fleet.due(every)):
+        is_due = self.new_labels >= every if self.fleet is None else self.fleet.due(every)
+        continues = self.training_left and not (once and self._news is not None)
+        if not is_due and not continues:
             return None
         try:
             self.store_waiting()
@@ -373,7 +389,7 @@ class ModelVersions:
                 return
         except StoreError as error:  # a version that is not stored would be gone with the process
             log.warning("a retrain was dropped, for it could not be stored: %s", error)
-            report, self._candidate = candidate.report, None
+            report, self._candidate, self._continues = candidate.report, None, False
             self.new_labels += report.n_traces  # its labels are as many new ones, so that the next retrain is soon
             self._news = replace(report, version=self.version, accepted=False, reason=f"dropped: not stored: {error}")
             return
@@ -420,6 +436,7 @@ class ModelVersions:
 
     def _swap(self, candidate: Candidate) -> None:
         model, self._news = candidate.model, candidate.report
+        self._continues = model is not None
         if model is not None:
             model.untold = model.untold or self.newest.untold
             self.answering, self.version = model, candidate.report.version  # one reference is swapped

@@ -91,6 +91,9 @@ class EngineModel(ABC):
     ) -> Self:
         """Learn from traces (n, C, T), labels, parts' hashes and labels' numbers (n,), from where a training ended."""
 
+    def warm_up(self) -> None:  # noqa: B027  # a default: nothing to load
+        """Load what the first training would load, beside the engine; see `Reducer.warm_up`."""
+
     def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default: nothing to begin with
         """Begin with a training on traces (n, C, T) with labels of these numbers; see `Reducer.look_ahead`."""
 

@@ -111,16 +111,7 @@ _COMPILED: dict[Any, Any] = {}  # a module of each structure: to script takes 24
 
 def mould_of(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
     """The compiled module of a predictor's structure, warm."""
-    plain = (bool, int, float, str, list)
-    structure = tuple(  # all that scripting reads of a module but its tensors' values
-        (
-            name,
-            type(module).__qualname__,
-            *sorted((key, repr(value)) for key, value in vars(module).items() if isinstance(value, plain)),
-            *((key, tuple(t.shape)) for key, t in module._buffers.items() if t is not None),
-        )
-        for name, module in eager.named_modules()
-    )
+    structure = structure_of(eager)
     if (mould := _COMPILED.get(structure)) is None:
         mould = script(eager)
         with torch.inference_mode():
@@ -133,10 +124,30 @@ def mould_of(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
     return mould
 
 
+def structure_of(eager: nn.Module) -> tuple[Any, ...]:
+    """Everything that scripting compiles into a module: classes, attributes and shapes, but not the tensors' values.
+
+    The classes themselves are part of it, not their names: a notebook cell that is run again defines another class.
+    """
+    return tuple(
+        (
+            name,
+            type(module),
+            *sorted((key, repr(value)) for key, value in vars(module).items() if not key.startswith("_")),
+            *((key, tuple(tensor.shape)) for key, tensor in _tensors_of(module)),
+        )
+        for name, module in eager.named_modules()
+    )
+
+
+def _tensors_of(module: nn.Module, recurse: bool = False) -> list[tuple[str, Tensor]]:
+    return [*module.named_parameters(recurse=recurse), *module.named_buffers(recurse=recurse)]
+
+
 def compiled(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
     """A scripted module with another one's tensors, shared, not copied."""
     module = copy.deepcopy(mould_of(eager, trace_shape))
-    for name, tensor in eager.named_buffers():
+    for name, tensor in _tensors_of(eager, recurse=True):
         *path, leaf = name.split(".")
         setattr(reduce(getattr, path, module), leaf, tensor)
     return module
@@ -232,6 +243,9 @@ class ModelPrediction(EngineModel):
         self.gate = fit_novelty(X, self.novelty, hashes) if self.novelty else NoveltyGate(*self.trace_shape)
         self._predictor = None  # built by `prepare`, or when it is asked
         return self
+
+    def warm_up(self) -> None:
+        self.spaces.warm_up()
 
     def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
         """`Reducer.look_ahead`; and where nothing answers yet, compile what will: a first retrain has no time for that."""

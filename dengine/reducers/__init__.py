@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from .conv import ConvReducer as ConvReducer
     from .pca import PcaReducer as PcaReducer
     from .rocket import RocketReducer as RocketReducer
+    from .torch_reducer import TorchReducer as TorchReducer
     from .umap import UmapReducer as UmapReducer
 
 # The lazy table: a module is imported where its class is asked for, since UMAP alone takes seconds.
 _NAMED = {name: f"{name.capitalize()}Reducer" for name in NAMED}
-_LAZY = {"base": ["Reducer", "CrossFitted"]} | {module: [name] for module, name in _NAMED.items()}
+_LAZY = {"base": ["Reducer", "CrossFitted"], "torch_reducer": ["TorchReducer"]}
+_LAZY |= {module: [name] for module, name in _NAMED.items()}
 
 MOST = 2**31 - 1  # of a parameter that is an integer
 

@@ -57,10 +57,15 @@ class StopRule:
 
 @dataclass(frozen=True, slots=True)
 class FitReport:
-    """What a fit says of itself: the steps that it took, and what there is to tell."""
+    """What a fit reports.
+
+    n_steps : optimiser steps that it took.  note : one line for the operator.
+    n_steps_left : steps that are missing until training is complete; the engine then retrains after every cycle.
+    """
 
     n_steps: int = 0
     note: str = ""
+    n_steps_left: int = 0
 
 
 class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
@@ -110,6 +115,9 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     def blank(self, X: Floats) -> Any:
         """A module as `module` will give after `train` on X (n, C, T), its dimension `dim`; None: that is not known."""
+
+    def warm_up(self) -> None:  # noqa: B027  # a default: nothing to load
+        """Load what the first training would load; an engine calls it in a thread when it starts."""
 
     def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
         """Do now what `train` on X (n, C, T) with labels of these numbers would begin with, as far as no label is read."""

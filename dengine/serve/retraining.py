@@ -40,7 +40,7 @@ class RetrainingProcess(ProcessPoolExecutor):
         # What is started here never hears the signals to the whole group: its parent ends it in time.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
         try:
-            self.submit(_import_torch)
+            self.submit(_warm_up)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         (self._process,) = set(multiprocessing.active_children()) - others
@@ -106,5 +106,8 @@ def _end_with_parent() -> None:
     os.nice(NICE)
 
 
-def _import_torch() -> None:
-    import torch  # noqa: F401  # before the first retrain
+def _warm_up() -> None:
+    """Import torch and its optimisers, before the first retrain."""
+    from ..reducers.torch_reducer import warm_optimizer
+
+    warm_optimizer()

@@ -16,9 +16,9 @@ from dengine.decision.rule import script
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule
-from dengine.reducers.conv import ConvEncoder, ConvReducer, averaging
+from dengine.reducers.preprocessing import averaging
 from dengine.reducers.features import FIRST_STEPS, MANY, PAIRS, SHARES, fit_heads, masked_loss, products
-from dengine.reducers.rocket import RocketFeatures
+from dengine.reducers.rocket import RocketEncoder
 
 
 def traces(n=160, channels=1, samples=152, seed=0):
@@ -34,7 +34,7 @@ def traces(n=160, channels=1, samples=152, seed=0):
 
 def fitted(**params):
     X, y = traces()
-    return ConvReducer(**params).fit(X, y), X, y
+    return RocketReducer(**params).fit(X, y), X, y
 
 
 def train(reducer, X, y):
@@ -49,7 +49,7 @@ def test_space_k_is_the_same_bit_for_bit_whatever_the_labels_of_fold_k_also_over
     folds, rng = content_fold(X, 3), np.random.default_rng(1)
     other = y.copy()
     other[folds == k] = 1 - y[folds == k]
-    one, two = ConvReducer(folds=3), ConvReducer(folds=3)
+    one, two = RocketReducer(folds=3), RocketReducer(folds=3)
     for n in (60, 110, 160):
         one.train(X[:n], y[:n], folds[:n])
         two.train(X[:n], other[:n], folds[:n])
@@ -76,7 +76,7 @@ def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit():
 
 def test_a_warm_start_ends_where_a_cold_start_does():
     X, y = traces(300)
-    cold = ConvReducer().fit(X, y)
+    cold = RocketReducer().fit(X, y)
     warm = train(train(clone(cold).set_state(cold.get_state()), X[:100], y[:100]), X, y)
     for one, other in zip(warm.towers_, cold.towers_, strict=True):
         assert (one.w - other.w).abs().max() < 5e-3
@@ -97,7 +97,7 @@ def test_the_leave_one_out_loss_is_close_to_the_loss_on_new_traces_and_better_th
 def test_no_step_begins_after_the_deadline():
     X, y = traces()
     ticks = iter(range(1000))
-    reducer = ConvReducer()
+    reducer = RocketReducer()
     reducer.train(X, y, content_fold(X, 5), StopRule(deadline=5.0, clock=lambda: float(next(ticks))))
     assert reducer.n_iter_ == 5
     before = reducer.embed(X)
@@ -109,7 +109,7 @@ def test_no_step_begins_after_the_deadline():
 
 def test_a_first_model_that_comes_too_late_has_learned_something_all_the_same():
     X, y = traces()
-    late = ConvReducer()
+    late = RocketReducer()
     late.train(X, y, content_fold(X, 5), StopRule(deadline=-1.0, clock=lambda: 0.0))
     assert late.n_iter_ == FIRST_STEPS
     apart = late.embed(X)[..., 0].mean(1)
@@ -120,7 +120,7 @@ def test_dead_channels_and_huge_scales_embed_finitely():
     X, y = traces(80, channels=2)
     X[:, 1] = 7.0
     X[:, 0] = X[:, 0] * 1e6 + 1e7
-    reducer = ConvReducer().fit(X, y)
+    reducer = RocketReducer().fit(X, y)
     Z = reducer.embed(np.concatenate([X, X * 100, X * 0]))
     assert np.isfinite(Z).all()
 
@@ -128,16 +128,16 @@ def test_dead_channels_and_huge_scales_embed_finitely():
 def test_too_little_to_learn_from_is_said_clearly():
     X, y = traces()
     with pytest.raises(SettingError, match="at least 20 traces, got 12"):
-        train(ConvReducer(), X[:12], y[:12])
+        train(RocketReducer(), X[:12], y[:12])
     with pytest.raises(SettingError, match="both classes outside fold 0"):
-        ConvReducer(folds=2).fit(X, np.ones(len(X), dtype=int))
+        RocketReducer(folds=2).fit(X, np.ones(len(X), dtype=int))
     folds = np.zeros(len(X), dtype=np.int64)
     with pytest.raises(SettingError, match="both classes outside fold 0, got 0"):
-        ConvReducer(folds=2).fit(X, y, folds=folds)
+        RocketReducer(folds=2).fit(X, y, folds=folds)
     with pytest.raises(SettingError, match="uses labels"):
-        ConvReducer().fit(X)
+        RocketReducer().fit(X)
     with pytest.raises(SettingError, match="at least 2 samples, got 1"):
-        ConvReducer().fit(np.arange(30.0)[:, None], np.arange(30) % 2)
+        RocketReducer().fit(np.arange(30.0)[:, None], np.arange(30) % 2)
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_too_little_to_learn_from_is_said_clearly():
 def test_a_setting_out_of_range_is_named(params, message):
     X, y = traces()
     with pytest.raises(SettingError, match=message):
-        ConvReducer(**params).fit(X, y)
+        RocketReducer(**params).fit(X, y)
 
 
 def test_a_trace_of_another_shape_is_an_error_that_names_both():
@@ -195,7 +195,7 @@ def test_heads_end_where_scikit_learns_logistic_regression_does():
 
 def test_the_components_are_found_anew_where_the_traces_grew_by_half_and_the_second_axis_keeps_its_direction():
     X, y = traces(160)
-    reducer = train(ConvReducer(), X[:60], y[:60])
+    reducer = train(RocketReducer(), X[:60], y[:60])
     found = []
     for n in (80, 100, 160):
         before = reducer.towers_[0].axes, reducer.embed(X)
@@ -205,7 +205,7 @@ def test_the_components_are_found_anew_where_the_traces_grew_by_half_and_the_sec
     assert found == [False, True, True]
 
 
-@pytest.mark.parametrize("kind", [partial(ConvReducer, groups=0), RocketReducer, ConvReducer])
+@pytest.mark.parametrize("kind", [partial(RocketReducer, groups=0), RocketReducer, RocketReducer])
 def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_tower(kind: Any) -> None:
     X, y = traces(100)
     reducer = kind(folds=3).fit(X, y)
@@ -231,7 +231,7 @@ def test_where_good_of_one_product_is_bad_of_the_other_the_products_of_component
     levels = rng.choice([-1.0, 1.0], (400, 2, 1)) + 0.3 * rng.standard_normal((400, 2, 1))
     time, y = np.linspace(0.0, 1.0, 200), (levels[:, 0, 0] * levels[:, 1, 0] > 0).astype(np.int64)
     X = levels[:, 0] * (time < 0.1) + levels[:, 1] * (time > 0.9) + 0.3 * rng.standard_normal((400, 200))
-    reducer = ConvReducer().fit(X[:150], y[:150])
+    reducer = RocketReducer().fit(X[:150], y[:150])
     assert roc_auc_score(y[150:], reducer.embed(X[150:, None])[..., 0].mean(1)) > 0.9
 
 
@@ -243,14 +243,14 @@ def test_where_a_resonance_tells_it_kernels_that_compete_sort_better_than_ramps_
     X = sum(noise[..., i : 400 + i] * own[:, None, None] for i, own in enumerate(echo)).astype(np.float32)
     auc = [
         roc_auc_score(y[300:], reducer.embed(X[300:])[..., 0].mean(1))
-        for reducer in (each.fit(X[:300], y[:300]) for each in (ConvReducer(groups=0), ConvReducer()))
+        for reducer in (each.fit(X[:300], y[:300]) for each in (RocketReducer(groups=0), RocketReducer()))
     ]
     assert auc[1] > auc[0] + 0.02
 
 
 def test_where_a_trace_is_flat_every_kernel_of_a_group_counts_alike() -> None:
     X, _ = traces(64)
-    encoder = ConvEncoder(1, X.shape[-1], 1, 28, 5, 3, 2).eval()
+    encoder = RocketEncoder(1, X.shape[-1], 1, 28, 5, 3, 2).eval()
     encoder.learn(torch.from_numpy(X), np.random.default_rng(0))
     flat = torch.full((1, 1, X.shape[-1]), float(X.mean()))
     flat[..., 0] += 1e-6  # as rounding would have it
@@ -270,14 +270,14 @@ def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkey
 
 
 def test_features_of_very_many_traces_are_those_of_each_to_the_bit() -> None:
-    X, features = traces(MANY + 50)[0], ConvReducer(folds=2).fit(*traces(100)).raw_features
+    X, features = traces(MANY + 50)[0], RocketReducer(folds=2).fit(*traces(100)).raw_features
     assert torch.equal(features(X), torch.cat([features(X[i : i + 7]) for i in range(0, len(X), 7)]))
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(channels: int) -> None:
     samples, dilations, kernels = 60, 3, 4
-    encoder = ConvEncoder(channels, samples, 1, kernels, dilations, 3, 0)
+    encoder = RocketEncoder(channels, samples, 1, kernels, dilations, 3, 0)
     a = torch.randn(5, channels, samples, generator=torch.Generator().manual_seed(0))
     encoder.learn_filters(a, np.random.default_rng(0))
     found = torch.bmm(encoder.kernel, encoder.windows(encoder.seen(a), dilations)).view(dilations, kernels, -1, 5)
@@ -303,7 +303,7 @@ def test_traces_are_averaged_to_two_hundred_samples_but_not_where_that_loses_an_
 def test_traces_of_any_shape_have_finite_features_the_same_when_scripted(samples: int, channels: int) -> None:
     rng = np.random.default_rng(0)
     X = torch.from_numpy(rng.normal(size=(24, channels, samples)).cumsum(2).astype(np.float32))
-    encoder = ConvEncoder(channels, samples, averaging(X), 28, 5, 3, 2).eval()
+    encoder = RocketEncoder(channels, samples, averaging(X), 28, 5, 3, 2).eval()
     with torch.no_grad():
         encoder.learn(X, rng)
         encoder.standardise(encoder.raw(X))
@@ -322,13 +322,13 @@ def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(tmp_path,
                 engine.settle()
     else:
         import_labelled(url, Dataset(X[:, 0], y), recipe)
-    where, raw = set(), ConvEncoder.raw
+    where, raw = set(), RocketEncoder.raw
 
     def told(self, x):
         where.add(threading.current_thread().name)
         return raw(self, x)
 
-    monkeypatch.setattr(ConvEncoder, "raw", told)
+    monkeypatch.setattr(RocketEncoder, "raw", told)
     with DataEngine.open(url, replaying=True) as engine:
         assert engine.retrain().accepted
     assert where == {"dengine-ahead_0"}  # neither in the opening nor in the retrain
@@ -337,4 +337,4 @@ def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(tmp_path,
 def test_a_model_of_other_sizes_is_refused_in_a_sentence_that_says_how_to_go_on() -> None:
     state = fitted(groups=0)[0].get_state()
     with pytest.raises(StoreError, match="other sizes; its labels are whole"):
-        ConvReducer().set_state(state)
+        RocketReducer().set_state(state)

@@ -1,0 +1,290 @@
+"""The trainer of PyTorch networks, with the shipped network and with a user's own."""
+
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sklearn.base import clone
+from torch import nn
+
+from dengine import ConvReducer, DataEngine, Dataset, Recipe, TorchReducer
+from dengine.datasets.importing import import_labelled
+from dengine.decision.rule import script
+from dengine.errors import SettingError
+from dengine.folds import content_fold
+from dengine.reducers import torch_reducer
+from dengine.reducers.base import StopRule
+from dengine.reducers.conv import ConvNetwork
+from dengine.reducers.encoder import Members
+from dengine.reducers.torch_reducer import Augmentation, draw_batches, load_checkpoint, save_checkpoint
+from dengine.testing import check_reducer, labels_of_a_fold_move_nothing_in_its_space, toy_traces
+
+
+class SmallNetwork(nn.Module):
+    """A user's own network, in plain PyTorch."""
+
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv1d(channels, 6, 7, stride=4, padding=3), nn.BatchNorm1d(6), nn.ReLU(), nn.AdaptiveAvgPool1d(4), nn.Flatten()
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.layers(x)
+        return features
+
+
+class PythonNetwork(SmallNetwork):
+    """One that TorchScript does not take."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return super().forward(torch.from_numpy(np.asarray(x.detach()))) + 0.0 * x.sum()
+
+
+def quick(**params: Any) -> ConvReducer:
+    return ConvReducer(**{"folds": 3, "steps": 4, "fit_steps": 30} | params)
+
+
+def own(network: Any = SmallNetwork) -> TorchReducer:
+    return TorchReducer(network=network, folds=2, steps=4, fit_steps=30)
+
+
+@pytest.mark.parametrize("make", [quick, lambda: own()], ids=["conv", "own network"])
+def test_labels_of_fold_k_move_nothing_in_space_k_over_warm_starts_weights_averages_and_statistics(make: Any) -> None:
+    X, y = toy_traces(120)
+    reducer, other = make(), make()
+    folds, rng = content_fold(X, reducer.folds), np.random.default_rng(1)
+    k = 1
+    for n in (40, 80, 120):
+        labels = y.copy()
+        labels[folds == k] = rng.integers(2, size=(folds == k).sum())
+        reducer.train(X[:n], y[:n], folds[:n])
+        other.train(X[:n], labels[:n], folds[:n])
+        one, two = reducer.embed(X), other.embed(X)
+        np.testing.assert_array_equal(one[:, k], two[:, k])
+        assert not np.array_equal(one, two)  # the other members did see these labels
+
+
+def test_a_member_that_is_trained_on_its_own_fold_is_caught_by_the_contract(monkeypatch: pytest.MonkeyPatch) -> None:
+    labels_of_a_fold_move_nothing_in_its_space(quick(folds=2))
+    honest = draw_batches
+    leaking = lambda folds, *rest: honest(np.full_like(folds, -1), *rest)  # noqa: E731  # no row is left out
+    monkeypatch.setattr(torch_reducer, "draw_batches", leaking)
+    with pytest.raises(AssertionError, match="labels of fold 0 moved space 0"):
+        labels_of_a_fold_move_nothing_in_its_space(quick(folds=2))
+
+
+def test_a_users_own_network_keeps_the_whole_contract_of_a_reducer() -> None:
+    check_reducer(own())
+
+
+def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit() -> None:
+    X, y = toy_traces(90)
+    reducer = quick()
+    folds = content_fold(X, 3)
+    for n in (50, 70):
+        reducer.train(X[:n], y[:n], folds[:n])
+    state = reducer.get_state()
+    restored = clone(reducer).set_state(state)
+    np.testing.assert_array_equal(restored.embed(X), reducer.embed(X))
+    np.testing.assert_array_equal(restored.train(X, y, folds), reducer.train(X, y, folds))
+    np.testing.assert_array_equal(restored.embed(X), reducer.embed(X))
+    assert restored.n_steps_ == reducer.n_steps_ > 0
+
+
+def test_references_lie_where_the_same_traces_are_embedded_later() -> None:
+    X, y = toy_traces(90)
+    reducer, folds = quick(), content_fold(X, 3)
+    points = reducer.train(X, y, folds)
+    np.testing.assert_allclose(points, reducer.embed_own(X, folds), atol=1e-5)
+
+
+def test_after_training_good_parts_have_a_higher_probability_than_bad_ones_never_seen() -> None:
+    X, y = toy_traces(160)
+    new, labels = toy_traces(100, seed=9)
+    probability = ConvReducer(folds=2, fit_steps=60).fit(X, y).embed(new)[:, :, 0].mean(1)
+    assert probability[labels == 1].mean() > probability[labels == 0].mean() + 0.4
+
+
+def test_no_step_begins_after_the_deadline_and_the_reducer_answers_all_the_same() -> None:
+    X, y = toy_traces(60)
+    ticks = iter(range(1000))
+    reducer, folds = quick(), content_fold(X, 3)
+    reducer.train(X, y, folds, StopRule(deadline=2.0, clock=lambda: float(next(ticks))))
+    assert reducer.report.n_steps == 2
+    assert np.isfinite(reducer.embed(X)).all()
+
+
+def test_a_retrain_takes_its_steps_and_twice_as_many_where_training_is_behind() -> None:
+    X, y = toy_traces(120)
+    reducer, folds = quick(steps=5, fit_steps=22), content_fold(X, 3)
+    taken = []
+    for _ in range(4):
+        reducer.train(X, y, folds)
+        taken.append((reducer.report.n_steps, reducer.report.n_steps_left))
+    assert taken == [(10, 12), (10, 2), (5, 0), (5, 0)]
+
+
+def test_grouped_members_compute_what_separate_networks_of_the_same_weights_compute() -> None:
+    together = ConvNetwork(4, 90, members=3).eval()
+    x = torch.randn(5, 3, 4, 90, generator=torch.Generator().manual_seed(0))
+    joint = together(x.flatten(1, 2)).view(5, 3, -1)
+    for k in range(3):
+        alone = ConvNetwork(4, 90).eval()
+        for name, value in alone.state_dict().items():
+            if value.dim():
+                whole = together.state_dict()[name]
+                value.copy_(whole.chunk(3)[k])
+        torch.testing.assert_close(alone(x[:, k]), joint[:, k])
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("samples", [2, 3, 9, 64, 152, 5000])
+def test_traces_of_any_shape_are_embedded_finitely_and_alike_when_scripted(samples: int, channels: int) -> None:
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(24, channels, samples)).cumsum(2).astype(np.float32)
+    reducer = quick(steps=1)
+    reducer.train(X, np.arange(24) % 2, np.arange(24) % 3)
+    embedded = reducer.embed(X)
+    assert np.isfinite(embedded).all()
+    module = script(reducer.module())
+    for x in torch.from_numpy(X[:3]):
+        with torch.inference_mode():
+            assert torch.equal(module(x[None]), reducer.module()(x[None]))
+
+
+def test_dead_channels_and_huge_values_are_embedded_finitely() -> None:
+    X, y = toy_traces(60, channels=2)
+    X[:, 1] = 7.0
+    reducer = quick()
+    reducer.train(X, y, content_fold(X, 3))
+    X[0, 0, 5] = 3e38
+    assert np.isfinite(reducer.embed(X)).all()
+
+
+def test_labels_of_one_class_are_learned_from() -> None:
+    X, _ = toy_traces(60)
+    reducer = quick()
+    reducer.train(X, np.ones(60, dtype=np.int64), content_fold(X, 3))
+    assert (reducer.embed(X)[:, :, 0] > 0.5).all()
+
+
+def test_batches_hold_each_row_outside_the_fold_as_often_as_any_other() -> None:
+    folds = np.arange(50) % 5
+    batches = torch.stack(list(draw_batches(folds, 5, 8, 10, np.random.default_rng(0)))).numpy()  # (steps, B, K)
+    for k in range(5):
+        rows, times = np.unique(batches[:, :, k], return_counts=True)
+        assert set(rows) == set(np.flatnonzero(folds != k))
+        assert times.tolist() == [2] * 40
+
+
+def test_an_augmentation_of_nothing_changes_nothing_and_a_shift_moves_a_trace_in_time() -> None:
+    x = torch.randn(6, 2, 3, 40, generator=torch.Generator().manual_seed(0))
+    y = (torch.arange(12.0) % 2).view(6, 2)
+    same_x, same_y = Augmentation(0, 0.0, 0.0, 0.0)(x, y, np.random.default_rng(0))
+    assert torch.equal(same_x, x)
+    assert torch.equal(same_y, y)
+    moved, _ = Augmentation(3, 0.0, 0.0, 0.0)(x, y, np.random.default_rng(0))
+    for one, other in zip(moved.flatten(0, 1), x.flatten(0, 1), strict=True):
+        inner = [torch.equal(one[:, 3:-3], other[:, 3 + by : 37 + by]) for by in range(-3, 4)]
+        assert any(inner)
+
+
+def test_mixed_traces_and_labels_lie_between_those_of_the_same_member() -> None:
+    x = torch.arange(4.0).repeat(2, 1)[..., None, None].expand(2, 4, 1, 5).contiguous()  # member k has traces of k
+    y = torch.tensor([[0.0] * 4, [1.0] * 4])
+    mixed, labels = Augmentation(0, 0.0, 0.0, 0.5)(x, y, np.random.default_rng(0))
+    assert torch.equal(mixed, x)  # nothing of another member comes in
+    assert ((labels >= 0.0) & (labels <= 1.0)).all()
+    assert ((labels[0] <= 0.5) & (labels[1] >= 0.5)).all()
+
+
+def test_every_member_starts_from_a_checkpoint_and_learns_from_it(tmp_path: Any) -> None:
+    single = Members(ConvNetwork, 2, 120, 1)
+    save_checkpoint(single, tmp_path / "encoder.pt")
+    several = Members(ConvNetwork, 2, 120, 3)
+    load_checkpoint(several, tmp_path / "encoder.pt")
+    x = torch.randn(4, 1, 2, 120, generator=torch.Generator().manual_seed(0))
+    expected = single.eval()(x).expand(-1, 3)
+    torch.testing.assert_close(several.eval()(x.expand(-1, 3, -1, -1)), expected)
+    X, y = toy_traces(60)
+    reducer = quick(checkpoint=str(tmp_path / "encoder.pt"))
+    before = reducer.blank(X)(torch.from_numpy(X))
+    reducer.train(X, y, content_fold(X, 3))
+    assert not np.array_equal(reducer.embed(X), before.numpy())
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"no checkpoint", "cannot be read"), (None, "cannot be read"), ("other", "of this network for traces")],
+)
+def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(tmp_path: Any, content: Any, message: str) -> None:
+    path = tmp_path / "encoder.pt"
+    if content == "other":
+        save_checkpoint(Members(ConvNetwork, 6, 120, 1), path)
+    elif content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SettingError, match=message):
+        load_checkpoint(Members(ConvNetwork, 2, 120, 3), path)
+
+
+def test_a_network_of_another_shape_is_refused_in_a_sentence() -> None:
+    X, y = toy_traces(30)
+    with pytest.raises(SettingError, match=r"maps \(B, 2, 120\) to \(B, features\), got one that gives 2 dimensions"):
+        own(lambda channels, samples: nn.Conv1d(channels, 3, 5)).fit(X, y)
+
+
+def test_a_network_that_does_not_compile_answers_in_python_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    X, y = toy_traces(60)
+    with caplog.at_level(logging.WARNING):
+        reducer = own(PythonNetwork).fit(X, y)
+    assert "PythonNetwork cannot be compiled by TorchScript" in caplog.text
+    assert reducer.module() is None
+    assert reducer.embed(X).shape == (60, 2, 2)
+
+
+def test_two_networks_of_one_name_in_one_process_answer_each_for_itself() -> None:
+    """A notebook cell that is run again defines another class of the same name."""
+
+    def network(sign: float) -> type:
+        class Network(SmallNetwork):
+            def __init__(self, channels: int, samples: int) -> None:
+                super().__init__(channels, samples)
+                self.sign = sign
+
+            def forward(self, x: torch.Tensor) -> torch.Tensor:
+                features: torch.Tensor = self.sign * self.layers(x)
+                return features
+
+        return Network
+
+    X, y = toy_traces(60)
+    embeddings = []
+    for sign in (1.0, -1.0):
+        engine = DataEngine(reducer=own(network(sign)), replaying=True, radius=0.07)
+        for x, good in zip(X, y, strict=True):
+            engine.report(engine.decide(x).id, bool(good))
+        assert engine.retrain().accepted
+        decision = engine.decide(X[0])
+        expected = engine.model.spaces.embed(X[:1])[0]
+        np.testing.assert_allclose(decision.embedding, expected, atol=1e-6)
+        embeddings.append(expected)
+    assert not np.allclose(*embeddings)
+
+
+def test_an_engine_trains_on_after_an_import_a_retrain_per_cycle_until_its_steps_are_complete(tmp_path: Any) -> None:
+    X, y = toy_traces(140, seed=3)
+    recipe = Recipe("conv", {"folds": 2, "steps": 4, "fit_steps": 20}, radius=0.07, retrain_every=1000)
+    url = str(tmp_path / "cell.db")
+    import_labelled(url, Dataset(X[:100, 0], y[:100].astype(np.int8)), recipe)
+    left = []
+    with DataEngine.open(url, replaying=True) as engine:
+        assert engine.retrain().accepted
+        for x, good in zip(X[100:], y[100:], strict=True):
+            left.append(engine.model.report.n_steps_left)
+            engine.report(engine.decide(x).id, bool(good))
+            engine.settle()
+    assert left[:4] == [12, 4, 0, 0]
+    assert set(left[3:]) == {0}
