@@ -41,6 +41,9 @@ class Window:
         nothing = np.zeros(0, np.int64)
         self.refill(Labelled(nothing, np.zeros((0, 1, 1), np.float32), nothing.astype(np.int8), nothing))
 
+    def __len__(self) -> int:
+        return self._end - self._first
+
     @property
     def newest_seq(self) -> int:
         """Sequence number of the newest label; 0 before the first."""

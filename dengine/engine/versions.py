@@ -338,7 +338,8 @@ class ModelVersions:
         every = recipe.retrain_every
         is_due = self.new_labels >= every if self.fleet is None else self.fleet.due(every)
         continues = self.training_left and not (once and self._news is not None)
-        if not is_due and not continues:
+        has_enough = max(self.new_labels, len(self.retrainer.window)) >= self.newest.min_traces
+        if not (is_due and has_enough) and not continues:
             return None
         try:
             self.store_waiting()

@@ -70,11 +70,13 @@ class EngineModel(ABC):
     description : what it is, its numbers included, the same at every start: a store compares it.
     untold : whether its rule missed what became of a part; it then raises instead of predicting.
     keeps_references : whether its state and the points stored with labels restore its references; a rival is refitted.
+    min_traces : how many labelled traces the first training waits for.
     is_compiled : whether no Python runs where it is asked, once it is trained.
     """
 
     keeps_references = True
     is_compiled = False
+    min_traces = 1
     untold = False
 
     user_model: Any

@@ -212,6 +212,10 @@ class ModelPrediction(EngineModel):
         return self.spaces.n_spaces
 
     @property
+    def min_traces(self) -> int:  # type: ignore[override]  # it depends on the reducer
+        return self.spaces.min_traces
+
+    @property
     def report(self) -> FitReport:
         own = self.spaces.report
         return replace(own, note="; ".join(filter(None, (own.note, self._note))))

@@ -74,12 +74,14 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     uses_labels : whether `fit` reads `y`. One that does, and does not cross-fit by itself, is cross-fitted from outside.
     scores : whether the first axis is the predicted probability of success.
     own_unit : whether the embedding has a unit of its own, a probability say, that must not be scaled away.
+    min_traces : how many labelled traces the first training in an engine waits for.
     single_tolerance : how far a trace may move when embedded alone, in the embedding's root mean square radii.
     """
 
     uses_labels = False
     scores = False
     own_unit = False
+    min_traces = 1
     single_tolerance = 1e-4
 
     @abstractmethod
@@ -116,7 +118,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def blank(self, X: Floats) -> Any:
         """A module as `module` will give after `train` on X (n, C, T), its dimension `dim`; None: that is not known."""
 
-    def warm_up(self) -> None:  # noqa: B027  # a default: nothing to load
+    def warm_up(self) -> None:  # a default: nothing to load
         """Load what the first training would load; an engine calls it in a thread when it starts."""
 
     def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:

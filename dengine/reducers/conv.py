@@ -23,7 +23,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 
-from .torch_reducer import NetworkFactory, TorchReducer
+from .encoder import NetworkFactory
+from .torch_reducer import TorchReducer
 
 REGIONS = 3  # early, middle and late: when a force rises says as much as how far
 SHORT = 160  # samples below which the first convolution has a stride of 2
@@ -75,7 +76,8 @@ class ConvNetwork(nn.Module):
         maximum = F.max_pool1d(h, self.window, self.stride)
         pooled = torch.cat([mean, maximum, mean.mean(2, keepdim=True), maximum.amax(2, keepdim=True)], 2)
         h = self.dropout(pooled.flatten(1)).unsqueeze(2)  # (B, members * pooled, 1)
-        return self.hidden_dropout(self.hidden(h).relu()).flatten(1)
+        features: Tensor = self.hidden_dropout(self.hidden(h).relu())
+        return features.flatten(1)
 
 
 def _convolution(groups: int, inputs: int, outputs: int, kernel: int, stride: int) -> list[nn.Module]:

@@ -49,8 +49,10 @@ class Members(nn.Module):
         super().__init__()
         self.count = count
         grouped = "members" in signature(network).parameters
-        self.networks: nn.Module = Grouped(network, channels, samples, count) if grouped else Separate(
-            [network(channels, samples) for _ in range(count)]
+        self.networks: nn.Module = (
+            Grouped(network, channels, samples, count)
+            if grouped
+            else Separate([network(channels, samples) for _ in range(count)])
         )
         features = _features_of(self.networks, count, channels, samples)
         bound = features**-0.5
@@ -66,7 +68,8 @@ class Members(nn.Module):
     def units(self, x: Tensor) -> Tensor:
         """(B, K, channels, samples) -> (B, K, 2), from 0 to 1."""
         features = self.networks(x)  # (B, K, F)
-        return ((features.unsqueeze(2) @ self.weight).squeeze(2) + self.bias).sigmoid()
+        units: Tensor = (features.unsqueeze(2) @ self.weight).squeeze(2) + self.bias
+        return units.sigmoid()
 
     def logits(self, units: Tensor) -> Tensor:
         """(B, K, 2) -> (B, K)."""
@@ -159,6 +162,8 @@ def _features_of(networks: nn.Module, count: int, channels: int, samples: int) -
         features = networks(torch.zeros(2, count, channels, samples))
     networks.train()
     if features.dim() != 3:
-        wanted = f"a network that maps (B, {channels}, {samples}) to (B, features)"
-        raise SettingError(f"Expected {wanted}, got one that gives {features.dim() - 1} dimensions; flatten its output.")
+        raise SettingError(
+            f"Expected a network that maps (B, {channels}, {samples}) to (B, features), "
+            f"got one that gives {features.dim() - 1} dimensions; flatten its output."
+        )
     return int(features.size(2))

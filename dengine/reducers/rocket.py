@@ -1,4 +1,4 @@
-"""The 1-D conv embedding: an encoder that reads no label, and heads that read all but their own fold's.
+"""Drawn convolution kernels under cross-fitted logistic heads: no kernel is trained.
 
     >>> reducer = RocketReducer(folds=5).fit(X, y)     # X (n, T) or (n, C, T), y (n,) 1 = success, 0 = failure
     >>> reducer.embed(X).shape                       # (n, K, d): every trace in each of the K spaces
@@ -23,34 +23,63 @@ Data Min. Knowl. Disc. 36, for several channels and differences. Cross-fitting: 
 also weighs the towers; Chernozhukov et al. (2018), Econometrics Journal 21.
 """
 
+import copy
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Self
+from itertools import combinations, pairwise
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import clone
+from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
-from ..errors import expect
+from ..decision.rule import part, restore, script
+from ..errors import SettingError, expect
+from ..folds import content_fold
 from ..records import is_whole
-from .base import Floats
-from .features import TAPS, FeatureReducer, Features, dilations_of, rocket_kernels
+from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, one_class_outside, own_places, seed_of
 from .preprocessing import averaging
 
+CLIP = 4.0  # deviations; an outlier may not carry a score by itself
+TAPS = 9  # of MiniRocket's kernels; 84 = 9 choose 3 ways to place its three 2s among -1s
+MIN_TRACES = 20  # that an engine's first model is trained on
+FIRST_STEPS = 3  # of heads that start from nothing, however late: without any, they would hold all parts for alike
+TRAIN_TRACES = 4000  # that the heads are fitted to at most, so that it ends in time however many references there are
+GROWN, FITS = 1.5, 20  # the components are found anew where traces have grown so, and at every so many-th fit
+# Variance of all components of a tower together: what a ridge is weighed against.
+VARIANCES = 40.0, 5.0
+PAIRS = 10.0  # of the products
+LEADING = 4  # components of the first tower whose products are a tower of their own
+DOUBT = 4.0  # nats that products must save to be the whole logit: by chance they would have a share where they tell nothing
+SHARES = 11  # of what came before a tower in the logit, from 0 to 1
+LEARNED = 256  # traces that channels' scales are read from: more tell no more
+MOST = 10**9  # of a parameter that is a whole number
+MANY = 3200  # traces, for which a second core is worth taking
+PIECE = 512  # of them at once
+CHUNK = 32  # traces embedded at a time: what they need stays in the cache, and is not asked of the kernel anew
+SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 WHOLE = 2.0  # weight of the mean over the whole trace beside that over a region: where it does not matter when
 PLACES = 600, 100  # of each tower at most: on traces that oscillate fewer say less
 RIVALS = 8  # kernels of a group
 NEARLY = 1.0  # deviation of the answers: who answers so far below the most of its group counts no more, in between in part
 
 
-class RocketEncoder(Features):
+class RocketEncoder(nn.Module):
     """(B, C, T) raw traces -> (B, P) features of both towers.
 
     channels, samples : C and T.  average : samples of one mean, `averaging`.  kernels, dilations, regions : F, D and R,
     fewer dilations on short traces.  groups : G; 0: no second tower.
     """
 
+    shift: Tensor
+    scale: Tensor
+    offset: Tensor
+    gain: Tensor
     taps: Tensor
     even: Tensor
     mix: Tensor
@@ -63,11 +92,20 @@ class RocketEncoder(Features):
     def __init__(
         self, channels: int, samples: int, average: int, kernels: int, dilations: int, regions: int, groups: int
     ) -> None:
+        super().__init__()
+        if samples < 2:
+            raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
         frames = samples // average
         places, few = max(1, min(frames, PLACES[0]) // regions) * regions, min(frames, PLACES[1])
         taps = _taps(frames, dilations, places)
         widths = len(taps) * regions * kernels, 4 * len(taps) * groups * RIVALS
-        super().__init__(channels, samples, *(widths if groups else widths[:1]))
+        ends = np.cumsum([0, *(widths if groups else widths[:1])]).tolist()
+        self.towers = [slice(*each) for each in pairwise(ends)]
+        # A channel becomes scale * x + shift, a feature gain * f + offset: one pass each.
+        self.register_buffer("shift", torch.zeros(channels, 1))
+        self.register_buffer("scale", torch.ones(channels, 1))
+        self.register_buffer("offset", torch.zeros(ends[-1]))
+        self.register_buffer("gain", torch.ones(ends[-1]))
         self.average, self.head = average, samples % average  # left out at the start: the end of an insertion tells most
         self.n_dilations, self.n_regions, self.n_kernels, self.n_places = len(taps), regions, kernels, places
         self.n_groups, self.n_few = groups, few
@@ -85,6 +123,35 @@ class RocketEncoder(Features):
         self.register_buffer("rival", torch.zeros(2 * self.n_dilations, groups * RIVALS, channels * TAPS))
         self.register_buffer("nothing", torch.zeros(1, channels, 1), persistent=False)
         self.register_buffer("share", torch.full((few,), 1.0 / few), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, P)."""
+        return self.clipped(self.raw(x))
+
+    def clipped(self, raw: Tensor) -> Tensor:
+        """(B, P) -> (B, P)."""
+        return torch.addcmul(self.offset, raw, self.gain).clamp_(-4.0, 4.0)  # CLIP: a scripted method reads no global
+
+    def learn(self, X: Tensor, rng: np.random.Generator) -> None:
+        """Set channel scales and filters from traces (n, C, T); done once, so that the map stays where it is."""
+        if len(X) > LEARNED:
+            X = X[torch.from_numpy(rng.permutation(len(X))[:LEARNED])]
+        wide = X.double()
+        centre, deviation = wide.mean((0, 2)), wide.std((0, 2), unbiased=False)
+        scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
+        self.scale.copy_(scale[:, None])
+        self.shift.copy_((-centre * scale)[:, None])
+        some = X[torch.from_numpy(rng.permutation(len(X))[:64])]
+        self.learn_filters(torch.addcmul(self.shift, some, self.scale), rng)
+
+    def standardise(self, raw: Tensor) -> None:
+        """Set mean and deviation of the features from raw ones (n, P)."""
+        deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
+        for tower in self.towers[1:]:  # of shares what moves more tells more
+            deviation[tower] = deviation[tower].square().mean().sqrt()
+        floor = 1e-3 * deviation.median() + 1e-12  # a feature that never moved must not explode when it does
+        self.gain.copy_(1.0 / (deviation + floor))
+        self.offset.copy_(-mean / (deviation + floor))
 
     def raw(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, P)."""
@@ -163,46 +230,467 @@ class RocketEncoder(Features):
                 self.rival[d] = rivals / (NEARLY * (rivals @ rows).std() + 1e-6)
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
-class RocketReducer(FeatureReducer):
-    """Trace -> point, by a convolutional encoder and cross-fitted heads.
+class InChunks(nn.Module):
+    """The raw features of many traces: compiled it holds up no Python, while an engine opens or compiles beside it."""
 
-    n_components : d, 1 or 2; the first axis is the predicted probability of success, the second is there to be seen.
-    folds : K. More folds train each head on more of the labels; the time to embed hardly grows.
-    kernels, dilations, regions : sizes of the first tower, F, D and R.  groups : G of the second; 0 leaves it out.
-    width : principal components of what each gives.
-    l2 : ridge of the heads, in units of one label each.
-    max_iter : Newton steps of the heads in one fit, at most.
-    random_state : of all that is drawn; None draws anew at each fit.
+    def __init__(self, features: RocketEncoder) -> None:
+        super().__init__()
+        self.features, self.chunk = features, CHUNK  # a scripted method reads no global
+
+    def forward(self, x: Tensor, out: Tensor) -> None:
+        """(n, C, T) -> out (n, P), n whole chunks."""
+        for i in range(0, x.size(0), self.chunk):
+            out[i : i + self.chunk] = self.features.raw(x[i : i + self.chunk])
+
+
+def rocket_kernels() -> Tensor:
+    """(84, 9): every way to place three 2s among -1s; each kernel sums to zero, so offsets do not matter."""
+    places = torch.tensor(list(combinations(range(TAPS), 3)))
+    return torch.full((84, TAPS), -1.0).scatter_(1, places, 2.0)
+
+
+def dilations_of(samples: int, n: int) -> list[int]:
+    """At most n spreads of a kernel, from 1 to the length of a trace."""
+    widest = np.log2((samples - 1) / (TAPS - 1)) if samples > TAPS else 0.0
+    return [int(d) for d in np.unique(np.floor(2.0 ** np.linspace(0.0, widest, n)))]
+
+
+class FeatureEmbedding(nn.Module):
+    """(B, C, T) raw traces -> (B, K, d): axis 1 the success probability of head k, axis 2 a principal direction.
+
+    A probability is the natural axis for counting: what is sure lies close together, and a radius of 0.05 means "parts as
+    promising as this one, give or take five in a hundred".
     """
 
-    variances = 40.0, 5.0
-    leading = 4
-    sizes = ("kernels", "dilations", "regions", "width")
+    weight: Tensor
+    bias: Tensor
+    of_pairs: Tensor
+    unit: Tensor
 
+    def __init__(self, features: RocketEncoder, folds: int, dim: int, leading: int) -> None:
+        super().__init__()
+        self.features, self.folds, self.dim, self.leading, self.n_scores = features, folds, dim, leading, folds * dim
+        # Axis 2 is the same in every space; its copies cost less than an op to spread it. Leading components come last.
+        self.register_buffer("weight", torch.zeros(len(features.gain), folds * dim + leading))
+        self.register_buffer("bias", torch.zeros(folds * dim + leading))
+        self.register_buffer("of_pairs", torch.zeros(leading * leading, folds * dim))
+        self.register_buffer("unit", torch.tensor([1.0, SECOND_AXIS][:dim]).repeat(folds))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T) float32 -> (B, K, d) float32."""
+        return self.places(self.features(x))
+
+    def places(self, f: Tensor) -> Tensor:
+        """(B, P) clipped features -> (B, K, d)."""
+        scores = torch.addmm(self.bias, f, self.weight)
+        pairs = products(scores.narrow(1, self.n_scores, self.leading))
+        scores = torch.addmm(scores.narrow(1, 0, self.n_scores), pairs, self.of_pairs)
+        return scores.sigmoid_().mul_(self.unit).view(-1, self.folds, self.dim)
+
+
+def products(g: Tensor) -> Tensor:
+    """(n, m) -> (n, m * m): of every two."""
+    return (g.unsqueeze(2) * g.unsqueeze(1)).flatten(1)
+
+
+def fit_heads(
+    g: Tensor, y: Tensor, outside: Tensor, w: Tensor, l2: float, max_iter: int, stop: StopRule | None, least: int = 0
+) -> tuple[Tensor, Tensor, list[int], int]:
+    """K ridge logistic regressions by Newton's method with a line search, from where they start.
+
+    g (n, W) features, y (n,) labels, outside (K, n) bool: which rows train head k.  w (K, W+1) float64: where each starts,
+    its bias last.  Each minimises its log loss + l2/2 |w|^2: convex, so it ends at one place wherever it starts. A head
+    that says held-out labels worse than their base rate does says the base rate: its own gate, for a common one would let
+    fold k's labels choose head k.  At most `max_iter` steps, the first `least` however late.
+    Returns w, the logit of each row by each head without it (K, n), the heads that say the base rate, and the steps taken.
+    """
+    small = torch.cat([g, torch.ones(len(g), 1)], 1)
+    g, y, mask = small.double(), y.double(), outside.double()
+    ridge = torch.full_like(w, l2)
+    ridge[:, -1] = 1e-3  # the base rate is not shrunk
+
+    def objective(w: Tensor) -> Tensor:
+        s = w @ g.T
+        return (mask * (F.softplus(s) - y * s)).sum(1) + 0.5 * (ridge * w * w).sum(1)
+
+    def triangle(k: int, p: Tensor) -> Tensor:
+        """Cholesky factor of head k's Hessian, (W+1, W+1); p (n,) what it says."""
+        curvature = (mask[k] * p * (1.0 - p)).float()
+        product = (small * curvature[:, None]).T @ small  # a step need not be exact
+        found: Tensor = torch.linalg.cholesky(product.double() + torch.diag(ridge[k]))
+        return found
+
+    # Every head takes part in every product, done or not: of another shape it would round otherwise, and so tell head k
+    # of fold k's labels by the last step of another head. Its factor is its own affair for the same reason.
+    done, before, step = torch.zeros(len(w), dtype=torch.bool), objective(w), 0
+    factors = [triangle(k, torch.sigmoid(w[k] @ g.T)) for k in range(len(w))]
+    stale, last = done, torch.ones(len(w), dtype=torch.float64)
+    while step < max_iter and not done.all() and not (stop is not None and stop.exhausted(step, least)):
+        p = torch.sigmoid(w @ g.T)
+        for k in stale.nonzero().flatten().tolist():
+            factors[k] = triangle(k, p[k])
+        slope = (mask * (p - y)) @ g + ridge * w
+        d = torch.cholesky_solve(slope[..., None], torch.stack(factors))[..., 0]
+        d[done] = 0.0
+        for _ in range(6):
+            after = objective(w - d)
+            rises = after > before + 1e-9 * before.abs()
+            if not rises.any():
+                break
+            d[rises] /= 2.0
+        d[rises] = 0.0
+        w, before, step = w - d, torch.where(rises, before, after), step + 1
+        size, fresh = d.abs().amax(1), stale | (step == 1)
+        done |= (size * (size / last).clamp(max=1.0) < 2e-4) & (fresh | ~rises)  # about what the next step would be
+        # A step with a former factor costs a tenth: a new one where that serves no more.
+        stale, last = ~done & (rises | (size > (last / 4.0).clamp(max=0.3))), size
+    left_out = leave_one_out(small, y, w @ g.T, torch.stack(factors))
+    rate = torch.logit((mask @ y) / mask.sum(1))[:, None].expand_as(left_out)
+    worse = masked_loss(left_out, y, mask) > masked_loss(rate, y, mask)
+    w = torch.where(worse[:, None], 0.0, w)  # anew: who has the former heads keeps them
+    w[worse, -1] = rate[worse, 0]
+    return w, torch.where(worse[:, None], rate, left_out), worse.nonzero().flatten().tolist(), step
+
+
+def leave_one_out(x: Tensor, y: Tensor, s: Tensor, factors: Tensor) -> Tensor:
+    """(K, n) logits of every row by the head without it, to first order: Rad and Maleki (2020), JRSS B 82(4).
+
+    x (n, W+1), y (n,).  s (K, n) logits by the heads.  factors (K, W+1, W+1) of the Hessians.
+    """
+    p = torch.sigmoid(s)
+    lever = torch.stack([((x @ each) * x).sum(1) for each in torch.cholesky_inverse(factors).float()])
+    return s + lever * (p - y) / (1.0 - lever * p * (1.0 - p)).clamp(min=0.05)
+
+
+def masked_loss(s: Tensor, y: Tensor, mask: Tensor) -> Tensor:
+    """(..., K, n) logits -> (..., K) mean log losses of labels (n,) on the rows that count, mask (K, n)."""
+    return (mask * (F.softplus(s) - y * s)).sum(-1) / mask.sum(1)
+
+
+class Tower(NamedTuple):
+    """Principal components of some of the features, and the heads on them."""
+
+    axes: Tensor  # (P of the tower, W), scaled so that all traces together have the tower's variance
+    centre: Tensor  # (W,) what is added
+    w: Tensor  # (K, W+1) float64, each head's bias last
+
+    @classmethod
+    def over(cls, f: Tensor, width: int, variance: float, weights: Tensor, scores: Tensor) -> Self:
+        """Of standardised features (n, P), with heads near `weights` (P, K) on them, whose mean is `scores` (K,)."""
+        centred = f - f.mean(0)
+        # In float32, in half the time: components are told from noise to 1e-6.
+        sizes, axes = torch.linalg.eigh(centred.T @ centred / len(f))
+        sizes, axes = (each[..., -width:].flip(-1) for each in (sizes.clamp(min=0.0), axes))
+        axes = axes * (sizes > 1e-6 * sizes[0])
+        size = (variance / sizes.sum().clamp(min=1e-9)).sqrt()
+        w, scaled = torch.cat([(axes.T @ weights / size).T, scores[:, None]], 1).double(), axes * size
+        return cls(scaled, -(f.mean(0) @ scaled), w)
+
+    def components(self, f: Tensor) -> Tensor:
+        """(n, P) -> (n, W)."""
+        return torch.addmm(self.centre, f, self.axes)
+
+    def heads(self) -> tuple[Tensor, Tensor]:
+        """Weights (P, K) and biases (K,) on the features."""
+        w, bias = self.w[:, :-1], self.w[:, -1]
+        return (self.axes.double() @ w.T).float(), (bias + w @ self.centre.double()).float()
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class RocketReducer(Reducer):
+    """Embed traces by drawn kernels and cross-fitted logistic heads.
+
+    The first axis of the embedding is the predicted probability of success; the second is there to be seen.
+
+    Parameters
+    ----------
+    n_components : {1, 2}, default 2
+    folds : int, default 5
+        K, heads and spaces.
+    kernels, dilations, regions : int, default 28, 5, 3
+        Sizes of the first tower, F, D and R.
+    groups : int, default 2
+        G, groups of competing kernels of the second tower; 0 leaves it out.
+    width : int, default 128
+        Principal components that are kept of each tower.
+    l2 : float, default 0.5
+        Ridge of the heads, in units of one label each.
+    max_iter : int, default 20
+        Newton steps of the heads in one fit, at most.
+    random_state : int, RandomState or None, default 0
+        Of all that is drawn.
+
+    Attributes
+    ----------
+    n_iter_ : int
+        Steps of the last fit.
+    holdout_losses_ : array of float64, shape (K,)
+        Leave-one-out log losses of the heads, each on rows outside its fold.
+    note_ : str
+        One line for the operator.
+    """
+
+    uses_labels = True
+    scores = True
+    min_traces = MIN_TRACES
+    own_unit = True  # a radius of 0.07 is seven in a hundred, never rescaled
+
+    n_components: int = 2
+    folds: int = 5
     kernels: int = 28
     dilations: int = 5
     regions: int = 3
     groups: int = 2
     width: int = 128
     l2: float = 0.5
+    max_iter: int = 20
+    random_state: Any = 0
 
-    def make_features(self, channels: int, samples: int) -> RocketEncoder:
-        expect(self.regions <= 16, "regions <= 16", self.regions)
-        expect(is_whole(self.groups, 0, 64), "groups from 0 to 64, an integer", self.groups)
-        sizes = self.kernels, self.dilations, self.regions, self.groups
-        return RocketEncoder(channels, samples, self.average_, *sizes)
+    @property
+    def n_spaces(self) -> int:
+        return int(self.folds)
+
+    def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
+        """Fit afresh.
+
+        folds : (n,) permanent folds; None: by content.
+        Raises SettingError where a setting is out of range, or a head would see one class alone.
+        """
+        traces = self.check_traces(X, reset=True)
+        labels = binary_labels(y, len(traces), type(self).__name__)
+        folds = content_fold(traces, self.folds) if folds is None else np.asarray(folds, dtype=np.int64)
+        within = folds.shape == labels.shape and folds.min() >= 0 and folds.max() < self.folds
+        expect(within, f"{len(labels)} folds from 0 to {self.folds - 1}", folds)
+        self._start(traces)
+        self._fit_heads(self.raw_features(traces), labels, folds)
+        return self
+
+    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
+        """Fit the heads from their present weights, on features that the first training set; see `Reducer.train`."""
+        expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first")
+        raw = self.raw_features(self._begun(X), numbers)
+        self._fit_heads(raw, binary_labels(y, len(X), type(self).__name__), folds, stop, numbers)
+        with torch.inference_mode():
+            places = in_chunks(lambda some: self.net_.places(self.net_.features.clipped(some)), raw, 16 * CHUNK)
+            return own_places(places.numpy(), folds)
+
+    def blank(self, X: Floats) -> FeatureEmbedding:
+        new: Self = self if len(X) >= MIN_TRACES or "net_" in vars(self) else clone(self)
+        new._begun(X)
+        return new.net_
+
+    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
+        """Compute the features of traces that a store brings: in the first retrain it would take too long."""
+        if len(X) >= MIN_TRACES:
+            self.raw_features(self._begun(X), numbers)
+
+    def _begun(self, X: Floats) -> Floats:
+        """The traces, checked, once there are features for them: the first ones that come set these."""
+        if "net_" not in vars(self):
+            self._start(self.check_traces(X, reset=True))
+        return self.check_traces(X)
 
     def _start(self, traces: Floats) -> None:
+        """Learn what stays where it is from now on: the scales of the channels and the filters. No label is read."""
         self.average_ = averaging(torch.from_numpy(traces))
-        super()._start(traces)
+        self._build(*self.trace_shape_)
+        self.net_.features.learn(torch.from_numpy(traces), np.random.default_rng(seed_of(self.random_state)))
+
+    def _build(self, channels: int, samples: int) -> None:
+        self.check()
+        sizes = self.kernels, self.dilations, self.regions, self.groups
+        features = RocketEncoder(channels, samples, self.average_, *sizes)
+        leading = min(LEADING, self.width, features.towers[0].stop)
+        self.net_ = FeatureEmbedding(features, self.folds, self.n_components, leading).eval()
+        self.n_fits_ = self.n_seen_ = 0
+        self.towers_: list[Tower] = []
+        self._numbers = np.zeros(0, dtype=np.int64)  # of the labels that were seen last
+        self._raw = torch.empty(0, len(features.gain))
+
+    def _fit_heads(
+        self, raw: Tensor, labels: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None
+    ) -> None:
+        """Train head k on rows outside fold k of the features (n, P), from the present weights."""
+        with torch.no_grad():
+            if len(raw) >= GROWN * self.n_seen_ or self.n_fits_ % FITS == 0:
+                self._compress(raw)
+            least = 0 if self.n_fits_ else FIRST_STEPS
+            rows = np.arange(len(raw))
+            if len(rows) > TRAIN_TRACES:
+                # A draw that is blind to labels, even in time, and mostly the last fit's: the heads are near their places.
+                draw = (rows if numbers is None else numbers).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+                rows = np.sort(np.argpartition(draw, TRAIN_TRACES)[:TRAIN_TRACES])
+                raw = raw[rows]
+            outside = self.trained_on(folds[rows])
+            for k, some in enumerate(outside):
+                if (classes := len(np.unique(labels[rows][some]))) < 2:
+                    raise one_class_outside(k, int(some.sum()), classes)
+            f, y, rows_of = self.net_.features.clipped(raw), torch.from_numpy(labels[rows]), torch.from_numpy(outside)
+            towers, said = [], []
+            for tower, seen in zip(self.towers_, self._seen(f), strict=True):
+                w, *rest = fit_heads(tower.components(seen), y, rows_of, tower.w, self.l2, self.max_iter, stop, least)
+                towers.append(tower._replace(w=w))
+                said.append(rest)
+            left_out, unsure, steps = zip(*said, strict=True)
+            # Leave-one-out logits of rows outside fold k alone weigh the towers of head k, one after the other.
+            mixed, own, tried = left_out[0], [torch.ones(self.folds)], torch.linspace(0.0, 1.0, SHARES).double()
+            for i, each in enumerate(left_out[1:], 1):
+                losses = masked_loss(each + tried[:, None, None] * (mixed - each), y, rows_of.double())
+                doubt = DOUBT if i == len(self.net_.features.towers) else 0.0  # of products
+                share = tried[(losses + doubt * (1.0 - tried)[:, None] / rows_of.sum(1)).argmin(0)]
+                mixed = each + share[:, None] * (mixed - each)
+                own = [*(share.float() * former for former in own), 1.0 - share.float()]
+            self._answer_by(towers, own)
+            losses = masked_loss(mixed, y, rows_of.double())
+        self.towers_, self.n_iter_ = towers, max(steps)
+        self.holdout_losses_, self.n_fits_ = losses.numpy(), self.n_fits_ + 1
+        heads = ", ".join(map(str, sorted(set.intersection(*map(set, unsure)))))
+        self.note_ = f"head {heads} says the base rate: it would have done worse" if heads else ""
+
+    def _answer_by(self, towers: list[Tower], shares: list[Tensor]) -> None:
+        """Put the towers' heads into what answers, each head in its share (K,) of the logit."""
+        net, first = self.net_, slice(0, self.net_.n_scores, self.n_components)
+        net.bias[first] = 0.0
+        weights = [*(net.weight[columns] for columns in net.features.towers), net.of_pairs]
+        for tower, own, held in zip(towers, shares, weights, strict=False):
+            weight, bias = tower.heads()
+            held[:, first] = own * weight
+            net.bias[first] += own * bias
+
+    def _seen(self, f: Tensor) -> list[Tensor]:
+        """What each tower sees of features (n, P): its own ones, the last of all products of leading components."""
+        seen = [f[:, columns] for columns in self.net_.features.towers]
+        return [*seen, products(self.towers_[0].components(seen[0])[:, : self.net_.leading])]
+
+    def trained_on(self, folds: Ints) -> NDArray[np.bool_]:
+        """(n,) -> (K, n): fold k never trains head k, or its labels would count themselves."""
+        return np.asarray(folds != np.arange(self.folds)[:, None])
+
+    def _compress(self, raw: Tensor) -> None:
+        """Find the principal components of raw features (n, P), and what the heads, if any, come to on these."""
+        net, self.n_seen_ = self.net_, len(raw)
+        some = raw[:: 1 + (len(raw) - 1) // 1000]
+        f, gain, former = net.features.clipped(some), net.features.gain.clone(), self.towers_
+        net.features.standardise(some)
+        now = net.features.clipped(some)
+        self.towers_ = []
+        for i, (columns, variance) in enumerate(zip(net.features.towers, VARIANCES, strict=False)):
+            weights, scores = torch.zeros(len(gain[columns]), self.folds), torch.zeros(self.folds)
+            if former:
+                weights, biases = former[i].heads()
+                scores = torch.addmm(biases, f[:, columns], weights).mean(0)
+                weights = weights * (gain / net.features.gain)[columns, None]
+            self.towers_.append(Tower.over(now[:, columns], self.width, variance, weights, scores))
+        columns, n, first = net.features.towers[0], net.n_scores, self.towers_[0]
+        # The heads of the products begin anew: they are products of other components now.
+        blank = torch.zeros(net.leading**2, self.folds), torch.zeros(self.folds)
+        self.towers_.append(Tower.over(self._seen(now)[-1], self.width, PAIRS, *blank))
+        net.weight[columns, n:] = first.axes[:, : net.leading]
+        net.bias[n:] = first.centre[: net.leading]
+        if self.n_components == 2:  # the second axis is the first component, of one deviation at both sides in the sigmoid
+            axis = first.axes[:, 0]
+            second = 2.0 * axis / (now[:, columns] @ axis).std().clamp(min=1e-12)
+            second = second if second @ net.weight[columns, 1] >= 0 else -second  # its sign as it was
+            net.weight[columns, 1:n:2], net.bias[1:n:2] = second[:, None], -(now[:, columns].mean(0) @ second)
+
+    def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
+        """(n, C, T) -> (n, P), not standardised: computed once a label's number, and forgotten once that is not given."""
+        with torch.no_grad():
+            if numbers is None:
+                return self._computed(traces)
+            at = np.searchsorted(self._numbers, numbers)
+            new = np.append(self._numbers, -1)[at] != numbers
+            if new.all():
+                at, self._raw = np.arange(len(at)), self._computed(traces)
+            elif new.any():
+                at[new] = len(self._raw) + np.arange(new.sum())
+                self._raw = torch.cat([self._raw, self._computed(traces[new])])
+            joined = len(at) > 0 and (np.diff(at) == 1).all()  # as long as nothing is forgotten: then none is moved
+            self._numbers, self._raw = numbers, self._raw[at[0] : at[-1] + 1] if joined else self._raw[torch.from_numpy(at)]
+        return self._raw
+
+    def _computed(self, traces: Floats) -> Tensor:
+        """(n, C, T) -> (n, P), the same to the bit whatever is beside a trace: each chunk is full, or filled up."""
+        features, x, n = self.net_.features, torch.from_numpy(traces), len(traces)
+        whole, out = n // CHUNK * CHUNK, torch.empty(n, len(features.gain))
+        rest = torch.zeros(CHUNK, *x.shape[1:])
+        rest[: n - whole] = x[whole:]
+        out[whole:] = features.raw(rest)[: n - whole]
+        if n < MANY:
+            InChunks(features)(x[:whole], out[:whole])
+            return out
+        many = script(InChunks(features))  # of a store that is opened
+        for _ in range(2):  # TorchScript's first calls compile
+            many(x[:CHUNK], out[:CHUNK])
+        with ThreadPoolExecutor(2, "dengine-features", torch.set_num_threads, (1,)) as pool:
+            pieces = [slice(i, min(i + PIECE, whole)) for i in range(0, whole, PIECE)]
+            list(pool.map(lambda piece: many(x[piece], out[piece]), pieces))
+        return out
+
+    def __getstate__(self) -> dict[str, Any]:
+        state: dict[str, Any] = super().__getstate__()
+        return state | {"_raw": self._raw.numpy()} if "net_" in vars(self) else state  # an array travels at less cost
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state | {"_raw": torch.from_numpy(state["_raw"])} if "net_" in state else state)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """A training changes the module in place; all else it binds anew, so that may be shared."""
+        new = copy.copy(self)
+        if "net_" in vars(self):
+            new.net_ = copy.deepcopy(self.net_, memo)
+        return new
+
+    @property
+    def report(self) -> FitReport:
+        check_is_fitted(self, "net_")
+        return FitReport(self.n_iter_, self.note_)
+
+    def embed(self, X: ArrayLike) -> Floats:
+        traces = self.check_traces(X)
+        with torch.inference_mode():
+            out: Floats = in_chunks(self.net_, torch.from_numpy(traces)).numpy()
+        return out
+
+    def module(self) -> nn.Module:
+        check_is_fitted(self, "net_")
+        return self.net_
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        return super().get_state() | {"average": np.array(self.average_)}
+        check_is_fitted(self, "net_")
+        counts = np.array([*self.trace_shape_, self.average_, self.n_fits_, self.n_seen_, self.n_iter_])
+        own = {"counts": counts, "losses": self.holdout_losses_}
+        own |= {f"{name}.{i}": v.numpy() for i, each in enumerate(self.towers_) for name, v in each._asdict().items()}
+        return own | {f"net.{name}": value.numpy().copy() for name, value in self.net_.state_dict().items()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        self.average_ = int(state["average"])
-        return super().set_state(state)
+        channels, samples, self.average_, n_fits, n_seen, self.n_iter_ = (int(v) for v in state["counts"])
+        self.trace_shape_, self.n_features_in_ = (channels, samples), channels * samples
+        self._build(channels, samples)
+        restore(self.net_, part(state, "net."))
+        held = (part(state, f"{name}.") for name in Tower._fields)
+        self.towers_ = [
+            Tower(*(torch.from_numpy(np.array(v)) for v in each))
+            for each in zip(*(each.values() for each in held), strict=True)
+        ]
+        self.n_fits_, self.n_seen_, self.holdout_losses_, self.note_ = n_fits, n_seen, np.array(state["losses"]), ""
+        return self
+
+    def check(self) -> None:
+        """Raise SettingError for a parameter out of its range."""
+        for name in ("n_components", "folds", "max_iter", "kernels", "dilations", "regions", "width"):
+            value = getattr(self, name)
+            expect(is_whole(value, 1, MOST), f"{name} >= 1, an integer", value)
+        expect(self.regions <= 16, "regions <= 16", self.regions)
+        expect(is_whole(self.groups, 0, 64), "groups from 0 to 64, an integer", self.groups)
+        expect(self.n_components <= 2, "n_components 1 or 2", self.n_components)
+        expect(self.l2 > 0, "l2 > 0, or separable labels have no solution", self.l2)
+        expect(self.folds >= 2, "folds >= 2 where labels are used", self.folds)
+
+
+def in_chunks(f: Any, x: Tensor, size: int = CHUNK) -> Tensor:
+    """The function over x, so many rows at a time."""
+    return torch.cat([f(x[i : i + size]) for i in range(0, max(1, len(x)), size)])
 
 
 def _taps(frames: int, dilations: int, places: int) -> NDArray[np.int64]:

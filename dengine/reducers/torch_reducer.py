@@ -21,6 +21,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, Self
 
 import numpy as np
@@ -41,11 +42,11 @@ from .preprocessing import Preprocessor, averaging
 
 log = logging.getLogger("dengine")
 
-MIN_TRACES = 10
+MIN_TRACES = 20
 CHUNK = 64  # traces that are embedded at once: what they need stays in the cache
 STATISTICS = 256  # traces from which the statistics of batch normalisation are taken
 STEPS_A_LABEL = 1.2  # that training must have had before it is called complete
-BEGINNING = 60  # steps that the first labels get on top
+BEGINNING = 36  # steps on top of these
 HURRY = 2  # times the steps of a retrain, as long as training is behind
 
 
@@ -63,7 +64,7 @@ class Augmentation:
     mixup: float
 
     def __call__(self, x: Tensor, y: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """x (B, K, C, L) and y (B, K) -> the same shapes; traces are mixed within each of the K members."""
+        """Augment x (B, K, C, L) and y (B, K); traces are mixed with others of the same member."""
         batch, members, _, length = x.shape
         offset = torch.from_numpy(rng.integers(-self.shift, self.shift + 1, size=(batch, members, 1, 1)))
         frame = (torch.arange(length) + offset).clamp(0, length - 1)
@@ -127,6 +128,7 @@ class TorchReducer(Reducer):
     uses_labels = True
     scores = True
     own_unit = True
+    min_traces = MIN_TRACES
 
     network: NetworkFactory
     n_components: int = 2
@@ -162,7 +164,7 @@ class TorchReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, or there are fewer than 10 traces.
+            If a parameter is out of its range, or there are fewer than 20 traces.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -184,16 +186,16 @@ class TorchReducer(Reducer):
     def n_steps_due(self, n_labels: int) -> int:
         """Steps that the next retrain takes on so many labels."""
         behind = self._n_steps_wanted(n_labels) - self.n_steps_
-        return int(min(max(behind, self.steps), HURRY * self.steps))
+        return min(max(behind, self.steps), HURRY * self.steps)
 
-    def _n_steps_wanted(self, n_labels: int) -> float:
-        return min(self.fit_steps, BEGINNING + STEPS_A_LABEL * n_labels)
+    def _n_steps_wanted(self, n_labels: int) -> int:
+        return int(min(self.fit_steps, BEGINNING + STEPS_A_LABEL * n_labels))
 
     def _start(self, traces: Floats) -> None:
         """Build preprocessor and members for traces (n, C, T), from which the scales are read; no label is read."""
         expect(len(traces) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(traces), "verify more parts first")
         x = torch.from_numpy(traces)
-        self._build(*traces.shape[1:], averaging(x))
+        self._build(traces.shape[1], traces.shape[2], averaging(x))
         self.preprocessor_.learn(x)
 
     def _build(self, channels: int, samples: int, average: int) -> None:
@@ -218,7 +220,7 @@ class TorchReducer(Reducer):
     def _train(self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule, steps: int) -> Tensor:
         """Train on traces (n, C, T) and let the averaged members answer; returns the preprocessed traces."""
         with torch.no_grad():
-            x = self.preprocessor_(torch.from_numpy(traces))
+            x: Tensor = self.preprocessor_(torch.from_numpy(traces))
         self.n_labels_ = len(labels)
         self.fit_loop(x, torch.from_numpy(labels).float(), folds, stop, steps)
         self.estimate_statistics(x)
@@ -230,7 +232,7 @@ class TorchReducer(Reducer):
         optimizer = self.make_optimizer()
         augmentation = Augmentation(self.shift, self.gain, self.noise, self.mixup)
         rng = np.random.default_rng([self.seed_, self.n_steps_])
-        losses = []
+        losses: list[float] = []
         self.members_.train()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(rng.integers(2**31)))  # of dropout
@@ -248,7 +250,7 @@ class TorchReducer(Reducer):
         logits = self.members_(x)
         loss = F.binary_cross_entropy_with_logits(logits, y)
         optimizer.zero_grad()
-        (self.folds * loss).backward()  # the members share nothing: each gets the gradient of its own mean loss
+        (self.folds * loss).backward()  # type: ignore[no-untyped-call]  # the members share nothing: each gets the gradient of its own mean loss
         optimizer.step()
         self.n_steps_ += 1
         self.average_weights()
@@ -257,7 +259,7 @@ class TorchReducer(Reducer):
     def make_optimizer(self) -> torch.optim.Optimizer:
         """AdamW as the last training left it; weights decay, biases and batch normalisation do not."""
         named = list(self.members_.named_parameters())
-        groups = [
+        groups: list[dict[str, Any]] = [
             {"params": [p for name, p in named if _decays(name, p)]},
             {"params": [p for name, p in named if not _decays(name, p)], "weight_decay": 0.0},
         ]
@@ -319,8 +321,8 @@ class TorchReducer(Reducer):
     def blank(self, X: Floats) -> Encoder:
         if "encoder_" in vars(self):
             return self.encoder_
-        new = clone(self)
-        new._build(*X.shape[1:], averaging(torch.from_numpy(X)))
+        new: Self = clone(self)
+        new._build(X.shape[1], X.shape[2], averaging(torch.from_numpy(X)))
         return new.encoder_
 
     def module(self) -> Encoder | None:
@@ -329,7 +331,7 @@ class TorchReducer(Reducer):
 
     @property
     def n_steps_left_(self) -> int:
-        return max(0, int(min(self.fit_steps, STEPS_A_LABEL * self.n_labels_)) - self.n_steps_)
+        return max(0, self._n_steps_wanted(self.n_labels_) - self.n_steps_)
 
     @property
     def report(self) -> FitReport:
@@ -380,9 +382,7 @@ class TorchReducer(Reducer):
             expect(0.0 <= getattr(self, name) < float("inf"), f"{name} >= 0", getattr(self, name))
 
 
-def draw_batches(
-    folds: Ints, n_folds: int, batch_size: int, steps: int, rng: np.random.Generator
-) -> Iterator[Tensor]:
+def draw_batches(folds: Ints, n_folds: int, batch_size: int, steps: int, rng: np.random.Generator) -> Iterator[Tensor]:
     """Draw rows for each step and member, without replacement until all rows of a member were drawn.
 
     Parameters
@@ -432,7 +432,7 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
     SettingError
         If the file cannot be read, or is of another network.
     """
-    with instead(SettingError, f"The checkpoint {path} cannot be read", OSError, RuntimeError, ValueError, EOFError):
+    with instead(SettingError, f"The checkpoint {path} cannot be read", OSError, RuntimeError, ValueError, EOFError, UnpicklingError):
         single = torch.load(path, map_location="cpu", weights_only=True)
     own = members.state_dict()
     wanted = {name: _of_one_member(name, value, members.count) for name, value in own.items()}

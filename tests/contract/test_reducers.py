@@ -15,7 +15,7 @@ from dengine.testing import REDUCER_CHECKS, check_reducer, toy_traces
 
 QUICK: dict[str, dict[str, Any]] = {
     "umap": {"n_epochs": 40, "n_neighbors": 8},
-    "conv": {"folds": 2},
+    "conv": {"folds": 2, "steps": 4, "fit_steps": 30},
     "rocket": {"folds": 2},
 }
 

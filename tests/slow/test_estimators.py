@@ -19,7 +19,7 @@ from dengine.reducers.base import LabelFree, Reducer
 
 ESTIMATORS = (
     WilsonRadiusClassifier(),
-    ConvReducer(),
+    ConvReducer(fit_steps=10),
     RocketReducer(),
     PcaReducer(),
     UmapReducer(n_neighbors=5, n_epochs=20),  # some checks have 20 rows, or 12: UMAP wants more than n_neighbors
@@ -39,7 +39,7 @@ EXCLUDED: dict[type, dict[str, str]] = {
 
 
 SMALL: dict[str, Reducer] = {
-    "conv": ConvReducer(),
+    "conv": ConvReducer(fit_steps=30),
     "rocket": RocketReducer(),
     "pca": PcaReducer(),
     "umap": UmapReducer(n_neighbors=5, n_epochs=20),

@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from dengine import load_dataset
+from dengine import ConvReducer, load_dataset
+from dengine.testing import toy_traces
 
 FOLDER = Path(__file__).resolve().parents[2] / "training"
 Run = Callable[..., str]
@@ -76,3 +77,40 @@ def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeat
     assert (data.y.tolist(), data.unit, round(data.rate_hz)) == ([1, 1, 0], "N·m", 833)
     with np.load(tmp_path / "out.npz") as stored:
         assert (stored["workpiece"].tolist(), stored["nth_run"].tolist()) == (["a", "b", "a"], [0, 0, 1])
+
+
+def test_a_trained_encoder_beats_the_base_rate_and_starts_conv(run: Run, tmp_path: Path) -> None:
+    X, y = toy_traces(120)
+    np.savez(tmp_path / "toy.npz", X=X, y=y)
+    out = tmp_path / "encoder"
+    words = ["--data", tmp_path / "toy.npz", "--epochs", 3, "--held-out", 0.25, "--out", out]
+    printed = run("train_encoder", *words)
+    assert f"Wrote {out}/encoder.pt" in printed
+
+    curve = pd.read_csv(out / "curve.csv")
+    rate = y.mean()
+    base_rate = -(rate * np.log(rate) + (1 - rate) * np.log(1 - rate))
+    assert curve["epoch"].tolist() == [1, 2, 3]
+    assert curve["log_loss"].min() < 0.8 * base_rate
+    assert (out / "curve.png").stat().st_size > 0
+
+    fresh = ConvReducer(folds=2).blank(X).members.state_dict()
+    started = ConvReducer(folds=2, checkpoint=str(out / "encoder.pt")).blank(X).members.state_dict()
+    assert fresh.keys() == started.keys()
+    assert not fresh["weight"].equal(started["weight"])
+    assert started["weight"][0].equal(started["weight"][1])  # both members start from one encoder
+
+
+def test_a_training_replaces_its_section_of_a_card_and_no_other(run: Run, tmp_path: Path) -> None:
+    X, y = toy_traces(60)
+    np.savez(tmp_path / "toy.npz", X=X, y=y)
+    card = tmp_path / "card.md"
+    card.write_text("## model.ts\n\nBefore.\n\n## encoder.pt\n\nOld.\n\n## Later\n\nAfter.\n")
+    for _ in range(2):
+        run("train_encoder", "--data", tmp_path / "toy.npz", "--epochs", 1, "--out", tmp_path)
+    text = card.read_text(encoding="utf-8")
+    headings = [line for line in text.splitlines() if line.startswith("## ")]
+    assert headings == ["## model.ts", "## encoder.pt", "## Later"]
+    assert "Before." in text
+    assert "After." in text
+    assert "Old." not in text

@@ -7,8 +7,6 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-import pytest
-
 from tests.support.faults import read_faults
 
 REPO = Path(__file__).resolve().parents[2]
@@ -17,13 +15,8 @@ FILES = {".".join(file.relative_to(REPO).with_suffix("").parts): file for file i
 MODULES = {name: ast.parse(file.read_text("utf-8")) for name, file in FILES.items()}  # a family's is named NAME.__init__
 
 
-PACKAGE_LINES, REST_LINES = 24_000, 20_000
+NODES = 210_000
 KNOWN = {name.removesuffix(".__init__") for name in MODULES} - {"dengine"}
-
-
-def lines(*folders: str) -> int:
-    """Lines of Python below these folders."""
-    return sum(len(file.read_text("utf-8").splitlines()) for each in folders for file in (REPO / each).rglob("*.py"))
 
 
 def test_at_most_ten_modules_stand_at_the_top() -> None:
@@ -31,12 +24,9 @@ def test_at_most_ten_modules_stand_at_the_top() -> None:
     assert len(top) <= 10, f"{len(top)} modules stand at the top; put one into a family: {', '.join(top)}"
 
 
-@pytest.mark.parametrize(
-    ("folders", "most"), [(("dengine",), PACKAGE_LINES), (("tests", "training"), REST_LINES)], ids=["package", "rest"]
-)
-def test_what_comes_in_pushes_something_out(folders: tuple[str, ...], most: int) -> None:
-    found = lines(*folders)
-    assert found <= most, f"{' and '.join(folders)} have {found} lines of Python, {found - most} too many: take some out"
+def test_the_package_keeps_its_size_in_syntax_nodes() -> None:
+    nodes = sum(1 for tree in MODULES.values() for _ in ast.walk(tree))
+    assert nodes <= NODES, f"dengine has {nodes} syntax nodes, {nodes - NODES} too many: take something out"
 
 
 def names(module: str) -> dict[str, str]:
@@ -69,6 +59,7 @@ def bases(module: str) -> Iterable[tuple[str, str]]:
 def test_no_base_of_ours_has_a_single_subclass() -> None:
     pairs = [pair for module in MODULES for pair in bases(module)]
     aside = {name for name, base in pairs if base in ("Protocol", "typing.Protocol", "Exception") or name.endswith("Error")}
+    aside.add("dengine.reducers.torch_reducer.TorchReducer")  # users derive from it, too
     subclasses = {base: [name for name, of in pairs if of == base] for _, base in pairs if base.startswith("dengine.")}
     alone = {base: names[0] for base, names in subclasses.items() if len(names) == 1 and base not in aside}
     told = ", ".join(f"{base} (of {name})" for base, name in alone.items())
@@ -87,7 +78,7 @@ def test_no_module_is_imported_by_a_string() -> None:
 
 
 def test_each_fault_of_the_net_fits_the_code_and_names_tests_that_are_there() -> None:
-    assert len(read_faults([])) == 61
+    assert len(read_faults([])) == 64
 
 
 def test_tests_go_through_public_faces() -> None:

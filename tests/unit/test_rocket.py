@@ -17,8 +17,18 @@ from dengine.errors import SettingError, StoreError, TraceError
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule
 from dengine.reducers.preprocessing import averaging
-from dengine.reducers.features import FIRST_STEPS, MANY, PAIRS, SHARES, fit_heads, masked_loss, products
-from dengine.reducers.rocket import RocketEncoder
+from dengine.reducers.rocket import (
+    FIRST_STEPS,
+    LEADING,
+    MANY,
+    PAIRS,
+    SHARES,
+    VARIANCES,
+    RocketEncoder,
+    fit_heads,
+    masked_loss,
+    products,
+)
 
 
 def traces(n=160, channels=1, samples=152, seed=0):
@@ -205,16 +215,15 @@ def test_the_components_are_found_anew_where_the_traces_grew_by_half_and_the_sec
     assert found == [False, True, True]
 
 
-@pytest.mark.parametrize("kind", [partial(RocketReducer, groups=0), RocketReducer, RocketReducer])
+@pytest.mark.parametrize("kind", [partial(RocketReducer, groups=0), RocketReducer])
 def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_tower(kind: Any) -> None:
     X, y = traces(100)
     reducer = kind(folds=3).fit(X, y)
     with torch.no_grad():
         f, logits = reducer.net_.features(torch.from_numpy(X)), []
         seen = [f[:, columns] for columns in reducer.net_.features.towers]
-        if reducer.leading:
-            seen.append(products(reducer.towers_[0].components(seen[0])[:, : reducer.leading]))
-        variances = (*reducer.variances[: len(reducer.net_.features.towers)], PAIRS)
+        seen.append(products(reducer.towers_[0].components(seen[0])[:, :LEADING]))
+        variances = (*VARIANCES[: len(reducer.net_.features.towers)], PAIRS)
         for tower, own, variance in zip(reducer.towers_, seen, variances, strict=False):
             g = own.double() @ tower.axes.double() + tower.centre
             logits.append((g @ tower.w[:, :-1].T + tower.w[:, -1]).numpy())
@@ -260,8 +269,8 @@ def test_where_a_trace_is_flat_every_kernel_of_a_group_counts_alike() -> None:
 def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkeypatch) -> None:
     X, y = traces(90)
     reducer, folds, computed, found = RocketReducer(), content_fold(X, 5), [], []
-    raw = RocketFeatures.raw
-    monkeypatch.setattr(RocketFeatures, "raw", lambda self, x: (computed.append(len(x)), raw(self, x))[1])
+    raw = RocketEncoder.raw
+    monkeypatch.setattr(RocketEncoder, "raw", lambda self, x: (computed.append(len(x)), raw(self, x))[1])
     for first, last in ((0, 60), (30, 90), (30, 90), (0, 60)):
         reducer.train(X[first:last], y[first:last], folds[first:last], numbers=np.arange(1 + first, 1 + last))
         found.append(sum(computed))
@@ -313,7 +322,7 @@ def test_traces_of_any_shape_have_finite_features_the_same_when_scripted(samples
 
 @pytest.mark.parametrize("retrained_before", [True, False])
 def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(tmp_path, monkeypatch, retrained_before) -> None:
-    url, recipe = str(tmp_path / "cell.sqlite"), Recipe("conv", params={"kernels": 6, "width": 8}, retrain_every=40)
+    url, recipe = str(tmp_path / "cell.sqlite"), Recipe("rocket", params={"kernels": 6, "width": 8}, retrain_every=40)
     X, y = traces(120 if retrained_before else 520)
     if retrained_before:
         with DataEngine(recipe=recipe, store=url, replaying=True) as engine:

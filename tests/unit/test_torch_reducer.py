@@ -28,7 +28,11 @@ class SmallNetwork(nn.Module):
     def __init__(self, channels: int, samples: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Conv1d(channels, 6, 7, stride=4, padding=3), nn.BatchNorm1d(6), nn.ReLU(), nn.AdaptiveAvgPool1d(4), nn.Flatten()
+            nn.Conv1d(channels, 6, 7, stride=4, padding=3),
+            nn.BatchNorm1d(6),
+            nn.ReLU(),
+            nn.AdaptiveAvgPool1d(4),
+            nn.Flatten(),
         )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -94,6 +98,17 @@ def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit() -> None:
     assert restored.n_steps_ == reducer.n_steps_ > 0
 
 
+def test_a_retrain_goes_on_with_the_moments_of_the_optimizer() -> None:
+    X, y = toy_traces(60)
+    reducer, folds = quick(), content_fold(X, 3)
+    reducer.train(X, y, folds)
+    state = reducer.get_state()
+    moments = {name for name in state if name.startswith("optimizer.")}
+    assert moments
+    without = clone(reducer).set_state({name: state[name] for name in state if name not in moments})
+    assert not np.array_equal(without.train(X, y, folds), reducer.train(X, y, folds))
+
+
 def test_references_lie_where_the_same_traces_are_embedded_later() -> None:
     X, y = toy_traces(90)
     reducer, folds = quick(), content_fold(X, 3)
@@ -125,6 +140,18 @@ def test_a_retrain_takes_its_steps_and_twice_as_many_where_training_is_behind() 
         reducer.train(X, y, folds)
         taken.append((reducer.report.n_steps, reducer.report.n_steps_left))
     assert taken == [(10, 12), (10, 2), (5, 0), (5, 0)]
+
+
+def test_an_engine_waits_for_enough_labels_and_drops_no_retrain(tmp_path: Any) -> None:
+    X, y = toy_traces(40)
+    recipe = Recipe("conv", {"folds": 2, "steps": 4, "fit_steps": 8}, radius=0.07, retrain_every=10)
+    engine = DataEngine(recipe=recipe, replaying=True)
+    reports = []
+    for x, good in zip(X, y, strict=True):
+        reports.append(engine.report(engine.decide(x).id, bool(good)))
+    trained_on = [report.n_traces for report in reports if report is not None]
+    assert trained_on == [20, 30, 40]
+    assert all(report.accepted for report in engine.store.retrains())
 
 
 def test_grouped_members_compute_what_separate_networks_of_the_same_weights_compute() -> None:
@@ -232,7 +259,7 @@ def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(tmp_path: Any, 
 
 def test_a_network_of_another_shape_is_refused_in_a_sentence() -> None:
     X, y = toy_traces(30)
-    with pytest.raises(SettingError, match=r"maps \(B, 2, 120\) to \(B, features\), got one that gives 2 dimensions"):
+    with pytest.raises(SettingError, match=r"maps \(B, 2, 120\) to \(B, features\), got one that gives 3 dimensions"):
         own(lambda channels, samples: nn.Conv1d(channels, 3, 5)).fit(X, y)
 
 

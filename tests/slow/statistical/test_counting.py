@@ -21,7 +21,7 @@ from dengine.model import neighbours as prediction
 from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
 from dengine.reducers import features
-from dengine.reducers.features import FeatureReducer
+from dengine.reducers.rocket import RocketReducer
 from tests.slow.proof.counts import count_noise, mean_square, moved, places, relabelled, weak_signal, white_noise
 from tests.slow.proof.replays import Case, broken, judge
 
@@ -78,7 +78,7 @@ Mutation = Callable[[pytest.MonkeyPatch], None]
 
 
 def heads_of_all_folds(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(FeatureReducer, "trained_on", lambda self, folds: np.ones((self.folds, len(folds)), dtype=np.bool_))
+    patch.setattr(RocketReducer, "trained_on", lambda self, folds: np.ones((self.folds, len(folds)), dtype=np.bool_))
 
 
 def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
