@@ -108,7 +108,9 @@ class Recipe:
             fits = callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type)
             expect(fits, "a recipe, its name, or a scikit-learn transformer", recipe)
             # A reducer of ours keeps the radius of its own recipe: it means something else in each.
-            base = RECIPES.get(type(recipe).__module__.removeprefix("dengine.reducers."), cls())
+            modules = [kind.__module__.removeprefix("dengine.reducers.") for kind in type(recipe).__mro__]
+            names = ["conv" if module == "torch_reducer" else module for module in modules]
+            base = next((RECIPES[name] for name in names if name in RECIPES), cls())
             return replace(base, reducer=recipe, params={})
         if str(recipe) in RECIPES:
             return RECIPES[str(recipe)]

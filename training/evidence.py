@@ -39,12 +39,13 @@ from dengine.experiments.paper import ALPHAS, LOWER_BOUNDS, findings, paper_tabl
 from dengine.experiments.replay import Contender
 from dengine.experiments.tables import write_csv
 from dengine.files import write_output
-from dengine.reducers import RocketReducer
+from dengine.reducers import ConvReducer
+from dengine.reducers.base import StopRule
 
 ROOT, PAGE = Path(__file__).resolve().parents[1], Path("docs/explanation/evidence.md")
 CELLS = ((0.1, 0.9), (0.05, 0.95))  # alpha, LB
 # Seconds of a core that a replay takes.
-SECONDS = {"conv": 2, "ramps": 2, "rocket": 6, "pca": 2, "knn": 1, "wskde": 2, "umap": 14, "gp": 24, "minirocket": 20}
+SECONDS = {"conv": 14, "rocket": 2, "pca": 2, "knn": 1, "wskde": 2, "umap": 14, "gp": 24, "minirocket": 20}
 SHUFFLES = dict.fromkeys(SECONDS, 30) | dict.fromkeys(("umap", "gp", "minirocket"), 10)  # the slow ones have fewer
 GRIDS = {("conv", "wilson"): 30, ("conv", "binomial"): 30, ("umap", "wilson"): 10, ("umap", "binomial"): 5}
 PROMISES = 10  # shuffles of each
@@ -123,11 +124,11 @@ def recorded(name: str, screw: Path | None) -> Dataset:
     return data.cut(round(1.2 * data.rate_hz)) if "1.2 s" in name else data
 
 
-class DishonestReducer(RocketReducer):
-    """conv with heads that are trained on every fold's labels, which are then counted in them: for comparison only."""
+class DishonestReducer(ConvReducer):
+    """conv with members that are trained on the labels of every fold, which are then counted: for comparison only."""
 
-    def trained_on(self, folds: np.ndarray) -> np.ndarray:
-        return np.ones((self.folds, len(folds)), dtype=np.bool_)
+    def fit_loop(self, x: torch.Tensor, y: torch.Tensor, folds: np.ndarray, stop: StopRule, steps: int) -> None:
+        super().fit_loop(x, y, np.full_like(folds, -1), stop, steps)
 
 
 def promises() -> list[Contender]:
@@ -145,17 +146,14 @@ def promises() -> list[Contender]:
     return [Contender(f"conv, {name}", recipe) for name, recipe in found.items()]
 
 
-def conditions(name: str, nth: int) -> Iterator[Contender]:
+def conditions(name: str, nth: int, cells: int) -> Iterator[Contender]:
     """All that the nth shuffle of a set is played with, each once."""
-    asked = [(who, "wilson", *cell) for (who, most), cell in product(SHUFFLES.items(), CELLS) if nth < most]
-    if name == "insertion":
-        cells = list(product(ALPHAS, LOWER_BOUNDS))
-        asked += [(*who, *cell) for (who, most), cell in product(GRIDS.items(), cells) if nth < most]
-    conv = Contender.load("conv").recipe
-    ramps = replace(conv, params={**conv.params, "groups": 0})  # one tower of the two
+    asked = [(who, "wilson", *cell) for (who, most), cell in product(SHUFFLES.items(), CELLS[:cells]) if nth < most]
+    if name == "insertion" and cells == len(CELLS):
+        grid = list(product(ALPHAS, LOWER_BOUNDS))
+        asked += [(*who, *cell) for (who, most), cell in product(GRIDS.items(), grid) if nth < most]
     for who, interval, alpha, bound in dict.fromkeys(asked):
-        one = Contender("ramps", ramps) if who == "ramps" else Contender.load(who)
-        yield one.with_policy(interval=interval, alpha=alpha, lower_bound=bound)
+        yield Contender.load(who).with_policy(interval=interval, alpha=alpha, lower_bound=bound)
     if name in ("insertion", "screw driving") and nth < PROMISES:
         yield from (one.with_policy(alpha=0.1, lower_bound=0.9) for one in promises())
 
@@ -328,6 +326,7 @@ def main() -> None:
     parser.add_argument("--sets", default=",".join(SETS), help="with commas between; all by default")
     parser.add_argument("--only", help="reducers and rivals, with commas between; 'promises' for the variants of conv")
     parser.add_argument("--cycles", type=int, default=1503, help="of a replay, at most")
+    parser.add_argument("--cells", type=int, default=len(CELLS), help="1: at (0.1, 90 %) alone, and no grid")
     args = parser.parse_args()
     names, only = args.sets.split(","), (args.only or f"{','.join(SHUFFLES)},promises").split(",")
     if unknown := {*names, *only} - {*SETS, *SHUFFLES, "promises"}:
@@ -363,7 +362,11 @@ def asked(nth: int, seed: int, name: str, args: Any, only: Sequence[str]) -> tup
     """The parts of one shuffle, and its replays."""
     data = MADE[name](np.random.default_rng(seed)) if name in MADE else recorded(name, args.screw)
     cycles = None if args.cycles >= len(data) else args.cycles
-    who = [one for one in conditions(name, nth) if ("promises" if one.name.startswith("conv, ") else one.name) in only]
+    who = [
+        one
+        for one in conditions(name, nth, args.cells)
+        if ("promises" if one.name.startswith("conv, ") else one.name) in only
+    ]
     return data, [Task(one, seed, cycles, name not in MADE) for one in who]
 
 
