@@ -95,7 +95,9 @@ def prepared(
     if model.untold:
         raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
     if model.spaces.module() is None:
-        raise ExportError(f"{model.name} cannot be scripted: it has no module; use conv, pca or rocket instead.")
+        raise ExportError(
+            f"{model.name} cannot be exported: it gives no module that TorchScript takes; see `Reducer.module`, or use conv, rocket or pca."
+        )
     size = model.n_spaces, model.index.dim
     coin = source.audit_rate, source.seed
     decision = DecisionModule(source.trace, model.predictor, *size, *coin, source.stops_all, source.windows)

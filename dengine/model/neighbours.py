@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, reduce
+from types import FunctionType
 from typing import Any, Self
 
 import numpy as np
@@ -106,6 +107,7 @@ class InPython(nn.Module):
         return torch.from_numpy(self.reducer.embed(x.numpy()))
 
 
+CONSTANTS = bool, int, float, str, list, tuple, dict, FunctionType, type(None)
 _COMPILED: dict[Any, Any] = {}  # a module of each structure: to script takes 24 ms and more, a copy of one 1 ms
 
 
@@ -133,11 +135,16 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
         (
             name,
             type(module),
-            *sorted((key, repr(value)) for key, value in vars(module).items() if not key.startswith("_")),
+            *sorted((key, repr(value)) for key, value in vars(module).items() if is_compiled_in(key, value)),
             *((key, tuple(tensor.shape)) for key, tensor in _tensors_of(module)),
         )
         for name, module in eager.named_modules()
     )
+
+
+def is_compiled_in(name: str, value: object) -> bool:
+    """Whether scripting compiles an attribute into the code, as it does with plain values and functions."""
+    return not name.startswith("_") and isinstance(value, CONSTANTS)
 
 
 def _tensors_of(module: nn.Module, recurse: bool = False) -> list[tuple[str, Tensor]]:

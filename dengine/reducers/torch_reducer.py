@@ -17,9 +17,11 @@ averaging, SIAM J. Control Optim. 30(4). Chernozhukov et al. (2018), Double/debi
 
 import copy
 import logging
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
+from io import BytesIO
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, Self
@@ -34,6 +36,7 @@ from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentatio
 
 from ..decision.rule import part, restore, script
 from ..errors import SettingError, expect, instead
+from ..files import write_output
 from ..folds import content_fold
 from ..records import is_whole
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, seed_of
@@ -41,6 +44,7 @@ from .encoder import Encoder, Members, NetworkFactory, fold_batch_norms
 from .preprocessing import Preprocessor, averaging
 
 log = logging.getLogger("dengine")
+SEPARATE = re.compile(r"^(networks\.networks\.)\d+\.")  # names in `encoder.Separate`
 
 MIN_TRACES = 20
 CHUNK = 64  # traces that are embedded at once: what they need stays in the cache
@@ -197,6 +201,9 @@ class TorchReducer(Reducer):
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
         self.preprocessor_.learn(x)
+        if self.checkpoint:
+            load_checkpoint(self.members_, self.checkpoint)
+            self.averaged_members_.load_state_dict(self.members_.state_dict())
 
     def _build(self, channels: int, samples: int, average: int) -> None:
         self.check()
@@ -208,14 +215,11 @@ class TorchReducer(Reducer):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed_)
             self.members_ = Members(self.network, *shape, self.folds)
-        if self.checkpoint:
-            load_checkpoint(self.members_, self.checkpoint)
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
         self.n_steps_ = self.n_labels_ = self.n_new_steps_ = 0
         self.loss_ = float("nan")
         self.encoder_ = self._new_encoder()
-        self.compiles_ = _compiles(self.encoder_, self.network)
 
     def _train(self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule, steps: int) -> Tensor:
         """Train on traces (n, C, T) and let the averaged members answer; returns the preprocessed traces."""
@@ -318,16 +322,17 @@ class TorchReducer(Reducer):
     def warm_up(self) -> None:
         warm_optimizer()
 
-    def blank(self, X: Floats) -> Encoder:
+    def blank(self, X: Floats) -> Encoder | None:
         if "encoder_" in vars(self):
-            return self.encoder_
+            return self.module()
         new: Self = clone(self)
         new._build(X.shape[1], X.shape[2], averaging(torch.from_numpy(X)))
-        return new.encoder_
+        return new.module()
 
     def module(self) -> Encoder | None:
         check_is_fitted(self, "encoder_")
-        return self.encoder_ if self.compiles_ else None
+        compiles = can_compile(self.network, self.preprocessor_.channels, self.preprocessor_.samples)
+        return self.encoder_ if compiles else None
 
     @property
     def n_steps_left_(self) -> int:
@@ -419,9 +424,11 @@ def warm_optimizer() -> None:
 
 
 def save_checkpoint(members: Members, path: str | Path) -> None:
-    """Write the weights of a single member as a file of tensors, from which any number of members can start."""
+    """Write the weights of a single member as a file of tensors, from which any number can start."""
     expect(members.count == 1, "a single member", members.count)
-    torch.save(members.state_dict(), path)
+    content = BytesIO()  # torch's own writer aborts the process on a full disk
+    torch.save(members.state_dict(), content)
+    write_output(path, content.getvalue(), force=True)
 
 
 def load_checkpoint(members: Members, path: str | Path) -> None:
@@ -432,10 +439,12 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
     SettingError
         If the file cannot be read, or is of another network.
     """
-    with instead(SettingError, f"The checkpoint {path} cannot be read", OSError, RuntimeError, ValueError, EOFError, UnpicklingError):
+    unreadable = OSError, RuntimeError, ValueError, EOFError, UnpicklingError
+    with instead(SettingError, f"The checkpoint {path} cannot be read", *unreadable):
         single = torch.load(path, map_location="cpu", weights_only=True)
     own = members.state_dict()
-    wanted = {name: _of_one_member(name, value, members.count) for name, value in own.items()}
+    sources = {name: SEPARATE.sub(r"\g<1>0.", name) for name in own}
+    wanted = {sources[name]: _shape_of_one(name, value, members.count) for name, value in own.items()}
     if not isinstance(single, dict) or {name: value.shape for name, value in single.items()} != wanted:
         raise SettingError(
             f"Expected a checkpoint of this network for traces of this many channels, {path} is of another; "
@@ -443,11 +452,15 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
         )
     with torch.no_grad():
         for name, value in own.items():
-            value.copy_(single[name] if value.dim() == 0 else single[name].repeat(members.count, *[1] * (value.dim() - 1)))
+            times = value.shape[0] // single[sources[name]].shape[0] if value.dim() else 1
+            value.copy_(torch.cat([single[sources[name]]] * times) if times > 1 else single[sources[name]])
 
 
-def _of_one_member(name: str, value: Tensor, count: int) -> torch.Size:
-    return value.shape if value.dim() == 0 else torch.Size([value.shape[0] // count, *value.shape[1:]])
+def _shape_of_one(name: str, value: Tensor, count: int) -> torch.Size:
+    """The shape that a tensor of all members has where there is a single member."""
+    if value.dim() == 0 or SEPARATE.match(name):
+        return value.shape
+    return torch.Size([value.shape[0] // count, *value.shape[1:]])
 
 
 def _decays(name: str, parameter: nn.Parameter) -> bool:
@@ -463,10 +476,13 @@ def _normal(rng: np.random.Generator, *shape: int) -> Tensor:
     return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
 
 
-def _compiles(encoder: Encoder, network: NetworkFactory) -> bool:
-    """Whether TorchScript takes the encoder; a network of a user's own may hold Python that it does not."""
+@lru_cache(maxsize=32)
+def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
+    """Whether TorchScript takes a network; one of a user's own may hold Python that it does not."""
+    with torch.random.fork_rng(devices=[]):
+        members = Members(network, channels, samples, 2).eval()
     try:
-        script(encoder)
+        script(fold_batch_norms(members))
     except Exception as error:
         name = getattr(network, "__qualname__", repr(network))
         reason = str(error).strip().splitlines()[0]

@@ -302,7 +302,7 @@ def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Datase
     missed = fitted(data)
     missed.untold = True
     for what, words in (
-        (fitted(data, PCA(2)), r"PCA cannot be scripted: it has no module; use conv, pca"),
+        (fitted(data, PCA(2)), r"PCA cannot be exported: it gives no module that TorchScript takes"),
         (fitted(data, interval="jeffreys"), "use wilson or binomial"),
         (missed, "missed what became of a part"),
         (DataEngine("pca"), "Nothing was trained yet"),

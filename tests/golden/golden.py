@@ -1,4 +1,7 @@
-"""Decisions that must never change by accident, most of the default engine: made once, kept, and played again by the test.
+"""Decisions that must never change by accident: made once, kept, and played again by the test.
+
+Most are of `rocket`, whose training is convex: its decisions are the same on every machine but for a few. A network that
+is trained by gradient carries the last digit of a float from step to step, so `conv` has no golden decisions.
 
     OMP_NUM_THREADS=1 python tests/golden/golden.py tests/golden/default    # makes them anew; only where that is meant
 
@@ -123,7 +126,8 @@ class Story:
     verbs: Mapping[int, Verb] = field(default_factory=dict)
 
     def start(self, store: Path) -> DataEngine:
-        return DataEngine(policy=Policy(**self.policy), store=str(store), seed=self.seed, replaying=True)
+        recipe = Recipe.load("rocket").with_policy(**self.policy)
+        return DataEngine(recipe=recipe, store=str(store), seed=self.seed, replaying=True)
 
     def live(self, store: Path) -> tuple[DataEngine, list[Cycle]]:
         """The engine after its last part, still open, and what happened."""
@@ -206,9 +210,7 @@ class Exported(Story):
 
 NOT_NOVEL = {"novelty": 0.0}  # as it was before 0.3
 STORIES: dict[str, Story | Replayed] = {
-    "replay": Replayed("conv", 0, LOCAL),
-    "rocket-90": Replayed("rocket", 4, LOCAL, 300, NOT_NOVEL),
-    "rocket-in-order": Replayed("rocket", 5, LOOSE, 300, NOT_NOVEL | {"retrain_every": 70}, {"shuffle": False}),
+    "replay": Replayed("rocket", 0, LOCAL),
     "pca-80": Replayed("pca", 6, LOOSE, 600, NOT_NOVEL),
     "pca-jeffreys": Replayed("pca", 7, LOOSE | {"interval": "jeffreys"}, 600, NOT_NOVEL),
     "pca-binomial": Replayed("pca", 8, {"interval": "binomial"}, 400, NOT_NOVEL, {"confirm": True}),

@@ -228,19 +228,24 @@ def test_mixed_traces_and_labels_lie_between_those_of_the_same_member() -> None:
     assert ((labels[0] <= 0.5) & (labels[1] >= 0.5)).all()
 
 
-def test_every_member_starts_from_a_checkpoint_and_learns_from_it(tmp_path: Any) -> None:
-    single = Members(ConvNetwork, 2, 120, 1)
+@pytest.mark.parametrize("network", [ConvNetwork, SmallNetwork])
+def test_every_member_starts_from_the_weights_of_a_checkpoint(network: Any, tmp_path: Any) -> None:
+    single = Members(network, 2, 120, 1)
     save_checkpoint(single, tmp_path / "encoder.pt")
-    several = Members(ConvNetwork, 2, 120, 3)
+    several = Members(network, 2, 120, 3)
     load_checkpoint(several, tmp_path / "encoder.pt")
     x = torch.randn(4, 1, 2, 120, generator=torch.Generator().manual_seed(0))
     expected = single.eval()(x).expand(-1, 3)
     torch.testing.assert_close(several.eval()(x.expand(-1, 3, -1, -1)), expected)
+
+
+def test_a_reducer_that_starts_from_a_checkpoint_learns_something_else_than_from_scratch(tmp_path: Any) -> None:
+    save_checkpoint(Members(ConvNetwork, 2, 120, 1), tmp_path / "encoder.pt")
     X, y = toy_traces(60)
-    reducer = quick(checkpoint=str(tmp_path / "encoder.pt"))
-    before = reducer.blank(X)(torch.from_numpy(X))
-    reducer.train(X, y, content_fold(X, 3))
-    assert not np.array_equal(reducer.embed(X), before.numpy())
+    from_checkpoint, from_scratch = quick(checkpoint=str(tmp_path / "encoder.pt")), quick()
+    for reducer in (from_checkpoint, from_scratch):
+        reducer.train(X, y, content_fold(X, 3))
+    assert not np.array_equal(from_checkpoint.embed(X), from_scratch.embed(X))
 
 
 @pytest.mark.parametrize(
@@ -267,8 +272,8 @@ def test_a_network_that_does_not_compile_answers_in_python_and_says_so(caplog: p
     X, y = toy_traces(60)
     with caplog.at_level(logging.WARNING):
         reducer = own(PythonNetwork).fit(X, y)
+        assert reducer.module() is None
     assert "PythonNetwork cannot be compiled by TorchScript" in caplog.text
-    assert reducer.module() is None
     assert reducer.embed(X).shape == (60, 2, 2)
 
 

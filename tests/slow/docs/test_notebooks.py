@@ -23,6 +23,7 @@ SMALLER = {  # by notebook: what makes its long cells quick; never in an exact o
     },
     "corrections": {"range(200)": "range(20)"},
     "recordings_to_deployment": {"--repeats 2": "--repeats 1 --cycles 80"},
+    "training_an_encoder": {"range(1, 13)": "range(1, 4)", "cycles=400": "cycles=120"},
     "shadow_and_costs": {'"alphas": (0.5, 0.1, 0.05)': '"alphas": (0.5, 0.1)', '"repeats": 6': '"repeats": 2'},
     "the_guarantee_seen": {
         "parts = 0.80, 0.2, 400": "parts = 0.80, 0.2, 160",
