@@ -217,7 +217,7 @@ class TorchReducer(Reducer):
             self.members_ = Members(self.network, *shape, self.folds)
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
-        self.n_steps_ = self.n_labels_ = self.n_new_steps_ = 0
+        self.n_steps_ = self.n_steps_left_ = self.n_new_steps_ = 0
         self.loss_ = float("nan")
         self.encoder_ = self._new_encoder()
 
@@ -225,8 +225,10 @@ class TorchReducer(Reducer):
         """Train on traces (n, C, T) and let the averaged members answer; returns the preprocessed traces."""
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
-        self.n_labels_ = len(labels)
         self.fit_loop(x, torch.from_numpy(labels).float(), folds, stop, steps)
+        missing = self._n_steps_wanted(len(labels)) - self.n_steps_
+        # Who limits the steps of a retrain wants no further retrains in their place.
+        self.n_steps_left_ = max(0, missing) if stop.max_steps is None else 0
         self.estimate_statistics(x)
         self.encoder_ = self._new_encoder()
         return x
@@ -335,10 +337,6 @@ class TorchReducer(Reducer):
         return self.encoder_ if compiles else None
 
     @property
-    def n_steps_left_(self) -> int:
-        return max(0, self._n_steps_wanted(self.n_labels_) - self.n_steps_)
-
-    @property
     def report(self) -> FitReport:
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
@@ -348,7 +346,7 @@ class TorchReducer(Reducer):
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         check_is_fitted(self, "encoder_")
-        numbers = [self.preprocessor_.average, self.seed_, self.n_steps_, self.n_labels_, self.n_new_steps_]
+        numbers = [self.preprocessor_.average, self.seed_, self.n_steps_, self.n_steps_left_, self.n_new_steps_]
         state = {"shape": np.array(self.trace_shape_), "numbers": np.array(numbers), "loss": np.array(self.loss_)}
         modules = {"preprocessor": self.preprocessor_, "members": self.members_, "averaged": self.averaged_members_}
         for prefix, module in modules.items():
@@ -359,10 +357,13 @@ class TorchReducer(Reducer):
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         channels, samples = (int(value) for value in state["shape"])
-        average, seed, n_steps, n_labels, n_new_steps = (int(value) for value in state["numbers"])
+        average, seed, n_steps, n_steps_left, n_new_steps = (int(value) for value in state["numbers"])
         self.trace_shape_, self.n_features_in_ = (channels, samples), channels * samples
         self._build(channels, samples, average)
-        self.seed_, self.n_steps_, self.n_labels_, self.n_new_steps_ = seed, n_steps, n_labels, n_new_steps
+        self.seed_ = seed
+        self.n_steps_ = n_steps
+        self.n_steps_left_ = n_steps_left
+        self.n_new_steps_ = n_new_steps
         self.loss_ = float(state["loss"])
         restore(self.preprocessor_, part(state, "preprocessor."))
         restore(self.members_, part(state, "members."))
