@@ -190,6 +190,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         beside = {"radius": radius, "folds": folds, "retrain_every": retrain_every, "budget": budget, "policy": policy}
         if model is not None:
             refuse_idle(reducer, beside)
+        if model is not None and recipe is None:
+            recipe = Recipe()  # the schedule of conv is its own
         settings = EngineSettings(chosen_recipe(reducer, recipe, beside), seed, trace=trace)
         settings, template = settings.with_template(model)  # before a store is made: a wrong setting leaves none behind
         with opening(store) as opened:
