@@ -161,13 +161,13 @@ class RecipeChoice:
     asked: str | None
     settings: Mapping[str, Any]
 
-    def load(self) -> Recipe:
-        """The recipe with these settings. SettingError where its reducer cannot be found."""
+    def load(self, base: Any = "conv") -> Recipe:
+        """The recipe with these settings, or `base` with them. SettingError where its reducer cannot be found."""
         from ..recipe import Recipe
         from ..reducers import REDUCERS, reducer_class
 
         policy = {name: value for name, value in self.settings.items() if name != "novelty"}
-        recipe = Recipe.load(self.asked or "conv").with_policy(**policy)
+        recipe = Recipe.load(self.asked or base).with_policy(**policy)
         recipe = recipe.with_settings(novelty=self.settings.get("novelty"))
         if recipe.reducer not in REDUCERS:
             reducer_class(recipe.reducer)  # now, and not when a store was made for it
@@ -182,7 +182,8 @@ class RecipeChoice:
         from ..experiments.replay import Contender
 
         if self.asked in names_of("rival"):
-            return replace(Contender.load(self.asked), recipe=RecipeChoice(None, self.settings).load())
+            rival = Contender.load(self.asked)
+            return replace(rival, recipe=RecipeChoice(None, self.settings).load(rival.recipe))
         return Contender(short_name(self.asked or "conv"), self.load())
 
 

@@ -130,7 +130,7 @@ def test_a_wrong_call_ends_with_2_and_changes_nothing(words: str, store: Path) -
 
 
 def test_a_retrain_that_is_dropped_ends_with_1_and_says_why(make_data, tmp_path: Path) -> None:
-    import_labelled(tmp_path / "a.db", make_data(40, failures=0.0), "conv", 0)
+    import_labelled(tmp_path / "a.db", make_data(40, failures=0.0), "rocket", 0)
     failed = dengine("retrain", tmp_path / "a.db")
     assert failed.exit_code == 1
     assert "No version answers yet." in failed.stdout

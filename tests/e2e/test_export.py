@@ -318,7 +318,7 @@ def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Datase
 
 def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(make_data, tmp_path: Path) -> None:
     data, new = make_data(120, SAMPLES), make_data(60, SAMPLES, seed=1)
-    model = fitted(data, make_reducer("conv", folds=2, kernels=4), capacity=150)
+    model = fitted(data, make_reducer("rocket", folds=2, kernels=4), capacity=150)
     exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
     for i, (x, y) in enumerate(zip(new.X, new.y, strict=True)):
         assert exported.learn(x, bool(y)) == min(121 + i, 150)

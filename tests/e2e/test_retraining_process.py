@@ -29,21 +29,21 @@ def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_ar
     x = torch.arange(60_000.0).reshape(300, 200)
     sent = x, x.t()[3:, 5:], torch.empty(0), torch.nn.Linear(3, 4).weight, x.numpy()[:, ::2]
     with RetrainingProcess() as process:
-        for got, was in zip(process.submit(copy.copy, sent).result(60), sent, strict=True):
+        for got, was in zip(process.submit(copy.copy, sent).result(300), sent, strict=True):
             assert np.array_equal(torch.as_tensor(got).detach(), torch.as_tensor(was).detach())
             with torch.no_grad():
                 got[:1] = 7.0
-        assert process.submit(os.getpid).result(60) != os.getpid()
+        assert process.submit(os.getpid).result(300) != os.getpid()
         with pytest.raises(ZeroDivisionError):
-            process.submit(divmod, 17, 0).result(60)
+            process.submit(divmod, 17, 0).result(300)
         with pytest.raises(Exception, match="pickle"):
-            process.submit(lambda: 1).result(60)
-        assert process.submit(divmod, 17, 5).result(60) == (3, 2)
+            process.submit(lambda: 1).result(300)
+        assert process.submit(divmod, 17, 5).result(300) == (3, 2)
 
 
 def test_it_ends_with_whoever_made_it_also_at_work() -> None:
     with RetrainingProcess() as process:
-        pid = process.submit(os.getpid).result(60)
+        pid = process.submit(os.getpid).result(300)
         at_work = process.submit(time.sleep, 600)
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
@@ -65,9 +65,9 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(data: Dataset) -> 
 def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retrains_in_line(data: Dataset) -> None:
     with RetrainingProcess() as process:
         engine = DataEngine(recipe=replace(CONV, reducer="pca", params={}), executor=process)
-        os.kill(process.submit(os.getpid).result(60), signal.SIGKILL)
+        os.kill(process.submit(os.getpid).result(300), signal.SIGKILL)
         with pytest.raises(BrokenExecutor):
-            process.submit(os.getpid).result(60)
+            process.submit(os.getpid).result(300)
         learn_and_settle(engine, data)
         engine.start_retrain()
     assert engine.version >= 1
