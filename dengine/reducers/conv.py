@@ -1,10 +1,10 @@
 """The 1-D convolutional network that embeds traces, and `ConvReducer`, which trains it.
 
     x (B, 2C, L)               preprocessed traces: each signal and its differences
-    conv 15, stride 4          12 channels a signal
-    conv  9, stride 2          24 channels a signal
-    conv  9, stride 2          24 channels a signal, (B, C * 24, P)
-    pool                       mean and maximum over three regions and over the whole trace, (B, C * 24 * 8)
+    conv 15, stride 4           8 channels a signal
+    conv  9, stride 2          16 channels a signal
+    conv  9, stride 2          16 channels a signal, (B, C * 16, P)
+    pool                       mean and maximum over three regions and over the whole trace, (B, C * 16 * 8)
     hidden layer               32 features, which see all signals and all regions together
 
 Batch normalisation and ReLU follow each convolution. `torch_reducer` puts two units and a logit behind the network and
@@ -40,14 +40,14 @@ class ConvNetwork(nn.Module):
     members : int, default 1
         Networks that are computed at once. Member k reads ``channels`` inputs from ``k * channels`` on and gives
         ``features`` outputs from ``k * features`` on; grouped convolutions keep the members apart.
-    width : int, default 12
+    width : int, default 8
         Outputs of the first convolution for each signal; the others have twice as many. It is reduced to a third where
         there are many signals, so that the time of a step hardly grows.
     features : int, default 32
         Outputs of each member.
     """
 
-    def __init__(self, channels: int, samples: int, members: int = 1, width: int = 12, features: int = 32) -> None:
+    def __init__(self, channels: int, samples: int, members: int = 1, width: int = 8, features: int = 32) -> None:
         super().__init__()
         signals = channels // 2
         width = max(width // 3, min(width, 2 * width // signals))
