@@ -115,9 +115,12 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
             tell(record | {"retrain": None}, said)
             return
         with progress("training", None):
-            report = engine.retrain()
+            reports = [engine.retrain()]
+            while reports[-1].accepted and engine.model.report.n_steps_left:
+                reports.append(engine.retrain())
+        report = reports[-1]
         labels = engine.store.status()["labels"]
-    answers = f"Version {report.version} of {name} answers. {retrain_line([report])}"
+    answers = f"Version {report.version} of {name} answers. {retrain_line(reports)}"
     answers = answers if report.version else "No version answers yet: every part is verified."
     table = facts(f"{data.name} into {store}", rows_of(imported))
     tell(record | {"retrain": report}, table, answers, f"{store} holds {labels} labels.")
