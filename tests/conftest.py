@@ -34,7 +34,7 @@ GROUPS = dict.fromkeys(PROGRAMS, "cpp")
 GROUPS |= dict.fromkeys(("test_estimators", "test_reducers"), "umap")
 # `make test` leaves out what is slow: these folders, and the cases of other tests that have these names.
 SLOW = REPO / "tests" / "slow"
-SLOW_CASES = ("umap", "postgres", "minirocket")
+SLOW_CASES = ("umap-learn", "postgres", "minirocket")
 # What is slow and yet run before each merge; single tests are marked where they stand.
 MERGE = ("test_cpp", "test_c_interface", "test_onnx_program", "test_estimators", "test_store_postgres", "test_site")
 

@@ -74,13 +74,11 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     uses_labels : whether `fit` reads `y`. One that does, and does not cross-fit by itself, is cross-fitted from outside.
     scores : whether the first axis is the predicted probability of success.
     own_unit : whether the embedding has a unit of its own, a probability say, that must not be scaled away.
-    single_tolerance : how far a trace may move when embedded alone, in the embedding's root mean square radii.
     """
 
     uses_labels = False
     scores = False
     own_unit = False
-    single_tolerance = 1e-4
 
     @abstractmethod
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
