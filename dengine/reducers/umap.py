@@ -70,8 +70,8 @@ class Frames(nn.Module):
 
     A frame is the sum over a stretch of samples, divided by the root of the stretch's length. The
     Euclidean distance between frames is then that between traces, without what averages out
-    within a stretch. The stretches are of nearly equal length and cover the whole trace. One
-    centre and one scale for all traces keep the numbers near 1, where float32 is exact enough.
+    within a stretch. The stretches are of nearly equal length and cover the whole trace. The mean
+    trace is subtracted, and one scale for all frames keeps them near 1, whatever their unit.
 
     Parameters
     ----------
@@ -88,25 +88,27 @@ class Frames(nn.Module):
     def __init__(self, channels: int, samples: int, n_frames: int) -> None:
         super().__init__()
         self.n_frames = n_frames
+        self.n_features = channels * n_frames
         edges = torch.linspace(0.0, samples, n_frames + 1).round()
         sample = torch.arange(samples)[:, None]
         inside = ((sample >= edges[:-1]) & (sample < edges[1:])).float()  # (T, n_frames)
         self.register_buffer("pool", inside / inside.sum(0).sqrt(), persistent=False)
-        self.register_buffer("centre", torch.zeros(channels * n_frames))
+        self.register_buffer("centre", torch.zeros(channels, samples))
         self.register_buffer("scale", torch.ones(1))
 
     @torch.jit.unused
     def learn(self, traces: Tensor) -> None:
         """Set centre and scale from traces (n, C, T)."""
-        frames = self(traces).double()
-        centre = frames.mean(0)
-        deviation = (frames - centre).square().mean().sqrt()
-        self.centre.copy_(centre)
+        self.centre.copy_(traces.double().mean(0))
+        deviation = self(traces).double().square().mean().sqrt()
         self.scale.copy_(torch.where(deviation > 0.0, deviation, 1.0))
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, F)."""
-        return ((x @ self.pool).flatten(1) - self.centre) / self.scale
+        # The difference has memory that torch aligned. A product of other memory, or of other
+        # strides, would differ in its last bits.
+        rows = (x - self.centre).flatten(0, 1)
+        return (rows @ self.pool).view(x.size(0), self.n_features) / self.scale
 
 
 def frames_for(traces: Floats) -> Frames:
@@ -366,7 +368,8 @@ def leading_eigenvectors(
     normalised = csr_matrix((values, (coordinates.row, coordinates.col)), graph.shape)
     size = graph.shape[0]
     if size <= max(DENSE, 4 * n):
-        return np.linalg.eigh(normalised.toarray())[1][:, -1 - n : -1]
+        _, all_vectors = torch.linalg.eigh(torch.from_numpy(normalised.toarray()))
+        return np.asarray(all_vectors[:, -1 - n : -1])
     start = rng.standard_normal(size)
     try:
         _, vectors = eigsh(normalised, n + 1, which="LA", v0=start, ncv=max(16, 4 * n), tol=1e-3)
@@ -807,7 +810,7 @@ class UmapReducer(Reducer):
         self.make_frames_.learn(torch.from_numpy(some))
         seed = seed_of(self.random_state)
         self.seed_ = int(np.random.default_rng().integers(2**31)) if seed is None else seed
-        n_features = len(self.make_frames_.centre)
+        n_features = self.make_frames_.n_features
         self.neighbors_ = Neighbors.empty(n_features, self.n_neighbors - 1)
         self.neighbors_ahead_ = None
         self.places_ = torch.zeros(0, self.n_components)
@@ -880,7 +883,7 @@ class UmapReducer(Reducer):
             return self.encoder_
         n = max(len(X), self.n_neighbors + 1)
         make_frames = frames_for(X)
-        references = torch.zeros(n, len(make_frames.centre))
+        references = torch.zeros(n, make_frames.n_features)
         places = torch.zeros(n, self.n_components)
         return UmapEncoder(make_frames, references, places, self.n_neighbors).eval()
 
