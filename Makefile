@@ -61,7 +61,7 @@ test: $(VENV)/.dev
 test-merge: $(VENV)/.dev
 	$(PYTEST) -m merge
 
-# Everything: each page and notebook, UMAP, fuzzing, outages, statistics.
+# Everything: each page and notebook, umap-learn, fuzzing, outages, statistics.
 test-all: $(VENV)/.dev
 	$(PYTEST)
 

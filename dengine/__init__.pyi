@@ -39,6 +39,7 @@ from .reducers.pca import PcaReducer as PcaReducer
 from .reducers.rocket import RocketReducer as RocketReducer
 from .reducers.torch_reducer import TorchReducer as TorchReducer
 from .reducers.umap import UmapReducer as UmapReducer
+from .reducers.umap_learn import UmapLearnReducer as UmapLearnReducer
 from .store.opening import open_store as open_store
 from .store.sql import SqlStore as SqlStore
 

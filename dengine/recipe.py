@@ -25,7 +25,6 @@ from .errors import SettingError, expect, instead, listed
 from .records import is_number, is_whole
 
 Params = Mapping[str, bool | int | float | str]
-NAMED = ("conv", "umap", "pca", "rocket")  # reducers: the modules of `reducers` that hold one, PcaReducer for "pca"
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # a name that TOML takes without quotes
 PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating)
@@ -108,8 +107,8 @@ class Recipe:
             fits = callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type)
             expect(fits, "a recipe, its name, or a scikit-learn transformer", recipe)
             # A reducer of ours keeps the radius of its own recipe: it means something else in each.
-            modules = [kind.__module__.removeprefix("dengine.reducers.") for kind in type(recipe).__mro__]
-            names = ["conv" if module == "torch_reducer" else module for module in modules]
+            modules = [kind.__module__.removeprefix("dengine.reducers.").replace("_", "-") for kind in type(recipe).__mro__]
+            names = ["conv" if module == "torch-reducer" else module for module in modules]
             base = next((RECIPES[name] for name in names if name in RECIPES), cls())
             return replace(base, reducer=recipe, params={})
         if str(recipe) in RECIPES:
@@ -117,7 +116,7 @@ class Recipe:
         text = _text_of(Path(recipe))
         if text is not None:
             return cls.from_toml(text, where=str(recipe))
-        if OWN.fullmatch(str(recipe)) or str(recipe) in NAMED:
+        if OWN.fullmatch(str(recipe)):
             return cls(str(recipe))
         wanted = f"a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer"
         raise SettingError(f"Expected {wanted}; {str(recipe)[:200]} is none.")
@@ -228,6 +227,7 @@ RECIPES: dict[str, Recipe] = {
     # The radius of conv and rocket is that of a probability. Small retrains of conv often beat large ones seldom.
     "conv": Recipe("conv", radius=0.07, retrain_every=10),
     "umap": Recipe("umap"),
+    "umap-learn": Recipe("umap-learn"),
     "pca": Recipe("pca", radius=0.2),
     "rocket": Recipe("rocket", radius=0.07),
     # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored; it asks nothing else of a trace.

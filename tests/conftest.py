@@ -28,13 +28,13 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
 LONG = ("test_docs", "test_notebooks", "test_page", "test_requests", "test_golden", "test_training", "test_cli")
-# The C++ programs are built once, by one worker; each process that fits a UMAP compiles it anew, for 25 s.
+# The C++ programs are built once, by one worker; each process that uses umap-learn compiles it anew, for 25 s.
 PROGRAMS = ("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program", "test_golden")
 GROUPS = dict.fromkeys(PROGRAMS, "cpp")
-GROUPS |= dict.fromkeys(("test_estimators", "test_reducers"), "umap")
+GROUPS |= dict.fromkeys(("test_estimators", "test_reducers", "test_umap"), "umap-learn")
 # `make test` leaves out what is slow: these folders, and the cases of other tests that have these names.
 SLOW = REPO / "tests" / "slow"
-SLOW_CASES = ("umap", "postgres", "minirocket")
+SLOW_CASES = ("umap-learn", "postgres", "minirocket")
 # What is slow and yet run before each merge; single tests are marked where they stand.
 MERGE = ("test_cpp", "test_c_interface", "test_onnx_program", "test_estimators", "test_store_postgres", "test_site")
 

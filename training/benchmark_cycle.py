@@ -1,4 +1,4 @@
-"""How long a cycle takes: retraining and deciding, with UMAP beside it, in one run.
+"""How long a cycle takes: retraining and deciding, with umap-learn beside it, in one run.
 
     python training/benchmark_cycle.py --replays 30 --out out/
 
@@ -47,11 +47,11 @@ def measure(data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repe
         found[f"decide, retraining in a {name}"], found[f"decide and swap, {name}"] = beside(data, recipe, executor)
     if umap_repeats:
         X = as_traces(data.X).reshape(len(data), -1)
-        make_reducer("umap").fit(X[:200])  # compiles
-        reducer = make_reducer("umap")
-        found[f"UMAP fit on {len(data)} traces"] = [wall_time(reducer.fit, X)[0] for _ in range(umap_repeats)]
+        make_reducer("umap-learn").fit(X[:200])  # compiles
+        reducer = make_reducer("umap-learn")
+        found[f"umap-learn fit on {len(data)} traces"] = [wall_time(reducer.fit, X)[0] for _ in range(umap_repeats)]
         reducer.transform(X[:1])
-        found["UMAP single transform"] = [wall_time(reducer.transform, x[None])[0] for x in X[:200]]
+        found["umap-learn single transform"] = [wall_time(reducer.transform, x[None])[0] for x in X[:200]]
     return [
         {"what": name, **quantiles(seconds), "target_s": BUDGET if name.startswith("retrain") else None}
         for name, seconds in found.items()
@@ -111,7 +111,9 @@ def main() -> None:
     parser.add_argument("--replays", type=int, default=30, help="shuffled replays whose retrains are timed")
     parser.add_argument("--repeats", type=int, default=10, help="warm retrains on the whole set")
     parser.add_argument("--burn", action="store_true", help="beside a process that burns each core")
-    parser.add_argument("--umap-repeats", type=int, default=3, help="fits of UMAP on the whole set, some seconds each")
+    parser.add_argument(
+        "--umap-repeats", type=int, default=3, help="fits of umap-learn on the whole set"
+    )
     args = parser.parse_args()
     recipe = Recipe.load(args.recipe).with_policy(**POLICY)
     with busy_cores() if args.burn else nullcontext():

@@ -164,7 +164,7 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Reducers and rivals, under one policy or a grid of them. UMAP takes much longer than the others. Ctrl-C
+    Reducers and rivals, under one policy or a grid of them. umap-learn takes much longer than the others. Ctrl-C
     shows the replays that were finished.
     """
     if len({short_name(one) for one in asked}) < len(asked):

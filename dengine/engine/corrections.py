@@ -92,8 +92,8 @@ class Corrections:
         """Let an earlier version answer again, as a new version, so that the history goes on in one line.
 
         Labels that came since are among its references, corrections count, and the rule keeps what it was told. The next
-        retrain goes on from this version. A reducer that is stored by its traces (umap), and a rival, are fitted again: the
-        first on what it was fitted on, the second on the same traces with the labels as they count now.
+        retrain goes on from this version. A reducer that is stored by its traces (umap-learn), and a rival, are fitted
+        again: the first on what it was fitted on, the second on the same traces with the labels as they count now.
         Raises StoreError for a version that is not kept, which names those that are.
         """
         if isinstance(version, bool) or not isinstance(version, int | np.integer):

@@ -342,8 +342,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def decide_at_once(self, trace: ArrayLike, part: str | int | None = None) -> Decision | None:
         """As `decide`, in any thread while no other uses the engine; None, and nothing was done, where that might wait.
 
-        It waits for neither store nor disk, and runs no code of the user's, nor umap's. It leaves to `settle` to bring in a
-        version, and to tell of safe mode.
+        It waits for neither store nor disk, and runs no code of the user's, nor umap-learn's. It leaves to `settle` to
+        bring in a version, and to tell of safe mode.
         """
         self._outbox.check()
         with self._outbox.unless_held() as free, self._alone:

@@ -96,7 +96,7 @@ class Predictor(nn.Module):
 
 
 class InPython(nn.Module):
-    """The embedding of a reducer that has no module, UMAP for one."""
+    """The embedding of a reducer that has no module, umap-learn for one."""
 
     def __init__(self, reducer: Reducer) -> None:
         super().__init__()

@@ -9,7 +9,7 @@ import lazy_loader
 import numpy as np
 
 from ..errors import SettingError, expect
-from ..recipe import NAMED, Recipe
+from ..recipe import Recipe
 from ..records import find_class, is_number, is_whole
 
 if TYPE_CHECKING:
@@ -20,11 +20,17 @@ if TYPE_CHECKING:
     from .rocket import RocketReducer as RocketReducer
     from .torch_reducer import TorchReducer as TorchReducer
     from .umap import UmapReducer as UmapReducer
+    from .umap_learn import UmapLearnReducer as UmapLearnReducer
 
-# The lazy table: a module is imported where its class is asked for, since UMAP alone takes seconds.
-_NAMED = {name: f"{name.capitalize()}Reducer" for name in NAMED}
+_NAMED = {  # by a reducer's name: its module, which is imported when it is asked for, and its class
+    "conv": ("conv", "ConvReducer"),
+    "umap": ("umap", "UmapReducer"),
+    "umap-learn": ("umap_learn", "UmapLearnReducer"),
+    "pca": ("pca", "PcaReducer"),
+    "rocket": ("rocket", "RocketReducer"),
+}
 _LAZY = {"base": ["Reducer", "CrossFitted"], "torch_reducer": ["TorchReducer"]}
-_LAZY |= {module: [name] for module, name in _NAMED.items()}
+_LAZY |= {module: [class_name] for module, class_name in _NAMED.values()}
 
 MOST = 2**31 - 1  # of a parameter that is an integer
 
@@ -32,7 +38,7 @@ MOST = 2**31 - 1  # of a parameter that is an integer
 def reducer_class(name: str) -> type:
     """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for."""
     expect(name in _NAMED or ":" in name, f"a reducer among {', '.join(_NAMED)}, or module:Class of your own", name)
-    found: type = __getattr__(_NAMED[name]) if name in _NAMED else find_class(name)
+    found: type = __getattr__(_NAMED[name][1]) if name in _NAMED else find_class(name)
     if missing := [each for each in ("fit", "transform", "get_params") if not callable(getattr(found, each, None))]:
         raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has no {' and no '.join(missing)}.")
     return found

@@ -75,14 +75,12 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     scores : whether the first axis is the predicted probability of success.
     own_unit : whether the embedding has a unit of its own, a probability say, that must not be scaled away.
     min_traces : how many labelled traces the first training in an engine waits for.
-    single_tolerance : how far a trace may move when embedded alone, in the embedding's root mean square radii.
     """
 
     uses_labels = False
     scores = False
     own_unit = False
     min_traces = 1
-    single_tolerance = 1e-4
 
     @abstractmethod
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:

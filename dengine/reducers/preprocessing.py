@@ -64,25 +64,27 @@ class Preprocessor(nn.Module):
         return ((x - self.mean) * self.scale).clamp(-self.clip, self.clip)
 
 
-def averaging(traces: Tensor) -> int:
+def averaging(traces: Tensor, frames: int = FRAMES) -> int:
     """Choose how many samples to average to one.
 
     Parameters
     ----------
     traces : Tensor of float32, shape (n, C, T)
+    frames : int, default 200
+        Samples that an averaged trace has at least.
 
     Returns
     -------
     int
-        The largest number that leaves 200 samples and 80 % of the variance; 1 where an oscillation would be lost.
+        The largest number that leaves so many samples and 80 % of the variance; 1 where an oscillation would be lost.
     """
     traces = traces[:: 1 + (len(traces) - 1) // TRACES]
     samples = traces.size(2)
     centred = traces.double() - traces.double().mean((0, 2), keepdim=True)
     variance = centred.square().mean((0, 2))
-    for average in range(samples // FRAMES, 1, -1):
-        frames = samples // average
-        means = centred[:, :, samples - frames * average :].reshape(len(traces), -1, frames, average).mean(3)
+    for average in range(samples // frames, 1, -1):
+        n_means = samples // average
+        means = centred[:, :, samples - n_means * average :].reshape(len(traces), -1, n_means, average).mean(3)
         if bool((means.square().mean((0, 2)) >= EXPLAINED * variance).all()):
             return average
     return 1

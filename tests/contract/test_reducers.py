@@ -14,7 +14,7 @@ from dengine.reducers import Reducer
 from dengine.testing import REDUCER_CHECKS, check_reducer, toy_traces
 
 QUICK: dict[str, dict[str, Any]] = {
-    "umap": {"n_epochs": 40, "n_neighbors": 8},
+    "umap-learn": {"n_epochs": 40, "n_neighbors": 8},
     "conv": {"folds": 2, "steps": 4, "fit_steps": 30},
     "rocket": {"folds": 2},
 }
@@ -40,14 +40,14 @@ def test_scikit_learns_transformers_keep_it_unchanged(reducer: Any, check: Any) 
 
 
 @every_reducer
-def test_every_reducer_but_umap_is_exported_restored_and_decides_at_once(name: str) -> None:
+def test_every_reducer_but_umap_learn_is_exported_restored_and_decides_at_once(name: str) -> None:
     X, y = toy_traces()
     fitted, engine = new(name).fit(X, y), DataEngine(reducer=new(name))
     for x, good in zip(X, y, strict=True):
         engine.report(engine.decide(x).id, bool(good))
     assert engine.retrain().accepted
     can = fitted.module() is not None, fitted.get_state() is not None, engine.decide_at_once(X[0]) is not None
-    assert can == 3 * (name != "umap",)
+    assert can == 3 * (name != "umap-learn",)
 
 
 @every_reducer

@@ -281,7 +281,7 @@ def test_a_foreseen_failure_is_one_line_and_exit_code_1(words: str, data: Path, 
     [
         ("nonsense", "No such command"),
         ("replay --guarantee global", "'global' is not one of 'local', 'pooled'"),
-        ("replay --reducer missing", "'missing' is not one of 'conv', 'umap', 'pca', 'rocket', 'paper', or FILE.toml"),
+        ("replay --reducer missing", "'missing' is not one of 'conv', 'umap', 'umap-learn', 'pca', 'rocket', 'paper',"),
         ("replay --audit-rate 1", "1.0 is not in the range 0.0<=x<1.0"),
         ("compare --reducers ,", "at least one value"),
         ("compare --alphas 0.1,2", "2.0 is not in the range"),

@@ -3,8 +3,6 @@
 Beside it a deliberately dishonest configuration, which the same test catches.
 """
 
-import os
-
 import numpy as np
 import pytest
 from sklearn.base import clone
@@ -16,7 +14,6 @@ from dengine.reducers.base import LabelFree, as_points
 
 POLICY = Policy(alpha=0.1, lower_bound=0.9)
 CYCLES = 1503
-PROOF = int(os.environ.get("DENGINE_PROOF_REPEATS", "2")) >= 20
 BY_CHANCE = 8.0  # certain cycles of 1503, on average: measured 0.1 to 0.8, in rare bursts
 
 
@@ -36,7 +33,7 @@ def error_rate(played: list[Replay]) -> float:
     return wrong / max(1, sum(map(certain, played)))
 
 
-@pytest.mark.parametrize("name", ["conv", "pca", pytest.param("umap", marks=pytest.mark.skipif(not PROOF, reason="slow"))])
+@pytest.mark.parametrize("name", ["conv", "pca", "umap"])
 def test_labels_of_noise_yield_next_to_nothing_certain(name: str, make_data, proof_repeats: int) -> None:
     recipe = RECIPES[name].with_policy(alpha=0.1, lower_bound=0.9)
     played = [replay(noise_labels(make_data, seed), recipe, seed=seed) for seed in range(proof_repeats)]

@@ -214,7 +214,7 @@ STORIES: dict[str, Story | Replayed] = {
     "pca-80": Replayed("pca", 6, LOOSE, 600, NOT_NOVEL),
     "pca-jeffreys": Replayed("pca", 7, LOOSE | {"interval": "jeffreys"}, 600, NOT_NOVEL),
     "pca-binomial": Replayed("pca", 8, {"interval": "binomial"}, 400, NOT_NOVEL, {"confirm": True}),
-    "umap-80": Replayed("umap", 9, LOOSE, 180, NOT_NOVEL | {"retrain_every": 60}),
+    "umap-learn-80": Replayed("umap-learn", 9, LOOSE, 180, NOT_NOVEL | {"retrain_every": 60}),
     "local": Story(1, LOCAL, plain),
     "local-all": Story(5, AUDITED | ALL, turned, {180: restart}),  # in safe mode, from part 167
     "pooled-some": Story(3, POOLED | {"audit_rate": 0.5}),  # its only evidence

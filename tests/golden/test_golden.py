@@ -40,7 +40,7 @@ def assert_same(found: Arrays, expected: Arrays) -> None:
 @pytest.mark.parametrize("name", [name for name in STORIES if name not in EXPORTED])
 def test_an_engine_takes_every_decision_that_it_took(name: str, tmp_path: Path) -> None:
     if name.startswith("umap") and not SAME_MACHINE:
-        pytest.skip("another processor's UMAP lays the traces out otherwise, and its decisions are other ones")
+        pytest.skip("another processor's umap-learn lays the traces out otherwise, and its decisions are other ones")
     assert_same(STORIES[name].play(tmp_path), kept(name))
 
 

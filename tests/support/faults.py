@@ -29,7 +29,7 @@ from typing import Any
 REPO = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_suffix(".toml")
 TIERS = {"all": [], "test": ["-m", "not slow"]}  # options of pytest
-SECONDS = 300.0  # for the tests of one fault: UMAP compiles for a minute, more on a busy machine
+SECONDS = 300.0  # for the tests of one fault: umap-learn compiles for a minute, more on a busy machine
 FAILED, NONE = 1, 5  # pytest's exit codes where tests failed, and where none was selected
 
 

@@ -60,7 +60,7 @@ def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path: Path) -> None
     assert Recipe.load(str(path)) == mine
     assert Recipe.load(mine) is mine
     assert Recipe.load("pca") is base
-    with pytest.raises(SettingError, match=r"conv, umap, pca, rocket, paper.*covn is none"):
+    with pytest.raises(SettingError, match=r"conv, umap, umap-learn, pca, rocket, paper.*covn is none"):
         Recipe.load("covn")
 
 

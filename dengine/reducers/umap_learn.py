@@ -1,0 +1,112 @@
+"""UMAP as the library umap-learn has it, to compare with `dengine.reducers.umap`."""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from sklearn.utils.validation import check_is_fitted
+
+from ..errors import SettingError
+from .base import Floats, Ints, Reducer, StopRule, as_points, as_rows
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class UmapLearnReducer(Reducer):
+    """Embed traces by umap-learn.
+
+    Every training fits anew, which takes seconds. There is no module to export and no state to
+    store, so an engine that is opened fits again. With a `random_state` the library uses one
+    thread, and a run repeats exactly.
+
+    `transform` places the traces of a batch together: with those beside it, a trace moves by up to
+    a tenth of the embedding's radius. `embed` places each trace alone, as a cell decides.
+
+    Parameters
+    ----------
+    n_components, n_neighbors, min_dist, n_epochs, random_state
+        As in umap-learn.
+
+    References
+    ----------
+    McInnes, Healy and Melville (2018), UMAP: Uniform manifold approximation and projection for
+    dimension reduction, arXiv:1802.03426.
+    """
+
+    n_components: int = 2
+    n_neighbors: int = 15
+    min_dist: float = 0.1
+    n_epochs: int | None = None
+    random_state: Any = 0
+
+    def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
+        """Fit on traces; labels are ignored.
+
+        Parameters
+        ----------
+        X : array of float, shape (n, T) or (n, C, T)
+            Traces.
+        y : ignored
+            Labels are not used.
+
+        Raises
+        ------
+        SettingError
+            If there are no more than `n_neighbors` traces.
+        """
+        traces = self.check_traces(X, reset=True)
+        n = len(traces)
+        if n <= self.n_neighbors:
+            wanted = f"more than n_neighbors = {self.n_neighbors} traces"
+            raise SettingError(f"UMAP needs {wanted}, got n_samples = {n}.")
+        from umap import UMAP
+
+        with _contained():
+            self.umap_ = UMAP(**self.get_params(), n_jobs=1).fit(as_rows(traces))
+        return self
+
+    def train(
+        self,
+        X: Floats,
+        y: Ints,
+        folds: Ints,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
+    ) -> Floats:
+        # The fit has placed its traces; `embed` would place them again, slowly.
+        return as_points(self.fit(X).umap_.embedding_)
+
+    def transform(self, X: ArrayLike) -> Floats:
+        check_is_fitted(self, "umap_")
+        return self._placed(self.check_traces(X))
+
+    def embed(self, X: Floats) -> Floats:
+        check_is_fitted(self, "umap_")
+        traces = self.check_traces(X)
+        alone = [self._placed(traces[i : i + 1]) for i in range(len(traces))]
+        return np.concatenate(alone)[:, None, :]
+
+    def _placed(self, traces: Floats) -> Floats:
+        with _contained():
+            return np.asarray(self.umap_.transform(as_rows(traces)), dtype=np.float32)
+
+
+@contextmanager
+def _contained() -> Iterator[None]:
+    """Keep umap-learn's warnings and its number of threads out of the process.
+
+    At its first kernel numba sets OpenMP's number of threads for the whole process, torch's too.
+    Other work then takes up to forty times as long.
+    """
+    threads = torch.get_num_threads()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"(umap|sklearn\.manifold)\..*")
+        try:
+            yield
+        finally:
+            if torch.get_num_threads() != threads:
+                torch.set_num_threads(threads)

@@ -1,0 +1,468 @@
+"""UMAP in PyTorch agrees with umap-learn, goes on from training to training, and is restored."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sklearn.manifold import trustworthiness
+from sklearn.metrics import pairwise_distances
+from sklearn.neighbors import NearestNeighbors
+from torch import Tensor
+
+from dengine import (
+    Action,
+    DataEngine,
+    Dataset,
+    ModelPrediction,
+    UmapLearnReducer,
+    UmapReducer,
+    WilsonRadiusClassifier,
+    export_torchscript,
+    load_dataset,
+    load_exported,
+)
+from dengine.decision.rule import script
+from dengine.errors import SettingError
+from dengine.reducers.base import StopRule
+from dengine.reducers.umap import (
+    CLOSING_EPOCHS,
+    Edges,
+    Neighbors,
+    attraction,
+    find_ab_params,
+    frames_for,
+    fuzzy_simplicial_set,
+    learning_rates,
+    membership_strengths,
+    negative_samples,
+    repulsion,
+)
+from dengine.testing import toy_traces
+
+N = 400
+NUMBERS = np.arange(1, N + 1)
+Traces = tuple[np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def insertion() -> Traces:
+    """The first traces of the bundled set, (n, 1, T), and their labels."""
+    data = load_dataset("insertion")
+    return np.ascontiguousarray(data.X[:N, None], dtype=np.float32), np.asarray(data.y[:N])
+
+
+@pytest.fixture(scope="module")
+def fitted(insertion: Traces) -> UmapReducer:
+    return UmapReducer().fit(insertion[0])
+
+
+def train(reducer: UmapReducer, X: np.ndarray, numbers: np.ndarray, **limits: Any) -> np.ndarray:
+    """Train as an engine does, on the traces of these labels' numbers, from 1."""
+    labels = np.ones(len(numbers), dtype=np.int64)
+    stop = StopRule(**limits)
+    return reducer.train(X[numbers - 1], labels, labels, stop, numbers)
+
+
+def label_agreement(places: np.ndarray, labels: np.ndarray) -> float:
+    """Share of the traces whose label is that of most of the 15 nearest others."""
+    nearest = NearestNeighbors(n_neighbors=16).fit(places).kneighbors(places)[1][:, 1:]
+    return float(((labels[nearest].mean(1) > 0.5) == labels).mean())
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """What umap-learn compiles sets the number of torch's threads."""
+    yield
+    torch.set_num_threads(1)
+
+
+# umap-learn compiles for half a minute: these are left out of `make test`.
+
+
+@pytest.fixture(scope="module")
+def exact(fitted: UmapReducer) -> np.ndarray:
+    """Distances between all frames, as umap-learn computes them of fewer than 4,096 traces."""
+    frames = fitted.neighbors_.frames.numpy()
+    return pairwise_distances(frames).astype(np.float32)
+
+
+@pytest.mark.merge
+@pytest.mark.usefixtures("one_thread")
+def test_the_neighbours_are_those_of_umap_learn(fitted: UmapReducer, exact: np.ndarray) -> None:
+    from umap.umap_ import nearest_neighbors
+
+    indices, distances, _ = nearest_neighbors(exact, 15, "precomputed", {}, False, None)
+    np.testing.assert_array_equal(fitted.neighbors_.indices, indices[:, 1:])  # without itself
+    np.testing.assert_allclose(fitted.neighbors_.distances, distances[:, 1:], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.merge
+@pytest.mark.usefixtures("one_thread")
+def test_the_membership_strengths_are_those_of_umap_learn(
+    fitted: UmapReducer,
+    exact: np.ndarray,
+) -> None:
+    from umap import umap_
+
+    expected, _, _ = umap_.fuzzy_simplicial_set(exact, 15, None, "precomputed")
+    neighbors = fitted.neighbors_
+    strengths = membership_strengths(neighbors.distances, 15)
+    found = fuzzy_simplicial_set(neighbors.indices, strengths)
+    assert abs(found - expected).max() < 1e-4
+    assert find_ab_params(0.1) == pytest.approx(umap_.find_ab_params(1.0, 0.1), rel=1e-6)
+
+
+@pytest.mark.merge
+@pytest.mark.usefixtures("one_thread")
+def test_the_places_are_as_trustworthy_as_those_of_umap_learn(
+    insertion: Traces,
+    fitted: UmapReducer,
+) -> None:
+    X, y = insertion
+    other = UmapLearnReducer().fit(X).umap_.embedding_
+    own = fitted.places_.numpy()
+    rows = X[:, 0]
+    trust = [trustworthiness(rows, places, n_neighbors=15) for places in (own, other)]
+    assert trust[0] == pytest.approx(trust[1], abs=0.01)
+    assert label_agreement(own, y) > label_agreement(other, y) - 0.01
+
+
+def test_places_that_were_trained_warm_are_as_good_as_those_of_one_fit(
+    insertion: Traces,
+    fitted: UmapReducer,
+) -> None:
+    X, y = insertion
+    warm = UmapReducer()
+    for n in range(50, N + 1, 50):
+        places = train(warm, X, NUMBERS[:n])
+    trust = [trustworthiness(X[:, 0], each, n_neighbors=15) for each in (places, fitted.places_)]
+    assert trust[0] > trust[1] - 0.01
+    assert label_agreement(places, y) > label_agreement(fitted.places_.numpy(), y) - 0.02
+
+
+def test_frames_keep_the_neighbours_of_whole_traces(insertion: Traces, fitted: UmapReducer) -> None:
+    rows = insertion[0][:, 0]
+    whole = NearestNeighbors(n_neighbors=14).fit(rows).kneighbors(return_distance=False)
+    pairs = zip(whole.tolist(), fitted.neighbors_.indices.tolist(), strict=True)
+    assert np.mean([len(set(one) & set(other)) / 14 for one, other in pairs]) > 0.95
+
+
+@pytest.mark.parametrize(
+    ("samples", "n_frames"),
+    [(1, 1), (2, 2), (99, 99), (101, 101), (250, 125), (404, 101), (1000, 100)],
+)
+def test_frames_cover_the_whole_trace(samples: int, n_frames: int) -> None:
+    X = np.random.default_rng(0).normal(size=(30, 2, 1)).repeat(samples, axis=2).astype(np.float32)
+    frames = frames_for(X)
+    assert frames.n_frames == n_frames
+    # Constant traces: nothing averages out, so that each sample left out would shorten a distance.
+    found = pairwise_distances(frames(torch.from_numpy(X)).numpy())
+    np.testing.assert_allclose(found, pairwise_distances(X.reshape(30, -1)), rtol=1e-3, atol=1e-3)
+
+
+def test_an_oscillation_is_not_averaged_away() -> None:
+    phase = np.random.default_rng(0).uniform(0.0, 6.28, size=(40, 1, 1))
+    X = np.sin(2.5 * np.arange(1000) + phase).astype(np.float32)
+    assert frames_for(X).n_frames == 1000
+
+
+def windows() -> Iterator[np.ndarray]:
+    """Numbers of the labels in a window: some arrive, the oldest or single ones leave."""
+    rng = np.random.default_rng(0)
+    yield NUMBERS[:40]
+    yield NUMBERS[:50]
+    yield NUMBERS[10:90]
+    yield np.sort(rng.choice(NUMBERS[20:130], 100, replace=False))
+    yield NUMBERS[20:200]
+    yield NUMBERS[20:200]
+    yield NUMBERS[190:400]
+
+
+def test_kept_neighbours_are_those_of_a_search_among_all(insertion: Traces) -> None:
+    X, _ = insertion
+    make_frames = frames_for(X)
+    none = kept = Neighbors.empty(make_frames.n_features, 14)
+    for numbers in windows():
+        kept = kept.update(X[numbers - 1], numbers, make_frames)
+        anew = none.update(X[numbers - 1], numbers, make_frames)
+        np.testing.assert_array_equal(kept.indices, anew.indices)
+        np.testing.assert_allclose(kept.distances, anew.distances, rtol=1e-5)
+
+
+def test_places_stay_with_their_labels_when_the_oldest_leave(insertion: Traces) -> None:
+    X, _ = insertion
+    reducer = UmapReducer()
+    before = train(reducer, X, NUMBERS[:300])
+    after = train(reducer, X, NUMBERS[60:320], max_steps=0)  # no epoch moves a place
+    np.testing.assert_array_equal(after[:240], before[60:])
+    new = reducer.transform(X[300:320])
+    assert np.linalg.norm(after[240:] - new, axis=1).mean() < 0.1 * before.std()
+
+
+def test_a_training_on_other_traces_starts_anew(insertion: Traces) -> None:
+    X, _ = insertion
+    reducer = UmapReducer()
+    train(reducer, X, NUMBERS[:100])
+    places = train(reducer, X, NUMBERS[100:])
+    np.testing.assert_array_equal(places, train(UmapReducer(), X, NUMBERS[100:]))
+
+
+def test_looking_ahead_changes_no_place(insertion: Traces) -> None:
+    X, _ = insertion
+    plain, ahead = UmapReducer(), UmapReducer()
+    for n in (200, 260):
+        ahead.look_ahead(X[:n], NUMBERS[:n])
+        found = train(ahead, X, NUMBERS[:n])
+        np.testing.assert_array_equal(found, train(plain, X, NUMBERS[:n]))
+
+
+def test_state_is_restored_bit_for_bit_over_further_trainings(insertion: Traces) -> None:
+    X, _ = insertion
+    reducer = UmapReducer(random_state=None)
+    for n in (100, 150):
+        train(reducer, X, NUMBERS[:n])
+    restored = UmapReducer(random_state=None).set_state(reducer.get_state())
+    np.testing.assert_array_equal(restored.transform(X), reducer.transform(X))
+    assert restored.report == reducer.report
+    for first, last in ((0, 200), (60, 230)):
+        numbers = NUMBERS[first:last]
+        np.testing.assert_array_equal(train(restored, X, numbers), train(reducer, X, numbers))
+        np.testing.assert_array_equal(restored.transform(X), reducer.transform(X))
+
+
+def test_places_repeat_exactly_with_a_random_state_and_differ_between_two(
+    insertion: Traces,
+) -> None:
+    X, _ = insertion
+    one, same, other = (UmapReducer(random_state=seed).fit(X[:100]).places_ for seed in (1, 1, 2))
+    assert torch.equal(one, same)
+    assert not torch.equal(one, other)
+
+
+def test_the_scripted_module_is_the_eager_one_bit_for_bit(
+    insertion: Traces,
+    fitted: UmapReducer,
+) -> None:
+    x = torch.from_numpy(insertion[0])
+    module = fitted.module()
+    scripted = script(module)
+    with torch.inference_mode():
+        for one in x.split(1):
+            assert torch.equal(scripted(one), module(one))
+        torch.testing.assert_close(scripted(x), module(x), rtol=1e-5, atol=1e-5)
+
+
+def test_the_place_of_a_trace_does_not_depend_on_its_address(
+    insertion: Traces,
+    fitted: UmapReducer,
+) -> None:
+    X, _ = insertion
+    memory = np.empty(1100, dtype=np.float32)
+    for offset in range(17):
+        view = memory[offset : offset + 1000].reshape(1, 1, 1000)
+        view[:] = X[:1]
+        with torch.inference_mode():
+            place = fitted.module()(torch.from_numpy(view))[0].numpy()
+        np.testing.assert_array_equal(place, fitted.transform(X[:1]))
+
+
+@pytest.mark.parametrize("n", [17, 256, 257])
+def test_empty_slots_of_the_module_attract_nothing(insertion: Traces, n: int) -> None:
+    X, _ = insertion
+    reducer = UmapReducer(n_epochs=5).fit(X[:n])
+    assert len(reducer.module().references) in (256, 512)
+    far = 1e4 * np.random.default_rng(0).normal(size=(50, 1, 1000)).astype(np.float32)
+    low, high = reducer.places_.numpy().min(0), reducer.places_.numpy().max(0)
+    for places in (reducer.transform(X), reducer.transform(far)):
+        assert (places >= low - 1e-3).all()
+        assert (places <= high + 1e-3).all()
+
+
+def test_both_exports_decide_as_the_model_does(
+    make_data: Callable[..., Dataset],
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    from dengine.export import export_onnx, load_onnx
+
+    data, new = make_data(300), make_data(100, seed=9)
+    classifier = WilsonRadiusClassifier(0.5, 0.2, 0.8)
+    model = ModelPrediction("umap", classifier).fit(data.X, data.y)
+    one = load_onnx(export_onnx(model, tmp_path / "model.onnx"))
+    two = load_exported(export_torchscript(model, tmp_path / "model.ts"))
+    expected = model.predict_many(new.X)
+    actions = [prediction.action for prediction in expected]
+    places = np.array([prediction.embedding for prediction in expected])
+    assert {Action.ACCEPT, Action.REJECT} <= set(actions)
+    for exported in (one, two):
+        decided = exported.decide_many(new.X)
+        assert [decision.action for decision in decided] == actions
+        found = [decision.embedding for decision in decided]
+        np.testing.assert_allclose(found, places, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("n_components", [1, 2, 3])
+def test_the_embedding_has_as_many_components_as_asked(n_components: int) -> None:
+    X, _ = toy_traces(120)
+    reducer = UmapReducer(n_components=n_components).fit(X)
+    assert reducer.places_.shape == reducer.transform(X).shape == (120, n_components)
+    assert reducer.module().dim == n_components
+    assert trustworthiness(X[:, 0], reducer.places_.numpy(), n_neighbors=15) > 0.8
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({}, "UMAP needs more than 15 traces, got n_samples = 15"),
+        ({"n_neighbors": 5, "n_components": 15}, "UMAP needs more than 15 traces"),
+        ({"n_components": 0}, "Expected n_components from 1 to 100, got 0"),
+        ({"n_neighbors": 1}, "Expected n_neighbors from 2 to 1000, got 1"),
+        ({"min_dist": 1.5}, "Expected min_dist from 0 to 1, got 1.5"),
+        ({"n_epochs": 0}, "Expected n_epochs of 1 or more, got 0"),
+    ],
+)
+def test_too_few_traces_or_a_parameter_out_of_range_is_a_setting_error(
+    params: dict,
+    message: str,
+) -> None:
+    X, _ = toy_traces(15)
+    for call in (
+        UmapReducer(**params).fit,
+        lambda X: train(UmapReducer(**params), X, NUMBERS[:15]),
+    ):
+        with pytest.raises(SettingError, match=message):
+            call(X)
+
+
+def test_traces_that_are_all_the_same_have_finite_places() -> None:
+    X = np.ones((60, 1, 50), dtype=np.float32)
+    reducer = UmapReducer().fit(X)
+    assert np.isfinite(reducer.places_.numpy()).all()
+    assert np.isfinite(reducer.transform(X)).all()
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e-3, 1e3, 1e12])
+def test_the_unit_of_the_traces_does_not_matter(insertion: Traces, unit: float) -> None:
+    X = insertion[0][:200]
+    plain, scaled = UmapReducer().fit(X), UmapReducer().fit((unit * X).astype(np.float32))
+    np.testing.assert_array_equal(scaled.neighbors_.indices, plain.neighbors_.indices)
+    assert trustworthiness(X[:, 0], scaled.places_.numpy()) > 0.97
+
+
+def test_a_cluster_apart_is_laid_out_as_well_as_the_others() -> None:
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(200, 1, 1)) * np.linspace(0.0, 1.0, 60)
+    X += 0.02 * rng.normal(size=X.shape)
+    X[:80] += 1000.0
+    reducer = UmapReducer().fit(X.astype(np.float32))
+    for rows in (slice(0, 80), slice(80, 200)):
+        assert trustworthiness(X[rows, 0], reducer.places_[rows].numpy(), n_neighbors=10) > 0.95
+
+
+class Ticking:
+    """A clock that goes on by a second whenever it is read."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 1.0
+        return self.now
+
+
+def test_a_limit_in_steps_is_a_limit_in_epochs(insertion: Traces) -> None:
+    reducer = UmapReducer()
+    train(reducer, insertion[0], NUMBERS[:100], max_steps=8)
+    assert reducer.report.n_steps == 8
+    assert reducer.report.n_steps_left == 192
+    train(reducer, insertion[0], NUMBERS[:100])
+    assert reducer.report.n_steps == 192
+    assert reducer.report.n_steps_left == 0
+
+
+def test_a_clock_that_ends_a_layout_leaves_no_high_rate(insertion: Traces) -> None:
+    stop = StopRule(deadline=20.0, clock=Ticking())
+    rates = list(learning_rates(100, stop))
+    assert stop.late
+    assert len(rates) == 19 + CLOSING_EPOCHS
+    assert rates[18] > 0.8
+    assert (np.diff(rates) < 0.0).all()
+    assert 0.0 < rates[-1] < 0.1
+
+    reducer = UmapReducer()
+    train(reducer, insertion[0], NUMBERS[:200], deadline=20.0, clock=Ticking())
+    assert reducer.report.n_steps == 29
+    assert reducer.report.n_steps_left == 171
+    trust = trustworthiness(insertion[0][:200, 0], reducer.places_.numpy(), n_neighbors=15)
+    assert trust > 0.95
+
+
+def test_a_layout_of_many_traces_takes_several_trainings() -> None:
+    X, _ = toy_traces(3000, samples=20)
+    reducer, steps = UmapReducer(), []
+    while not steps or reducer.report.n_steps_left:
+        train(reducer, X, np.arange(1, 3001))
+        steps.append(reducer.report.n_steps)
+    assert steps == [133, 67]
+    assert reducer.n_epochs_due(3000) == 80
+    assert reducer.n_epochs_due(10_000) == 40
+    assert reducer.n_epochs_due(100) == 200
+
+
+def cross_entropy_of_edges(places: Tensor, edges: Edges, a: float, b: float) -> Tensor:
+    """Cross entropy of the membership strengths, without pairs that have no edge."""
+    squared = (places[:, edges.head] - places[:, edges.tail]).square().sum(0)
+    return (edges.strength * torch.log(1.0 + a * squared.pow(b))).sum()
+
+
+def test_attraction_is_the_gradient_of_the_cross_entropy(fitted: UmapReducer) -> None:
+    a, b = find_ab_params(0.1)
+    neighbors = fitted.neighbors_
+    strengths = membership_strengths(neighbors.distances, 15)
+    edges = Edges.of(fuzzy_simplicial_set(neighbors.indices, strengths))
+    places = torch.randn(2, N, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    cross_entropy_of_edges(places, edges, a, b).backward()
+    pull, stiffness = attraction(places.detach(), edges, a, b)
+    torch.testing.assert_close(pull, -places.grad, rtol=1e-3, atol=1e-3)
+    assert (stiffness > 0.0).all()
+
+
+def test_repulsion_is_the_gradient_of_the_cross_entropy_of_places_that_are_apart() -> None:
+    a, b = find_ab_params(0.1)
+    places = torch.zeros(2, 1, requires_grad=True)
+    samples = 3.0 * torch.nn.functional.normalize(torch.randn(2, 1, 8), dim=0)
+    squared = (places.unsqueeze(2) - samples).square().sum(0)
+    strength = 1.0 / (1.0 + a * squared.pow(b))
+    (-torch.log(1.0 - strength)).mean().backward()
+    push = repulsion(places.detach(), samples, a, b)
+    torch.testing.assert_close(push, -places.grad, rtol=1e-3, atol=1e-5)
+
+
+def test_negative_samples_are_other_places_each_drawn_equally_often() -> None:
+    places = torch.arange(50.0).unsqueeze(0)
+    order, samples = negative_samples(places, 16, torch.Generator().manual_seed(0))
+    assert samples.shape == (1, 50, 16)
+    assert sorted(order.tolist()) == list(range(50))
+    assert (samples != places[:, order].unsqueeze(2)).all()
+    assert (torch.bincount(samples.flatten().long()) == 16).all()
+
+
+def test_an_engine_with_umap_is_opened_without_a_refit(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    X, y = toy_traces(120)
+    url = str(tmp_path / "engine.db")
+    with DataEngine("umap", store=url, replaying=True) as engine:
+        for x, label in zip(X, y, strict=True):
+            engine.report(engine.decide(x).id, bool(label))
+        version = engine.version
+    assert version
+    monkeypatch.setattr(UmapReducer, "_train", None)
+    with DataEngine.open(url) as engine:
+        assert engine.version == version
+        assert engine.decide(X[0]).embedding is not None
