@@ -51,6 +51,7 @@ CHUNK = 64  # traces that are embedded at once: what they need stays in the cach
 STATISTICS = 256  # traces from which the statistics of batch normalisation are taken
 STEPS_A_LABEL = 1.2  # that training must have had before it is called complete
 BEGINNING = 36  # steps on top of these
+MANY = 4000  # labels beyond which embedding them leaves no time for more steps
 HURRY = 2  # times the steps of a retrain, as long as training is behind
 
 
@@ -190,7 +191,8 @@ class TorchReducer(Reducer):
     def n_steps_due(self, n_labels: int) -> int:
         """Steps that the next retrain takes on so many labels."""
         behind = self._n_steps_wanted(n_labels) - self.n_steps_
-        return min(max(behind, self.steps), HURRY * self.steps)
+        most = self.steps if n_labels > MANY else HURRY * self.steps
+        return min(max(behind, self.steps), most)
 
     def _n_steps_wanted(self, n_labels: int) -> int:
         return int(min(self.fit_steps, BEGINNING + STEPS_A_LABEL * n_labels))
