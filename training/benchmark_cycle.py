@@ -111,9 +111,7 @@ def main() -> None:
     parser.add_argument("--replays", type=int, default=30, help="shuffled replays whose retrains are timed")
     parser.add_argument("--repeats", type=int, default=10, help="warm retrains on the whole set")
     parser.add_argument("--burn", action="store_true", help="beside a process that burns each core")
-    parser.add_argument(
-        "--umap-repeats", type=int, default=3, help="fits of umap-learn on the whole set"
-    )
+    parser.add_argument("--umap-repeats", type=int, default=3, help="fits of umap-learn on the whole set")
     args = parser.parse_args()
     recipe = Recipe.load(args.recipe).with_policy(**POLICY)
     with busy_cores() if args.burn else nullcontext():
