@@ -448,13 +448,18 @@ def part(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[An
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
+def model_of_another_version(defect: str) -> StoreError:
+    """What is said of a stored model that this version of dengine cannot restore."""
+    got = f"one whose {defect}; its labels are whole"
+    do = "learn from them anew, by `dengine train --data OLD.db --store NEW.db`"
+    return StoreError(f"Expected a model of this version of dengine, got {got}: {do}.")
+
+
 def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Copy arrays into a module's parameters and buffers by name; StoreError where these have other names or sizes."""
     own = module.state_dict()  # shares its tensors with the module
     if {name: value.shape for name, value in arrays.items()} != {name: tuple(v.shape) for name, v in own.items()}:
-        got = f"one whose {type(module).__name__} has other sizes; its labels are whole"
-        do = "learn from them anew, by `dengine train --data OLD.db --store NEW.db`"
-        raise StoreError(f"Expected a model of this version of dengine, got {got}: {do}.")
+        raise model_of_another_version(f"{type(module).__name__} has other sizes")
     for name, value in arrays.items():
         own[name].copy_(torch.from_numpy(np.array(value)))
 

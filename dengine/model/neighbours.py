@@ -26,7 +26,7 @@ from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
 from ..decision.references import Counts, RadiusIndex
-from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, part, restore, script
+from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, model_of_another_version, part, restore, script
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
@@ -422,6 +422,8 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         if not self.needs_refit(state):
             self.spaces.set_state(part(state, "reducer."))
+        elif self.spaces.get_state() is not None:  # another reducer of that name, whose points lie elsewhere
+            raise model_of_another_version(f"{type(self.spaces).__name__} has no state")
         self.trace_shape = tuple(int(n) for n in state["trace_shape"])
         self.scale = np.asarray(state["scale"])
         self.index = RadiusIndex.from_state(state, self.classifier.capacity)

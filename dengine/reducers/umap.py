@@ -696,8 +696,8 @@ class UmapReducer(Reducer):
     """Embed traces by UMAP, without labels, within the time of a retrain.
 
     `fit` starts anew. `train` goes on from the places of the last training, as long as at least
-    half of the traces were in it. So references move little from version to version, and a
-    training takes 60 to 200 epochs, fewer of more traces.
+    half of the traces were in it. So references move little from version to version, and few
+    epochs are enough.
 
     Parameters
     ----------
@@ -708,8 +708,8 @@ class UmapReducer(Reducer):
     min_dist : float, default 0.1
         Distance in the embedding up to which neighbours are drawn together.
     n_epochs : int, optional
-        Epochs of every training; by default 200 of `fit`, and 240,000 / n between 60 and 200 of
-        `train`.
+        Epochs of every training. By default `fit` takes 200; `train` takes 240,000 / n, from 60
+        to 200, and at most 400,000 / n, which bounds its time.
     random_state : int, RandomState or None, default 0
         Of the negative samples and the noise on a start.
 
@@ -718,7 +718,8 @@ class UmapReducer(Reducer):
     n_epochs_ : int
         Epochs since the spectral start.
     n_steps_left_ : int
-        Epochs that are missing to the 200 that a layout needs from a spectral start.
+        Epochs that are missing to the 200 that a layout needs from a spectral start; an engine
+        then trains again after every cycle.
 
     References
     ----------
@@ -755,6 +756,7 @@ class UmapReducer(Reducer):
             If a parameter is out of its range, or there are no more than `n_neighbors` traces.
         """
         traces = self.check_traces(X, reset=True)
+        self.check(len(traces))
         self._start(traces)
         self._train(traces, None, StopRule(), self._n_first_epochs)
         return self
@@ -768,6 +770,7 @@ class UmapReducer(Reducer):
         numbers: Ints | None = None,
     ) -> Floats:
         traces = self.check_traces(X, reset=not self._is_fitted)
+        self.check(len(traces))
         if numbers is None or not self._knows(numbers):
             self._start(traces)
         self._train(traces, numbers, stop or StopRule())
@@ -783,9 +786,10 @@ class UmapReducer(Reducer):
 
     def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
         """Search the neighbours of these traces, which the next training need not do."""
-        if numbers is None or len(X) <= self.n_neighbors:
+        if numbers is None:
             return
         traces = self.check_traces(X, reset=not self._is_fitted)
+        self.check(len(traces))
         if not self._is_fitted:
             self._start(traces)
         ahead = self.neighbors_.update(traces, numbers, self.make_frames_)
@@ -804,7 +808,6 @@ class UmapReducer(Reducer):
 
     def _start(self, traces: Floats) -> None:
         """Forget all trainings, and fit the frames to traces (n, C, T)."""
-        self.check()
         some = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(some)
         self.make_frames_.learn(torch.from_numpy(some))
@@ -824,12 +827,8 @@ class UmapReducer(Reducer):
         stop: StopRule,
         n_epochs: int | None = None,
     ) -> None:
-        n = len(traces)
-        least = max(self.n_neighbors, self.n_components)
-        if n <= least:
-            raise SettingError(f"UMAP needs more than {least} traces, got n_samples = {n}.")
         if numbers is None:
-            numbers = np.arange(-n, 0)  # of no label
+            numbers = np.arange(-len(traces), 0)  # of no label
         rng = np.random.default_rng([self.seed_, self.n_steps_])
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         before = self.neighbors_ahead_ or self.neighbors_
@@ -837,7 +836,7 @@ class UmapReducer(Reducer):
         strengths = membership_strengths(neighbors.distances, self.n_neighbors)
         graph = fuzzy_simplicial_set(neighbors.indices, strengths)
         places = self._starting_places(neighbors, graph, rng)
-        n_epochs = n_epochs or self.n_epochs_due(n)
+        n_epochs = n_epochs or self.n_epochs_due(len(traces))
         places, taken = optimize_layout(places, graph, self.min_dist, n_epochs, stop, generator)
         self._keep(neighbors, places)
         self.n_new_steps_ = taken
@@ -940,11 +939,15 @@ class UmapReducer(Reducer):
         self._keep(neighbors, torch.from_numpy(np.array(state["places"])))
         return self
 
-    def check(self) -> None:
-        """Raise SettingError for a parameter out of its range."""
+    def check(self, n_traces: int) -> None:
+        """Raise SettingError for a parameter out of its range, or too few traces."""
         expect(is_whole(self.n_components, 1, 100), "n_components from 1 to 100", self.n_components)
         expect(is_whole(self.n_neighbors, 2, 1000), "n_neighbors from 2 to 1000", self.n_neighbors)
         is_distance = is_number(self.min_dist) and 0.0 <= self.min_dist <= 1.0
         expect(is_distance, "min_dist from 0 to 1", self.min_dist)
         epochs = self.n_epochs
         expect(epochs is None or is_whole(epochs, 1, 10**6), "n_epochs of 1 or more", epochs)
+        least = max(self.n_neighbors, self.n_components)
+        if n_traces <= least:
+            got = f"n_samples = {n_traces}"
+            raise SettingError(f"UMAP needs more than {least} traces, got {got}.")

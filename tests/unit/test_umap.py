@@ -1,5 +1,6 @@
 """UMAP in PyTorch agrees with umap-learn, goes on from training to training, and is restored."""
 
+import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from dengine import (
     load_exported,
 )
 from dengine.decision.rule import script
-from dengine.errors import SettingError
+from dengine.errors import SettingError, StoreError
 from dengine.reducers.base import StopRule
 from dengine.reducers.umap import (
     CLOSING_EPOCHS,
@@ -466,3 +467,20 @@ def test_an_engine_with_umap_is_opened_without_a_refit(
     with DataEngine.open(url) as engine:
         assert engine.version == version
         assert engine.decide(X[0]).embedding is not None
+
+
+def test_points_of_another_umap_are_not_counted_with_this_one() -> None:
+    X, y = toy_traces(120)
+    state = ModelPrediction("umap").fit(X, y).get_state()
+    stateless = {name: value for name, value in state.items() if not name.startswith("reducer.")}
+    refitted = ModelPrediction("umap").fit(X, y)
+    with pytest.raises(StoreError, match=r"whose UmapReducer has no state; .*dengine train"):
+        refitted.set_state(stateless)
+
+
+def test_a_fitted_reducer_travels_between_processes(insertion: Traces) -> None:
+    X, _ = insertion
+    reducer = UmapReducer()
+    train(reducer, X, NUMBERS[:100])
+    received = pickle.loads(pickle.dumps(reducer))
+    np.testing.assert_array_equal(train(received, X, NUMBERS), train(reducer, X, NUMBERS))
