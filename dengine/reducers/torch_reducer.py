@@ -169,7 +169,7 @@ class TorchReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, or there are fewer than 20 traces.
+            If a parameter is out of its range, or fewer than two traces lie outside a fold.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -182,6 +182,7 @@ class TorchReducer(Reducer):
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
         if "members_" not in vars(self):
+            expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first")
             self._start(self.check_traces(X, reset=True))
         traces = self.check_traces(X)
         labels = binary_labels(y, len(X), type(self).__name__)
@@ -199,7 +200,6 @@ class TorchReducer(Reducer):
 
     def _start(self, traces: Floats) -> None:
         """Build preprocessor and members for traces (n, C, T), from which the scales are read; no label is read."""
-        expect(len(traces) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(traces), "verify more parts first")
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
         self.preprocessor_.learn(x)
@@ -407,7 +407,7 @@ def draw_batches(folds: Ints, n_folds: int, batch_size: int, steps: int, rng: np
     pools = [np.flatnonzero(folds != k) for k in range(n_folds)]
     smallest = min(map(len, pools))
     if smallest < 2:
-        got = f"{smallest} of {len(folds)}; all traces may be the same"
+        got = f"{smallest} (n_samples = {len(folds)}); all traces may be the same"
         raise SettingError(f"Expected at least 2 traces outside each fold, got {got}. Look at the sensor, or the unit.")
     size = min(batch_size, smallest)
     drawn = np.empty((steps, size, n_folds), dtype=np.int64)

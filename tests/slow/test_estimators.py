@@ -112,13 +112,19 @@ def test_of_two_classes_the_larger_is_the_success(name: str, names: tuple[Any, A
         (np.arange(80) % 3, "Only binary classification is supported. The type of the target is multiclass"),
         (np.linspace(0.0, 1.0, 80), "Unknown label type: continuous"),
         (np.where(np.arange(80) == 3, np.nan, 1.0), "Input y contains NaN"),
-        (np.ones(80, dtype=int), "Expected both classes outside fold 0"),
         (None, "requires y to be passed, but the target y is None"),
     ],
 )
 def test_labels_that_are_not_of_two_classes_are_refused_in_scikit_learns_words(name: str, labels, message: str) -> None:
     with pytest.raises(SettingError, match=message):
         clone(SMALL[name]).fit(traces()[0], labels)
+
+
+def test_labels_of_one_class_are_refused_by_regressions_and_learned_by_a_network() -> None:
+    X, ones = traces()[0], np.ones(80, dtype=int)
+    with pytest.raises(SettingError, match="Expected both classes outside fold 0"):
+        clone(SMALL["rocket"]).fit(X, ones)
+    assert clone(SMALL["conv"]).fit(X, ones).transform(X).shape == (80, 2)
 
 
 @every_reducer
