@@ -44,15 +44,13 @@ def worse_than_allowed(replays: int, case: Case = JUST_BEYOND) -> float:
     return broken([judge(seed, case) for seed in range(replays)], "passed, end", 0.2) / replays
 
 
-@pytest.mark.parametrize(
-    ("reducer", "seeds"), [("conv", 6), ("rocket", SEEDS), ("pca", 2 * SEEDS)]
-)  # the plane of pca has fewer balls
+@pytest.mark.parametrize(("reducer", "seeds"), [("rocket", SEEDS), ("pca", 2 * SEEDS)])  # the plane of pca has fewer balls
 def test_labels_of_noise_are_counted_as_chance_says(reducer: str, seeds: int) -> None:
     assert HONEST[0] <= z2(reducer, seeds) <= HONEST[1]
 
 
 def test_labels_of_noise_are_counted_by_a_trained_network_as_chance_says() -> None:
-    # A network says the same of all noise, so the balls of a seed hold the same labels, and z^2 varies more from seed to seed.
+    # A network says the same of all noise: the balls of a seed hold the same labels, and z^2 varies between seeds.
     assert 0.5 <= z2("conv", 2 * SEEDS) <= HONEST[1]
 
 
