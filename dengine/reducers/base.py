@@ -228,6 +228,19 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     return np.asarray(labels == classes[-1], dtype=np.int64)
 
 
+def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
+    """Return the folds (n,) of traces (n, C, T): those given, or by the traces' content.
+
+    Raises SettingError unless there is one from 0 to n_folds - 1 for each trace.
+    """
+    if folds is None:
+        return content_fold(traces, n_folds)
+    given = np.asarray(folds, dtype=np.int64)
+    within = given.shape == (len(traces),) and given.min() >= 0 and given.max() < n_folds
+    expect(within, f"{len(traces)} folds from 0 to {n_folds - 1}", given)
+    return given
+
+
 def one_class_outside(fold: int, n: int, classes: int) -> SettingError:
     """What is said where clone or head `fold` would learn from n traces of fewer than two classes."""
     got = f"{n} traces of {classes} class; collect more labels before the first fit."

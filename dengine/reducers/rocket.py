@@ -40,9 +40,19 @@ from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from ..decision.rule import part, restore, script
 from ..errors import SettingError, expect
-from ..folds import content_fold
 from ..records import is_whole
-from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, one_class_outside, own_places, seed_of
+from .base import (
+    FitReport,
+    Floats,
+    Ints,
+    Reducer,
+    StopRule,
+    binary_labels,
+    folds_of,
+    one_class_outside,
+    own_places,
+    seed_of,
+)
 from .preprocessing import averaging
 
 CLIP = 4.0  # deviations; an outlier may not carry a score by itself
@@ -458,9 +468,7 @@ class RocketReducer(Reducer):
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
-        folds = content_fold(traces, self.folds) if folds is None else np.asarray(folds, dtype=np.int64)
-        within = folds.shape == labels.shape and folds.min() >= 0 and folds.max() < self.folds
-        expect(within, f"{len(labels)} folds from 0 to {self.folds - 1}", folds)
+        folds = folds_of(traces, self.folds, folds)
         self._start(traces)
         self._fit_heads(self.raw_features(traces), labels, folds)
         return self

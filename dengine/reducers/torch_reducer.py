@@ -37,9 +37,8 @@ from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentatio
 from ..decision.rule import part, restore, script
 from ..errors import SettingError, expect, instead
 from ..files import write_output
-from ..folds import content_fold
 from ..records import is_whole
-from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, seed_of
+from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, folds_of, seed_of
 from .encoder import Encoder, Members, NetworkFactory, fold_batch_norms
 from .preprocessing import Preprocessor, averaging
 
@@ -173,9 +172,7 @@ class TorchReducer(Reducer):
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
-        folds = content_fold(traces, self.folds) if folds is None else np.asarray(folds, dtype=np.int64)
-        within = folds.shape == labels.shape and folds.min() >= 0 and folds.max() < self.folds
-        expect(within, f"{len(labels)} folds from 0 to {self.folds - 1}", folds)
+        folds = folds_of(traces, self.folds, folds)
         self._start(traces)
         self._train(traces, labels, folds, StopRule(), steps=self.fit_steps)
         return self
@@ -342,9 +339,8 @@ class TorchReducer(Reducer):
     def report(self) -> FitReport:
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
-        if self.n_steps_left_:
-            note += f", {self.n_steps_left_} to go"
-        return FitReport(self.n_new_steps_, note, self.n_steps_left_)
+        left = f"{self.n_steps_left_} steps to go" if self.n_steps_left_ else ""
+        return FitReport(self.n_new_steps_, ", ".join(filter(None, (note, left))), self.n_steps_left_)
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         check_is_fitted(self, "encoder_")
