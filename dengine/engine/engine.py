@@ -228,7 +228,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._feedback = Feedback(self._outbox, self._versions, self._settings, on_safe_mode)
         self._maker = DecisionMaker(self._settings, store.clock)
         self._corrections = Corrections(self._outbox, self._settings, self._versions, self._feedback)
-        if not reading:
+        if replaying:
+            template.warm_up()  # no cell waits, and the first retrain is timed without it
+        elif not reading:
             threading.Thread(target=template.warm_up, name="dengine-warm-up").start()
 
     @contextmanager
