@@ -326,7 +326,7 @@ def main() -> None:
     parser.add_argument("--sets", default=",".join(SETS), help="with commas between; all by default")
     parser.add_argument("--only", help="reducers and rivals, with commas between; 'promises' for the variants of conv")
     parser.add_argument("--cycles", type=int, default=1503, help="of a replay, at most")
-    parser.add_argument("--cells", type=int, default=len(CELLS), help="1: at (0.1, 90 %) alone, and no grid")
+    parser.add_argument("--cells", type=int, default=len(CELLS), help="1: at (0.1, 90 %%) alone, and no grid")
     args = parser.parse_args()
     names, only = args.sets.split(","), (args.only or f"{','.join(SHUFFLES)},promises").split(",")
     if unknown := {*names, *only} - {*SETS, *SHUFFLES, "promises"}:
