@@ -45,9 +45,20 @@ from dengine.reducers.base import StopRule
 ROOT, PAGE = Path(__file__).resolve().parents[1], Path("docs/explanation/evidence.md")
 CELLS = ((0.1, 0.9), (0.05, 0.95))  # alpha, LB
 # Seconds of a core that a replay takes.
-SECONDS = {"conv": 14, "rocket": 2, "pca": 2, "knn": 1, "wskde": 2, "umap": 14, "gp": 24, "minirocket": 20}
-SHUFFLES = dict.fromkeys(SECONDS, 30) | dict.fromkeys(("umap", "gp", "minirocket"), 10)  # the slow ones have fewer
-GRIDS = {("conv", "wilson"): 30, ("conv", "binomial"): 30, ("umap", "wilson"): 10, ("umap", "binomial"): 5}
+SECONDS = {
+    "conv": 10,
+    "rocket": 2,
+    "umap": 4,
+    "umap-learn": 60,
+    "pca": 2,
+    "knn": 1,
+    "wskde": 2,
+    "gp": 24,
+    "minirocket": 20,
+}
+SLOW = {"gp": 10, "minirocket": 10, "umap-learn": 5}  # shuffles
+SHUFFLES = dict.fromkeys(SECONDS, 30) | SLOW
+GRIDS = {("conv", "wilson"): 30, ("conv", "binomial"): 30, ("umap", "wilson"): 30, ("umap", "binomial"): 30}
 PROMISES = 10  # shuffles of each
 LABELS = 50  # from one point of a learning curve to the next
 PARTS, SAMPLES = 1000, 400  # of a made set
