@@ -49,9 +49,9 @@ MIN_TRACES = 20
 CHUNK = 64  # traces that are embedded at once: what they need stays in the cache
 STATISTICS = 256  # traces from which the statistics of batch normalisation are taken
 STEPS_A_LABEL = 1.2  # that training must have had before it is called complete
-BEGINNING = 36  # steps on top of these
-MANY = 4000  # labels beyond which embedding them leaves no time for more steps
-HURRY = 2  # times the steps of a retrain, as long as training is behind
+INITIAL_STEPS = 36  # steps on top of these
+MANY_LABELS = 4000  # labels beyond which embedding them leaves no time for more steps
+CATCH_UP_FACTOR = 2  # times the steps of a retrain, as long as training is behind
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,11 +189,11 @@ class TorchReducer(Reducer):
     def n_steps_due(self, n_labels: int) -> int:
         """Steps that the next retrain takes on so many labels."""
         behind = self._n_steps_wanted(n_labels) - self.n_steps_
-        most = self.steps if n_labels > MANY else HURRY * self.steps
+        most = self.steps if n_labels > MANY_LABELS else CATCH_UP_FACTOR * self.steps
         return min(max(behind, self.steps), most)
 
     def _n_steps_wanted(self, n_labels: int) -> int:
-        return int(min(self.fit_steps, BEGINNING + STEPS_A_LABEL * n_labels))
+        return int(min(self.fit_steps, INITIAL_STEPS + STEPS_A_LABEL * n_labels))
 
     def _start(self, traces: Floats) -> None:
         """Build preprocessor and members for traces (n, C, T), from which the scales are read; no label is read."""
