@@ -42,7 +42,9 @@ STATED = re.compile(r"[\[({</]\s*(?P<n>\d*[.,]?\d+)?\s*(?P<unit>[a-zµμ]+)\s*[\
 DAY_FIRST = re.compile(r"^(\d\d?)\.(\d\d?)\.(\d{4})")  # a German day
 SLASHED_DAY = re.compile(r"^(\d\d?)/(\d\d?)/(\d{4})")
 OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
-STAMP = re.compile(r"(\d{4}-?\d\d-?\d\d|\d{4}/\d\d/\d\d|\d\d?[./]\d\d?[./]\d{2,4})([T ].*)?|\d{1,2}:\d\d(:\d\d)?([.,]\d+)?")
+DAY_FORM = r"\d{4}-?\d\d-?\d\d|\d{4}/\d\d?/\d\d?|\d\d?[./]\d\d?[./]\d{2,4}"
+TIME_FORM = r"\d{1,2}:?\d\d(:?\d\d([.,]\d+)?)?\s*(Z|UTC|AM|PM|[+\-−]\d\d(:?\d\d)?)?"
+STAMP = re.compile(rf"({DAY_FORM})([T ]\s*{TIME_FORM})?|\d{{1,2}}:\d\d(:\d\d)?([.,]\d+)?", re.IGNORECASE)
 
 
 class Clock(NamedTuple):

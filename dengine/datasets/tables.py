@@ -287,11 +287,11 @@ def _one_long(tables: Mapping[str, pd.DataFrame], asked: Asked) -> pd.DataFrame:
 
 
 def _from_long(
-    frame: pd.DataFrame, asked: Asked, found: Collected, source: str, told: Mapping[str, str]
+    frame: pd.DataFrame, asked: Asked, found: Collected, source: str, written: Mapping[str, str]
 ) -> Dataset:
     """A row a sample: the rows of a part, by their times, are one insertion. A label is a column, or in a file of parts.
 
-    told : the units of columns.
+    written : the units of columns.
     """
     time = asked.time or next((name for name in frame.columns if is_time(name)), "")
     for name in (asked.part, time):
@@ -303,7 +303,7 @@ def _from_long(
     frame = _row_a_sample(frame, [asked.part, time, *([label] if label else [])], asked)
     left = [name for name in frame.columns if name not in (asked.part, time, label) and not floats(frame[name])[1]]
     found.channels = _chosen(left, asked)
-    order, *_ = seconds_of(frame[time], time, told.get(time, ""))
+    order, *_ = seconds_of(frame[time], time, written.get(time, ""))
     parts = {str(part): rows for part, rows in frame.assign(**{ORDER: order}).groupby(asked.part, sort=False)}
 
     places = [frame.columns.get_loc(name) for name in found.channels]
@@ -312,8 +312,8 @@ def _from_long(
 
     def read(rows: pd.DataFrame) -> Timed:
         rows = rows.sort_values(ORDER, kind="stable").drop(columns=ORDER)
-        timed = recording_of(rows, places, how, found.notes, [told.get(name, "") for name in rows.columns])
-        return timed._replace(units=tuple(told.get(name) or units.split(name)[1] for name in found.channels))
+        timed = recording_of(rows, places, how, found.notes, [written.get(name, "") for name in rows.columns])
+        return timed._replace(units=tuple(written.get(name) or units.split(name)[1] for name in found.channels))
 
     def find(part: str) -> labels.Known:
         words = [word for word in parts[part][label].unique().tolist() if str(word).strip().lower() not in NOTHING]
@@ -347,6 +347,7 @@ def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.Dat
 
 def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
     """How to say which column is what, where a table looks as if it had a row a sample; else nothing."""
+    frame = frame.loc[:, ~frame.columns.duplicated(keep=False)]
     time = next((name for name in frame.columns if is_time(name)), None)
     if time is None or max(map(len, _numbered(frame.columns).values()), default=0) > 2:
         return ""
@@ -369,7 +370,8 @@ def _chosen(have: Sequence[str], asked: Asked) -> tuple[str, ...]:
     if missing or not chosen:
         raise DataError(f"Expected the channel {listed(missing) or 'of the samples'}, found {listed(have) or 'none'}.")
     if not asked.channels and len(chosen) > 1:
-        raise DataError(f"Expected the channel to be named, as in channel={chosen[0]!r}; there are {listed(have)}.")
+        one = min(chosen, key=chosen.count)  # a name that is there twice is none
+        raise DataError(f"Expected the channel to be named, as in channel={one!r}; there are {listed(have)}.")
     return chosen
 
 

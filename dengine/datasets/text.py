@@ -282,7 +282,11 @@ def place_of(name: str, header: Sequence[str], line: int = 1) -> int:
         places = [i for i, word in enumerate(header) if same(word)]
         if places:
             break
-    if len(places) != 1:
-        have = ", ".join(header)[:200]
-        raise UnreadableError(f"Expected a column {name}, got {'it twice or more in ' if places else ''}{have}", line)
+    have = ", ".join(header)[:200]
+    if not places:
+        raise UnreadableError(f"Expected a column {name}, got {have}", line)
+    if len(places) > 1:
+        anew = ",".join(f"{word}_{i}" if word in header[:i] else word for i, word in enumerate(header, start=0))
+        do = f"name them anew, columns={anew!r}"
+        raise UnreadableError(f"Expected a column {name}, got it twice or more in {have}; {do}", line)
     return places[0]
