@@ -34,9 +34,9 @@ LATEST = 5e9  # seconds since 1970: the year 2128
 TELLING = 200  # rows that tell whether a column rises
 STEADY = 0.9  # of the steps of a column that rises steadily, each within a half of their median
 SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "sekunden": 1.0}
-SECONDS |= {name: 1e-3 for name in ("ms", "msec", "msecs", "millis", "millisec", "milliseconds")}
-SECONDS |= {name: 1e-6 for name in ("us", "µs", "μs", "usec", "usecs", "micros", "microseconds")}
-SECONDS |= {name: 1e-9 for name in ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanoseconds")}
+SECONDS |= dict.fromkeys(("ms", "msec", "msecs", "millis", "millisec", "milliseconds"), 0.001)
+SECONDS |= dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "micros", "microseconds"), 1e-06)
+SECONDS |= dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosec", "nanoseconds"), 1e-09)
 SECONDS |= {"min": 60.0, "h": 3600.0, "d": DAY, "days": DAY}
 STATED = re.compile(r"[\[({</]\s*(?P<n>\d*[.,]?\d+)?\s*(?P<unit>[a-zµμ]+)\s*[\])}>]?\s*$|\bin (?P<such>[a-zµμ]+)$")
 DAY_FIRST = re.compile(r"^(\d\d?)\.(\d\d?)\.(\d{4})")  # a German day
@@ -164,7 +164,9 @@ def _parts_of_seconds(frame: pd.DataFrame, name: str) -> NDArray[np.float64] | N
         return None
     known = {str(column): i for i, column in enumerate(frame.columns)}
     whole = next((known[n] for n in (f"{match[1]}secs", f"{match[1]}sec") if n in known), None)
-    part = next((known[n] for n in (f"{match[1]}{k}" for k in ("nsecs", "nsec", "nanosec", "nanosecs")) if n in known), None)
+    part = next(
+        (known[n] for n in (f"{match[1]}{k}" for k in ("nsecs", "nsec", "nanosec", "nanosecs")) if n in known), None
+    )
     if whole is None or part is None:
         return None
     seconds, odd = floats(frame.iloc[:, whole])

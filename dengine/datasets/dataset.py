@@ -67,7 +67,8 @@ class Dataset:
     """Labelled traces in the order they were recorded.
 
     X : (n, T) or (n, C, T) float32.  y : (n,) int8, 1 = success, 0 = failure.
-    name, unit : for people.  rate_hz : of the samples; None: nothing tells it.  cause : (n,) why a part failed, where that is known.
+    name, unit : for people.  rate_hz : of the samples; None: nothing tells it.
+    cause : (n,) why a part failed, where that is known.
     part : (n,) the number of the part that each trace was recorded on; None: every trace is a part of its own.
     faults : what could not be read and was left out.  channels : the channels' names, where they have any.
     notes : what was found about the files, and is no fault.

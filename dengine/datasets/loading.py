@@ -18,10 +18,10 @@ from ..files import is_database, read_archive, reading
 from ..records import trace_in
 from ..traces import as_trace, spec_of
 from .bags import is_stream, read_bag
+from .clocks import clock_of, rate_of
 from .dataset import Asked, Collected, Dataset, Recorded, UnreadableError, as_dataset, make_dataset, must, names_of, refit
 from .labels import in_order, label_of, meanings
 from .tables import FORCE, from_frame, hold_many, read_folder, read_tables, recordings_in
-from .clocks import clock_of, rate_of
 from .text import SUFFIXES as TEXTS
 from .triggers import Trigger
 

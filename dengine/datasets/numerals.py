@@ -100,11 +100,11 @@ def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None
                 continue
             if LARGE.search(text):  # without a mark of thousands: so this one is none
                 return mark
-            if mark == "." and delimiter in ", ":
+            if mark == "." and delimiter in (",", " "):
                 return mark  # who groups by points has decimal commas, and parts cells by something else
             both = f"{found[0].replace(mark, '.')} or {found[0].replace(mark, '')}"
             what = f"Expected a cell that tells the decimal mark, {found[0]} in column {name} may be {both}"
-            raise UndecidedError(f"{what}; say which, decimal='.' or decimal=',' (or thousands)")
+            raise UndecidedError(f"{what}; say which, decimal={mark!r} or thousands={mark!r}")
     return None
 
 

@@ -22,8 +22,8 @@ from ..errors import DataError, listed
 from ..files import reading
 from ..traces import is_time
 from . import labels, units
-from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
 from .clocks import NOTHING, floats, place_of_clock, seconds_of
+from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
 from .numerals import UndecidedError
 from .text import SUFFIXES as TEXTS
 from .text import Sheet, Timed, cells_of, decoded, numbers, read_recording, read_table, recording_of
@@ -213,9 +213,7 @@ def from_frame(frame: pd.DataFrame, asked: Asked) -> Dataset:
     return _from_tables({"row": _counted(frame)}, asked, Collected("data", ()))
 
 
-def _from_tables(
-    tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected, told: Sequence[str] = ()
-) -> Dataset:
+def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected, told: Sequence[str] = ()) -> Dataset:
     """Tables of one form, by the names of their files, whose lines are their index. told : the units of their columns."""
     first, *_ = tables
     for source, frame in tables.items():
@@ -230,7 +228,9 @@ def _from_tables(
         if apart := listed(sorted(_form(frame) ^ _form(tables[first]))):
             raise DataError(f"Expected the same columns in {first} and in {source}, only one of them has {apart}.")
     if asked.time is not None or asked.labels is not None:
-        return _from_long(_one_long(tables, asked), asked, found, first, dict(zip(tables[first].columns, told, strict=False)))
+        return _from_long(
+            _one_long(tables, asked), asked, found, first, dict(zip(tables[first].columns, told, strict=False))
+        )
     for source, frame in tables.items():
         _take_rows(frame, asked, found, source)
     return as_dataset(found, asked)
@@ -286,9 +286,7 @@ def _one_long(tables: Mapping[str, pd.DataFrame], asked: Asked) -> pd.DataFrame:
     return frame.assign(**{asked.part: number.where(~twice, home)})
 
 
-def _from_long(
-    frame: pd.DataFrame, asked: Asked, found: Collected, source: str, written: Mapping[str, str]
-) -> Dataset:
+def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str, written: Mapping[str, str]) -> Dataset:
     """A row a sample: the rows of a part, by their times, are one insertion. A label is a column, or in a file of parts.
 
     written : the units of columns.

@@ -26,7 +26,7 @@ LARGEST = 128 * 2**20  # bytes of one text file
 DELIMITERS = ("\t", ";", "|", ",", " ", "")  # in the order in which equals are taken; " ": any blanks; "": one column
 SAMPLED = 30  # lines, from the end, that tell the delimiter, and
 CELLS = 40  # cells of each
-WORD = re.compile(r'"((?:[^"]|"")*)"|([^\s"]+(?:\s+[\[(][^\])]*[\])])?)')  # between blanks; a unit goes with its name
+WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')  # between blanks; a unit goes with its name
 HINT = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 UNIT = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|")  # a cell of a row of units, beside what `units` knows
 
@@ -40,7 +40,7 @@ class Timed(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """A text's cells. line : of the header.  units : a column each, "" where none.  rows : by the numbers of their lines."""
+    """A text's cells. line : of the header.  units : a column each, "" where none.  rows : by the numbers of lines."""
 
     header: list[str]
     line: int
@@ -95,9 +95,9 @@ def _delimiter(lines: Sequence[str]) -> str:
             return 0.0
         named = width if rows[0][-1:] != [""] else width - 1  # a delimiter at the end of the data alone
         cells = [cell for row in rows if len(row) == width for cell in row[:CELLS]]
-        values = sum(is_numeral(cell) or STAMP.fullmatch(cell) is not None or cell.lower() in NOTHING for cell in cells)
+        values = sum(map(_is_value, cells))
         heads = (row for row in (_ended(_split(line, delimiter)) for line in top) if len(row) in (named, width))
-        headed = any(2 * sum(map(is_numeral, row[:CELLS])) <= min(len(row), CELLS) for row in heads)
+        headed = any(2 * sum(map(_is_value, row[:CELLS])) <= min(len(row), CELLS) for row in heads)
         return values / len(cells) * times / len(rows) * (1.0 if headed else 0.5)
 
     scores = {delimiter: score(delimiter) for delimiter in DELIMITERS} if lines else {"": 0.0}
@@ -106,6 +106,10 @@ def _delimiter(lines: Sequence[str]) -> str:
         return next(delimiter for delimiter in DELIMITERS if scores[delimiter] > 0.98 * best)
     counts = {each: Counter(len(_split(line, each)) for line in few).most_common(1) for each in "\t;|," if few}
     return next((each for each, found in counts.items() if found[0][0] > 1), ",")
+
+
+def _is_value(cell: str) -> bool:
+    return is_numeral(cell) or STAMP.fullmatch(cell) is not None or cell.lower() in NOTHING
 
 
 def _ended(row: list[str]) -> list[str]:
@@ -272,7 +276,7 @@ def recording_of(
 
 
 def place_of(name: str, header: Sequence[str], line: int = 1) -> int:
-    """Where a header has a name, as it is written, in any case, or without its unit; UnreadableError for none, or several."""
+    """Where a header has a name, as it is, in any case, or without its unit; UnreadableError for none, or several."""
     bare = units.split(name)[0].lower()
     for same in (
         lambda word: word == name,

@@ -5,16 +5,38 @@ from __future__ import annotations
 import re
 
 PREFIXES = {
-    **{"G": 1e9, "M": 1e6, "k": 1e3, "da": 1e1, "d": 1e-1, "c": 1e-2, "m": 1e-3},
-    **{"u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9, "": 1.0},
+    "G": 1e9,
+    "M": 1e6,
+    "k": 1e3,
+    "da": 1e1,
+    "d": 1e-1,
+    "c": 1e-2,
+    "m": 1e-3,
+    "u": 1e-6,
+    "µ": 1e-6,
+    "μ": 1e-6,
+    "n": 1e-9,
+    "": 1.0,
 }
 # What a prefix may stand before, with the dimension and the factor; and what stands alone.
 BASES = {
-    **{name: ("N", 1.0) for name in ("N", "Newton", "newton", "Newtons")},
-    **{name: ("Nm", 1.0) for name in ("Nm", "N·m", "N*m", "N.m", "N m")},
-    **{"Nmm": ("Nm", 1e-3), "N·mm": ("Nm", 1e-3), "Ncm": ("Nm", 1e-2), "m": ("m", 1.0), "s": ("s", 1.0)},
-    **{"V": ("V", 1.0), "A": ("A", 1.0), "g": ("g", 1.0), "Pa": ("Pa", 1.0), "bar": ("Pa", 1e5)},
-    **{"Hz": ("Hz", 1.0), "rad": ("rad", 1.0), "sec": ("s", 1.0), "W": ("W", 1.0), "K": ("K", 1.0)},
+    **dict.fromkeys(("N", "Newton", "newton", "Newtons"), ("N", 1.0)),
+    **dict.fromkeys(("Nm", "N·m", "N*m", "N.m", "N m"), ("Nm", 1.0)),
+    "Nmm": ("Nm", 1e-3),
+    "N·mm": ("Nm", 1e-3),
+    "Ncm": ("Nm", 1e-2),
+    "m": ("m", 1.0),
+    "s": ("s", 1.0),
+    "V": ("V", 1.0),
+    "A": ("A", 1.0),
+    "g": ("g", 1.0),
+    "Pa": ("Pa", 1.0),
+    "bar": ("Pa", 1e5),
+    "Hz": ("Hz", 1.0),
+    "rad": ("rad", 1.0),
+    "sec": ("s", 1.0),
+    "W": ("W", 1.0),
+    "K": ("K", 1.0),
 }
 ALONE = ("°", "deg", "°C", "%", "lbf", "lb", "kgf", "kp", "in", "inch", "ft", "psi", "mV/V", "V/V")
 CLOSED = re.compile(r"(?P<name>.*?)\s*[\[({<]\s*(?P<unit>[^\[\](){}<>]*?)\s*[\])}>]\s*")  # FZ [kN]

@@ -387,7 +387,10 @@ REFUSED: dict[str, tuple[Callable[[Dataset, Path], Any], str]] = {
     "no label": (lambda data, tmp: (data.X[:2], [1, None]), "got 'None'"),
     "an empty folder": (lambda data, tmp: tmp, "Expected CSV files, one an insertion"),
     **{
-        kind: (lambda data, tmp, kind=kind: written_text(tmp / f"data.{kind}"), r"a file \.npz, \.csv, .*\.parquet or \.mcap")
+        kind: (
+            lambda data, tmp, kind=kind: written_text(tmp / f"data.{kind}"),
+            r"a file \.npz, \.csv, .*\.parquet or \.mcap",
+        )
         for kind in ("xlsx", "npy")
     },
 }
