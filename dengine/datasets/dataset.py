@@ -314,19 +314,21 @@ def _in_one_unit(found: Collected, asked: Asked) -> str:
     n = max((len(each.units) for each in found.read), default=0)
     stated = asked.unit.split(",") if asked.unit and len(asked.unit.split(",")) == n else [asked.unit or ""] * n
     wanted = [Counter(filter(None, (each.units[c] for each in found.read if each.units))) for c in range(n)]
-    usual = [max(counts, key=counts.__getitem__, default="") for counts in wanted]
+    most = [counts if 2 * counts.total() >= len(found.read) else Counter[str]() for counts in wanted]
+    usual = [max(counts, key=counts.__getitem__, default="") for counts in most]
     usual = [told.strip() if units.parse(told.strip()) else most for told, most in zip(stated, usual, strict=True)]
     why = dict[int, str]()
     for i, recording in enumerate(found.read):
         factors = np.ones(max(n, 1))
         for c, (unit, want) in enumerate(zip(recording.units or [""] * n, usual, strict=True)):
             name = found.channels[c] if c < len(found.channels) else f"channel {c + 1}"
-            if unit == want or (not unit and (stated[c] or not want)):
+            if unit == want or (not unit and stated[c]):
                 continue
             factor = units.factor(unit, want) if unit else None
             if factor is None:
-                got = f"got {unit}" if unit else f"got no unit; state it, unit={want!r}, or write it into the header"
-                why.setdefault(i, f"Expected {name} in {want}, as {'asked' if stated[c] else 'the others are'}, {got}")
+                got = f"as {'asked' if stated[c] else 'the others are'}, got {unit or 'no unit'}"
+                do = "" if unit and want else f"; state that of all, unit={unit or want!r}, or write it into each header"
+                why.setdefault(i, f"Expected {name} in {want or 'no unit'}, {got}{do}")
                 continue
             factors[c] = factor
             found.notes[f"{name} is converted from {unit} to {want}, times {factor:g}"] += 1

@@ -67,9 +67,13 @@ SMALL = re.compile(rf"^{SIGN}[1-9]\d{{0,2}}$", re.MULTILINE)
 LARGE = re.compile(rf"^{SIGN}[1-9]\d{{3,}}$", re.MULTILINE)
 
 
+def _decides(mark: str, text: str) -> bool:
+    return mark in text and DECIDING[mark].search(text) is not None
+
+
 def _looks_grouped(text: str, mark: str) -> bool:
     """Whether a mark groups the thousands of a column, for smaller numbers have none."""
-    if DECIDING[mark].search(text) or LARGE.search(text) or not SMALL.search(text):
+    if mark not in text or DECIDING[mark].search(text) or LARGE.search(text) or not SMALL.search(text):
         return False
     return len(UNDECIDED[mark].findall(text)) >= ENOUGH
 
@@ -80,7 +84,7 @@ def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None
     columns : the name of each numeric column, and its cells, a line each. UndecidedError where the
     values depend on it and nothing decides; UnreadableError where a column contradicts the others.
     """
-    certain = [mark for mark in MARKS if any(DECIDING[mark].search(text) for _, text in columns)]
+    certain = [mark for mark in MARKS if any(_decides(mark, text) for _, text in columns)]
     if len(certain) > 1:  # most cells count; the others are named one by one
         times = {mark: sum(len(DECIDING[mark].findall(text)) for _, text in columns) for mark in MARKS}
         certain = [max(MARKS, key=times.__getitem__)]

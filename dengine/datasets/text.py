@@ -27,6 +27,7 @@ DELIMITERS = ("\t", ";", "|", ",", " ", "")  # in the order in which equals are 
 SAMPLED = 30  # lines, from the end, that tell the delimiter, and
 CELLS = 40  # cells of each
 WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')  # between blanks; a unit goes with its name
+COMMENTS = ("comment", "comments", "kommentar", "remark")
 HINT = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 UNIT = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|")  # a cell of a row of units, beside what `units` knows
 
@@ -79,8 +80,8 @@ def cells_of(text: str, columns: Sequence[str] = ()) -> Cells:
 def _split(line: str, delimiter: str) -> list[str]:
     if delimiter in ("", " "):
         words = [quoted.replace('""', '"') or plain for quoted, plain in WORD.findall(line)]
-        return words if delimiter else [line.strip().strip('"')]
-    return [word.strip() for word in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
+        return words if delimiter else [line.strip().strip("\"'")]
+    return [word.strip().strip("'") for word in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
 
 
 def _delimiter(lines: Sequence[str]) -> str:
@@ -149,6 +150,8 @@ def _from_header(lines: dict[int, list[str]], delimiter: str, columns: list[str]
         if 2 * len(numbers(row)) > len(row) and not all(row[i].isdecimal() for i in numbers(row)):
             raise UnreadableError(f"Expected a header, its first line is of numbers; {_named(rows)}", places[header])
     told = {i: rows[k] for k, i in enumerate(places) if k >= max(data, 1)}
+    if names[-1:] and names[-1].lower() in COMMENTS and all(len(row) < len(names) for row in told.values()):
+        names = names[:-1]  # LabVIEW's, of which its rows say nothing
     return Cells(names, places[header] if places else 0, _stripped(said, len(names)), told, delimiter)
 
 

@@ -432,7 +432,12 @@ WRITERS: dict[str, Callable[[Path], object]] = {
         path, ["Zeit [s]", "Kraft [kN]"], german(times()), german(texts()), delimiter=";", above=["sep=;"]
     ),
     "lvm": lambda path: write(
-        path, ["X_Value", "Untitled"], times(), texts(), delimiter="\t", above=["LabVIEW Measurement", "***End***"]
+        path,
+        ["X_Value", "Untitled", "Comment"],
+        times(),
+        texts(),
+        delimiter="\t",
+        above=["LabVIEW Measurement", "***End***"],
     ),
 }
 
