@@ -361,14 +361,14 @@ def _at_one_rate(found: Collected, asked: Asked) -> tuple[Asked, float | None]:
         found.leave_out({i: f"{wanted}, got {rates[i]:g} Hz{do}" for i in off})
         kept = [each.rate_hz for each in found.read if each.rate_hz]
         return asked, float(np.median(kept))
-    usual = float(f"{np.median(known):.4g}")
+    usual = float(f"{np.median(known):.2g}")  # two digits: recordings that are added do not move it, nor all samples
     off = np.flatnonzero((rates > MOST_APART * usual) | (rates * MOST_APART < usual)).tolist()
     found.leave_out({i: f"Expected timestamps at about {usual:g} Hz, got {rates[i]:g} Hz" for i in off})
     have = [each.rate_hz or usual for each in found.read]
     spans = [(each.trace.shape[1] - 1) / rate for each, rate in zip(found.read, have, strict=True)]
     points = 1 + float(np.median(spans)) * usual
     samples = asked.samples or round(points)
-    rate = usual if asked.samples is None else usual * samples / points
+    rate = usual if abs(samples - points) <= NEAR * points else usual * samples / points
     for i, (each, own, span) in enumerate(zip(found.read, have, spans, strict=True)):
         at = np.arange(1 + int(span * rate + 1e-6)) * (own / rate)
         trace = np.stack([np.interp(at, np.arange(len(x)), x) for x in each.trace]).astype(np.float32)

@@ -17,6 +17,7 @@ from ..errors import DataError, instead, listed
 from ..files import is_database, read_archive, reading
 from ..records import trace_in
 from ..traces import as_trace, spec_of
+from . import units
 from .bags import is_stream, read_bag
 from .clocks import clock_of, rate_of
 from .dataset import Asked, Collected, Dataset, Recorded, UnreadableError, as_dataset, make_dataset, must, names_of, refit
@@ -78,6 +79,7 @@ def load_dataset(
         wrench, where there are several. Its channels are FX ... MZ, FZ if not given; its `label` is the topic that tells
         them, and its file of `labels` names the insertions by number. Not given, `samples` is two seconds.
 
+    Files of text are .csv, .tsv, .txt or .dat, with commas, blanks, tabs or ; between their cells.
     columns : "time,fx,fz", the names of the columns of text files without a header, or with another one.
     decimal, thousands : the marks in the numbers of text files, "," and "."; not given, the cells of each file tell.
 
@@ -297,7 +299,9 @@ def _from_list(traces: list[Any], labels: list[Any], asked: Asked) -> Dataset:
             raise UnreadableError(f"Expected {len(found.read[0].trace)} channel(s), as the first has, got {len(x)}")
         found.channels = found.channels or spec_of(x, picked).columns
         clock = clock_of(_with_index(trace), asked.time) if timed else None
-        return Recorded(x, label, f"trace {number}", rate_hz=None if clock is None else rate_of(clock, trace.index))
+        rate = None if clock is None else rate_of(clock, trace.index)
+        told = tuple(units.split(name)[1] for name in found.channels)
+        return Recorded(x, label, f"trace {number}", rate_hz=rate, units=told)
 
     for row in zip(count(1), traces, labels, strict=False):
         found.take("data", partial(recorded, *row), row[0])

@@ -29,7 +29,7 @@ CELLS = 40  # cells of each
 WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')  # between blanks; a unit goes with its name
 COMMENTS = ("comment", "comments", "kommentar", "remark")
 HINT = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
-UNIT = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|")  # a cell of a row of units, beside what `units` knows
+UNIT = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")  # a cell of a row of units, beside what `units` knows
 
 
 class Timed(NamedTuple):

@@ -34,11 +34,29 @@ BASES = {
     "bar": ("Pa", 1e5),
     "Hz": ("Hz", 1.0),
     "rad": ("rad", 1.0),
-    "sec": ("s", 1.0),
+    **dict.fromkeys(("sec", "second", "seconds", "Sek.", "Sekunden"), ("s", 1.0)),
     "W": ("W", 1.0),
     "K": ("K", 1.0),
 }
-ALONE = ("°", "deg", "°C", "%", "lbf", "lb", "kgf", "kp", "in", "inch", "ft", "psi", "mV/V", "V/V")
+ALONE = (
+    "°",
+    "deg",
+    "°C",
+    "%",
+    "lbf",
+    "lb",
+    "kgf",
+    "kp",
+    "counts",
+    "digits",
+    "a.u.",
+    "in",
+    "inch",
+    "ft",
+    "psi",
+    "mV/V",
+    "V/V",
+)
 CLOSED = re.compile(r"(?P<name>.*?)\s*[\[({<]\s*(?P<unit>[^\[\](){}<>]*?)\s*[\])}>]\s*")  # FZ [kN]
 SLASHED = re.compile(r"(?P<name>.*\S)\s*/\s*(?P<unit>\S+)|(?P<other>.*\S) in (?P<such>\S+)")  # F/kN, F in kN
 ENDING = re.compile(r"(?P<name>.*[^_. -])[_. -]+(?P<unit>[A-Za-zµμ·]+)")  # FZ_kN

@@ -289,6 +289,26 @@ def test_recordings_in_another_unit_are_converted_and_that_is_said(form: str, tm
     assert in_kn.unit == "kN"
 
 
+@pytest.mark.parametrize(
+    ("row", "step"), [("ms;;;kN", 4), ("[ms];;;[kN]", 4), ("0.001 ms;-;-;kN", 4000), ("Sek.;;;kN", 0.004)]
+)
+def test_a_row_of_units_is_of_the_clock_too_and_of_a_long_table(row: str, step: float, tmp_path: Path) -> None:
+    cells = [f"{step * i:g}" for i in range(N)]
+    path = write(
+        tmp_path / "long.csv", ["Zeit", "part", "label", "FZ"], cells, ["7"] * N, ["OK"] * N, texts(), delimiter=";"
+    )
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, row, *rows]))
+    data = load_dataset(path, time="Zeit")
+    assert (data.rate_hz, data.unit, data.notes) == (250.0, "kN", ())
+
+
+def test_the_unit_of_frames_is_that_of_their_columns() -> None:
+    frame = pd.DataFrame({"t [ms]": 4 * np.arange(N), "FZ [kN]": VALUES})
+    data = load_dataset(([frame, frame * [1, 2]], [1, 0]))
+    assert (data.rate_hz, data.unit) == (250.0, "kN")
+
+
 def test_a_unit_that_nothing_converts_or_that_is_not_told_is_a_fault(tmp_path: Path) -> None:
     for i, unit in enumerate(["kN", "kN", "mm", ""]):
         write(tmp_path / f"{i}_OK.csv", ["time", f"FZ [{unit}]" if unit else "FZ"], times(), texts())
@@ -366,6 +386,21 @@ def test_recordings_at_several_rates_are_resampled_by_their_own_times(as_long: b
     np.testing.assert_allclose(data.X[:, :440], np.tile(20 * np.sin(3 * t) + 30 * t, (len(rates), 1)), atol=0.3)
     assert "are put on" in data.notes[0]
     assert data.rates.tolist() == pytest.approx(rates, rel=1e-3)
+
+
+def test_resampled_recordings_are_imported_once_also_when_others_are_added(tmp_path: Path) -> None:
+    rng, words = (
+        np.random.default_rng(0),
+        ("train", "--data", tmp_path / "cell", "--fit", "resample", "--store", tmp_path / "a.db"),
+    )
+    (tmp_path / "cell").mkdir()
+    for known, until in ((0, 30), (30, 30), (30, 34)):
+        for i in range(known, until):
+            pd.DataFrame(uneven(rate := rng.uniform(228, 280), 500 / rate), columns=["time", "FZ"]).assign(
+                FZ=lambda frame: frame["FZ"] + rng.normal(size=len(frame))
+            ).to_csv(tmp_path / "cell" / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False)
+        found = document(*words, *(() if known else ("--reducer", "pca")))["import"]
+        assert (found["imported"], found["known"]) == (until - known, known)
 
 
 def left_out(data: Dataset) -> list[str]:
