@@ -13,7 +13,7 @@ HIDDEN = "***"
 URL = re.compile(r"(\w[\w+.-]*:/{1,2}[^\s:/@'\"]*):(\S*|[^\n'\"]*)@")
 NAMED = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)  # in a URL's query, or of libpq
 QUOTES = ("'", '"')
-OPTIONS = "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic"
+OPTIONS = "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic|columns|decimal|thousands"
 OPTION = re.compile(rf"(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))")
 SHORT = reprlib.Repr()
 SHORT.maxstring = SHORT.maxother = SHORT.maxlong = 60

@@ -16,8 +16,20 @@ from .errors import DataError, TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
 from .records import FITS, REASONS, Reason, TraceSpec, Window
 
-# Names of no channel.
-TIME = re.compile(r"(time|timestamp|t|date|datetime|seconds|zeit|zeitstempel)([ _\-.(\[].*)?", re.IGNORECASE)
+# What clocks are called, in the languages of recorders. Any word of a name, as in `header.stamp` or `Relative Time`;
+# and names that say it only by themselves, as `ms`.
+CLOCKS = {
+    *("time", "times", "timestamps", "datetime", "stamp", "elapsed", "epoch", "clock", "date", "datum", "uhrzeit"),
+    *("zeit", "temps", "heure", "tiempo", "hora", "tempo", "ora", "tijd", "tid", "czas", "čas", "время", "idő", "aika"),
+    *("時間", "时间", "時刻", "时刻", "시간"),
+}
+ALONE = {
+    *("t", "ms", "us", "µs", "ns", "sec", "secs", "second", "seconds", "msec", "usec", "nsec", "nsecs", "nanosec"),
+    *("millis", "micros", "nanos", "milliseconds", "microseconds", "nanoseconds", "sekunden", "x value"),
+}
+AFTER_T = {f"t {word}" for word in (*ALONE, "s", "rel", "abs", "start")}
+AFTER_NAME = re.compile(r"\s*([\[({<].*|(/|\bin )\s*[a-zµμ]{1,4}|\.\d+)$", re.IGNORECASE)  # a unit, or pandas' number
+WORDS = re.compile(r"[A-Z]+(?![a-zµ])|[A-Z]?[^\W\d_A-Z]+")
 NOT_FINITE, CONSTANT, SATURATED = (REASONS.index(r) for r in (Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED))
 
 
@@ -104,8 +116,11 @@ def fits(have: int, samples: int, fit: int) -> bool:
 
 
 def is_time(name: str) -> bool:
-    """Whether a column of this name says when, and is no channel."""
-    return TIME.fullmatch(name.strip()) is not None
+    """Whether a column of this name says when, and is no channel: `%time`, `t [ms]`, `Zeit/s`, `header.stamp`, `t_ms`."""
+    words = [word.lower() for word in WORDS.findall(AFTER_NAME.sub("", name.strip()))]
+    if not CLOCKS.isdisjoint(words) or any("zeit" in word or word.endswith(("time", "stamp")) for word in words):
+        return True
+    return " ".join(words) in ALONE | AFTER_T
 
 
 def _is_frame(trace: Any) -> bool:

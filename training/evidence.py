@@ -132,7 +132,7 @@ def recorded(name: str, screw: Path | None) -> Dataset:
     if name == "screw driving":
         return load_dataset(screw, 400)
     data = load_dataset("insertion")
-    return data.cut(round(1.2 * data.rate_hz)) if "1.2 s" in name else data
+    return data.cut(round(1.2 * data.spec.rate_hz)) if "1.2 s" in name else data
 
 
 class DishonestReducer(ConvReducer):

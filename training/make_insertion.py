@@ -51,7 +51,7 @@ def first_of_each(insertions: Iterable[Insertion], successes: int, failures: int
 def draw_causes(data: Dataset, path: Path) -> None:
     """Thirty traces of each cause, in panels of one scale."""
     figure = Figure(figsize=(13, 5.5), layout="constrained")
-    time_s = np.arange(data.X.shape[1]) / data.rate_hz
+    time_s = np.arange(data.X.shape[1]) / data.spec.rate_hz
     for axes, cause in zip(figure.subplots(2, 4, sharex=True, sharey=True).flat, CAUSES, strict=True):
         rows = np.flatnonzero(data.cause == cause)
         axes.plot(time_s, data.X[rows[:SHOWN]].T, linewidth=0.5, alpha=0.7)

@@ -329,9 +329,10 @@ def describe_channels(data: Dataset) -> str:
 def describe_data(data: Dataset, n_held_out: int) -> str:
     """Describe a data set and its split in two sentences."""
     n_success = int(data.y.sum())
+    rate = "an unknown rate" if data.rate_hz is None else f"{data.rate_hz:g} Hz"
     return (
         f"`{data.name}`: {len(data)} traces of {describe_channels(data)} and {data.spec.samples} "
-        f"samples at\n{data.rate_hz:g} Hz in {data.unit}; {n_success} good and "
+        f"samples at\n{rate} in {data.unit}; {n_success} good and "
         f"{len(data) - n_success} bad parts. {n_held_out} traces were held out."
     )
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..errors import as_options, listed
 from . import options
 from .options import DataChoice, RecipeChoice, left_out, short_name, verb
 from .output import EndAskedError, Out, end_interrupted, facts, progress, rows_of, steps, tell
@@ -35,12 +36,16 @@ def data(source: DataChoice, out: Out | None) -> None:
 
     dataset = load_dataset(source.data, **source.how)
     found = survey(dataset)
-    tables: list[Any] = [facts(found.name, rows_of(found, "name", "faults", "drift"))]
+    rows = list(rows_of(found, "name", "faults", "drift", "not_finite_in"))
+    rows += [] if found.rate_hz else [("rate", "unknown")]
+    tables: list[Any] = [facts(found.name, rows), *map(as_options, dataset.notes)]
+    if found.not_finite_in:
+        tables.append(f"Not finite, for cells are empty or no number: {listed(found.not_finite_in)}.")
     tables.append(facts("By tenths of the recorded order", map(_drift, found.drift), ("", "means", "")))
     if found.near_repeats > SUSPICIOUS:
         tables.append("Many traces nearly repeat another part's: if parts come twice, give their numbers (--part).")
     tell(
-        {"data": source.data, "survey": found},
+        {"data": source.data, "survey": found, "notes": dataset.notes},
         *(*tables, *left_out(dataset, MOST)),
         out=out,
         made=lambda: {"data.png": data_picture(dataset, found.name)},
@@ -109,7 +114,10 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
         end_interrupted(f"Interrupted: {there}; the same command goes on from there.")
     asked: dict[str, Any] = {"recipe": choice.if_asked(), "allow_import": allow_import}
     with DataEngine.open_or_create(store, wait=UNHURRIED, **asked) as engine:
-        name, record = short_name(engine.recipe.name), {"store": store, "faults": data.faults, "import": imported}
+        name, record = (
+            short_name(engine.recipe.name),
+            {"store": store, "faults": data.faults, "notes": data.notes, "import": imported},
+        )
         if not (imported.imported or engine.new_labels) and engine.version:
             said = f"{store} knows all of {data.name}, nothing was done. Version {engine.version} of {name} answers."
             tell(record | {"retrain": None}, said)

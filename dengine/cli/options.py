@@ -232,7 +232,7 @@ class DataChoice:
         from ..datasets import load_dataset
 
         data = load_dataset(self.data, **self.how)
-        for line in [] if as_json() else (*data.notes, *left_out(data, 3)):
+        for line in [] if as_json() else (*map(as_options, data.notes), *left_out(data, 3)):
             click.echo(line, err=True)
         return data
 
@@ -253,8 +253,12 @@ _LABEL = (
 )
 _LABELS = "A CSV file of labels: of a folder's files, of a long table's parts, or of an .npz file's traces in their order."
 _LABEL_MAP = "What other words mean, as in 'i.O.=good,n.i.O.=bad'."
-_TIME = "The column of times of a long table, a row a sample, whose --part tells the insertions."
-_HERTZ = "Samples a second.  [default: what timestamps tell, else 500]"
+_TIME = "The column of times: of a long table, a row a sample, whose --part tells the insertions; or of recordings."
+_HERTZ = "Samples a second.  [default: what timestamps tell; live: 500]"
+_UNIT = "Of the samples; recordings whose header says another, kN for N, are converted.  [default: the header's, else N]"
+_COLUMNS = "The names of the columns of text files without a header, as in time,fx,fz."
+_DECIMAL = "The decimal mark in text files, . or ,  [default: as each file's cells tell]"
+_THOUSANDS = "What groups thousands in text files, as the point in 1.043,5.  [default: as each file's cells tell]"
 _FIT = "What becomes of traces of another length.  [default: strict where all are alike, else pad; live: strict]"
 _NAMES = Listed(click.STRING)
 _RATE = click.FloatRange(0.0, min_open=True)
@@ -270,7 +274,7 @@ _DATA = (
 TRACE = {
     "samples": click.option("--samples", type=COUNT, help=_SAMPLES),
     "rate_hz": click.option("--rate-hz", type=_RATE, metavar="HZ", help=_HERTZ),
-    "unit": click.option("--unit", metavar="TEXT", help="Of the samples, for people.  [default: N]"),
+    "unit": click.option("--unit", metavar="TEXT", help=_UNIT),
     "channel": click.option("--channels", "--channel", "channel", type=_NAMES, metavar="NAMES", help=_CHANNELS),
     "fit": click.option("--fit", type=Known("fit"), help=_FIT),
 }
@@ -278,6 +282,9 @@ DATA = TRACE | {
     "label": click.option("--label", metavar="PATTERN", help=_LABEL),
     "labels": click.option("--labels", metavar="FILE", help=_LABELS),
     "label_map": click.option("--label-map", metavar="WORDS", help=_LABEL_MAP),
+    "columns": click.option("--columns", type=_NAMES, metavar="NAMES", help=_COLUMNS),
+    "decimal": click.option("--decimal", metavar="MARK", help=_DECIMAL),
+    "thousands": click.option("--thousands", metavar="MARK", help=_THOUSANDS),
     "time": click.option("--time", metavar="COLUMN", help=_TIME),
     "trigger": click.option("--trigger", metavar="TEXT", help=_TRIGGER),
     "topic": click.option("--topic", metavar="NAME", help="Of the wrench in an .mcap file.  [default: the only one]"),

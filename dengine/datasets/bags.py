@@ -161,7 +161,7 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     def read(cut: "Insertion") -> Timed:
         if cut.fault:
             raise UnreadableError(cut.fault)
-        return cut.trace, None if asked.rate_hz else rate
+        return Timed(cut.trace, None if asked.rate_hz else rate)
 
     return as_dataset(labels.collect(insertions, read, told, Collected(name, channels)), asked)
 

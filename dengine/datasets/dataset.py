@@ -18,11 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import DataError, TraceError, expect
 from ..records import FITS, TraceSpec, in_html
 from ..traces import as_traces, fits, fitted
+from . import units
 
 if TYPE_CHECKING:
     import pandas as pd
 
 NEAR = 0.03  # of the others' rate
+MOST_APART = 2.0  # times the others' rate: so far a recording is resampled
+UNKNOWN_RATE = "The rate is unknown, for nothing tells it: times are in samples until it is stated, rate_hz=..."
 MOST_WORDS = 12  # that somebody says the meaning of
 must = partial(expect, error=DataError)
 
@@ -64,7 +67,8 @@ class Dataset:
     """Labelled traces in the order they were recorded.
 
     X : (n, T) or (n, C, T) float32.  y : (n,) int8, 1 = success, 0 = failure.
-    name, rate_hz, unit : for people.  cause : (n,) why a part failed, where that is known.
+    name, unit : for people.  rate_hz : of the samples; None: nothing tells it.
+    cause : (n,) why a part failed, where that is known.
     part : (n,) the number of the part that each trace was recorded on; None: every trace is a part of its own.
     faults : what could not be read and was left out.  channels : the channels' names, where they have any.
     notes : what was found about the files, and is no fault.
@@ -75,7 +79,7 @@ class Dataset:
     X: NDArray[np.float32]
     y: NDArray[np.int8]
     name: str = "data"
-    rate_hz: float = 500.0
+    rate_hz: float | None = None
     unit: str = "N"
     cause: NDArray[np.str_] | None = None
     part: NDArray[np.str_] | None = None
@@ -92,7 +96,8 @@ class Dataset:
 
     def __repr__(self) -> str:
         good, names = int(self.y.sum()), f" of {', '.join(self.channels)}" if self.channels else ""
-        form = f"{' x '.join(map(str, self.X.shape[1:]))} samples{names} at {self.rate_hz:g} Hz"
+        rate = "an unknown rate" if self.rate_hz is None else f"{self.rate_hz:g} Hz"
+        form = f"{' x '.join(map(str, self.X.shape[1:]))} samples{names} at {rate}"
         known = f"{good} good, {len(self) - good} bad, {len(self.faults)} left out"
         return f"<Dataset {self.name}: {len(self)} traces, {form}, {known}>"
 
@@ -100,9 +105,13 @@ class Dataset:
 
     @property
     def spec(self) -> TraceSpec:
-        """The contract by which a live engine takes traces of the same form, `DataEngine(trace=data.spec)`."""
+        """The contract by which a live engine takes traces of the same form, `DataEngine(trace=data.spec)`.
+
+        Where the rate is unknown, it has that of a `TraceSpec` by default: state `rate_hz` before times matter.
+        """
         n_channels = 1 if self.X.ndim == 2 else self.X.shape[1]
-        return TraceSpec(self.X.shape[-1], self.rate_hz, n_channels, self.unit, fit=self.fit, columns=self.channels)
+        spec = TraceSpec(self.X.shape[-1], channels=n_channels, unit=self.unit, fit=self.fit, columns=self.channels)
+        return spec if self.rate_hz is None else replace(spec, rate_hz=self.rate_hz)
 
     def to_frame(self) -> "pd.DataFrame":
         """A row a trace: `label`, `part` and `cause` where known, and `FZ_0 ...`, a column a sample of each channel.
@@ -131,7 +140,7 @@ def make_dataset(
     X: ArrayLike,
     y: ArrayLike,
     *,
-    rate_hz: float = 500.0,
+    rate_hz: float | None = None,
     channels: tuple[str, ...] = (),
     part: Any = None,
     cause: Any = None,
@@ -147,7 +156,7 @@ def make_dataset(
     turned = X.ndim == 3 and X.shape[1] > X.shape[2]
     must(not turned, "X (n, channels, samples)", X.shape, "it looks transposed; pass X.transpose(0, 2, 1)")
     must(bool(np.isin(y, (0, 1)).all()), "labels 1 (success) and 0 (failure)", sorted(set(map(str, y.tolist()))))
-    must(0 < rate_hz < np.inf, "a rate above 0 Hz", rate_hz)
+    must(rate_hz is None or 0 < rate_hz < np.inf, "a rate above 0 Hz", rate_hz)
     n_channels = 1 if X.ndim == 2 else X.shape[1]
     must(not channels or len(channels) == n_channels, f"a name for each of {n_channels} channels", channels)
     if part is not None:
@@ -175,6 +184,9 @@ class Asked:
     time: str | None = None
     unit: str | None = None
     words: Mapping[str, bool] = field(default_factory=dict)
+    columns: tuple[str, ...] = ()
+    decimal: str | None = None
+    thousands: str | None = None
 
     def __post_init__(self) -> None:
         if self.label is not None and self.labels is not None:
@@ -183,6 +195,11 @@ class Asked:
         must(self.rate_hz is None or self.rate_hz > 0, "a rate above 0 Hz", self.rate_hz)
         must(self.samples is None or self.samples >= 1, "1 or more samples", self.samples)
         must(len(set(self.channels)) == len(self.channels), "each channel once", self.channels)
+        must(len(set(self.columns)) == len(self.columns), "each of the columns once", self.columns)
+        must(self.decimal in (None, ".", ","), "a decimal mark, '.' or ','", self.decimal)
+        marks = (None, ".", ",", "'", "’", " ", "")
+        apart = self.thousands in marks and (not self.thousands or self.thousands != self.decimal)
+        must(apart, "a mark of thousands, ',', '.', ' ' or an apostrophe, that is not the decimal one", self.thousands)
 
 
 def names_of(channel: str | Sequence[str] | None) -> tuple[str, ...]:
@@ -192,13 +209,19 @@ def names_of(channel: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 class Recorded(NamedTuple):
-    """One recording as it was read. trace : (C, T) float32.  rate_hz : by its own timestamps, where it has any."""
+    """One recording as it was read.
+
+    trace : (C, T) float32.  rate_hz : by its own timestamps, where it has any.  units : of its channels, "" where one's is
+    not told.  length : samples as recorded, where the trace has others by now.
+    """
 
     trace: NDArray[np.float32]
     label: int
     source: str
     part: str | None = None
     rate_hz: float | None = None
+    units: tuple[str, ...] = ()
+    length: int = 0
 
 
 @dataclass
@@ -209,7 +232,7 @@ class Collected:
     channels: tuple[str, ...]
     faults: list[Fault] = field(default_factory=list)
     read: list[Recorded] = field(default_factory=list)
-    encodings: Counter[str] = field(default_factory=Counter)  # of files that are not UTF-8
+    notes: Counter[str] = field(default_factory=Counter)  # what was found that is no fault, and how many times
     unknown: Counter[str] = field(default_factory=Counter)  # words for labels
     beside: str = "labels.csv"  # a file that may list labels, as an error advises
 
@@ -251,14 +274,12 @@ class Collected:
 def as_dataset(found: Collected, asked: Asked) -> Dataset:
     """One data set of all that can be fitted; DataError where nothing can.
 
-    A recording at another rate than the others is another trace of the same insertion: it is a fault.
+    A recording at another rate than the others is another trace of the same insertion: it is a fault, or with
+    `fit="resample"` is put on the others' rate.  One in another unit is converted, or a fault.
     """
     found.must_mean_something()
-    rates = np.array([each.rate_hz or np.nan for each in found.read])
-    known = rates[~np.isnan(rates)]
-    usual = max(known, key=lambda one: (np.abs(known - one) <= NEAR * one).sum(), default=0.0)
-    off = np.flatnonzero(np.abs(rates - usual) > NEAR * usual).tolist()
-    found.leave_out({i: f"Expected timestamps at {usual:g} Hz, as the others have, got {rates[i]:g} Hz" for i in off})
+    unit = _in_one_unit(found, asked)
+    asked, rate = _at_one_rate(found, asked)
     lengths = np.array([each.trace.shape[1] for each in found.read], dtype=np.int64)
     fit, samples = form_of(lengths, asked.fit, asked.samples)
     stretch = samples / float(np.median(lengths)) if fit == "resample" else 1.0
@@ -266,23 +287,97 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
     found.leave_out({i: f"Expected {_wanted(samples, fit)}, got {lengths[i]}" for i in unfit})
     block = np.stack([_fitted(each.trace, samples, fit) for each in found.read])
     rates = np.array([each.rate_hz or np.nan for each in found.read])
-    rate = asked.rate_hz or (float(np.nanmedian(rates)) if len(known) else 500.0)
+    notes = [f"{text}{f' ({n} times)' if n > 1 else ''}." for text, n in found.notes.items()]
     parts = [each.part or each.source for each in found.read]  # without a number it is a part of its own
     return make_dataset(
         block[:, 0] if block.shape[1] == 1 else block,
         [each.label for each in found.read],
         name=found.name,
-        rate_hz=float(f"{rate * stretch:.4g}"),
+        rate_hz=None if rate is None else float(f"{rate * stretch:.4g}"),
         fit=fit,
         part=np.array(parts) if any(each.part is not None for each in found.read) else None,
         faults=tuple(found.faults),
         channels=found.channels,
-        unit=asked.unit or _unit_of(found.channels),
-        notes=tuple(f"{n} file{'' if n == 1 else 's'} read as {name}, not UTF-8." for name, n in found.encodings.items()),
+        unit=unit,
+        notes=tuple(notes if rate else [*notes, UNKNOWN_RATE]),
         source=np.array([each.source for each in found.read]),
-        lengths=np.delete(lengths, unfit),
-        rates=rates if len(known) else None,
+        lengths=np.array([each.length or each.trace.shape[1] for each in found.read], dtype=np.int64),
+        rates=rates if np.isfinite(rates).any() else None,
     )
+
+
+def _in_one_unit(found: Collected, asked: Asked) -> str:
+    """Convert recordings to the unit of most, or to the one that was asked for, a channel at a time; returns the units.
+
+    One whose unit nothing turns into it, or that tells none where others do, is a fault.
+    """
+    n = max((len(each.units) for each in found.read), default=0)
+    stated = asked.unit.split(",") if asked.unit and len(asked.unit.split(",")) == n else [asked.unit or ""] * n
+    wanted = [Counter(filter(None, (each.units[c] for each in found.read if each.units))) for c in range(n)]
+    most = [counts if 2 * counts.total() >= len(found.read) else Counter[str]() for counts in wanted]
+    usual = [max(counts, key=counts.__getitem__, default="") for counts in most]
+    usual = [told.strip() if units.parse(told.strip()) else most for told, most in zip(stated, usual, strict=True)]
+    why = dict[int, str]()
+    for i, recording in enumerate(found.read):
+        factors = np.ones(max(n, 1))
+        for c, (unit, want) in enumerate(zip(recording.units or [""] * n, usual, strict=True)):
+            name = found.channels[c] if c < len(found.channels) else f"channel {c + 1}"
+            if unit == want or (not unit and stated[c]):
+                continue
+            factor = units.factor(unit, want) if unit else None
+            if factor is None:
+                got = f"as {'asked' if stated[c] else 'the others are'}, got {unit or 'no unit'}"
+                do = "" if unit and want else f"; state that of all, unit={unit or want!r}, or write it into each header"
+                why.setdefault(i, f"Expected {name} in {want or 'no unit'}, {got}{do}")
+                continue
+            factors[c] = factor
+            found.notes[f"{name} is converted from {unit} to {want}, times {factor:g}"] += 1
+        if (factors != 1).any():
+            trace = (recording.trace * factors[:, None]).astype(np.float32)
+            found.read[i] = recording._replace(trace=trace)
+    found.leave_out(why)
+    if asked.unit or not any(usual):
+        return asked.unit or _unit_of(found.channels)
+    known = [want or _unit_of(found.channels[c : c + 1]) for c, want in enumerate(usual)]
+    return known[0] if len(set(known)) == 1 else ", ".join(known)
+
+
+def _at_one_rate(found: Collected, asked: Asked) -> tuple[Asked, float | None]:
+    """Leave out recordings at another rate than the others, or resample all; returns how to fit them, and the rate.
+
+    Resampled ones that last as long fit by stretching; of others only what came at the same time is compared: padded.
+    """
+    rates = np.array([each.rate_hz or np.nan for each in found.read])
+    known = rates[~np.isnan(rates)]
+    if not len(known):
+        return asked, asked.rate_hz
+    if silent := len(rates) - len(known):
+        found.notes["No clock is known, and the rate of the others is taken for it"] += silent
+    usual = float(max(known, key=lambda one: (np.abs(known - one) <= NEAR * one).sum()))
+    if asked.fit != "resample" or not (np.abs(known - usual) > NEAR * usual).any():
+        off = np.flatnonzero(np.abs(rates - usual) > NEAR * usual).tolist()
+        do = "" if asked.fit == "resample" else "; fit='resample' puts all on one rate by their own times"
+        wanted = f"Expected timestamps at {usual:g} Hz, as the others have"
+        found.leave_out({i: f"{wanted}, got {rates[i]:g} Hz{do}" for i in off})
+        kept = [each.rate_hz for each in found.read if each.rate_hz]
+        return asked, float(np.median(kept))
+    usual = float(f"{np.median(known):.2g}")  # two digits: recordings that are added do not move it, nor all samples
+    off = np.flatnonzero((rates > MOST_APART * usual) | (rates * MOST_APART < usual)).tolist()
+    found.leave_out({i: f"Expected timestamps at about {usual:g} Hz, got {rates[i]:g} Hz" for i in off})
+    have = [each.rate_hz or usual for each in found.read]
+    spans = [(each.trace.shape[1] - 1) / rate for each, rate in zip(found.read, have, strict=True)]
+    points = 1 + float(np.median(spans)) * usual
+    samples = asked.samples or round(points)
+    rate = usual if abs(samples - points) <= NEAR * points else usual * samples / points
+    for i, (each, own, span) in enumerate(zip(found.read, have, spans, strict=True)):
+        at = np.arange(1 + int(span * rate + 1e-6)) * (own / rate)
+        trace = np.stack([np.interp(at, np.arange(len(x)), x) for x in each.trace]).astype(np.float32)
+        found.read[i] = each._replace(trace=trace, length=each.trace.shape[1])
+    alike = all(abs(each.trace.shape[1] - samples) <= 1 + NEAR * samples for each in found.read)
+    low, high = min(have), max(have)
+    how = "" if alike else "; they do not last as long, so they are padded, not stretched"
+    found.notes[f"Recordings at {low:g} to {high:g} Hz are put on {rate:.4g} Hz by their own times{how}"] += 1
+    return replace(asked, samples=samples, fit="resample" if alike else "pad"), rate
 
 
 def _unit_of(channels: Sequence[str]) -> str:
@@ -330,7 +425,8 @@ def refit(data: Dataset, asked: Asked) -> Dataset:
     if not fits(have, samples, FITS.index(fit)):
         raise DataError(f"Expected {_wanted(samples, fit)}, {data.name} has {have}.")
     stretch = samples / have if fit == "resample" else 1.0
-    return replace(data, X=_fitted(data.X, samples, fit), fit=fit, rate_hz=data.rate_hz * stretch)
+    rate = None if data.rate_hz is None else data.rate_hz * stretch
+    return replace(data, X=_fitted(data.X, samples, fit), fit=fit, rate_hz=rate)
 
 
 def _fitted(x: NDArray[np.float32], samples: int, fit: str) -> NDArray[np.float32]:

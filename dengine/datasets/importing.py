@@ -64,7 +64,7 @@ def must_agree(data: Dataset, agreed: TraceSpec) -> None:
         do = f"load it with samples={agreed.samples}, fit={agreed.fit!r}, or what is known would count again"
         wanted = f"recordings brought to {agreed.samples} samples by {agreed.fit}"
         raise TraceError(f"Expected {wanted}, {data.name} was to {spec.samples} by {spec.fit}; {do}.")
-    if not math.isclose(agreed.rate_hz, spec.rate_hz, rel_tol=RATE):
+    if data.rate_hz is not None and not math.isclose(agreed.rate_hz, spec.rate_hz, rel_tol=RATE):
         raise TraceError(f"Expected traces at {agreed.rate_hz:g} Hz, {data.name} has {spec.rate_hz:g} Hz; resample it.")
     if data.channels and agreed.columns and data.channels != agreed.columns:
         raise TraceError(f"Expected the channels {', '.join(agreed.columns)}, got {', '.join(data.channels)}.")

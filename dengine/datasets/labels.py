@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from ..errors import DataError, instead
 from .dataset import Collected, Fault, Recorded, UnknownWordError, UnreadableError, must
-from .text import Timed, read_table
+from .text import SUFFIXES, Timed, read_table
 
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "gut", "1")
 BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "schlecht", "0")
@@ -165,11 +165,11 @@ def in_order(path: str | os.PathLike[str], part: str) -> list[str]:
 
 def _rows(path: str | os.PathLike[str], part: str, names: Sequence[str] = ()) -> tuple[list[_Row], list[Fault]]:
     try:
-        table, faults = read_table(Path(path))
+        table, faults, *_ = read_table(Path(path))
     except (OSError, UnreadableError) as error:
         raise DataError(f"Cannot read the labels in {path}: {error}.") from error
     header, cells = list(table.columns), dict(zip(table.index, table.to_numpy().tolist(), strict=True))
-    if header[0].lower().endswith(".csv"):
+    if header[0].lower().endswith(SUFFIXES):
         header, cells = ["file", "label", *header[2:]], {1: header, **cells}
     ends = {_words(name)[0] for name in names}
     named = [i for i in range(len(header)) if any(_words(row[i])[0] in ends for row in cells.values())]
@@ -188,7 +188,8 @@ def _rows(path: str | os.PathLike[str], part: str, names: Sequence[str] = ()) ->
 def _words(path: str) -> tuple[str, ...]:
     """A path's file and folders, from its end, in lower case, without suffix, as Windows or another system writes it."""
     words = [word for word in path.lower().replace("\\", "/").split("/") if word not in ("", ".")] or [""]
-    return words.pop().removesuffix(".csv"), *reversed(words)
+    file = words.pop()
+    return next((file.removesuffix(end) for end in SUFFIXES if file.endswith(end)), file), *reversed(words)
 
 
 def column_among(header: Sequence[str], known: Sequence[str]) -> int | None:
@@ -221,8 +222,8 @@ def collect(places: Mapping[str, Any], read: Callable[[Any], Timed], labels: Lab
         except UnreadableError as error:
             unlabelled.extend([] if isinstance(error, UnknownWordError) else [name])
             raise
-        trace, rate = read(place)
-        return Recorded(trace, label, name, part, rate)
+        timed = read(place)
+        return Recorded(timed.trace, label, name, part, timed.rate_hz, timed.units)
 
     for name, place in places.items():
         found.take(name, partial(recorded, name, place))

@@ -17,18 +17,21 @@ from ..errors import DataError, instead, listed
 from ..files import is_database, read_archive, reading
 from ..records import trace_in
 from ..traces import as_trace, spec_of
+from . import units
 from .bags import is_stream, read_bag
+from .clocks import clock_of, rate_of
 from .dataset import Asked, Collected, Dataset, Recorded, UnreadableError, as_dataset, make_dataset, must, names_of, refit
 from .labels import in_order, label_of, meanings
 from .tables import FORCE, from_frame, hold_many, read_folder, read_tables, recordings_in
-from .text import rate_of
+from .text import SUFFIXES as TEXTS
 from .triggers import Trigger
 
 BUNDLED = {"insertion": "insertion.npz"}
 USED = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")  # arrays, beside that of the parts' numbers
+WRITTEN = ("columns", "decimal", "thousands")  # how a text file is written
 Files = Mapping[str, Path]
-TABLES = (".csv", ".parquet", ".pq")
-FORMS = ".npz, .csv, .parquet or .mcap"
+TABLES = (*TEXTS, ".parquet", ".pq")
+FORMS = ".npz, .csv, .tsv, .txt, .dat, .parquet or .mcap"
 
 
 def load_dataset(
@@ -46,6 +49,9 @@ def load_dataset(
     time: str | None = None,
     unit: str | None = None,
     label_map: Mapping[str, Any] | str | None = None,
+    columns: str | Sequence[str] | None = None,
+    decimal: str | None = None,
+    thousands: str | None = None,
 ) -> Dataset:
     """A data set from recordings as people have them.
 
@@ -63,25 +69,33 @@ def load_dataset(
         name of the column; for an .npz file of the array.
     labels : for a folder, a CSV file with a column of file names and one of labels; for a long table of parts; for an .npz
         file a row a trace.
-    label_map : what other words mean, "i.O.=good,n.i.O.=bad", or a dict.  time : the column of times of a long table.
+    label_map : what other words mean, "i.O.=good,n.i.O.=bad", or a dict.  time : the column of times, of a long table
+        or of recordings whose clock is not known by its name.
     fit : what becomes of traces of another length, as in `TraceSpec`. Not given: recordings of one length stay as they
         are (strict); of several lengths, "pad" to their median; where all have the `samples` asked for, "cut".
-    rate_hz : instead of what the timestamps tell, which are then not looked at.  unit : of the samples, for people.
+    rate_hz : instead of what the timestamps tell, which are then not looked at. Without either the rate is unknown, None.
+    unit : of the samples; recordings whose header says another one, kN for N, are converted to it.
     trigger : of one long recording, when an insertion begins, a `Trigger` or its text (`as_trigger`).  topic : of its
         wrench, where there are several. Its channels are FX ... MZ, FZ if not given; its `label` is the topic that tells
         them, and its file of `labels` names the insertions by number. Not given, `samples` is two seconds.
+
+    Files of text are .csv, .tsv, .txt or .dat, with commas, blanks, tabs or ; between their cells.
+    columns : "time,fx,fz", the names of the columns of text files without a header, or with another one.
+    decimal, thousands : the marks in the numbers of text files, "," and "."; not given, the cells of each file tell.
 
     A recording that cannot be read, or not honestly be fitted, becomes a `Fault` in `faults`, and the others are kept. A
     number that is missing is a NaN, which the engine finds. `spec` is the contract for live traces of the same form.
     Raises DataError where nothing can be read, or the options do not fit what is there.
     """
     chosen = (label, labels, fit, rate_hz, trigger, topic, time, unit)
-    asked = Asked(samples, part, names_of(channel), *chosen, meanings(label_map))
+    written = (names_of(columns), decimal, thousands)
+    asked = Asked(samples, part, names_of(channel), *chosen, meanings(label_map), *written)
     what, takes, read = _reader(source, asked)
-    options = ("label", "labels", "trigger", "topic", "time")
-    idle = [name for name in options if getattr(asked, name) is not None and name not in takes]
+    options = ("label", "labels", "trigger", "topic", "time", *WRITTEN)
+    idle = [name for name in options if getattr(asked, name) not in (None, ()) and name not in takes]
     if idle:
-        why = "only a table has columns" if "time" in idle else "it has its labels"
+        why = "only text files are written so" if set(WRITTEN) & set(idle) else "it has its labels"
+        why = "only a table has columns" if "time" in idle else why
         why = "only one long recording is cut" if {"trigger", "topic"} & set(idle) else why
         raise DataError(f"Expected no {' or '.join(idle)} for {what}: {why}; leave it out.")
     return read()
@@ -112,7 +126,7 @@ def _reader_of_files(path: Path, asked: Asked) -> tuple[Sequence[str], Callable[
         return ("label", "labels", "trigger", "topic"), partial(read_bag, path, name, asked)
     named = {path.name: path}
     if path.is_dir() and not hold_many(named := recordings_in(path, asked), asked):
-        return ("label", "labels"), partial(read_folder, path, named, name, asked)
+        return ("label", "labels", "time", *WRITTEN), partial(read_folder, path, named, name, asked)
     if len(named) == 1:
         path = next(iter(named.values()))
         name, named = path.stem, {path.name: path}
@@ -125,7 +139,7 @@ def _reader_of_files(path: Path, asked: Asked) -> tuple[Sequence[str], Callable[
     if len(kinds) > 1:
         raise DataError(f"Expected tables or .npz files in {path}, got {kinds[True].name} and {kinds[False].name}.")
     if True in kinds:
-        return ("label", "labels", "time"), partial(read_tables, named, name, asked)
+        return ("label", "labels", "time", *WRITTEN), partial(read_tables, named, name, asked)
     if path.is_dir() or path.suffix.lower() == ".npz" or zipfile.is_zipfile(path):
         return ("label", "labels"), partial(_read_npz, named, name, asked)
     raise DataError(f"Expected a file {FORMS}, got {path}; save it as one of these.")
@@ -170,7 +184,8 @@ def _read_npz(named: Files, name: str, asked: Asked) -> Dataset:
         if "scale" in found:
             X = X.astype(np.float32) * found["scale"].astype(np.float32)
         about: dict[str, Any] = {"part": found.get(asked.part), "cause": found.get("cause")}
-        about |= {"unit": str(found.get("unit", "N")), "rate_hz": float(found.get("rate_hz", 500.0))}
+        rate = found.get("rate_hz")
+        about |= {"unit": str(found.get("unit", "N")), "rate_hz": None if rate is None else float(rate)}
         if len(own) == 1 and X.ndim == 3:  # one array of several channels names none of them
             own, asked = (), replace(asked, channels=())
         about["channels"] = own or tuple(map(str, found.get("channels", ())))
@@ -263,6 +278,11 @@ def _labels(y: Any, asked: Asked) -> Any:
     return told
 
 
+def _with_index(frame: Any) -> Any:
+    """A DataFrame whose index may be its clock, as a column."""
+    return frame.reset_index() if frame.index.dtype.kind in "fMm" else frame
+
+
 def _from_list(traces: list[Any], labels: list[Any], asked: Asked) -> Dataset:
     must(len(traces) == len(labels), f"a label for each of {len(traces)} traces", len(labels))
     has_force = any(FORCE in getattr(trace, "columns", ()) for trace in traces)
@@ -278,7 +298,10 @@ def _from_list(traces: list[Any], labels: list[Any], asked: Asked) -> Dataset:
         if found.read and len(x) != len(found.read[0].trace):
             raise UnreadableError(f"Expected {len(found.read[0].trace)} channel(s), as the first has, got {len(x)}")
         found.channels = found.channels or spec_of(x, picked).columns
-        return Recorded(x, label, f"trace {number}", rate_hz=rate_of(trace) if timed else None)
+        clock = clock_of(_with_index(trace), asked.time) if timed else None
+        rate = None if clock is None else rate_of(clock, trace.index)
+        told = tuple(units.split(name)[1] for name in found.channels)
+        return Recorded(x, label, f"trace {number}", rate_hz=rate, units=told)
 
     for row in zip(count(1), traces, labels, strict=False):
         found.take("data", partial(recorded, *row), row[0])

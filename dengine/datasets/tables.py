@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +21,12 @@ from numpy.typing import NDArray
 from ..errors import DataError, listed
 from ..files import reading
 from ..traces import is_time
-from . import labels
+from . import labels, units
+from .clocks import NOTHING, floats, place_of_clock, seconds_of
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import NOTHING, Timed, cells_of, decoded, floats, numbers, read_recording, read_table, recording_of
+from .numerals import UndecidedError
+from .text import SUFFIXES as TEXTS
+from .text import Sheet, Timed, cells_of, decoded, numbers, read_recording, read_table, recording_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,9 +34,10 @@ if TYPE_CHECKING:
 FORCE = "FZ_Base"  # what a UR cell calls the force along the insertion
 NUMBERED = re.compile(r"(?P<channel>.*?)[_\-. \[]*(?P<number>\d+)\]?")  # FZ_0
 FIRST = re.compile(r"[A-Za-z]{0,6}[_\-. ]?(?P<number>\d+)[_\-. ]+(?P<channel>\D.*)")  # s000_fz
+ORDER = "\0order"  # a column of a long table's times in seconds, whose name no file has
 MANY = 8  # numbered columns of a channel, which a single recording has none of
 FEWEST = 0.75  # of a wide table's columns that are numbered
-SUFFIXES = (".csv", ".parquet", ".pq", ".npz")
+SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
 
 
 def recordings_in(folder: Path, asked: Asked) -> dict[str, Path]:
@@ -46,22 +50,28 @@ def recordings_in(folder: Path, asked: Asked) -> dict[str, Path]:
         have = listed(sorted(p.name for p in folder.iterdir()))
         wanted = f"CSV files, one an insertion, or tables ({', '.join(SUFFIXES)}), in the folder {folder}"
         raise DataError(f"Expected {wanted}, found none{f' among {have}; save them as such' if have else ''}.")
-    others = [name for name, path in named.items() if path.suffix.lower() != ".csv"]  # beside a list of labels
-    return {name: named[name] for name in sorted(others or named, key=natural)}
+    others = [name for name, path in named.items() if path.suffix.lower() not in TEXTS]  # beside a list of labels
+    times = Counter(path.suffix.lower() for path in named.values())
+    texts = [name for name, path in named.items() if times[path.suffix.lower()] == max(times.values())]
+    return {name: named[name] for name in sorted(others or texts, key=natural)}
 
 
 def hold_many(named: Mapping[str, Path], asked: Asked) -> bool:
     """Whether a folder's files hold many insertions each, as tables and archives do; CSV files may be one each."""
     path = next(iter(named.values()))
-    if asked.time is not None or path.suffix.lower() != ".csv":
+    if path.suffix.lower() not in TEXTS:
         return True
-    header = _top(path)[0]
+    header = _top(path, asked)[0]
+    if asked.time is not None and (asked.part in header or asked.label in header):
+        return True
     if sum(len(names) for names in _numbered(header).values() if len(names) >= MANY) > FEWEST * len(header):
         return True
     with suppress(DataError):
         return asked.labels is None and not [labels.named(asked.label, asked.words).find(name) for name in named]
     known = asked.part in header or labels.column_among(header, labels.LABEL_COLUMNS) is not None
-    return len(named) == 1 or (known and bool(_long_columns(read_table(path)[0], asked, "")))
+    if len(named) == 1 or asked.time is not None:
+        return True
+    return known and bool(_long_columns(read_table(path, asked).frame, asked, ""))
 
 
 def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
@@ -73,7 +83,21 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
     else:
         told = labels.listed(asked.labels, asked.part, list(named), asked.words)
     found = Collected(name, asked.channels or _usual_channel(named.values(), asked))
-    read = partial(read_recording, channels=found.channels, timed=asked.rate_hz is None, encodings=found.encodings)
+    found.notes.update(_left_aside(folder, named, asked))
+    mark = cache(partial(_mark_of, list(named.values()), asked))
+
+    def read(path: Path) -> Timed:
+        notes = Counter[str]()
+        try:
+            recording = read_recording(path, found.channels, asked, notes)
+        except UndecidedError:
+            notes.clear()
+            if mark() is None:
+                raise
+            recording = read_recording(path, found.channels, asked, notes, mark())
+        found.notes.update(notes)
+        return recording
+
     try:
         labels.collect(named, read, told, found).must_mean_something()
     except DataError as error:
@@ -84,18 +108,39 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
     return as_dataset(found, asked)
 
 
-def _top(path: Path) -> list[list[str]]:
-    """The cells of a CSV file's first lines; none where they cannot be read, which is said when the whole file is."""
+def _mark_of(paths: Sequence[Path], asked: Asked) -> str | None:
+    """The decimal mark of all files of a folder whose cells tell theirs; None where they have several, or none."""
+    marks = set[str]()
+    for path in paths:
+        with suppress(UnreadableError, OSError):
+            marks |= {read_table(path, asked).decimal} - {""}
+    return marks.pop() if len(marks) == 1 else None
+
+
+def _left_aside(folder: Path, named: Mapping[str, Path], asked: Asked) -> list[str]:
+    """What to know of text files that are none of the recordings, for most files have another suffix."""
+    suffix = next(iter(named.values())).suffix.lower()
+    skipped = None if asked.labels is None else Path(asked.labels).resolve()
+    paths = (path for path in folder.rglob("*") if path.suffix.lower() in TEXTS and path.is_file())
+    aside = sorted(p.name for p in paths if p.suffix.lower() != suffix and p.resolve() != skipped)
+    return [f"Not read, for most files are {suffix}: {listed(aside)}"] if aside else []
+
+
+def _top(path: Path, asked: Asked) -> list[list[str]]:
+    """The cells of a text file's first lines; none where they cannot be read, which is said when the whole file is."""
     with suppress(UnreadableError, OSError), path.open("rb") as file:
         text, _ = decoded(b"\n".join(file.read(2**18).split(b"\n")[:100]))
-        return list(cells_of(text).values()) or [[]]
+        cells = cells_of(text, asked.columns)
+        return [cells.header, *cells.rows.values()]
     return [[]]
 
 
 def _listing(folder: Path, named: Mapping[str, Path]) -> Path | None:
     """The file whose second line names another one, as a file of labels does."""
     stems = {path.stem.lower() for path in named.values()}
-    words = {path: {word.lower().removesuffix(".csv") for word in _top(path)[-1]} for path in folder.rglob("*.csv")}
+    none = Asked()
+    tops = {path: _top(path, none)[-1] for path in folder.rglob("*") if path.suffix.lower() in TEXTS}
+    words = {path: {word.lower().removesuffix(path.suffix) for word in row} for path, row in tops.items()}
     return next((path for path, said in words.items() if said & (stems - {path.stem.lower()})), None)
 
 
@@ -107,34 +152,55 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 def _usual_channel(paths: Iterable[Path], asked: Asked) -> tuple[str, ...]:
     """The force, or the only channel that there is."""
-    headers = [tuple(name for name in _top(path)[0] if name and not is_time(name)) for path in paths]
+    headers = [tuple(_channels_in(_top(path, asked), asked)) for path in paths]
     if not any(headers) or FORCE.lower() in {name.lower() for header in headers for name in header}:
         return (FORCE,)
     return _chosen(Counter(headers).most_common(1)[0][0], asked)
+
+
+def _channels_in(top: list[list[str]], asked: Asked) -> list[str]:
+    """The names of a header that are no clock's. top : the header, and some rows."""
+    import pandas as pd
+
+    header, *rows = top
+    whole = [row for row in rows if len(row) == len(header)]
+    clock = None
+    with suppress(UnreadableError):
+        frame = pd.DataFrame(whole, columns=header, dtype=object)
+        clock = place_of_clock(frame, asked.time)
+    return [name for i, name in enumerate(header) if name and i != clock and not is_time(name)]
 
 
 def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
     """CSV and Parquet files of one form, one after the other. DataError where their columns are not the same."""
     found = Collected(name, ())
     tables: dict[str, pd.DataFrame] = {}
+    told_by = dict[str, list[str]]()
     for source, path in named.items():
         try:
-            frame, faults = read_table(path, found.encodings) if path.suffix.lower() == ".csv" else _parquet(path)
+            is_text = path.suffix.lower() in TEXTS
+            frame, faults, _, told, _ = read_table(path, asked, found.notes) if is_text else _parquet(path)
         except UnreadableError as error:
             raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
         if frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
         found.faults += [replace(fault, source=source) for fault in faults]
         tables[source] = frame
+        told_by[source] = told
         found.beside = next((str(p) for p in path.parent.glob("*.csv") if p not in named.values()), found.beside)
-    return _from_tables(tables, asked, found)
+    first, *others = told_by
+    for source in others:
+        if told_by[source] != told_by[first]:
+            one, two = (", ".join(told_by[each]) or "none" for each in (first, source))
+            raise DataError(f"Expected the same units in {first} and in {source}, got {one} and {two}; convert one.")
+    return _from_tables(tables, asked, found, told_by[first])
 
 
-def _parquet(path: Path) -> tuple[pd.DataFrame, list[Fault]]:
+def _parquet(path: Path) -> Sheet:
     import pandas as pd
 
     with reading(path, "a Parquet file", "pyarrow", "files"):
-        return _counted(pd.read_parquet(path)), []
+        return Sheet(_counted(pd.read_parquet(path)), [], 0, [], "")
 
 
 def _counted(frame: pd.DataFrame) -> pd.DataFrame:
@@ -147,17 +213,24 @@ def from_frame(frame: pd.DataFrame, asked: Asked) -> Dataset:
     return _from_tables({"row": _counted(frame)}, asked, Collected("data", ()))
 
 
-def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected) -> Dataset:
-    """Tables of one form, by the names of their files, whose lines are their index."""
+def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected, told: Sequence[str] = ()) -> Dataset:
+    """Tables of one form, by the names of their files, whose lines are their index. told : the units of their columns."""
     first, *_ = tables
     for source, frame in tables.items():
+        for name in frame.columns:
+            cell = frame[name].iloc[0] if (frame.columns == name).sum() == 1 and len(frame) else None
+            if isinstance(cell, list | tuple | np.ndarray):
+                do = "give a trace a row, its samples a column each, or load_dataset((X, y)) with the lists as X"
+                raise DataError(f"Expected a number or a text a cell in {source}, column {name} holds lists; {do}.")
         twice = frame.columns[frame.columns.duplicated()]
         if len(twice):
             raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
         if apart := listed(sorted(_form(frame) ^ _form(tables[first]))):
             raise DataError(f"Expected the same columns in {first} and in {source}, only one of them has {apart}.")
     if asked.time is not None or asked.labels is not None:
-        return _from_long(_one_long(tables, asked), asked, found, first)
+        return _from_long(
+            _one_long(tables, asked), asked, found, first, dict(zip(tables[first].columns, told, strict=False))
+        )
     for source, frame in tables.items():
         _take_rows(frame, asked, found, source)
     return as_dataset(found, asked)
@@ -213,8 +286,11 @@ def _one_long(tables: Mapping[str, pd.DataFrame], asked: Asked) -> pd.DataFrame:
     return frame.assign(**{asked.part: number.where(~twice, home)})
 
 
-def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str) -> Dataset:
-    """A row a sample: the rows of a part, by their times, are one insertion. A label is a column, or in a file of parts."""
+def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str, written: Mapping[str, str]) -> Dataset:
+    """A row a sample: the rows of a part, by their times, are one insertion. A label is a column, or in a file of parts.
+
+    written : the units of columns.
+    """
     time = asked.time or next((name for name in frame.columns if is_time(name)), "")
     for name in (asked.part, time):
         if name not in frame:
@@ -225,14 +301,17 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
     frame = _row_a_sample(frame, [asked.part, time, *([label] if label else [])], asked)
     left = [name for name in frame.columns if name not in (asked.part, time, label) and not floats(frame[name])[1]]
     found.channels = _chosen(left, asked)
-    times, odd = floats(frame[time])
-    frame = frame.assign(**{time: frame[time] if odd else times})
-    parts = {str(part): rows for part, rows in frame.groupby(asked.part, sort=False)}
+    order, *_ = seconds_of(frame[time], time, written.get(time, ""))
+    parts = {str(part): rows for part, rows in frame.assign(**{ORDER: order}).groupby(asked.part, sort=False)}
 
     places = [frame.columns.get_loc(name) for name in found.channels]
 
+    how = replace(asked, time=time)
+
     def read(rows: pd.DataFrame) -> Timed:
-        return recording_of(rows.sort_values(time, kind="stable"), places, asked.rate_hz is None, time)
+        rows = rows.sort_values(ORDER, kind="stable").drop(columns=ORDER)
+        timed = recording_of(rows, places, how, found.notes, [written.get(name, "") for name in rows.columns])
+        return timed._replace(units=tuple(written.get(name) or units.split(name)[1] for name in found.channels))
 
     def find(part: str) -> labels.Known:
         words = [word for word in parts[part][label].unique().tolist() if str(word).strip().lower() not in NOTHING]
@@ -266,6 +345,7 @@ def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.Dat
 
 def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
     """How to say which column is what, where a table looks as if it had a row a sample; else nothing."""
+    frame = frame.loc[:, ~frame.columns.duplicated(keep=False)]
     time = next((name for name in frame.columns if is_time(name)), None)
     if time is None or max(map(len, _numbered(frame.columns).values()), default=0) > 2:
         return ""
@@ -288,7 +368,8 @@ def _chosen(have: Sequence[str], asked: Asked) -> tuple[str, ...]:
     if missing or not chosen:
         raise DataError(f"Expected the channel {listed(missing) or 'of the samples'}, found {listed(have) or 'none'}.")
     if not asked.channels and len(chosen) > 1:
-        raise DataError(f"Expected the channel to be named, as in channel={chosen[0]!r}; there are {listed(have)}.")
+        one = min(chosen, key=chosen.count)  # a name that is there twice is none
+        raise DataError(f"Expected the channel to be named, as in channel={one!r}; there are {listed(have)}.")
     return chosen
 
 

@@ -1,4 +1,4 @@
-"""CSV files in the dialects that people's tools write; and the rate that a column of times tells."""
+"""Text files of numbers in the dialects that people's tools write: .csv, .tsv, .txt and .dat."""
 
 from __future__ import annotations
 
@@ -8,67 +8,173 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..traces import is_time
-from .dataset import Fault, UnreadableError
+from . import units
+from .clocks import NOTHING, STAMP, clock_of, evenly, floats, is_rising, rate_of, rising
+from .dataset import Asked, Fault, UnreadableError
+from .numerals import as_python, is_numeral
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Timed = tuple[NDArray[np.float32], float | None]  # (C, T), and hertz where there are timestamps
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 LARGEST = 128 * 2**20  # bytes of one text file
-NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # a cell without a number: kept as NaN
-DECIMAL = re.compile(r"(?<![^\s;\"])([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)(?![^\s;\"])")  # a whole cell
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan", re.IGNORECASE)
-UNIT = re.compile(r"\[.*\]|\(.*\)|[kmµu]?[sNVAgm]|ns|Nm|N[·*.]m|bar|Hz|rad|°C?|%|-")  # a cell of a row of units
-DAY_FIRST = re.compile(r"^(\d\d)\.(\d\d)\.(\d{4})")  # a German day
-GAP = 5.0  # median steps: a pause that a late message does not explain
-SLOW = 0.5  # seconds: no recorder of forces steps so slowly; a clock without a unit counts thousandths, or less
-UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+DELIMITERS = ("\t", ";", "|", ",", " ", "")  # in the order in which equals are taken; " ": any blanks; "": one column
+SAMPLED = 30  # lines, from the end, that tell the delimiter, and
+CELLS = 40  # cells of each
+WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')  # between blanks; a unit goes with its name
+COMMENTS = ("comment", "comments", "kommentar", "remark")
+HINT = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
+UNIT = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")  # a cell of a row of units, beside what `units` knows
 
 
-def cells_of(text: str) -> dict[int, list[str]]:
-    """Line number -> cells, of the lines that are not blank; UnreadableError for a line of megabytes.
+class Timed(NamedTuple):
+    """One recording's values. trace : (C, T).  rate_hz : by its timestamps.  units : a channel each, "" where unknown."""
 
-    The delimiter is the tab or ; of which most lines have as many, or else the one of , ; and tab that the first line has
-    most of. Where it is not the comma, a comma is a decimal's, as a German Excel writes numbers.
+    trace: NDArray[np.float32]
+    rate_hz: float | None = None
+    units: tuple[str, ...] = ()
+
+
+class Cells(NamedTuple):
+    """A text's cells. line : of the header.  units : a column each, "" where none.  rows : by the numbers of lines."""
+
+    header: list[str]
+    line: int
+    units: list[str]
+    rows: dict[int, list[str]]
+    delimiter: str
+
+
+class Sheet(NamedTuple):
+    """A table of texts, whose index are the numbers of its lines, and what was wrong with other lines."""
+
+    frame: pd.DataFrame
+    faults: list[Fault]
+    line: int
+    units: list[str]
+    decimal: str  # the mark, where its cells tell it; else ""
+
+
+def cells_of(text: str, columns: Sequence[str] = ()) -> Cells:
+    """The cells of the lines that are not blank; UnreadableError for a line of megabytes, or where no header is.
+
+    columns : their names, where the file has no header, or another one.
     """
     lines = {i: line for i, line in enumerate(text.splitlines(), start=1) if line.strip()}
-    delimiter = max(",;\t", key=next(iter(lines.values()), "").count)
-    for each in "\t;":
-        n, times = next(iter(Counter(line.count(each) for line in lines.values()).most_common(1)), (0, 0))
-        delimiter = each if n and 2 * times > len(lines) else delimiter
-    if delimiter != ",":
-        lines = {i: DECIMAL.sub(r"\1.\2", line) for i, line in lines.items()}
+    hint = HINT.fullmatch(next(iter(lines.values()), "").strip())
+    if hint:
+        del lines[min(lines)]
     try:
-        rows = {i: next(csv.reader([line], delimiter=delimiter, skipinitialspace=True)) for i, line in lines.items()}
+        delimiter = hint[1] if hint else _delimiter(list(lines.values()))
+        rows = {i: _split(line, delimiter) for i, line in lines.items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
-    return _from_header(list(rows), [[word.strip() for word in row] for row in rows.values()])
+    return _from_header(rows, delimiter, list(columns))
 
 
-def _from_header(lines: list[int], rows: list[list[str]]) -> dict[int, list[str]]:
-    """Line number -> cells from the header on, without what a recorder writes above it, and without a row of units.
+def _split(line: str, delimiter: str) -> list[str]:
+    if delimiter in ("", " "):
+        words = [quoted.replace('""', '"') or plain for quoted, plain in WORD.findall(line)]
+        return words if delimiter else [line.strip().strip("\"'")]
+    return [word.strip().strip("'") for word in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
+
+
+def _delimiter(lines: Sequence[str]) -> str:
+    """What parts the most cells into numbers and times, as many in each line and in the header."""
+    few = [units.LEADING.sub("", line) for line in lines[-SAMPLED:]]
+    top = [units.LEADING.sub("", line) for line in lines[: len(lines) - 1][:100]]
+
+    def score(delimiter: str) -> float:
+        rows = [_split(line, delimiter) for line in few]
+        width, times = Counter(map(len, rows)).most_common(1)[0]
+        if width == 1 and delimiter:
+            return 0.0
+        named = width if rows[0][-1:] != [""] else width - 1  # a delimiter at the end of the data alone
+        cells = [cell for row in rows if len(row) == width for cell in row[:CELLS]]
+        values = sum(map(_is_value, cells))
+        heads = (row for row in (_ended(_split(line, delimiter)) for line in top) if len(row) in (named, width))
+        headed = any(2 * sum(map(_is_value, row[:CELLS])) <= min(len(row), CELLS) for row in heads)
+        return values / len(cells) * times / len(rows) * (1.0 if headed else 0.5)
+
+    scores = {delimiter: score(delimiter) for delimiter in DELIMITERS} if lines else {"": 0.0}
+    best = max(scores.values())
+    if best > 0:
+        return next(delimiter for delimiter in DELIMITERS if scores[delimiter] > 0.98 * best)
+    counts = {each: Counter(len(_split(line, each)) for line in few).most_common(1) for each in "\t;|," if few}
+    return next((each for each, found in counts.items() if found[0][0] > 1), ",")
+
+
+def _is_value(cell: str) -> bool:
+    return is_numeral(cell) or STAMP.fullmatch(cell) is not None or cell.lower() in NOTHING
+
+
+def _ended(row: list[str]) -> list[str]:
+    """A row without the empty cells at its end."""
+    n = len(row)
+    while n and not row[n - 1]:
+        n -= 1
+    return row[:n]
+
+
+def _is_unit(cell: str) -> bool:
+    return UNIT.fullmatch(cell) is not None or units.parse(cell) is not None
+
+
+def _from_header(lines: dict[int, list[str]], delimiter: str, columns: list[str]) -> Cells:
+    """The cells from the header on, without what a recorder writes above it; and the row of units below it.
 
     A row of data has numbers in most columns that have them in the last rows. A first line that may be the header is one,
     if only one other line is above the data: that is damaged data. UnreadableError where there is none.
     """
+    places, rows = list(lines), list(lines.values())
     numbers: Callable[[list[str]], frozenset[int]]
-    numbers = lambda row: frozenset(i for i, word in enumerate(row) if NUMBER.fullmatch(word))  # noqa: E731
-    usual = Counter(map(numbers, rows[1:][-20:])).most_common(1)
+    numbers = lambda row: frozenset(i for i, word in enumerate(row) if is_numeral(word) or word.lower() == "nan")  # noqa: E731
+    usual = Counter(map(numbers, (rows if columns else rows[1:])[-20:])).most_common(1)
     data = next((k for k, row in enumerate(rows) for some, _ in usual if 2 * len(numbers(row) & some) > len(some)), 0)
-    units = [all(map(UNIT.fullmatch, row)) for row in rows[:data]]
-    header = max(data - 1 - (data > 1 and units[-1]), 0)
-    if header == 1 and len(rows[0]) >= len(rows[data]) and not units[0]:
+    above = [_without_mark(row, delimiter) for row in rows[: max(data, 1)]]
+    in_units = [any(row) and all(map(_is_unit, row)) for row in above]
+    header = max(data - 1 - (data > 1 and in_units[-1]), 0)
+    if header == 1 and len(rows[0]) >= len(rows[data]) and not in_units[0]:
         header = data = 0
-    for row in rows[header : header + 1]:  # whole numbers may be names
+    said = above[header + 1] if header + 1 < data else []
+    if columns:
+        told = {i: row for k, (i, row) in enumerate(zip(places, rows, strict=True)) if k >= data}
+        return Cells(columns, 0, _stripped(said, len(columns)), told, delimiter)
+    names = above[header] if above else []
+    for row in [names] if names else []:  # whole numbers may be names
         if 2 * len(numbers(row)) > len(row) and not all(row[i].isdecimal() for i in numbers(row)):
-            raise UnreadableError("Expected a header, its first line is of numbers; write one above, as in time,FZ", 1)
-    return {i: rows[k] for k, i in enumerate(lines) if k == header or k >= max(data, 1)}
+            raise UnreadableError(f"Expected a header, its first line is of numbers; {_named(rows)}", places[header])
+    told = {i: rows[k] for k, i in enumerate(places) if k >= max(data, 1)}
+    if names[-1:] and names[-1].lower() in COMMENTS and all(len(row) < len(names) for row in told.values()):
+        names = names[:-1]  # LabVIEW's, of which its rows say nothing
+    return Cells(names, places[header] if places else 0, _stripped(said, len(names)), told, delimiter)
+
+
+def _without_mark(row: list[str], delimiter: str) -> list[str]:
+    """A header without the # or % by which another program takes it for a comment."""
+    first = units.LEADING.sub("", row[0])
+    return row[1:] if not first and delimiter == " " else [first, *row[1:]]  # `# time fx` has a word too many
+
+
+def _stripped(said: list[str], n: int) -> list[str]:
+    """A row of units as one a column, without brackets."""
+    return [cell.strip("[](){} ") for cell in said][:n] + [""] * (n - len(said))
+
+
+def _named(rows: list[list[str]]) -> str:
+    """How to name the columns of a file without a header."""
+    some = [row for row in rows[:200] if len(row) == len(rows[0])]
+    try:
+        first = [float(row[0].replace(",", ".")) for row in some]
+    except ValueError:
+        first = []
+    names = ["time" if not i and is_rising(np.array(first)) else f"c{i}" for i in range(len(rows[0]))]
+    return f"write one above, or name its {len(names)} columns, columns={','.join(names)[:200]!r}"
 
 
 def decoded(raw: bytes) -> tuple[str, str]:
@@ -84,10 +190,14 @@ def decoded(raw: bytes) -> tuple[str, str]:
     return raw.decode("latin-1"), "Latin-1"
 
 
-def read_table(path: Path, encodings: Counter[str] | None = None) -> tuple[pd.DataFrame, list[Fault]]:
-    """A CSV file's cells as text, each row under the number of its line; rows of too few or too many cells are faults.
+def read_table(
+    path: Path, asked: Asked | None = None, notes: Counter[str] | None = None, decimal: str | None = None
+) -> Sheet:
+    """A text file's cells, each row under the number of its line; rows of too few or too many cells are faults.
 
-    encodings : counts what is not UTF-8.  UnreadableError for a file that is empty or too large.
+    asked : how its numbers and columns are written, as somebody stated it; None: numbers stay as they are written.
+    notes : counts what people should know.  decimal : the mark of the other files, where the file's own cells tell none.
+    UnreadableError for a file that is empty or too large, or whose number format is not known.
     """
     import pandas as pd
 
@@ -95,36 +205,24 @@ def read_table(path: Path, encodings: Counter[str] | None = None) -> tuple[pd.Da
     if size > LARGEST:
         raise UnreadableError(f"Expected at most {LARGEST // 2**20} MB, got {size // 2**20} MB; split it, or write Parquet")
     text, encoding = decoded(path.read_bytes())
-    rows = cells_of(text)
-    if encodings is not None and encoding != "utf-8-sig":
-        encodings[encoding] += 1
-    if not rows:
+    cells = cells_of(text, () if asked is None else asked.columns)
+    if notes is not None and encoding != "utf-8-sig":
+        notes[f"Text is read as {encoding}, not UTF-8"] += 1
+    if not cells.header:
         raise UnreadableError("Expected a header and rows, it is empty")
-    header = rows.pop(min(rows))
-    while header and not header[-1]:  # a delimiter at its end
-        header.pop()
+    header = _ended(cells.header)  # a delimiter at its end
     if not header:
-        raise UnreadableError("Expected a header, the first line names no column", 1)
+        raise UnreadableError("Expected a header, the first line names no column", cells.line)
     n = len(header)
-    whole = {i: row[:n] for i, row in rows.items() if len(row) >= n and not any(row[n:])}
-    faults = [Fault(path.name, i, f"Expected {n} columns, got {len(row)}") for i, row in rows.items() if i not in whole]
-    return pd.DataFrame(list(whole.values()), index=list(whole), columns=header, dtype=object), faults
-
-
-def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
-    """(n,) numbers, NaN where a cell says nothing; and under which index a cell holds what is no number."""
-    import pandas as pd
-
-    if pd.api.types.is_numeric_dtype(cells):
-        return cells.to_numpy(dtype=np.float64, na_value=np.nan), []
-    values, wrong = np.full(len(cells), np.nan), []
-    for i, (index, cell) in enumerate(cells.items()):
-        try:
-            values[i] = float(cell)
-        except (TypeError, ValueError, OverflowError):
-            if str(cell).strip().lower() not in NOTHING:
-                wrong.append(index)
-    return values, wrong
+    whole = {i: row[:n] for i, row in cells.rows.items() if len(row) >= n and not any(row[n:])}
+    wrong = {i: f"Expected {n} columns, got {len(row)}" for i, row in cells.rows.items() if i not in whole}
+    frame = pd.DataFrame(list(whole.values()), index=list(whole), columns=header, dtype=object)
+    mark = ""
+    if asked is not None:
+        mark, odd = as_python(frame, cells.delimiter, asked.decimal or decimal, asked.thousands)
+        wrong |= odd
+    faults = [Fault(path.name, i, what) for i, what in sorted(wrong.items())]
+    return Sheet(frame.drop(index=[i for i in wrong if i in whole]), faults, cells.line, cells.units[:n], mark)
 
 
 def numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
@@ -133,81 +231,69 @@ def numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
     for i, name in enumerate(frame.columns):
         block[:, i], odd = floats(cells := frame.iloc[:, i])
         for index in odd:
-            wrong.setdefault(index, f"Expected a number in column {name}, got {str(cells[index])[:20]!r}")
+            wrong.setdefault(index, f"Expected a number in column {name}, got {str(cells[index])[:40]!r}")
     with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which the engine finds
         return block.astype(np.float32), wrong
 
 
-def read_recording(path: Path, channels: Sequence[str], timed: bool, encodings: Counter[str]) -> Timed:
-    """One file's channels (C, T), and its rate by its timestamps, if timed; UnreadableError names the line at fault."""
-    frame, faults = read_table(path, encodings)
-    places = [place_of(name, list(frame.columns)) for name in channels]
+def read_recording(
+    path: Path, channels: Sequence[str], asked: Asked, notes: Counter[str], decimal: str | None = None
+) -> Timed:
+    """One file's channels (C, T), and its rate by its timestamps; UnreadableError names the line at fault.
+
+    notes, decimal : as of `read_table`.
+    """
+    frame, faults, line, told, _ = read_table(path, asked, notes, decimal)
+    places = [place_of(name, list(frame.columns), line) for name in channels]
     if faults:
         raise UnreadableError(faults[0].what, faults[0].line)
     if frame.empty:
-        raise UnreadableError("Expected samples below the header, found none", 1)
-    return recording_of(frame, places, timed)
+        raise UnreadableError("Expected samples below the header, found none", line)
+    said = tuple(told[i] or units.split(str(frame.columns[i]))[1] for i in places)
+    return recording_of(frame, places, asked, notes, told)._replace(units=said)
 
 
-def recording_of(rows: pd.DataFrame, places: Sequence[int], timed: bool, time: str | None = None) -> Timed:
-    """Rows, a sample each, as (C, T), and their rate, if timed, as `rate_of`. places : of the channels' columns.
+def recording_of(
+    rows: pd.DataFrame, places: Sequence[int], asked: Asked, notes: Counter[str], told: Sequence[str] = ()
+) -> Timed:
+    """Rows, a sample each, as (C, T), and their rate, unless it was stated. places : of the channels' columns.
 
     An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
+    told : the units of all columns.  With `fit="resample"` the samples are put on even times by the clock.
     """
     values, wrong = numbers(rows.iloc[:, places])
     if wrong:
         raise UnreadableError(wrong[min(wrong)], min(wrong))
-    return np.ascontiguousarray(values.T), rate_of(rows, time) if timed else None
+    trace = np.ascontiguousarray(values.T)
+    clock = None if asked.rate_hz is not None else clock_of(rows, asked.time, told)
+    if clock is None:
+        known = set(range(rows.shape[1])) if asked.rate_hz is not None else set(places)
+        offered = [str(rows.columns[i]) for i in rising(rows) if i not in known]
+        for name in offered[:1]:
+            notes[f"No clock is known; column {name} rises steadily: time={name!r} if it is one"] += 1
+        return Timed(trace)
+    rate = rate_of(clock, rows.index)
+    if clock.said:
+        notes[clock.said] += 1
+    return Timed(evenly(trace, clock) if asked.fit == "resample" else trace, rate)
 
 
-def place_of(name: str, header: Sequence[str]) -> int:
-    """Where a header has a name, in any case if it is not there as it is written; UnreadableError for none, or several."""
-    places = [i for i, word in enumerate(header) if word == name]
-    places = places or [i for i, word in enumerate(header) if word.lower() == name.lower()]
-    if len(places) != 1:
-        have = ", ".join(header)[:100]
-        raise UnreadableError(f"Expected a column {name}, got {'it twice or more in ' if places else ''}{have}", 1)
+def place_of(name: str, header: Sequence[str], line: int = 1) -> int:
+    """Where a header has a name, as it is, in any case, or without its unit; UnreadableError for none, or several."""
+    bare = units.split(name)[0].lower()
+    for same in (
+        lambda word: word == name,
+        lambda word: word.lower() == name.lower(),
+        lambda word: units.split(word)[0].lower() == bare,
+    ):
+        places = [i for i, word in enumerate(header) if same(word)]
+        if places:
+            break
+    have = ", ".join(header)[:200]
+    if not places:
+        raise UnreadableError(f"Expected a column {name}, got {have}", line)
+    if len(places) > 1:
+        anew = ",".join(f"{word}_{i}" if word in header[:i] else word for i, word in enumerate(header, start=0))
+        do = f"name them anew, columns={anew!r}"
+        raise UnreadableError(f"Expected a column {name}, got it twice or more in {have}; {do}", line)
     return places[0]
-
-
-def rate_of(frame: pd.DataFrame, time: str | None = None) -> float | None:
-    """Samples a second, to four digits, by the median step of a table's timestamps; None where it has none.
-
-    Timestamps are numbers, in the unit that name or steps tell, or times of day as text.  time : their column, where its
-    name does not say so. UnreadableError where one is missing, turns back or jumps.
-    """
-    import pandas as pd
-
-    place = next((i for i, name in enumerate(frame.columns) if name == time or (not time and is_time(str(name)))), None)
-    if place is None or len(frame) < 2:
-        return None
-    column = frame.iloc[:, place]
-    times, odd = floats(column)
-    unit = _unit_of(times, str(column.name))
-    if 2 * len(odd) >= len(times):
-        said = column.astype(str).str.replace(DAY_FIRST, r"\3-\2-\1", regex=True).str.replace(",", ".")
-        stamps = pd.to_datetime(said, errors="coerce", format="ISO8601", utc=True)
-        odd, unit = stamps.index[stamps.isna()].tolist(), 1.0
-        times = (stamps - stamps.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
-    if odd:
-        wanted, got = "in seconds or as 2026-03-01T12:00:00.002", str(column[odd[0]])[:30]
-        what = f"Expected a time in column {column.name}, {wanted}, got {got!r}; a stated rate (rate_hz) needs none"
-        raise UnreadableError(what, odd[0])
-    steps = np.diff((times - times[0]) * unit)
-    for where in np.flatnonzero(~(steps > 0))[:1].tolist():
-        what = "Expected a later time than that of the row before, or a stated rate (rate_hz)"
-        raise UnreadableError(what, column.index[where + 1])
-    step = float(np.median(steps))
-    for where in np.flatnonzero(steps > GAP * step)[:1].tolist():
-        what = f"Expected a step of {step:.3g} s in time, got a gap of {steps[where]:.3g} s"
-        raise UnreadableError(what, column.index[where + 1])
-    return float(f"{1.0 / step:.4g}")
-
-
-def _unit_of(times: NDArray[np.float64], name: str) -> float:
-    """Seconds in one of a clock: by its name, or so that its steps are a recorder's."""
-    ending = re.search(r"[_ \[(](ms|us|µs|ns)[\])]?$", name.lower())
-    if ending:
-        return UNITS[ending[1]]
-    step = float(np.median(np.diff(times)))
-    return next((unit for unit in (1.0, 1e-3, 1e-6) if step * unit < SLOW), 1e-9)

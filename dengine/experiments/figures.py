@@ -410,16 +410,17 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     figure = blank(9.0, 7.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
     names = data.channels or tuple(f"channel {i + 1}" if X.shape[1] > 1 else "trace" for i in range(X.shape[1]))
-    time_s, unit = np.arange(X.shape[2]) / data.rate_hz, f" [{data.unit}]" if X.shape[1] == 1 else ""
+    time, axis = np.arange(X.shape[2]) / (data.rate_hz or 1.0), "time [s]" if data.rate_hz else "sample"
+    unit = f" [{data.unit}]" if X.shape[1] == 1 else ""
     above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
     for i, axes in enumerate(above.subplots(1, min(X.shape[1], 3), squeeze=False)[0]):
         for label, name, colour, line, _ in KINDS:
             some = X[shown & (y == label), i]  # (n, T)
             if len(some):
                 low, median, high = np.quantile(some, (0.1, 0.5, 0.9), axis=0)
-                axes.fill_between(time_s, low, high, color=colour, alpha=0.18, linewidth=0)
-                axes.plot(time_s, median, line, color=colour, linewidth=1.2, label=f"{name} ({len(some)})")
-        finish(axes, legend=3 if shown.any() and not i else 0, xlabel="time [s]", ylabel=f"{names[i]}{unit}")
+                axes.fill_between(time, low, high, color=colour, alpha=0.18, linewidth=0)
+                axes.plot(time, median, line, color=colour, linewidth=1.2, label=f"{name} ({len(some)})")
+        finish(axes, legend=3 if shown.any() and not i else 0, xlabel=axis, ylabel=f"{names[i]}{unit}")
     share, level = below.subplots(2, 1, sharex=True)
     window, x = max(1, len(y) // 10), np.arange(1, len(y) + 1)
     full = x >= window  # a share of the first few jumps

@@ -19,7 +19,7 @@ from ..cells.base import Cell
 from ..cells.replay import ReplayCell
 from ..datasets import load_dataset
 from ..engine.engine import DataEngine
-from ..errors import expect
+from ..errors import DataError, expect
 from ..recipe import RECIPES, Recipe
 from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, in_html
 from .metrics import VERIFY_SECONDS, Costs
@@ -318,6 +318,8 @@ def replay(
     expect(1 <= n <= len(data), f"1 to {len(data)} cycles from {data.name}", n)
     order = (np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data)))[:n]
     engine: DataEngine = recipe if who is None else who.engine(seed)
+    if data.rate_hz is None and any(window.along is None for window in engine.policy.windows):
+        raise DataError(f"Expected the rate of {data.name}, for windows are in seconds; state it, rate_hz=...")
     begin = time.perf_counter()
     log = watch(engine, ReplayCell(data, order, confirm), n, on_cycle and (lambda cycle: on_cycle(cycle.index + 1)))
     return replace(

@@ -43,8 +43,8 @@ class Drift:
 class Survey:
     """What is known of a data set.
 
-    lengths, rates : as recorded, None where not known.  faults : what was left out.
-    not_finite, constant : traces that the engine verifies and never learns from.
+    seconds, rate_hz, lengths, rates : as recorded, None where not known.  faults : what was left out.
+    not_finite, constant : traces that the engine verifies and never learns from.  not_finite_in : their files, or rows.
     duplicates : traces equal to an earlier one, sample by sample; contradicting : of these, with another label.
     near_repeats : of the newest `looked_at` that can be learned from, traces much nearer to another part's than parts are
     to each other.  parts : how many, where known.  drift : of the share of good labels, and of each channel's mean.
@@ -55,8 +55,8 @@ class Survey:
     channels: int
     names: tuple[str, ...]
     samples: int
-    seconds: float
-    rate_hz: float
+    seconds: float | None
+    rate_hz: float | None
     unit: str
     fit: str
     lengths: Spread | None
@@ -65,6 +65,7 @@ class Survey:
     bad: int
     faults: tuple[Fault, ...]
     not_finite: int
+    not_finite_in: tuple[str, ...]
     constant: int
     duplicates: int
     contradicting: int
@@ -91,12 +92,13 @@ def survey(data: Dataset) -> Survey:
         **{name: getattr(data, name) for name in ("name", "rate_hz", "unit", "fit", "faults")},
         **dict(zip(("traces", "channels", "samples"), X.shape, strict=True)),
         names=data.channels,
-        seconds=X.shape[2] / data.rate_hz,
+        seconds=None if data.rate_hz is None else X.shape[2] / data.rate_hz,
         lengths=_spread(data.lengths),
         rates=_spread(data.rates),
         good=good,
         bad=len(data) - good,
         not_finite=int((~finite).sum()),
+        not_finite_in=() if data.source is None else tuple(data.source[~finite].tolist()),
         constant=int(constant.sum()),
         duplicates=len(again) - len(first),
         contradicting=sum(before != label for before, label in again),

@@ -7,7 +7,7 @@ import pytest
 from sklearn.decomposition import PCA
 
 from dengine import DataEngine, Dataset, Outcome, Recipe, Replay, ReplayCell, replay
-from dengine.errors import SettingError
+from dengine.errors import DataError, SettingError
 from dengine.experiments.replay import Contender, watch
 from tests.support.driving import RECIPE
 from tests.support.replays import same
@@ -93,6 +93,9 @@ def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(playe
 def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(data: Dataset, played: Replay) -> None:
     highest = data.X.max(axis=1)
     window = f"0:1:-1e9:{np.quantile(highest, 0.8)}:reject"
+    with pytest.raises(DataError, match="for windows are in seconds; state it, rate_hz"):
+        replay(data, RECIPE.with_policy(windows=[window]))
+    data = replace(data, rate_hz=500.0)
     log, wide = (replay(data, RECIPE.with_policy(windows=[each]), seed=1) for each in (window, "0:1:-1e9:"))
     same(wide, played, "recipe")
     out = highest[log.index] > np.quantile(highest, 0.8)

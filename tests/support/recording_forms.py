@@ -1,0 +1,123 @@
+"""The forms of recordings that are read: the tests try each, and the documentation lists them.
+
+`python -m tests.support.recording_forms` writes the lists into the page.
+"""
+
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "recording_forms.md"
+BEGIN, END = "<!-- {}: written by tests/support/recording_forms.py -->", "<!-- end of {} -->"
+STEP = 0.004  # seconds: 250 Hz
+
+# A delimiter's name -> what stands between the cells.
+DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "blank": " ", "several blanks": "   "}
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+
+# 1043.5 in a number format -> how it writes a number.
+NUMBERS: Mapping[str, Callable[[float], str]] = {
+    "1043.50": lambda x: f"{x:.2f}",
+    "1043,50": lambda x: f"{x:.2f}".replace(".", ","),
+    "1,043.50": lambda x: f"{x:,.2f}",
+    "1.043,50": lambda x: f"{x:,.2f}".translate(str.maketrans(",.", ".,")),
+    "1 043,50": lambda x: f"{x:,.2f}".translate(str.maketrans(",.", " ,")),
+    "1\u202f043,50": lambda x: f"{x:,.2f}".translate(str.maketrans(",.", "\u202f,")),
+    "1 043.50": lambda x: f"{x:,.2f}".replace(",", " "),
+    "1'043.50": lambda x: f"{x:,.2f}".replace(",", "'"),
+    "1’043,50": lambda x: f"{x:,.2f}".translate(str.maketrans(",.", "’,")),
+    "1.0435E+03": lambda x: f"{x:.4E}",
+    "1,0435e+03": lambda x: f"{x:.4e}".replace(".", ","),
+    "+1043.50": lambda x: f"{x:+.2f}",
+    "−1043,50": lambda x: f"{x:.2f}".translate(str.maketrans("-.", "−,")),
+}
+
+# What a column of seconds is called.
+CLOCK_NAMES = (
+    *("time", "Time", "TIME", "timestamp", "Timestamp", "TimeStamp", "timestamps", "time_stamp", "%time", "# time"),
+    *("__time", "Time.1", "elapsed", "elapsed_time", "Elapsed Time (s)", "Relative Time", "relative_time", "runtime"),
+    *("System Time", "Sample Time", "X_Value", "Time_s", "t", "t_s", "t [s]", "t/s", "t_rel", "Time/s", "time(s)"),
+    *("log_time", "receive_time", "header.stamp", "field.header.stamp", "stamp", "rosbagTimestamp", "ros_time"),
+    *("sec", "seconds", "epoch", "clock", "date_time", "DateTime", "Date", "Date/Time", "Zeit", "Zeit/s", "Uhrzeit"),
+    *("Messzeit", "Zeitstempel", "Temps", "heure", "tiempo", "hora", "Tempo", "tijd", "czas", "時間", "时间", "시간"),
+)
+# What a column of other units is called -> the seconds of one.
+CLOCK_UNITS = {
+    **dict.fromkeys(("time_ms", "Time (ms)", "t [ms]", "t/ms", "Millis", "millis", "ms", "timeMs", "Zeit in ms"), 1e-3),
+    **dict.fromkeys(("time [us]", "timestamp_us", "t [µs]", "micros", "Time(us)"), 1e-6),
+    **dict.fromkeys(("time_ns", "epoch_ns", "Zeit(0.001 us)"), 1e-9),
+    "Zeit(0.001 ms)": 1e-6,
+    "Zeit [0,1 ms]": 1e-4,
+    "time [min]": 60.0,
+}
+
+START = datetime(2026, 3, 1, 6, 0, 0, tzinfo=UTC)
+
+
+def _at(i: int) -> datetime:
+    return START + timedelta(seconds=STEP * i)
+
+
+def _trimmed(i: int) -> str:
+    return f"{_at(i):%Y-%m-%dT%H:%M:%S.%f}".rstrip("0").rstrip(".")
+
+
+# A form of times, as its third row says it -> how it writes a row's.
+TIMES: Mapping[str, Callable[[int], str]] = {
+    "0.008 (s)": lambda i: f"{STEP * i:.3f}",
+    "8 (ms)": lambda i: str(round(1e3 * STEP * i)),
+    "8000 (µs)": lambda i: str(round(1e6 * STEP * i)),
+    "8000000 (ns)": lambda i: str(round(1e9 * STEP * i)),
+    "1772344800.008 (s since 1970)": lambda i: f"{_at(i).timestamp():.3f}",
+    "1772344800008 (ms)": lambda i: str(round(_at(i).timestamp() * 1e3)),
+    "1772344800008.00 (ms)": lambda i: f"{_at(i).timestamp() * 1e3:.2f}",
+    "1772344800008000 (µs)": lambda i: str(round(_at(i).timestamp() * 1e6)),
+    "1772344800008000000 (ns)": lambda i: f"{1772344800000 + 4 * i}000000",
+    "2026-03-01T06:00:00.008Z": lambda i: f"{_trimmed(i)}Z",
+    "2026-03-01T06:00:00.008+01:00": lambda i: f"{_at(i):%Y-%m-%dT%H:%M:%S.%f}+01:00",
+    "2026-03-01T06:00:00.008+01": lambda i: f"{_trimmed(i)}+01",
+    "2026-03-01 06:00:00,008": lambda i: f"{_at(i):%Y-%m-%d %H:%M:%S},{4 * i % 1000:03d}",
+    "2026-03-01 06:00:00.008 UTC": lambda i: f"{_at(i):%Y-%m-%d %H:%M:%S.%f} UTC",
+    "20260301T060000.008Z": lambda i: f"{_at(i):%Y%m%dT%H%M%S.%f}Z",
+    "2026/03/01 06:00:00.008": lambda i: f"{_at(i):%Y/%m/%d %H:%M:%S.%f}",
+    "01.03.2026 06:00:00,008": lambda i: f"{_at(i):%d.%m.%Y %H:%M:%S},{4 * i % 1000:03d}",
+    "3/1/2026 6:00:00.008 AM": lambda i: f"{_at(i):3/1/2026 6:%M:%S.%f} AM",
+    "06:00:00.008": lambda i: f"{_at(i):%H:%M:%S.%f}",
+    "06:00:00,008": lambda i: f"{_at(i):%H:%M:%S},{4 * i % 1000:03d}",
+    "00:00.008": lambda i: f"{_at(i):%M:%S}.{4 * i % 1000:03d}",
+    "46082.25000009 (Excel's days)": lambda i: f"{46082.25 + STEP * i / 86400:.12f}",
+}
+# How a header says a unit, of a channel FZ in kN; `` over it stands for a row of units below the header.
+UNITS = ("FZ [kN]", "FZ (kN)", "FZ_kN", "FZ/kN", "FZ in kN", "FZ kN", "a row of units")
+
+
+def in_code(words: Mapping[str, object] | tuple[str, ...]) -> str:
+    return ", ".join(f"`{word}`".replace("|", "\\|") for word in words)
+
+
+def tables() -> dict[str, str]:
+    """The page's lists by their names, in Markdown."""
+    rows = {
+        "Files": in_code(SUFFIXES),
+        "Between cells": ", ".join(DELIMITERS),
+        "1043.5 is written as": in_code(NUMBERS),
+        "A clock in seconds is called": in_code(CLOCK_NAMES),
+        "A clock in another unit": in_code(CLOCK_UNITS),
+        "A time is written as": in_code(TIMES),
+        "The unit kN of a channel": in_code(UNITS),
+    }
+    lines = ["| what | forms that are read |", "| --- | --- |", *(f"| {what} | {forms} |" for what, forms in rows.items())]
+    return {"recordings": "\n".join(lines)}
+
+
+def page(text: str) -> str:
+    """A page with its lists as they are now."""
+    for name, table in tables().items():
+        begin, end = BEGIN.format(name), END.format(name)
+        before, _, rest = text.partition(begin)
+        text = f"{before}{begin}\n\n{table}\n\n{end}{rest.partition(end)[2]}"
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(PAGE.read_text("utf-8")), "utf-8")
