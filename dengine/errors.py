@@ -4,6 +4,7 @@ import math
 import re
 import reprlib
 import shlex
+import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,8 +16,9 @@ NAMED = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)
 QUOTES = ("'", '"')
 OPTIONS = "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic|columns|decimal|thousands"
 OPTION = re.compile(rf"(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))")
+LONG = 60  # characters of a value in an error
 SHORT = reprlib.Repr()
-SHORT.maxstring = SHORT.maxother = SHORT.maxlong = 60
+SHORT.maxstring = SHORT.maxother = SHORT.maxlong = LONG
 
 
 def without_password(text: str) -> str:
@@ -30,6 +32,16 @@ def shortened(value: Any) -> str:
         return SHORT.repr(value)
     except ValueError:  # an integer of more digits than Python prints
         return f"a number of {value.bit_length()} bits" if isinstance(value, int) else f"a {type(value).__name__}"
+
+
+def excerpt(text: str, at: int = 0) -> str:
+    """Some 60 characters of a text, as `repr` shows them, around the one at `at`, which is named if it is not ASCII."""
+    begin = max(min(at - LONG // 2, len(text) - LONG), 0)
+    said = f"{'...' if begin else ''}{text[begin : begin + LONG]!r}{'...' if len(text) > begin + LONG else ''}"
+    odd = text[at : at + 1]
+    if not odd or (odd.isascii() and odd.isprintable()):
+        return said
+    return f"{said}, with {unicodedata.name(odd, 'a control character')} (U+{ord(odd):04X}) at character {at + 1}"
 
 
 def listed(names: Iterable[Any]) -> str:
@@ -86,7 +98,7 @@ class UnknownDecisionError(ReportError):
 
 
 class ReportConflictError(ReportError):
-    """A report against what is recorded: a second label, or one on a rejected part."""
+    """A report against what is recorded: a second label."""
 
 
 class TraceConflictError(TraceError):

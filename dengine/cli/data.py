@@ -25,9 +25,10 @@ CLEAR = 0.01  # p-values below it are called drift
 def data(source: DataChoice, out: Out | None) -> None:
     """Say what a data set is, and what is wrong with it.
 
-    A folder of CSV files, one an insertion, its label in its name; a wide .csv or .parquet, a row an insertion; .npz with
-    X (traces, samples) and y (1 success, 0 failure); one long .mcap, cut by --trigger; the file of a store, for what
-    is labelled in it; or the bundled set, insertion.
+    A folder of CSV files, one an insertion, its label in its name or in a column; a wide .csv or .parquet, a row an
+    insertion; a long one, a row a sample, with --part, --time and --label; .npz with X (traces, samples) and y (1 success,
+    0 failure); one long .mcap, cut by --trigger; the file of a store, for what is labelled in it; or the bundled set,
+    insertion.
     """
     from ..datasets import load_dataset
     from ..experiments.figures import data_picture
@@ -41,7 +42,10 @@ def data(source: DataChoice, out: Out | None) -> None:
     tables: list[Any] = [facts(found.name, rows), *map(as_options, dataset.notes)]
     if found.not_finite_in:
         tables.append(f"Not finite, for cells are empty or no number: {listed(found.not_finite_in)}.")
-    tables.append(facts("By tenths of the recorded order", map(_drift, found.drift), ("", "means", "")))
+    if dataset.ordered:
+        tables.append(facts("By tenths of the recorded order", map(_drift, found.drift), ("", "means", "")))
+    else:
+        tables.append("The files are in the order of their labels, not of their recording: no drift is looked for.")
     if found.near_repeats > SUSPICIOUS:
         tables.append("Many traces nearly repeat another part's: if parts come twice, give their numbers (--part).")
     tell(

@@ -241,19 +241,22 @@ def left_out(data: Dataset, most: int) -> list[str]:
     """What could not be read, a line each for the first few; none where all could."""
     n = len(data.faults)
     rest = [f"- and {n - most} more"] if n > most else []
-    title = f"Left out {n} of {n + len(data)} recordings of {data.name}:"
+    title = f"Left out {n} of {n + len(data) + data.unlabelled} recordings of {data.name}:"
     return [title, *(f"- {as_options(str(fault))}" for fault in data.faults[:most]), *rest] if n else []
 
 
 _SAMPLES = "Of a trace: of recordings only the first so many, which decides earlier, on less.  [default: all]"
 _CHANNELS = "FZ_Base, or several with commas between.  [default: FZ_Base, or the only one]"
 _LABEL = (
-    "In a folder a regular expression whose group is the label, as in '_(OK|NOK)_'; in a table its column, of .npz its "
-    "array.  [default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
+    "In a folder a regular expression whose group is the label, as in '_(OK|NOK)_', or a column of its files; in a table "
+    "its column, of .npz its array.  [default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
 )
 _LABELS = "A CSV file of labels: of a folder's files, of a long table's parts, or of an .npz file's traces in their order."
-_LABEL_MAP = "What other words mean, as in 'i.O.=good,n.i.O.=bad'."
-_TIME = "The column of times: of a long table, a row a sample, whose --part tells the insertions; or of recordings."
+_LABEL_MAP = "What other words mean, as in 'heil=good,Riss=bad'; 1=good,0=bad where a file's name ends in the label."
+_TIME = (
+    "The column of times: of a long table, a row a sample, whose --part tells the insertions, it needs both; or of "
+    "recordings."
+)
 _HERTZ = "Samples a second.  [default: what timestamps tell; live: 500]"
 _UNIT = "Of the samples; recordings whose header says another, kN for N, are converted.  [default: the header's, else N]"
 _COLUMNS = "The names of the columns of text files without a header, as in time,fx,fz."

@@ -126,11 +126,13 @@ def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
         raise DataError(f"Expected MCAP files in the bag {path}, found none; ros2 bag convert makes them of .db3 files.")
     with reading(path, "MCAP files", "mcap_ros2", "mcap"):
         have = _topics(files)
+    kinds = {kind.rpartition("/")[2]: topic for topic, kind in have.items()}
+    told = f"label={kinds['Bool']!r}" if "Bool" in kinds else "a CSV file of them by number, from 1 (labels)"
     if asked.trigger is None:
-        kinds = {kind.rpartition("/")[2]: topic for topic, kind in have.items()}
         phase = next((f"register@{topic}" for kind, topic in kinds.items() if "Int" in kind), "contact=5")
-        told = f"label={kinds['Bool']!r}" if "Bool" in kinds else "labels='labels.csv'"
         raise DataError(f"Expected what cuts {path} into insertions, and their labels, as trigger={phase!r} and {told}.")
+    if asked.label is None and asked.labels is None:
+        raise DataError(f"Expected the labels of the insertions in {path}, as {told}.")
     trigger = as_trigger(asked.trigger)
     wrenches = [topic for topic, kind in have.items() if kind in WRENCHES and asked.topic in (None, topic)]
     found = listed(wrenches or have) or "none"
@@ -153,10 +155,8 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     insertions = {f"{name}/{i}": cut for i, cut in enumerate(cuts, start=1)}
     if asked.labels is not None:
         told = labels.listed(asked.labels, asked.part, list(insertions), asked.words)
-    elif asked.label is not None:
-        told = _told(asked, messages, cuts, list(insertions))
     else:
-        raise DataError("Expected the labels' topic (label='/height_check/ok'), or a file of them (labels='labels.csv').")
+        told = _told(asked, messages, cuts, list(insertions))
 
     def read(cut: "Insertion") -> Timed:
         if cut.fault:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import excerpt, listed
 from ..traces import is_time
 from . import units
 from .dataset import UnreadableError
@@ -83,7 +84,7 @@ def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
         places = [i for i, name in enumerate(names) if name == time]
         places = places or [i for i, name in enumerate(names) if units.split(name)[0] == units.split(time)[0]]
         if not places:
-            raise UnreadableError(f"Expected a column {time} of times, found {', '.join(names)[:100]}")
+            raise UnreadableError(f"Expected a column {time} of times, found {listed(names)}")
         return places[0]
     if places := [i for i, name in enumerate(names) if is_time(name)]:
         return max(places, key=lambda i: _rises(head.iloc[:, i]))  # a date beside the time of day does not
@@ -148,8 +149,8 @@ def clock_of(frame: pd.DataFrame, time: str | None = None, told: Sequence[str] =
     if seconds is None:
         seconds, odd, said = seconds_of(column, name, told[place] if told else "")
     if odd:
-        wanted, got = "in seconds or as 2026-03-01T12:00:00.002", str(column[odd[0]])[:40]
-        what = f"Expected a time in column {name}, {wanted}, got {got!r}; a stated rate (rate_hz) needs none"
+        wanted, got = "in seconds or as 2026-03-01T12:00:00.002", excerpt(str(column[odd[0]]))
+        what = f"Expected a time in column {name}, {wanted}, got {got}; a stated rate (rate_hz) needs none"
         raise UnreadableError(what, odd[0])
     if time is None and not is_time(name):
         known = f"Column {name or place + 1} is taken as the clock by its values"

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import DataError, TraceError, expect
+from ..errors import DataError, TraceError, expect, shortened
 from ..records import FITS, TraceSpec, in_html
 from ..traces import as_traces, fits, fitted
 from . import units
@@ -55,11 +55,15 @@ class UnreadableError(DataError):
 
 
 class UnknownWordError(UnreadableError):
-    """A label in a word that nobody said the meaning of. what : where it is no label by its place alone."""
+    """A label in a word that nobody said the meaning of."""
 
-    def __init__(self, word: str, what: str = "") -> None:
-        super().__init__(what or f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {word[:20]!r}")
+    def __init__(self, word: str) -> None:
+        super().__init__(f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {shortened(word)}")
         self.word = word
+
+
+class UnlabelledError(UnreadableError):
+    """A recording that nobody has checked yet: it is counted, and left out."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -74,6 +78,8 @@ class Dataset:
     notes : what was found about the files, and is no fault.
     source : (n,) the file, or row, that each trace came from.  fit : how other lengths became T, as in `TraceSpec`.
     lengths : (n,) samples as recorded.  rates : (n,) hertz, from each recording's own timestamps.
+    unlabelled : recordings that were left out since nobody has checked them yet: their label is empty.
+    ordered : whether the order says what was recorded first; that of the files in `good/` and `bad/` does not.
     """
 
     X: NDArray[np.float32]
@@ -90,6 +96,8 @@ class Dataset:
     lengths: NDArray[np.int64] | None = None
     rates: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
+    unlabelled: int = 0
+    ordered: bool = True
 
     def __len__(self) -> int:
         return len(self.y)
@@ -98,7 +106,7 @@ class Dataset:
         good, names = int(self.y.sum()), f" of {', '.join(self.channels)}" if self.channels else ""
         rate = "an unknown rate" if self.rate_hz is None else f"{self.rate_hz:g} Hz"
         form = f"{' x '.join(map(str, self.X.shape[1:]))} samples{names} at {rate}"
-        known = f"{good} good, {len(self) - good} bad, {len(self.faults)} left out"
+        known = f"{good} good, {len(self) - good} bad, {self.unlabelled} unlabelled, {len(self.faults)} left out"
         return f"<Dataset {self.name}: {len(self)} traces, {form}, {known}>"
 
     _repr_html_ = in_html
@@ -234,12 +242,16 @@ class Collected:
     read: list[Recorded] = field(default_factory=list)
     notes: Counter[str] = field(default_factory=Counter)  # what was found that is no fault, and how many times
     unknown: Counter[str] = field(default_factory=Counter)  # words for labels
-    beside: str = "labels.csv"  # a file that may list labels, as an error advises
+    beside: str = ""  # a file that may list labels, as an error advises
+    unlabelled: int = 0
+    ordered: bool = True
 
     def take(self, source: str, read: Callable[[], Recorded], line: int = 0) -> None:
         """Add what is read, or the fault for which it is left out. line : of the source, where it is known before."""
         try:
             self.read.append(read())
+        except UnlabelledError:
+            self.unlabelled += 1
         except (OSError, TraceError, UnreadableError) as error:
             if isinstance(error, UnknownWordError):
                 self.unknown[error.word] += 1
@@ -257,8 +269,8 @@ class Collected:
         said = ",".join(f"{word}={'bad' if word in bad else 'good'}" for word in words)
         do = f"say what they mean, label_map={said!r}{'' if len(kinds) == 1 else ' or the other way round'}"
         if len(words) > MOST_WORDS:
-            do = "so many are no labels: say where they are, label='...', or list them in a file, labels='labels.csv'"
-        got = ", ".join(f"{word[:20]!r} {times} times" for word, times in self.unknown.most_common(4))
+            do = "so many are no labels: say where they are (label), or list them in a CSV file (labels)"
+        got = ", ".join(f"{shortened(word)} {times} times" for word, times in self.unknown.most_common(4))
         beside = f" beside {len(self.read)} {'good' if 1 in kinds else 'bad'} ones" if len(kinds) == 1 else ""
         raise DataError(f"Expected labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0, got {got}{beside}; {do}.")
 
@@ -268,7 +280,9 @@ class Collected:
         self.read = [each for i, each in enumerate(self.read) if i not in why]
         if not self.read:
             n, few = len(self.faults), "; ".join(map(str, self.faults[:3]))
-            raise DataError(f"Expected recordings that can be read in {self.name}, found none of {n}: {few}.")
+            if self.unlabelled:
+                few = f"{self.unlabelled} have no label yet{few and '; '}{few}"
+            raise DataError(f"Expected labelled recordings in {self.name}, found none of {n + self.unlabelled}: {few}.")
 
 
 def as_dataset(found: Collected, asked: Asked) -> Dataset:
@@ -288,6 +302,9 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
     block = np.stack([_fitted(each.trace, samples, fit) for each in found.read])
     rates = np.array([each.rate_hz or np.nan for each in found.read])
     notes = [f"{text}{f' ({n} times)' if n > 1 else ''}." for text, n in found.notes.items()]
+    if found.unlabelled:
+        seen = len(found.read) + len(found.faults) + found.unlabelled
+        notes.append(f"{found.unlabelled} of {seen} recordings of {found.name} have no label yet: they are left out.")
     parts = [each.part or each.source for each in found.read]  # without a number it is a part of its own
     return make_dataset(
         block[:, 0] if block.shape[1] == 1 else block,
@@ -300,6 +317,8 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
         channels=found.channels,
         unit=unit,
         notes=tuple(notes if rate else [*notes, UNKNOWN_RATE]),
+        unlabelled=found.unlabelled,
+        ordered=found.ordered,
         source=np.array([each.source for each in found.read]),
         lengths=np.array([each.length or each.trace.shape[1] for each in found.read], dtype=np.int64),
         rates=rates if np.isfinite(rates).any() else None,

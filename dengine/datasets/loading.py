@@ -3,6 +3,7 @@
 import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib.resources import files
@@ -20,7 +21,19 @@ from ..traces import as_trace, spec_of
 from . import units
 from .bags import is_stream, read_bag
 from .clocks import clock_of, rate_of
-from .dataset import Asked, Collected, Dataset, Recorded, UnreadableError, as_dataset, make_dataset, must, names_of, refit
+from .dataset import (
+    Asked,
+    Collected,
+    Dataset,
+    Recorded,
+    UnlabelledError,
+    UnreadableError,
+    as_dataset,
+    make_dataset,
+    must,
+    names_of,
+    refit,
+)
 from .labels import in_order, label_of, meanings
 from .tables import FORCE, from_frame, hold_many, read_folder, read_tables, recordings_in
 from .text import SUFFIXES as TEXTS
@@ -64,13 +77,14 @@ def load_dataset(
     part : the name of the array, or column, of parts' numbers, texts or whole numbers; for a folder a column of `labels`.
         Where there is no `part`, every trace is a part of its own. In a long table it tells which rows are one insertion.
     channel : "FZ_Base", or several, "FZ_Base,FX_Base", which give (n, C, T). Not given: FZ_Base, or the only one there is.
-    label : for a folder, a regular expression with one group that finds the label in a file's path; not given: True/False,
-        OK/NOK, pass/fail, good/bad, success/failure or 1/0 at the end of its name, or as its folder's. For a table, the
-        name of the column; for an .npz file of the array.
+    label : for a folder, a regular expression with one group that finds the label in a file's path, or the name of a
+        column of the files; not given: True/False, OK/NOK, pass/fail, good/bad, success/failure or i.O./n.i.O. at the
+        end of its name but for numbers, or as its folder's; else in a column that is called so. For a table, the name of
+        the column; for an .npz file of the array.
     labels : for a folder, a CSV file with a column of file names and one of labels; for a long table of parts; for an .npz
         file a row a trace.
-    label_map : what other words mean, "i.O.=good,n.i.O.=bad", or a dict.  time : the column of times, of a long table
-        or of recordings whose clock is not known by its name.
+    label_map : what other words mean, "heil=good,Riss=bad", or a dict; "1=good,0=bad" where names end in numbers that
+        are labels.  time : the column of times, of a long table or of recordings whose clock its name does not tell.
     fit : what becomes of traces of another length, as in `TraceSpec`. Not given: recordings of one length stay as they
         are (strict); of several lengths, "pad" to their median; where all have the `samples` asked for, "cut".
     rate_hz : instead of what the timestamps tell, which are then not looked at. Without either the rate is unknown, None.
@@ -189,7 +203,7 @@ def _read_npz(named: Files, name: str, asked: Asked) -> Dataset:
         if len(own) == 1 and X.ndim == 3:  # one array of several channels names none of them
             own, asked = (), replace(asked, channels=())
         about["channels"] = own or tuple(map(str, found.get("channels", ())))
-        return refit(make_dataset(X, _labels(found[label], asked), name=name, **about), asked)
+        return refit(_checked(X, found[label], asked, name, **about), asked)
 
 
 def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str, NDArray[Any]], list[str]]:
@@ -242,11 +256,13 @@ def _wanted_arrays(named: Files, asked: Asked) -> str:
     found, have = _archives(named, asked, every=True)
     traces = [name for name, x in found.items() if x.ndim in (2, 3) and len(x)]
     single = [name for name, x in found.items() if x.ndim == 1 and traces and len(x) in found[traces[0]].shape]
-    told = min(single, key=lambda name: len(set(found[name].tolist())), default="")
+    told = f"label={min(single, key=lambda name: len(set(found[name].tolist())))!r}" if single else ""
     shapes = ", ".join(f"{name} {found[name].shape}" for name in have) or "none"
     channel = "" if "X" in have else f"channel={traces[0]!r} and " if traces else ""
-    beside = sorted(next(iter(named.values())).parent.glob("*.csv"))
-    told = f"label={told!r}" if told else f"labels={str(beside[0])!r}, in the order of the traces" if beside else ""
+    for beside in sorted(next(iter(named.values())).parent.glob("*.csv")):
+        with suppress(DataError):
+            if not told and traces and len(in_order(beside, asked.part)) in found[traces[0]].shape:
+                told = f"labels={str(beside)!r}, in the order of the traces"
     return f"arrays X and y in {listed(named)}{f', or their names, as in {channel}{told}' if told else ''}; found {shapes}."
 
 
@@ -256,26 +272,36 @@ def _from_pair(X: Any, y: Any, asked: Asked) -> Dataset:
         traces = list(X)
         if traces and not all(np.isscalar(each) for each in traces):
             return _from_list(traces, list(y), asked)
-    return refit(make_dataset(X, _labels(y, asked)), asked)
+    return refit(_checked(X, y, asked), asked)
 
 
-def _labels(y: Any, asked: Asked) -> Any:
-    """Labels as they came; words as 1 and 0."""
-    found = Collected("the array of labels", ())
+def _checked(X: Any, y: Any, asked: Asked, name: str = "data", **about: Any) -> Dataset:
+    """A data set of the traces that have a label; words become 1 and 0, and what has no label yet is counted."""
+    found, words = Collected(name, ()), asked.words
 
-    def meant(word: Any) -> int:
+    def meant(word: Any) -> float:
         try:
-            return label_of(word, asked.words)
+            return label_of(word, words)
+        except UnlabelledError:
+            return np.nan
         except UnreadableError:
             found.unknown[str(word)] += 1
             return 0
 
     with instead(DataError, "Expected a label for each trace, 1 (success) or 0 (failure)", ValueError, TypeError):
-        words = np.asarray(y)
-        given = words.dtype.kind in "OUS" or asked.words
-        told = np.array([meant(each) for each in words.tolist()]) if given else words
+        given = np.asarray(y)
+        in_words = given.dtype.kind in "OUS" or words
+        labels = np.array([meant(word) for word in given.tolist()]) if in_words else given
     found.must_mean_something()
-    return told
+    fits = labels.dtype.kind == "f" and labels.shape == np.shape(X)[:1]
+    empty = np.isnan(labels) if fits else np.zeros(1, dtype=bool)
+    if not empty.any():
+        return make_dataset(X, labels, name=name, **about)
+    n, left = int(empty.sum()), ~empty
+    must(not empty.all(), f"labelled traces in {name}", f"{n} that have no label yet")
+    about |= {key: np.asarray(about[key])[left] for key in ("part", "cause") if about.get(key) is not None}
+    about["notes"] = (f"{n} of {len(labels)} traces of {name} have no label yet: they are left out.",)
+    return make_dataset(np.asarray(X)[left], labels[left], name=name, unlabelled=n, **about)
 
 
 def _with_index(frame: Any) -> Any:
@@ -292,7 +318,7 @@ def _from_list(traces: list[Any], labels: list[Any], asked: Asked) -> Dataset:
         have = list(map(str, getattr(trace, "columns", ())))
         timed = hasattr(trace, "iloc") and trace.ndim == 2 and not asked.rate_hz
         for name in (name for name in found.channels if have and name not in have):
-            raise UnreadableError(f"Expected a column {name}, got {', '.join(have)[:100]}")
+            raise UnreadableError(f"Expected a column {name}, got {listed(have)}")
         picked = trace[list(found.channels)] if have and found.channels else trace
         x, label = as_trace(picked, None), label_of(word, asked.words)
         if found.read and len(x) != len(found.read[0].trace):

@@ -22,8 +22,19 @@ from ..errors import DataError, listed
 from ..files import reading
 from ..traces import is_time
 from . import labels, units
-from .clocks import NOTHING, floats, place_of_clock, seconds_of
-from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
+from .clocks import floats, place_of_clock, seconds_of
+from .dataset import (
+    MOST_WORDS,
+    Asked,
+    Collected,
+    Dataset,
+    Fault,
+    Recorded,
+    UnknownWordError,
+    UnlabelledError,
+    UnreadableError,
+    as_dataset,
+)
 from .numerals import UndecidedError
 from .text import SUFFIXES as TEXTS
 from .text import Sheet, Timed, cells_of, decoded, numbers, read_recording, read_table, recording_of
@@ -37,6 +48,7 @@ FIRST = re.compile(r"[A-Za-z]{0,6}[_\-. ]?(?P<number>\d+)[_\-. ]+(?P<channel>\D.
 ORDER = "\0order"  # a column of a long table's times in seconds, whose name no file has
 MANY = 8  # numbered columns of a channel, which a single recording has none of
 FEWEST = 0.75  # of a wide table's columns that are numbered
+FEW = 20  # recordings that advice on a column is tried on
 SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
 
 
@@ -62,12 +74,14 @@ def hold_many(named: Mapping[str, Path], asked: Asked) -> bool:
     if path.suffix.lower() not in TEXTS:
         return True
     header = _top(path, asked)[0]
-    if asked.time is not None and (asked.part in header or asked.label in header):
+    if asked.time is not None and asked.part in header:
         return True
     if sum(len(names) for names in _numbered(header).values() if len(names) >= MANY) > FEWEST * len(header):
         return True
     with suppress(DataError):
         return asked.labels is None and not [labels.named(asked.label, asked.words).find(name) for name in named]
+    if len(named) > 1 and asked.part not in header and _one_label_each(named, asked):
+        return False
     known = asked.part in header or labels.column_among(header, labels.LABEL_COLUMNS) is not None
     if len(named) == 1 or asked.time is not None:
         return True
@@ -78,11 +92,11 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
     """The recordings of a folder, a file each, as `recordings_in` names them; DataError where none can be read."""
     if asked.labels is None and asked.part != "part":
         raise DataError(f"Expected a file of labels with a column {asked.part}: a folder's names tell no parts' numbers.")
-    if asked.labels is None:
-        told = labels.named(asked.label, asked.words)
-    else:
-        told = labels.listed(asked.labels, asked.part, list(named), asked.words)
-    found = Collected(name, asked.channels or _usual_channel(named.values(), asked))
+    told, column = _labels_of(named, asked)
+    found = Collected(name, asked.channels or _usual_channel(named.values(), asked, column))
+    if column is not None:
+        found.notes[f"The labels are those in column {column} of each file"] += 1
+    found.ordered = sorted(named, key=natural) == sorted(named, key=lambda each: natural(told.rest(each)))
     found.notes.update(_left_aside(folder, named, asked))
     mark = cache(partial(_mark_of, list(named.values()), asked))
 
@@ -101,11 +115,88 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
     try:
         labels.collect(named, read, told, found).must_mean_something()
     except DataError as error:
-        if asked.label or asked.labels or (listing := _listing(folder, named)) is None:
+        advice = None
+        if not (asked.label or asked.labels):
+            advice = _listing(folder, named, asked) or (None if found.unknown else _advice(named, asked))
+        if advice is None:
             raise
-        advice = f"{listing.name} names files; give it, labels={str(listing)!r}"
-        raise DataError(f"Expected labels in {folder}: {advice}.") from error
+        raise DataError(f"{str(error).rpartition(';')[0]}; {advice}.") from error
     return as_dataset(found, asked)
+
+
+def _labels_of(named: Mapping[str, Path], asked: Asked) -> tuple[labels.Labels, str | None]:
+    """Where a folder's labels are; and in which column of its files, if there.
+
+    A column is looked at where it is asked for, or where it has a label's name and no file's name tells a label.
+    """
+    if asked.labels is not None:
+        return labels.listed(asked.labels, asked.part, list(named), asked.words), None
+    header = _top(next(iter(named.values())), asked)[0]
+    if asked.label is not None:
+        column = asked.label if asked.label in header else None
+    else:
+        usual = [known for known in labels.LABEL_COLUMNS if known not in labels.SIGNALS]
+        place = labels.column_among(header, usual)
+        column = None if place is None or set(_told(named, labels.named(None, asked.words))) != {None} else header[place]
+    if column is not None:
+        return labels.in_column(named, column, asked), column
+    return labels.named(asked.label, asked.words), None
+
+
+def _one_label_each(named: Mapping[str, Path], asked: Asked) -> bool:
+    """Whether a column of the files tells labels, and the first file has one in it, as a recording has."""
+    with suppress(DataError):
+        told, column = _labels_of(named, asked)
+        return column is not None and _told([next(iter(named))], told)[None] == 0
+    return False
+
+
+def _told(names: Iterable[str], told: labels.Labels) -> Counter[Any]:
+    """How often each label is told of names, each word that may be one, and None where there is nothing."""
+    found = Counter[Any]()
+    for name in names:
+        try:
+            found[told.find(name)[0]] += 1
+        except UnknownWordError as error:
+            found[error.word] += 1
+        except (UnreadableError, OSError) as error:
+            found["" if isinstance(error, UnlabelledError) else None] += 1
+    return found
+
+
+def _tells(found: Counter[Any]) -> bool:
+    """Whether most are labels, or words so few that a person can say their meaning."""
+    words = set(+found) - {None, ""}
+    return found.total() > 2 * found[None] and (words <= {0, 1} or 2 <= len(words) <= MOST_WORDS)
+
+
+def _listing(folder: Path, named: Mapping[str, Path], asked: Asked) -> str | None:
+    """How to name the file of labels that is in the folder: its last line names a recording, and it has most of them."""
+    stems = {path.stem.lower() for path in named.values()}
+    for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in TEXTS):
+        words = {word.lower().removesuffix(path.suffix) for word in _top(path, Asked())[-1]}
+        if words.isdisjoint(stems - {path.stem.lower()}):
+            continue
+        with suppress(DataError):
+            if _tells(_told(named, labels.listed(path, asked.part, list(named), asked.words))):
+                return f"{path.name} names files: give it, labels={str(path)!r}"
+    return None
+
+
+def _advice(named: Mapping[str, Path], asked: Asked) -> str | None:
+    """How to say where the labels of recordings are, if that was tried on them and tells most; else None."""
+    likely = [(_told(named, told), f"{why}, say so: {do}") for why, do, told in labels.likely(list(named), asked.words)]
+    found, advice = max(likely, key=lambda each: -each[0][None])
+    if _tells(found) and found[0] and found[1]:
+        return advice
+    some = dict(list(named.items())[:: max(len(named) // FEW, 1)])
+    columns = [name for name in _top(next(iter(named.values())), asked)[0] if name and not is_time(name)]
+    known = {name: _told(some, labels.in_column(some, name, asked)) for name in columns}
+    telling = [name for name, found in known.items() if not found[None] and _tells(found) and len(+found) > 1]
+    if telling:
+        column = min(telling, key=lambda name: len(set(known[name]) - {0, 1, ""}))
+        return f"if column {column} tells them, name it: label={column!r}"
+    return None
 
 
 def _mark_of(paths: Sequence[Path], asked: Asked) -> str | None:
@@ -135,24 +226,15 @@ def _top(path: Path, asked: Asked) -> list[list[str]]:
     return [[]]
 
 
-def _listing(folder: Path, named: Mapping[str, Path]) -> Path | None:
-    """The file whose second line names another one, as a file of labels does."""
-    stems = {path.stem.lower() for path in named.values()}
-    none = Asked()
-    tops = {path: _top(path, none)[-1] for path in folder.rglob("*") if path.suffix.lower() in TEXTS}
-    words = {path: {word.lower().removesuffix(path.suffix) for word in row} for path, row in tops.items()}
-    return next((path for path, said in words.items() if said & (stems - {path.stem.lower()})), None)
-
-
 def natural(name: str) -> list[tuple[int, int, str]]:
     """A key that sorts numbers in a name by their size."""
     words = re.split(r"(\d+)", name.lower())
     return [(0, int(word), "") if word.isdecimal() else (1, 0, word) for word in words if word]
 
 
-def _usual_channel(paths: Iterable[Path], asked: Asked) -> tuple[str, ...]:
-    """The force, or the only channel that there is."""
-    headers = [tuple(_channels_in(_top(path, asked), asked)) for path in paths]
+def _usual_channel(paths: Iterable[Path], asked: Asked, label: str | None = None) -> tuple[str, ...]:
+    """The force, or the only channel that there is. label : a column that is none."""
+    headers = [tuple(name for name in _channels_in(_top(path, asked), asked) if name != label) for path in paths]
     if not any(headers) or FORCE.lower() in {name.lower() for header in headers for name in header}:
         return (FORCE,)
     return _chosen(Counter(headers).most_common(1)[0][0], asked)
@@ -231,6 +313,9 @@ def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collec
         return _from_long(
             _one_long(tables, asked), asked, found, first, dict(zip(tables[first].columns, told, strict=False))
         )
+    if advice := _long_columns(tables[first], asked, found.beside):
+        have = listed(tables[first].columns)
+        raise DataError(f"Expected a row an insertion, got a row a sample: {have}; a long table needs {advice}.")
     for source, frame in tables.items():
         _take_rows(frame, asked, found, source)
     return as_dataset(found, asked)
@@ -248,7 +333,7 @@ def _take_rows(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
     An empty cell before others is a NaN: the engine finds it, and the part is verified. A row whose last cells are empty is
     a shorter trace. A row with text in it, or no label, is a fault.
     """
-    label = _label_column(frame, asked, found)
+    label = _label_column(frame, asked)
     if asked.part != "part" and asked.part not in frame:
         raise DataError(f"Expected a column {asked.part} of parts' numbers, found {listed(frame.columns)}.")
     columns = _sample_columns([name for name in frame.columns if name not in (label, asked.part)], asked)
@@ -297,7 +382,7 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str,
             wanted = f"a row a sample in {source}, with columns of parts (part) and times (time)"
             advice = f"; name {names}" if (names := _long_columns(frame, asked, found.beside)) else ""
             raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
-    label = None if asked.labels is not None else _label_column(frame, asked, found)
+    label = None if asked.labels is not None else _label_column(frame, asked)
     frame = _row_a_sample(frame, [asked.part, time, *([label] if label else [])], asked)
     left = [name for name in frame.columns if name not in (asked.part, time, label) and not floats(frame[name])[1]]
     found.channels = _chosen(left, asked)
@@ -314,10 +399,7 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str,
         return timed._replace(units=tuple(written.get(name) or units.split(name)[1] for name in found.channels))
 
     def find(part: str) -> labels.Known:
-        words = [word for word in parts[part][label].unique().tolist() if str(word).strip().lower() not in NOTHING]
-        if len(words) != 1:
-            raise UnreadableError(f"Expected one label in column {label}, got {listed(words) or 'none'}")
-        return labels.label_of(words[0], asked.words), None
+        return labels.agreed(parts[part][label], str(label), asked.words), None
 
     told = labels.Labels(find, "name the column of labels (label)")
     if asked.labels is not None:
@@ -344,21 +426,46 @@ def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.Dat
 
 
 def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
-    """How to say which column is what, where a table looks as if it had a row a sample; else nothing."""
+    """How to say which column is what, where that was not said, if a table looks as if it had a row a sample."""
     frame = frame.loc[:, ~frame.columns.duplicated(keep=False)]
-    time = next((name for name in frame.columns if is_time(name)), None)
-    if time is None or max(map(len, _numbered(frame.columns).values()), default=0) > 2:
+    if max(map(len, _numbered(frame.columns).values()), default=0) > 2:
+        return ""
+    part = asked.part if asked.part in frame and frame[asked.part].duplicated().any() else ""
+    time = asked.time or next((name for name in frame.columns if is_time(name)), "")
+    time = time or next((name for name in frame.columns if part and name != part and _rises(frame, part, name)), "")
+    if not (time or part):
         return ""
     rows = frame.mask(frame == "").bfill()  # a label may stand in a part's last row alone
-    changes = {name: int((rows[name] != rows[name].shift()).sum()) for name in frame.columns if name != time}
+    others = [name for name in frame.columns if name not in (time, part)]
+    changes = {name: int((rows[name] != rows[name].shift()).sum()) for name in others}
     few = [name for name, n in changes.items() if 2 <= n <= len(frame) / 5]
-    if not few:
+    if not (part or few):
         return ""
-    part = max(few, key=changes.__getitem__)
-    label = min(few, key=lambda name: (name.lower() not in labels.LABEL_COLUMNS, changes[name]))
-    told = f"label={label!r}" if label != part else f"labels={beside!r}, a file of parts and labels"
-    told = f" and time={time!r}" if asked.labels is not None else f", time={time!r} and {told}"
-    return f"the columns that tell which part it is, when, and the label, as in part={part!r}{told}"
+    told = [] if part else [f"part={(part := max(few, key=changes.__getitem__))!r}"]
+    if not asked.time:
+        told.append(f"time={time!r}" if time else "the column of times (time)")
+    if not (asked.label or asked.labels):
+        label = min(few, key=lambda name: (name.lower() not in labels.LABEL_COLUMNS, changes[name]), default=part)
+        told.append(f"label={label!r}" if label != part else _parts_listing(frame[part], beside, asked))
+    return f"the columns that tell which part it is, when, and the label, as in {', '.join(told)}" if told else ""
+
+
+def _rises(frame: pd.DataFrame, part: str, name: str) -> bool:
+    """Whether a column's numbers, or times as text, rise from row to row of each part."""
+    with suppress(ValueError, TypeError):
+        values, odd, _ = seconds_of(frame[name], name)
+        same = (frame[part] == frame[part].shift()).to_numpy()
+        return not odd and bool(same.any()) and bool((np.diff(values)[same[1:]] > 0).all())
+    return False
+
+
+def _parts_listing(parts: pd.Series, beside: str, asked: Asked) -> str:
+    """How to name a file of parts and labels: the one beside the table, if it has most of them."""
+    named = [str(part) for part in parts.unique()]
+    with suppress(DataError):
+        if _tells(_told(named, labels.listed(beside, "part", named, asked.words))):
+            return f"labels={beside!r}, a file of parts and labels"
+    return "and a CSV file of parts and labels (labels)"
 
 
 def _chosen(have: Sequence[str], asked: Asked) -> tuple[str, ...]:
@@ -379,13 +486,11 @@ def _ended(trace: NDArray[np.float32]) -> NDArray[np.float32]:
     return trace[:, : known[-1] + 1] if len(known) else trace
 
 
-def _label_column(frame: pd.DataFrame, asked: Asked, found: Collected) -> str:
+def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
     if asked.label is not None:
         if asked.label not in frame:
             raise DataError(f"Expected a column {asked.label} of labels, found {listed(frame.columns)}.")
         return asked.label
-    if asked.time is None and (advice := _long_columns(frame, asked, found.beside)):
-        raise DataError(f"Expected a row an insertion, got a row a sample: {listed(frame.columns)}; name {advice}.")
     if (known := labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)) is not None:
         return str(frame.columns[known])
     several = {name for names in _numbered(frame.columns).values() if len(names) > 1 for _, name in names}
@@ -393,9 +498,11 @@ def _label_column(frame: pd.DataFrame, asked: Asked, found: Collected) -> str:
     if asked.time is None and len(left) == len(frame.columns) and any(is_time(name) for name in left):
         do = "as in one recording; give a folder of such CSV files"
         raise DataError(f"Expected a row an insertion, got {listed(left)}, {do}.")
-    likely = min(left, key=lambda name: (frame[name].nunique() < 2, frame[name].nunique()), default="...")
-    have = listed(left or frame.columns)
-    raise DataError(f"Expected a column of labels, y or label, found {have}; name it: label={likely!r}.")
+    likely = [name for name in left if 2 <= frame[name].nunique() <= MOST_WORDS]
+    do = (
+        f"name it: label={min(likely, key=lambda name: frame[name].nunique())!r}" if likely else "add one that is called so"
+    )
+    raise DataError(f"Expected a column of labels, y or label, found {listed(left or frame.columns)}; {do}.")
 
 
 def _numbered(names: Iterable[str]) -> dict[str, list[tuple[int, str]]]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import excerpt, listed
 from . import units
 from .clocks import NOTHING, STAMP, clock_of, evenly, floats, is_rising, rate_of, rising
 from .dataset import Asked, Fault, UnreadableError
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 LARGEST = 128 * 2**20  # bytes of one text file
+BEGINS = re.compile(r"\s*[+-]?\d*\.?\d*(?:(?<=\d)[eE][+-]?\d+)?")  # what of a cell is a number
 DELIMITERS = ("\t", ";", "|", ",", " ", "")  # in the order in which equals are taken; " ": any blanks; "": one column
 SAMPLED = 30  # lines, from the end, that tell the delimiter, and
 CELLS = 40  # cells of each
@@ -231,7 +233,9 @@ def numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
     for i, name in enumerate(frame.columns):
         block[:, i], odd = floats(cells := frame.iloc[:, i])
         for index in odd:
-            wrong.setdefault(index, f"Expected a number in column {name}, got {str(cells[index])[:40]!r}")
+            cell = str(cells[index])
+            said = excerpt(cell, BEGINS.match(cell).end())  # type: ignore[union-attr]  # it matches nothing, too
+            wrong.setdefault(index, f"Expected a number in column {name}, got {said}")
     with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which the engine finds
         return block.astype(np.float32), wrong
 
@@ -289,7 +293,7 @@ def place_of(name: str, header: Sequence[str], line: int = 1) -> int:
         places = [i for i, word in enumerate(header) if same(word)]
         if places:
             break
-    have = ", ".join(header)[:200]
+    have = listed(header)
     if not places:
         raise UnreadableError(f"Expected a column {name}, got {have}", line)
     if len(places) > 1:

@@ -47,7 +47,8 @@ class Survey:
     not_finite, constant : traces that the engine verifies and never learns from.  not_finite_in : their files, or rows.
     duplicates : traces equal to an earlier one, sample by sample; contradicting : of these, with another label.
     near_repeats : of the newest `looked_at` that can be learned from, traces much nearer to another part's than parts are
-    to each other.  parts : how many, where known.  drift : of the share of good labels, and of each channel's mean.
+    to each other.  parts : how many, where known.  unlabelled : left out, since nobody has checked them yet.
+    drift : of the share of good labels, and of each channel's mean; empty where the order does not say what came first.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Survey:
     rates: Spread | None
     good: int
     bad: int
+    unlabelled: int
     faults: tuple[Fault, ...]
     not_finite: int
     not_finite_in: tuple[str, ...]
@@ -88,8 +90,9 @@ def survey(data: Dataset) -> Survey:
     again = [(first.setdefault(content, label), label) for content, label in labels]
     names = data.channels or tuple(f"channel {i + 1}" for i in range(X.shape[1]))
     means = np.where(usable[:, None], levels(np.where(np.isfinite(X), X, 0)), np.nan).T
+    quantities = zip(("good", *names), [data.y.astype(np.float64), *means], strict=True)
     return Survey(
-        **{name: getattr(data, name) for name in ("name", "rate_hz", "unit", "fit", "faults")},
+        **{name: getattr(data, name) for name in ("name", "rate_hz", "unit", "fit", "unlabelled", "faults")},
         **dict(zip(("traces", "channels", "samples"), X.shape, strict=True)),
         names=data.channels,
         seconds=None if data.rate_hz is None else X.shape[2] / data.rate_hz,
@@ -105,7 +108,7 @@ def survey(data: Dataset) -> Survey:
         near_repeats=near_repeats(X[usable], own[usable]),
         looked_at=min(int(usable.sum()), NEWEST),
         parts=None if data.part is None else len(set(parts)),
-        drift=tuple(_drift(*each) for each in zip(("good", *names), [data.y.astype(np.float64), *means], strict=True)),
+        drift=tuple(_drift(*each) for each in quantities) if data.ordered else (),
     )
 
 

@@ -15,9 +15,11 @@ import pytest
 from click.testing import Result
 
 from dengine import DataEngine, Dataset, load_dataset
+from dengine.errors import DataError
 from dengine.experiments.figures import data_picture
 from dengine.experiments.survey import survey
 from tests.support.command_line import dengine, document, well
+from tests.support.recording_forms import NOT_CHECKED
 from training.make_recordings import write_plants, write_recordings
 
 
@@ -187,7 +189,9 @@ def test_python_objects_are_not_read_unasked_and_the_error_says_what_to_type(
     assert (found.y.tolist(), found.lengths.tolist()) == (data.y.tolist(), [30 + i % 10 for i in range(30)])
 
 
-@pytest.mark.parametrize(("good", "bad"), [("OK", "Ausschuss"), ("in Ordnung", "Riss"), ("Gutteil", "kein Gutteil")])
+@pytest.mark.parametrize(
+    ("good", "bad"), [("OK", "Ausschuss"), ("in Ordnung", "Riss"), ("Gutteil", "kein Gutteil"), ("gut, heil", "is a=b")]
+)
 def test_words_are_told_apart_by_the_map_that_the_error_says(good: str, bad: str, make_data, tmp_path: Path) -> None:
     data = make_data(41, samples=40)
     wide(data.X, np.array([bad, good])[data.y]).to_csv(tmp_path / "table.csv", index=False)
@@ -198,6 +202,180 @@ def test_words_are_told_apart_by_the_map_that_the_error_says(good: str, bad: str
         found = load_dataset(source, **as_advised("data", str(source))[1])
         assert {int(found.y.sum()), 41 - int(found.y.sum())} == {int(data.y.sum()), 41 - int(data.y.sum())}
         assert found.faults == ()
+
+
+def file_each(folder: Path, data: Dataset, name: str, **columns: Callable[[int], Any]) -> None:
+    """A file an insertion. name : with i, y, ok, own and k, a number of an attempt, in it.  columns : by label."""
+    for i, (x, y) in enumerate(zip(data.X, data.y.tolist(), strict=True)):
+        path = folder / name.format(i=i, y=y, ok="OK" if y else "NOK", own="heil" if y else "Riss", k=i // 3 % 2)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        frame = pd.DataFrame({"time": np.arange(len(x)) / 100, "FZ": x})
+        frame.assign(**{column: cell(y) for column, cell in columns.items()}).to_csv(path, index=False)
+
+
+def listing(path: Path, data: Dataset, word: Callable[[int], str], file: str = "insertion_{}.csv") -> None:
+    rows = [f"{file.format(i)},{word(y)}" for i, y in enumerate(data.y.tolist())]
+    path.write_text("\n".join(["file,verdict", *rows]))
+
+
+def with_listing(folder: Path, data: Dataset, word: Callable[[int], str] = str) -> None:
+    file_each(folder, data, "insertion_{i}.csv")
+    (folder / "a_sizes.csv").write_text("file,bytes\n" + "\n".join(f"insertion_{i}.csv,{i}" for i in range(30)))
+    listing(folder / "labels.csv", data, word)
+
+
+MISTAKES: dict[str, Callable[[Path, Dataset], Any]] = {  # what a person may have in a folder
+    "a verdict, then an attempt": lambda path, data: file_each(path, data, "part_{i:04d}_{ok}_{k}.csv"),
+    "a 1 or a 0 at the end": lambda path, data: file_each(path, data, "part_{i}_{y}.csv"),
+    "folders 1 and 0": lambda path, data: file_each(path, data, "{y}/run_{i}.csv"),
+    "folders 1 and 0, and attempts": lambda path, data: file_each(path, data, "{y}/part_{i}_{k}.csv"),
+    "words for all in front": lambda path, data: file_each(path, data, "pass_fail_log_{i}_{ok}.csv"),
+    "folders with numbers, a verdict in them": lambda path, data: file_each(path, data, "part_{i}_{ok}/run_{k}.csv"),
+    "words of one's own in a folder": lambda path, data: file_each(path, data, "{own}/x/insertion_{i}.csv"),
+    "a column of verdicts": lambda path, data: file_each(path, data, "data/run_{i}.csv", success=bool),
+    "a column of verdicts, and attempts": lambda path, data: file_each(path, data, "{i}/run_{k}.csv", Verdict=bool),
+    "a column of states": lambda path, data: file_each(path, data, "run_{i}.csv", status=int, program=lambda y: 7),
+    "a column of words of one's own": lambda path, data: file_each(
+        path, data, "run_{i}.csv", crack=["ja", "nix"].__getitem__
+    ),
+    "a list of files, and another that tells none": with_listing,
+    "a list of words of one's own": lambda path, data: with_listing(path, data, ["Riss", "heil"].__getitem__),
+    "a list of words, some not checked": lambda path, data: with_listing(path, data, ["n.i.O.", "i.O."].__getitem__),
+    "a long table": lambda path, data: long(data.X, data.y == 1).to_csv(path / "t.csv", index=False),
+    "a long table whose clock has another name": lambda path, data: (
+        long(data.X, data.y == 1).rename(columns={"time": "counter"}).to_csv(path / "t.csv", index=False)
+    ),
+}
+ASKED = {"a long table whose clock has another name": ["--part", "serial", "--label", "verdict"]}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_what_an_error_advises_gets_further_as_it_stands_and_no_label_is_wrong(
+    mistake: str, make_data, tmp_path: Path
+) -> None:
+    data = make_data(30, samples=40)
+    MISTAKES[mistake](tmp_path, data)
+    asked = ASKED.get(mistake, [])
+    _, told = as_advised("data", str(tmp_path), *asked)
+    given = {name.strip("-"): value for name, value in zip(asked[::2], asked[1::2], strict=True)}
+    found = load_dataset(tmp_path, **told, **given)
+    by_trace = {x.tobytes(): y for x, y in zip(data.X, data.y.tolist(), strict=True)}
+    agree = [by_trace[x.tobytes()] == y for x, y in zip(found.X, found.y.tolist(), strict=True)]
+    assert (len(found), len(set(agree))) == (30, 1)  # which of two words is the good one a person has to say
+    assert agree[0] or "label_map" in told
+
+
+@pytest.mark.parametrize(
+    "options", [[], ["--time", "time"], ["--label", "success"], ["--time", "time", "--label", "success"]]
+)
+def test_a_column_tells_the_labels_of_a_folders_files_whatever_else_is_said(
+    options: list[str], make_data, tmp_path: Path
+) -> None:
+    data = make_data(30, samples=40)
+    file_each(tmp_path, data, "{i}/run_{k}.csv", success=bool)
+    found = document("data", tmp_path, *options)
+    assert (found["survey"]["traces"], found["survey"]["good"]) == (30, int(data.y.sum()))
+    assert found["survey"]["names"] == ["FZ"]
+    assert any("in column success of each file" in note for note in found["notes"])
+
+
+def test_without_labels_nothing_is_advised_that_cannot_be_typed(make_data, tmp_path: Path) -> None:
+    data = make_data(30, samples=40)
+    file_each(tmp_path / "cell" / "data", data, "insertion_{i}.csv")
+    (tmp_path / "cell" / "sizes.csv").write_text("name\n" + "\n".join(f"insertion_{i}" for i in range(30)))
+    long(data.X, data.y == 1).drop(columns="verdict").to_csv(tmp_path / "long.csv", index=False)
+    said = " ".join(dengine("data", tmp_path / "cell").stderr.split())
+    assert "of 31 have none" in said
+    assert re.findall(r"--[a-z-]+ ?[\w'./]*", said) == ["--label", "--labels"]
+    wide(data.X, data.y == 1).drop(columns=["day", "Urteil"]).to_csv(tmp_path / "wide.csv", index=False)
+    assert "--label" not in dengine("data", tmp_path / "wide.csv").stderr
+    np.savez(tmp_path / "cell.npz", force=data.X)
+    (tmp_path / "sizes.csv").write_text("trace,bytes\n0,7\n1,9\n")
+    assert "sizes.csv" not in dengine("data", tmp_path / "cell.npz").stderr
+    done = dengine("data", tmp_path / "long.csv")
+    assert re.search(r"--part serial, --time time, and a CSV file of parts and labels \(--labels\)", done.stderr), (
+        done.stderr
+    )
+
+
+def test_a_long_table_whose_times_are_not_named_is_told_to_name_them(make_data, tmp_path: Path) -> None:
+    data = make_data(30, samples=40)
+    long(data.X, data.y == 1).to_csv(tmp_path / "t.csv", index=False)
+    done = dengine("data", tmp_path / "t.csv", "--part", "serial", "--label", "verdict")
+    assert "a long table needs" in done.stderr
+    assert "--time time" in done.stderr
+    assert "--part serial" not in done.stderr
+    assert "a long one, a row a sample, with --part, --time" in " ".join(well("data", "--help").stdout.split())
+
+
+@pytest.mark.parametrize("empty", NOT_CHECKED, ids=repr)
+def test_a_part_without_a_verdict_is_counted_as_unlabelled_and_left_out(empty: str, make_data, tmp_path: Path) -> None:
+    data = make_data(30, samples=40)
+    words = [("OK" if y else "NOK") if i % 3 == 0 else empty for i, y in enumerate(data.y.tolist())]
+    table = pd.DataFrame(data.X.astype(float), columns=[f"FZ_{i}" for i in range(40)]).assign(verdict=words)
+    table.to_csv(tmp_path / "wide.csv", index=False)
+    rows = long(data.X, data.y == 1).assign(verdict=np.repeat(words, 40))
+    rows.to_csv(tmp_path / "long.csv", index=False)
+    for i, x in enumerate(data.X):
+        (tmp_path / "column").mkdir(exist_ok=True)
+        (tmp_path / "plain").mkdir(exist_ok=True)
+        pd.DataFrame({"FZ": x, "verdict": words[i]}).to_csv(tmp_path / "column" / f"run_{i}.csv", index=False)
+        pd.DataFrame({"FZ": x}).to_csv(tmp_path / "plain" / f"run_{i}.csv", index=False)
+    (tmp_path / "labels.csv").write_text("file,label\n" + "\n".join(f"run_{i}.csv,{word}" for i, word in enumerate(words)))
+    np.savez(tmp_path / "x.npz", X=data.X, y=np.array(words), part=np.arange(30))
+    sources = {"wide.csv": [], "long.csv": ["--part", "serial", "--time", "time"], "column": [], "x.npz": []}
+    sources["plain"] = ["--labels", tmp_path / "labels.csv"]
+    for source, options in sources.items():
+        found = document("data", tmp_path / source, *options)["survey"]
+        assert (found["traces"], found["unlabelled"], found["faults"]) == (10, 20, []), source
+        assert found["good"] == int(data.y[::3].sum())
+        assert "20 of 30" in well("data", tmp_path / source, *options).stdout
+    played = well("replay", "--data", tmp_path / "wide.csv", "--reducer", "pca", "--cycles", 10, "--repeats", 1)
+    assert "20 of 30 recordings of wide have no label yet: they are left out." in played.stderr
+
+
+def test_numbers_that_are_missing_in_an_array_of_labels_are_unlabelled_and_other_numbers_are_refused(make_data) -> None:
+    data = make_data(30, samples=40)
+    y = np.where(np.arange(30) % 3 == 0, data.y, np.nan)
+    for labels in (y, pd.Series(y), [None if np.isnan(each) else bool(each) for each in y]):
+        found = load_dataset((data.X, labels))
+        assert (found.y.tolist(), found.unlabelled) == (data.y[::3].tolist(), 20)
+    with pytest.raises(DataError, match=r"labels 1 \(success\) and 0 \(failure\)"):
+        load_dataset((data.X, 2 * data.y - 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "ordered"),
+    [("{ok}/{i}.csv", False), ("{ok}_{i}.csv", False), ("day_1/{ok}/{i}.csv", False), ("{i}_{ok}.csv", True)],
+)
+def test_files_that_their_labels_put_in_order_have_no_recorded_order_and_no_drift(
+    name: str, ordered: bool, make_data, tmp_path: Path
+) -> None:
+    file_each(tmp_path, make_data(60, samples=40), name)
+    result = well("data", tmp_path)
+    assert ("with the order" not in result.stdout) or ordered
+    assert ("in the order of their labels, not of their recording" in result.stdout) is not ordered
+    assert bool(document("data", tmp_path)["survey"]["drift"]) is ordered
+
+
+@pytest.mark.parametrize(
+    ("cell", "shown"),
+    [
+        ("1234567.8901234567890123N", "123N'"),
+        ("0" * 100 + "x" + "0" * 100, "00x00"),
+        ("0.0123456789012345678901234567\u041e", "CYRILLIC CAPITAL LETTER O (U+041E) at character 31"),
+        ("10\u200b43.5", "ZERO WIDTH SPACE (U+200B) at character 3"),
+    ],
+)
+def test_an_error_shows_the_character_that_is_wrong(cell: str, shown: str, make_data, tmp_path: Path) -> None:
+    data = make_data(12, samples=40)
+    file_each(tmp_path, data, "{i}_{ok}.csv")
+    path = next(tmp_path.glob("3_*.csv"))
+    lines = path.read_text().splitlines()
+    lines[5] = f"{lines[5].partition(',')[0]},{cell}"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    (fault,) = load_dataset(tmp_path).faults
+    assert (fault.line, shown in fault.what, len(fault.what) < 200) == (6, True, True), fault.what
 
 
 def test_a_row_a_signal_and_an_array_of_channels_are_the_traces_that_they_were(make_data, tmp_path: Path) -> None:

@@ -91,6 +91,73 @@ TIMES: Mapping[str, Callable[[int], str]] = {
 UNITS = ("FZ [kN]", "FZ (kN)", "FZ_kN", "FZ/kN", "FZ in kN", "FZ kN", "a row of units")
 
 
+# Where a name has its label -> names of good recordings, and of bad ones.
+LABEL_FORMS: Mapping[str, tuple[list[str], list[str]]] = {
+    "a word at the end of the name": (
+        ["insertion_0001_True.csv", "OK.csv", "a-PASS.CSV", "sub/x good.csv", "success.csv", "0001_yes.csv", "7_gut.csv"],
+        [
+            "insertion_0001_False.csv",
+            "NOK.csv",
+            "a-FAIL.CSV",
+            "x_bad.csv",
+            "x.failure.csv",
+            "0001_no.csv",
+            "7_schlecht.csv",
+        ],
+    ),
+    "a word, and numbers behind it": (
+        [
+            "part_0001_OK_0.csv",
+            "OK_0001.csv",
+            "pass-0.csv",
+            "x_true_2026-03-01.csv",
+            "x_good_v0.csv",
+            "OK1.csv",
+            "IO_7.csv",
+        ],
+        ["part_0001_NOK_1.csv", "NOK_0001.csv", "fail-1.csv", "x_false_1_1.csv", "x_bad_run1.csv", "NOK1.csv", "NIO_7.csv"],
+    ),
+    "i.O. and n.i.O., as Germans write them": (
+        ["7_i.O..csv", "7_i.O.csv", "7_iO.csv", "7_IO.csv", "7_i_O.csv", "i.O._7.csv", "io/7.csv"],
+        ["7_n.i.O..csv", "7_n.i.O.csv", "7_niO.csv", "7_NIO.csv", "7_n_i_O.csv", "7_nicht i.O..csv", "n.i.O./7.csv"],
+    ),
+    "a word after a not": (
+        ["run_7_not_failed.csv", "run_7_NotFailed.csv"],
+        [
+            "run_7_not-OK.csv",
+            "run_7_not_ok.csv",
+            "NOTOK.csv",
+            "nok/7.csv",
+            "runNotOk.csv",
+            "run_7_n.ok.csv",
+            "not ok/7.csv",
+        ],
+    ),
+    "other separators and capitals": (
+        ["part7OK.csv", "partOk.csv", "part(ok).csv", "part=pass.csv", "part.7.ok.csv", "part [OK] 7.csv", "part+true.csv"],
+        [
+            "part7NOK.csv",
+            "partNok.csv",
+            "part(ng).csv",
+            "part=fail.csv",
+            "part.7.nok.csv",
+            "part [NG] 7.csv",
+            "part+false.csv",
+        ],
+    ),
+    "the folder's name": (
+        ["good/0.csv", "ok/monday/7.csv", "OK/run_0.csv", "part_003_OK/run_0.csv"],
+        ["NOK/1.csv", "fail/run 7.csv", "cell/nok/b/3.csv", "part_003_NOK/run_1.csv"],
+    ),
+    "copies": (
+        ["run_7_true (2).csv", "run_7_true(1).csv", "run_7_true - Copy.csv"],
+        ["run_7_NOK - Kopie (3).csv", "1/x_nok.csv", "run_7_false copy.csv"],
+    ),
+}
+# The label of a part that was not checked yet.
+NOT_CHECKED = ("", "nan", "NaN", "None", "-", "n/a", " ", "NULL", "?", "pending")
+
+
 def in_code(words: Mapping[str, object] | tuple[str, ...]) -> str:
     return ", ".join(f"`{word}`".replace("|", "\\|") for word in words)
 
@@ -107,7 +174,16 @@ def tables() -> dict[str, str]:
         "The unit kN of a channel": in_code(UNITS),
     }
     lines = ["| what | forms that are read |", "| --- | --- |", *(f"| {what} | {forms} |" for what, forms in rows.items())]
-    return {"recordings": "\n".join(lines)}
+    said = [f"| {form} | {in_code(tuple(good))} | {in_code(tuple(bad))} |" for form, (good, bad) in LABEL_FORMS.items()]
+    empty = ", ".join(f"`{word}`" for word in NOT_CHECKED if word.strip())
+    head = ["| the label is | good | bad |", "| --- | --- | --- |"]
+    labels = [
+        *head,
+        *said,
+        "",
+        f"An empty label, or {empty}, is of a part that was not checked yet: it is counted, and left out.",
+    ]
+    return {"recordings": "\n".join(lines), "labels": "\n".join(labels)}
 
 
 def page(text: str) -> str:

@@ -156,7 +156,7 @@ def test_what_cannot_be_cut_is_said_with_what_to_give(bag: Bag, tmp_path: Path) 
     path = bag.write(tmp_path / "cell.mcap")
     for change, said in (
         ({"trigger": None}, "Expected what cuts .* as trigger='register@/phase' and label='/height_check/ok'"),
-        ({"label": None}, "Expected the labels' topic"),
+        ({"label": None}, "Expected the labels of the insertions in .*, as label='/height_check/ok'"),
         ({"trigger": "register@/nothing"}, "Expected the topic /nothing"),
         ({"label": "/nothing"}, "Expected the topic /nothing"),
         ({"topic": PHASE}, "Expected a topic of a wrench"),

@@ -13,6 +13,7 @@ from dengine import DataEngine, Dataset, TraceSpec, load_dataset
 from dengine.datasets.importing import import_labelled
 from dengine.datasets.labels import named
 from dengine.errors import DataError, TraceError
+from tests.support.recording_forms import LABEL_FORMS
 
 
 def write_csv(
@@ -141,25 +142,50 @@ def test_each_fault_is_named_with_file_and_line_and_nothing_else_is_lost(make_da
     np.testing.assert_array_equal(loaded.X, data.X)
 
 
-@pytest.mark.parametrize(
-    ("label", "names"),
-    [
-        (1, "insertion_0001_True.csv, OK.csv, a-PASS.CSV, sub/x good.csv, success.csv, run_1.csv, run_7_not_failed.csv"),
-        (0, "insertion_0001_False.csv, NOK.csv, a-FAIL.CSV, x_bad.csv, run_7_not-OK.csv, run_7_not_ok.csv, NOTOK.csv"),
-        (1, "good/0.csv, OK/x_true.csv, ok/monday/7.csv, run_7_true (2).csv, run_7_true(1).csv, run_7_true - Copy.csv"),
-        (0, "NOK/1.csv, fail/run 7.csv, 1/x_nok.csv, nok/1/x.csv, cell/nok/b/3.csv, run_7_NOK - Kopie (3).csv, run_0.csv"),
-        (None, "insertion_0001.csv, run_10.csv, token.csv, ok_then.csv, maybe.csv"),
-    ],
+NO_LABELS = (
+    "insertion_0001.csv, run_10.csv, run_1.csv, part_003/run_0.csv, 1/7.csv, token.csv, smoke_3.csv, okuma.csv, "
+    "Broken.csv, ok_then.csv, maybe.csv, part_no_7.csv, io_link.csv, nation.csv, badge_1.csv, gutter.csv, "
+    "compass.csv, passage_0.csv"
 )
-def test_a_label_is_read_from_a_name_or_its_folder_as_people_write_them(label: int | None, names: str) -> None:
-    for name in names.split(", "):
-        if label is None:
-            with pytest.raises(DataError, match="Expected a label"):
-                named().find(name)
-        else:
-            assert named().find(name) == (label, None), name
-    with pytest.raises(DataError, match="its name and its folder good contradict"):
-        named().find("good/x_NOK.csv")
+CONTRADICTIONS = (
+    "good/x_NOK.csv, bad/1/x_ok_2.csv, x_OK_NOK.csv, x_NOK_OK_1.csv, pass_fail_log_7_OK.csv, ok_not_ok.csv, "
+    "good/bad/7.csv, good/nok_sensor.csv, NOK_7/OK/x_true_NG.csv"
+)
+
+
+@pytest.mark.parametrize("form", LABEL_FORMS)
+def test_a_label_is_read_from_a_name_or_its_folder_as_people_write_them(form: str) -> None:
+    good, bad = LABEL_FORMS[form]
+    assert [name for name in good if named().find(name) != (1, None)] == []
+    assert [name for name in bad if named().find(name) != (0, None)] == []
+
+
+@pytest.mark.parametrize("name", NO_LABELS.split(", "))
+def test_a_number_or_a_part_of_another_word_is_no_label(name: str) -> None:
+    with pytest.raises(DataError, match="Expected a label at the end of the name"):
+        named().find(name)
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS.split(", "))
+def test_two_labels_in_a_name_that_contradict_each_other_are_an_error(name: str) -> None:
+    with pytest.raises(DataError, match=r"Expected one label.*contradict each other.*\(label\)"):
+        named().find(name)
+
+
+def test_a_number_is_a_label_of_a_name_where_somebody_says_so_and_never_against_a_word() -> None:
+    told = named(None, {"1": True, "0": False})
+    assert [told.find(name)[0] for name in ("run_1.csv", "part_003/run_0.csv", "1/7.csv", "0/a.csv", "x-1.csv")] == [
+        1,
+        0,
+        1,
+        0,
+        1,
+    ]
+    assert told.find("part_0001_OK_1.csv") == (1, None)
+    with pytest.raises(DataError, match="contradict"):
+        told.find("part_0001_NOK_1.csv")
+    with pytest.raises(DataError, match="at the end of the name"):
+        told.find("run_11.csv")
 
 
 def test_labels_come_from_folders_a_pattern_or_a_file(small: Dataset, tmp_path: Path) -> None:
@@ -317,7 +343,7 @@ def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(few
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({}, r"4 of 4 have none.*give the pattern of it"),
+        ({}, r"4 of 4 have none.*give the pattern of it in the path \(label\), or list the files"),
         ({"label": "("}, "regular expression"),
         ({"label": "ok"}, "one group"),
         ({"labels": True}, r"4 of 4 have none.*labels\.csv names OK, NOK: call its columns file and label"),
@@ -328,7 +354,7 @@ def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(few
 )
 def test_where_a_folders_labels_are_not_is_said(small: Dataset, tmp_path: Path, asked: dict, words: str) -> None:
     for i, x in enumerate(small.X[2:6], start=2):
-        write_csv(tmp_path / "cell" / f"run_{i}.csv", x)  # run_0 and run_1 would be labels by themselves
+        write_csv(tmp_path / "cell" / f"run_{i}.csv", x)
     (tmp_path / "labels.csv").write_text("a,b\nOK,1\nNOK,2\n")
     with pytest.raises(DataError, match=words):
         load_dataset(tmp_path / "cell", **(asked | ({"labels": tmp_path / "labels.csv"} if "labels" in asked else {})))
@@ -384,7 +410,10 @@ REFUSED: dict[str, tuple[Callable[[Dataset, Path], Any], str]] = {
     "transposed": (lambda data, tmp: (np.zeros((5, 100, 2)), [1] * 5), r"looks transposed; pass X\.transpose"),
     "transposed in a list": (lambda data, tmp: ([np.zeros((100, 2))] * 3, [1, 0, 1]), "looks transposed"),
     "a word that is no label": (lambda data, tmp: (data.X[:2], ["OK", "perhaps"]), r"as True/False.*got 'perhaps'"),
-    "no label": (lambda data, tmp: (data.X[:2], [1, None]), "got 'None'"),
+    "no label at all": (
+        lambda data, tmp: (data.X[:2], ["", None]),
+        "labelled traces in data, got .2 that have no label yet",
+    ),
     "an empty folder": (lambda data, tmp: tmp, "Expected CSV files, one an insertion"),
     **{
         kind: (
