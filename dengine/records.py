@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from .errors import ReportConflictError, ReportError, SettingError, StoreError, expect, instead, shortened, without_password
+from .errors import ReportError, SettingError, StoreError, expect, instead, shortened, without_password
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
@@ -68,6 +68,7 @@ class Source(StrEnum):
     AUDIT = "audit"  # the model was certain and was checked all the same
     STOP = "stop"  # accepted, and the system stopped: a failure
     CONFIRMED = "confirmed"  # accepted, and known to be fine
+    INSPECTION = "inspection"  # rejected, and looked at afterwards: evidence that came unasked
 
 
 class Outcome(StrEnum):
@@ -290,10 +291,10 @@ def as_outcome(value: Any, of: str = "") -> Outcome:
         return Outcome(value)
 
 
-def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
-    """Where a label on a decision comes from; ReportError for a rejected part, which went back to the bin."""
+def source_of(action: Action, audit: bool, success: bool) -> Source:
+    """Where a label on a decision comes from."""
     if action is Action.REJECT:
-        raise ReportConflictError(f"Decision {decision_id!r} was a reject; the part went back to the bin and has no label.")
+        return Source.INSPECTION
     if action is Action.VERIFY:
         return Source.AUDIT if audit else Source.VERIFICATION
     return Source.CONFIRMED if success else Source.STOP

@@ -129,14 +129,15 @@ def _told(each: StoredVersion | Event) -> str:
 
 @verb("dengine explain engine.db last --out why.png")
 @options.store_argument
-@click.argument("decision", metavar="DECISION")
+@click.argument("decision", metavar="PART|ID")
 @click.option("--neighbours", type=click.IntRange(0), default=10, show_default=True, help="Nearest references, shown.")
 @options.picture_option
 def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None:
     """Say why a decision came out as it did.
 
-    DECISION is its id, as `dengine history STORE` lists it, or the word last. Counts, bound and action are shown as they
-    were recorded; neighbours are found again by the version that answered, where the store keeps it.
+    It is named by its id, as `dengine history STORE` lists it, by its part's number, or by the word last. Counts,
+    bound and action are shown as they were recorded; neighbours are found again by the version that answered, where the
+    store keeps it.
     The picture shows the trace with its neighbours and with the band that 95 % of the known successes lie in.
     """
     from ..errors import ReportError

@@ -67,10 +67,11 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
     """Report what became of a part.
 
     It is named by its number, where one decision was made on it, or by that decision's id. An accepted part that was bad
-    is a system stop. A label that is wrong is put right by `dengine correct`.
+    is a system stop; a rejected one that was looked at afterwards is an inspection, which trains. A label that is
+    wrong is put right by `dengine correct`.
     """
     from ..engine.corrections import Changed
-    from ..history.status import of_part
+    from ..history.explain import of_part
 
     def change(engine: DataEngine) -> Changed:
         id_ = of_part(engine.store, part)
@@ -85,15 +86,17 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
 
 @verb("dengine correct engine.db import-d684ff7e4dbab839-0 bad")
 @on_store
-@click.argument("decision", metavar="ID")
+@click.argument("part", metavar="PART|ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
-def correct(store: str, decision: str, label: str, author: str, allow_import: bool) -> None:
+def correct(store: str, part: str, label: str, author: str, allow_import: bool) -> None:
     """Say that a label was wrong: the part was good, or bad.
 
-    From now on the decision ID counts so. The label as it was reported stays in the store, and so does what was
-    decided; the correction is a later row. A forgotten label counts again by it.
+    The part is named as for `dengine report`; from now on its decision counts so. The label as it was reported stays
+    in the store, and so does what was decided; the correction is a later row. A forgotten label counts again by it.
     """
-    _changed(store, author, allow_import, lambda engine: engine.correct(decision, LABELS[label], author))
+    from ..history.explain import of_part
+
+    _changed(store, author, allow_import, lambda engine: engine.correct(of_part(engine.store, part), LABELS[label], author))
 
 
 @verb("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")

@@ -153,7 +153,7 @@ def import_parts(
             if counts_silence and decision.action is Action.ACCEPT:  # one held without a label was counted as silent
                 silent += (label is None) - (held is not None)
             if label is not None:
-                source = source_of(decision.id, decision.action, decision.audit, label)
+                source = source_of(decision.action, decision.audit, label)
                 of = decision.id, label, source, 0, None, 0 if fault else silent
                 labels.append(NewLabel(*of, store.clock(), known.content_hash, known.time))
                 silent = silent if fault else 0

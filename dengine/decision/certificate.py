@@ -103,6 +103,7 @@ class Outcomes:
 
     accepted, rejected : let go without a check.  stops, confirmed : of the accepted, known to be bad, and to be good.
     audited_accepts, audited_accepts_bad : checked though the model would have accepted, and the bad ones of them.
+    false_rejects : of the rejected, those that somebody looked at and found good.
     audited_rejects, audited_rejects_good : checked though the model would have rejected, and the good ones of them.
     forgotten_accepts, forgotten_audited_accepts, forgotten_audited_rejects : those whose label was forgotten, which are in
         none of the counts of labels above.
@@ -122,6 +123,7 @@ class Outcomes:
     forgotten_audited_rejects: int = 0
     overdue_audited_accepts: int = 0
     overdue_audited_rejects: int = 0
+    false_rejects: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +223,8 @@ def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audi
     Under "some" the bound comes from audits and is about all parts the model would have accepted, let go or audited. It
     never lies below the share known to be bad. A cell that confirmed or stopped every accepted part knows as much as under
     "all". Where both are possible they share alpha: whoever sees now the one and now the other is wrong with probability
-    alpha at most. Rejected parts are known by audits alone. A label that was forgotten, or is overdue, counts as a wrong
+    alpha at most. Rejected parts are known by audits; what is found good of them without being asked for is a share that
+    the bound never lies below. A label that was forgotten, or is overdue, counts as a wrong
     decision.
     """
     expect(stops in ("all", "some"), "stops among all, some", stops)
@@ -246,7 +249,9 @@ def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audi
         accepted = _bounded(n, o.audited_accepts, n_bad, audit_rate, (1.0 - share) * alpha)
         upper = max(accepted.upper, (n_bad + o.stops) / max(1, n))
         accepted = replace(accepted, upper=upper, shadowed=audit_rate == 1.0 and o.accepted == 0)
-    rejected = _bounded(o.rejected + o.audited_rejects, o.audited_rejects, o.audited_rejects_good, audit_rate, alpha)
+    n, n_good = o.rejected + o.audited_rejects, o.audited_rejects_good
+    rejected = _bounded(n, o.audited_rejects, n_good, audit_rate, alpha)
+    rejected = replace(rejected, upper=max(rejected.upper, (n_good + o.false_rejects) / max(1, n)))
     rejected = replace(rejected, shadowed=audit_rate == 1.0 and o.rejected == 0)
     return Certificate(alpha, tolerance, accepted, rejected)
 

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ..cells.base import Cell
+from ..cells.base import Cell, must_be_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
@@ -414,7 +414,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 return as_agreed(trace, self.trace, False)
         elif self._settings.waiting:
             self._settings.save()
-        if self._unseen and self.trace is not None:
+        if self._unseen and self.trace is not None and np.isfinite(x).all():
             self._unseen = False
             if not self.version:  # what will answer is compiled before there is much to do
                 self._versions.template.look_ahead_safely(x[None])
@@ -426,10 +426,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Tell what became of a decision; the label survives a killed process once this returns.
 
         success : what the verification said; False for a system stop after an accept, True for a part known to be fine. A
-            stop that comes after the part was confirmed, however late, takes that back: it counts as a correction.
+            stop that comes after the part was confirmed, however late, takes that back: it counts as a correction. Of a
+            rejected part, what it turned out to be when somebody looked: the label trains, and the rule is not told.
         trace, part : only for a system stop whose decision was lost: it is then stored with this trace.
-        Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, a
-        rejected part, or what is no label; StoreError where the label is not known to be taken: say the same again.
+        Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, or
+        what is no label; StoreError where the label is not known to be taken: say the same again.
         """
         said, id_ = as_success(success), as_id(decision_id)  # refused before anything is written
         self._outbox.check()
@@ -464,7 +465,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Drive a cell; iterate: a record a cycle, as it happens. What the cell raises propagates, after all is written.
 
         Python's collector works between decisions, and after a hundred cycles only on what is newer: `gc.freeze`.
+        Raises SettingError, before the first part, for a cell that lacks one of its four methods.
         """
+        must_be_cell(cell)
+        return self._run(cell, cycles)
+
+    def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         with ExitStack() as ending:
             ending.callback(self.flush, UNHURRIED if self.store.wait is not None else None)
             for index in range(cycles):
@@ -487,7 +493,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         else:
             cell.reject()
         if success is not None:
-            source = source_of(decision.id, decision.action, decision.audit, success)
+            source = source_of(decision.action, decision.audit, success)
             try:
                 self.report(decision.id, success)
             except NotTakenError as error:  # it waits for the disk, and every part is verified until that is well

@@ -124,7 +124,7 @@ class Feedback:
     def _take_in(self, known: StoredDecision, success: bool) -> bool:
         """Learn a label, which goes into the journal; whether the part was taken for confirmed until now, and was not."""
         made = known.decision
-        source = source_of(made.id, made.action, made.audit, success)
+        source = source_of(made.action, made.audit, success)
         if known.source is not None:
             stands, now = (bool(known.success), known.source), (success, source)
             if (stands, now) != LATE_STOP:
@@ -184,9 +184,15 @@ class Feedback:
         self.arrive()
 
     def _learn(self, known: StoredDecision, success: bool, source: Source) -> NewLabel:
-        """Tell rule and references what became of a part; returns its label."""
+        """Tell rule and references what became of a part; returns its label.
+
+        The rule is not told of a rejected part: which of them come back is somebody's choice, and no sample.
+        """
         made, version, point, silent = known.decision, self.versions.version, None, 0
-        if not known.quarantined:
+        if source is Source.INSPECTION:
+            if not known.quarantined:
+                point = self.versions.learn(known, success, None)
+        elif not known.quarantined:
             counted = made.action is Action.ACCEPT and made.id not in self._went_on and not self._stops_all
             # It was counted among the unobserved before its label came.
             silent = self._unobserved - (counted and made.model_version >= self.settings.now.policy_since)

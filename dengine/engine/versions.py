@@ -184,10 +184,13 @@ class ModelVersions:
         self.answering, self.version, self._newest = model, number, max(number, self._newest)
         self._trained_on = trained_on
 
-    def learn(self, known: StoredDecision, success: bool, unobserved: int) -> Point | None:
-        """Take in what became of a part: tell the rule, and make the trace a reference; returns its place, where kept."""
+    def learn(self, known: StoredDecision, success: bool, unobserved: int | None) -> Point | None:
+        """Take in what became of a part: tell the rule, and make the trace a reference; returns its place, where kept.
+
+        unobserved : accepted parts that went on unheard of before it; None: the rule is not told.
+        """
         made, model, point = known.decision, self.answering, None
-        if made.model_version >= self.evidence.since:
+        if unobserved is not None and made.model_version >= self.evidence.since:
             how = ACTIONS.index(made.predicted), made.looked
             self.newest.tell_safely(made.lower, made.upper, success, made.reason is Reason.NOVEL, unobserved, *how)
         number = 0 if model is None else next(self._provisional)

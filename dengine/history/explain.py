@@ -24,12 +24,12 @@ from ..decision.novelty import NoveltyGate
 from ..decision.policy import RULES, Policy
 from ..decision.references import RadiusIndex
 from ..decision.rule import NOBODY, DecisionRule, part, restore
-from ..errors import StoreError, UnknownDecisionError
+from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, Source, TraceSpec, in_html, trace_in
-from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision, VersionError
-from ..store.views import PastLabel
+from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision, VersionError, unknown_decision
+from ..store.views import HistoryFilter, PastLabel
 from ..traces import WindowGate
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Decisi
     except StoreError:  # the rule was another one, handed in with its model, or had missed something
         return None
     for label in told:
-        if not label.quarantined:
+        if not label.quarantined and label.source is not Source.INSPECTION:
             rule.observe(label.silent, label.novel)
             rule.tell(label.lower, label.upper, label.success, label.predicted, label.looked)
     return rule
@@ -481,18 +481,36 @@ class Explanation:
     _repr_html_ = in_html
 
 
+def of_part(store: SqlStore, part: str) -> str:
+    """The id of the one decision of a part, without earlier rejects of it; or the id itself, where no part has it.
+
+    UnknownDecisionError where there is none, ReportConflictError where there are several.
+    """
+    known = store.decisions(HistoryFilter(part=part), 20)
+    found = [each for each in known if each.decision.action is not Action.REJECT] or known  # it was put in again
+    found = found or [each for each in [store.get_decision(part, trace=False)] if each is not None]
+    if not found:
+        got = f"{shortened(part)}, which is unknown; `dengine history STORE` lists them"
+        raise UnknownDecisionError(f"Expected the number of a part that was decided on, or a decision's id, got {got}.")
+    if len(found) > 1:
+        ids = ", ".join(each.decision.id for each in reversed(found))
+        raise ReportConflictError(f"Expected one decision of that part, there are {len(found)}; name its id: {ids}.")
+    return found[0].decision.id
+
+
 def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanation:
     """Explain one decision, by what its store keeps.
 
+    decision_id : its id, or its part's number as `of_part` takes it.
     neighbours : how many of the nearest references to show.
-    Raises ReportError for an id that the store does not hold, StoreError for a store that no engine has used.
+    Raises ReportError for what the store does not hold, StoreError for a store that no engine has used.
     """
-    known, past = store.settings(), store.get_decision(decision_id)
+    known = store.settings()
     if "recipe" not in known:
         raise StoreError("Expected a store that an engine has used, this one is empty; make a DataEngine with it.")
+    past = store.get_decision(decision_id) or store.get_decision(of_part(store, decision_id))
     if past is None:
-        got = f"{decision_id!r}, which its store does not hold; `dengine history STORE` lists the ids, newest last"
-        raise UnknownDecisionError(f"Expected the id of a decision of cell {store.cell_id!r}, got {got}.")
+        raise unknown_decision(decision_id)
     made, trace, recipe = past.decision, past.trace, Recipe.from_toml(known["recipe"])
     channels, samples = trace.shape
     answering = as_it_stood(store, made.model_version, recipe, past) if made.model_version else None

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from ..decision.certificate import Certificate
 from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
-from ..errors import ReportConflictError, StoreError, UnknownDecisionError, expect, shortened
+from ..errors import StoreError, expect
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceSpec, in_html, trace_in
 from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Outcomes, StoredDecision, StoredVersion
@@ -61,6 +61,7 @@ class Span:
     outside : left an operator's window, and were verified or rejected without the model.
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
     accepted, rejected : by the model, without a check.  stops : of the accepted, those known to be bad.
+    false_rejects : of the rejected, those that were looked at and found good.
     bad_accepts : parts that it let pass or would have, by the policy's alpha.
     would_accept, would_reject : by audits alone, in the shadow mode every part; at 95 %, whatever the policy's alpha.
     unlabelled : verified, of which no result was reported.
@@ -80,6 +81,7 @@ class Span:
     accepted: int
     rejected: int
     stops: int
+    false_rejects: int
     would_accept: Judged
     would_reject: Judged
     bad_accepts: Judged
@@ -153,13 +155,16 @@ class Status:
     @property
     def alarm(self) -> str:
         """What somebody should look at, the worst first; "" where there is nothing."""
-        accepts, errors = self.newest.bad_accepts, self.newest.errors
+        accepts, errors, late = self.newest.bad_accepts, self.newest.errors, self.newest.false_rejects
+        rejects = _judged(self.newest.rejected, late, self.recipe.policy.tolerances[1])
+        found_good = f"{late} of the {rejects.n} newest rejected parts were good: more than {rejects.tolerance:.1%}."
         failing = "" if self.version or len(self.retrains) < FAILING else self.retrains[-1].report.reason
         broken = f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
             (accepts.verdict == "broken", broken),
+            (late and rejects.verdict == "broken", found_good),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
             (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),
@@ -227,6 +232,7 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         accepted=outcomes.accepted,
         rejected=outcomes.rejected,
         stops=outcomes.stops,
+        false_rejects=outcomes.false_rejects,
         would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0]),
         would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy.tolerances[1]),
         bad_accepts=bad_accepts(outcomes, policy),
@@ -326,23 +332,6 @@ def paged(
         found = found[::-1] if newest else found
         yield from found
         beyond = found[-1].decision.id
-
-
-def of_part(store: SqlStore, part: str) -> str:
-    """The id of the one decision of a part that a label can be of; of a part that is unknown, it may be the id itself.
-
-    UnknownDecisionError where there is none, ReportConflictError where there are several.
-    """
-    known = store.decisions(HistoryFilter(part=part), 20)
-    found = [each for each in known if each.decision.action is not Action.REJECT]
-    found = found or [each for each in [store.get_decision(part, trace=False)] if each is not None]
-    if not found:
-        got = f"{shortened(part)}, which {'went back to the bin' if known else 'is unknown'}"
-        raise UnknownDecisionError(f"Expected the number of a part that was decided on and not rejected, got {got}.")
-    if len(found) > 1:
-        ids = ", ".join(each.decision.id for each in reversed(found))
-        raise ReportConflictError(f"Expected one decision of that part, there are {len(found)}; name its id: {ids}.")
-    return found[0].decision.id
 
 
 def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:

@@ -31,9 +31,9 @@ from .. import __version__
 from ..decision.policy import Policy
 from ..engine.corrections import Changed
 from ..engine.engine import DataEngine
-from ..history.explain import explain
+from ..history.explain import explain, of_part
 from ..history.map import part_map
-from ..history.status import NEWEST, course, of_part, paged
+from ..history.status import NEWEST, course, paged
 from ..model.base import Exportable
 from ..records import Action, is_name
 from ..store.records import StoredDecision, unknown_decision
@@ -120,21 +120,26 @@ class HttpApi:
         """Report what became of a part; the label is on the disk when this answers. The same twice is no error.
 
         id : of the decision.  part : its number in the place of that, where there is one decision of it; or the id.
-        success : true, or 1: good; false, or 0: bad, of an accepted part that came back a system stop.
+        success : true, or 1: good; false, or 0: bad, of an accepted part that came back a system stop. Of a rejected part
+            that was looked at afterwards it is an inspection.
         author : who says so, for the event log, where the token has no name; a robot leaves it out.
         """
+        by = _name(author) if author or SHOWN.get().name else ""
+        return answer("Told", await self.service.report(await self._of(id_, part), success, by))
+
+    async def _of(self, id_: str, part: str) -> str:
         if bool(id_) == bool(part):
             raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")
-        by = _name(author) if author or SHOWN.get().name else ""
-        found = id_ or await self.service.look(lambda store: of_part(store, part))
-        return answer("Told", await self.service.report(found, success, by))
+        return id_ or await self.service.look(lambda store: of_part(store, part))
 
-    async def correct(self, id_: str, success: bool, author: str = "") -> Json:
+    async def correct(self, success: bool, id_: str = "", part: str = "", author: str = "") -> Json:
         """Put a label right, from the next decision on; what was reported stays on record.
 
-        id : of the decision.  success : what it counts as from now on.  author : who asks, for the event log.
+        success : what it counts as from now on.  id, part : of the decision, as in /report.
+        author : who asks, for the event log.
         """
-        return await self._change(author, lambda engine, by: engine.correct(id_, success, by))
+        found = await self._of(id_, part)
+        return await self._change(author, lambda engine, by: engine.correct(found, success, by))
 
     async def forget(self, ids: list[str], author: str = "", reason: str = "") -> Json:
         """Leave labels out of all that is learned and counted; /correct brings one back.
@@ -215,7 +220,10 @@ class HttpApi:
         return {"decisions": [answer("Decision", each, trace=None) for each in found], "older": older}
 
     async def explanation(self, id_: str) -> Json:
-        """Why a decision came out as it did, with its trace, the band of good parts, and some bad ones."""
+        """Why a decision came out as it did, with its trace, the band of good parts, and some bad ones.
+
+        id : of the decision, or its part's number.
+        """
         return await self.service.look(lambda store: _explained(store, id_))
 
     async def course(self, hours: Hours = 0.0, start: Hours = 0.0, batch: Annotated[str, Meta(max_length=9)] = "") -> Json:
@@ -309,7 +317,7 @@ def _explained(store: SqlStore, id_: str) -> Json:
     digits = 4 - int(np.log10(np.ptp(np.nan_to_num(trace, posinf=0.0, neginf=0.0)) or 1.0))  # what lies around is a picture
     around = {name: getattr(band, name, None) for name in ("low", "median", "high")} | {"bads": bads}
     drawn = {name: None if each is None else np.round(each.astype(np.float64), digits) for name, each in around.items()}
-    corrections = [each for each in store.corrections() if each.decision_id == id_]
+    corrections = [each for each in store.corrections() if each.decision_id == found.decision.decision.id]
     return answer("Explanation", found, trace=trace, corrections=corrections, **drawn)
 
 

@@ -277,6 +277,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def evidence_since(self, seq: int, since_version: int = 0) -> list[Evidence]:
         """Return what a rule is told of the labels after number `seq`, in their order, of this cell alone.
 
+        It is not told of rejected parts, of which those come back that somebody chose.
         A level that other cells' streams certify says nothing certain of this one's, and a watch that counts them would
         notice too late that this cell has changed.
         """
@@ -284,6 +285,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         novel = DECISION.c.reason == Reason.NOVEL.value
         of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label == 1, novel, LABEL.c.silent, *how_looked())
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > int(seq))
+        mine &= LABEL.c.source != Source.INSPECTION.value
         query = sa.select(*of).select_from(LABEL.join(DECISION, LABEL_OF_DECISION)).where(mine, label != FORGOTTEN)
         rows = self._read(query.where(DECISION.c.model_version >= since_version).order_by(LABEL.c.seq))
         return [Evidence(*row) for row in rows]

@@ -85,6 +85,11 @@ class Kind:
     n: int
 
     @property
+    def is_false_reject(self) -> bool:
+        """Whether the model rejected parts that were found good."""
+        return self.action is Action.REJECT and self.reason is not Reason.OUTSIDE and self.label == "good"
+
+    @property
     def label(self) -> str:
         """good, bad, forgotten, overdue or none."""
         if self.source is not None:
@@ -132,6 +137,7 @@ class Tally:
             rejected=actions[reject] - self.count(lambda kind: (kind.action, kind.reason) == (reject, Reason.OUTSIDE)),
             audited_rejects=audited[reject, "bad"] + audited[reject, "good"],
             audited_rejects_good=audited[reject, "good"],
+            false_rejects=sum(kind.n for kind in self.kinds if kind.is_false_reject),
             forgotten_accepts=done[accept, "forgotten"],
             forgotten_audited_accepts=audited[accept, "forgotten"],
             forgotten_audited_rejects=audited[reject, "forgotten"],

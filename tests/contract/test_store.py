@@ -234,7 +234,7 @@ def test_status_counts_what_was_put(store: SqlStore) -> None:
     assert (status["decisions"], status["labels"], status["quarantined"]) == (3, 2, 1)
     assert status["actions"] == {"verify": 2, "accept": 1, "reject": 0}
     assert (status["reasons"]["certain"], status["reasons"]["constant"], status["reasons"]["audit"]) == (1, 1, 0)
-    assert status["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0}
+    assert status["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0, "inspection": 0}
     assert store.tally().first <= store.tally().last <= store.tally().last_label
 
 

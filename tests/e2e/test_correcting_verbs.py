@@ -65,9 +65,17 @@ def test_a_part_is_found_and_reported_by_its_number(store: Path, make_data) -> N
         engine.set_policy(replace(engine.policy, windows=("0:0:1000::reject",)))
         engine.decide(np.roll(make_data(1).X[0], 9), "P-8")
         assert "or its HTTP where it is served" in dengine("report", store, "P-7", "bad").stderr  # while it runs
-    assert "'P-8', which went back to the bin" in dengine("report", store, "P-8", "good").stderr
+    assert said("report", store, "P-8", "good", "--author", "kim").endswith(" was good. Event 2, by kim.")
+    (reject,) = document("history", store, "--part", "P-8")["decisions"]
+    assert (reject["action"], reject["label"], reject["source"]) == ("reject", "good", "inspection")
+    assert "good inspection" in said("history", store, "--part", "P-8")
+    assert "inspection 1" in " ".join(said("status", store).split())
+    assert "failure" in said("correct", store, "P-8", "bad", "--author", "kim")
+    assert document("explain", store, "P-8")["decision"]["id"] == reject["id"]
+    assert "'P-9', which is unknown" in dengine("correct", store, "P-9", "good").stderr
+    assert "'P-9', which is unknown" in dengine("explain", store, "P-9").stderr
     assert "'P-9', which is unknown" in dengine("report", store, "P-9", "good").stderr
-    assert said("report", store, "P-7", "bad", "--author", "kim").endswith(" was bad. Event 2, by kim.")
+    assert said("report", store, "P-7", "bad", "--author", "kim").endswith(" was bad. Event 4, by kim.")
     (found,) = document("history", store, "--part", "P-7")["decisions"]
     assert (found["part"], found["label"]) == ("P-7", "bad")
 

@@ -56,7 +56,7 @@ def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
         ("history", "--action pass", "'pass' is not one of"),
         ("history", "--reason why", "'why' is not one of"),
         ("history", "--last 0", "0 is not in the range"),
-        ("explain", "nonsense", "Error: Expected the id of a decision of cell 'cell', got 'nonsense'"),
+        ("explain", "nonsense", "or a decision's id, got 'nonsense', which is unknown; `dengine history STORE`"),
     ],
 )
 def test_a_wrong_word_is_a_wrong_call(verb: str, words: str, expected: str, store: Path) -> None:

@@ -211,6 +211,25 @@ def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another
             must_be_problem(client.post("/report", json={"success": False} | both), 422)
 
 
+def test_a_rejected_part_that_was_found_good_is_reported_corrected_and_explained_by_its_number(stream: Dataset) -> None:
+    with serving() as (_, client):
+        client.post("/decide", json={"trace": stream.X[0].tolist(), "request": "first"})
+        client.post("/policy", json={"windows": ["0:0:1000000::reject"], "author": "Kim"})
+        decided = client.post("/decide", json={"trace": stream.X[1].tolist(), "request": "r", "part": "R1"}).json()
+        assert decided["action"] == "reject"
+        assert client.post("/report", json={"part": "R1", "success": True}).json()["decision_id"] == "r"
+        (found,) = client.get("/decisions", params={"part": "R1"}).json()["decisions"]
+        assert (found["success"], found["source"]) == (True, "inspection")
+        assert client.get("/status").json()["sources"]["inspection"] == 1
+        assert client.get("/explanations/R1").json()["decision"]["id"] == "r"
+        assert client.post("/report", json={"part": "R1", "success": True}).json()["repeated"] is True
+        must_be_problem(client.post("/report", json={"part": "R1", "success": False}), 409)
+        assert client.post("/correct", json={"part": "R1", "success": False, "author": "Kim"}).json()["event"] is not None
+        assert client.get("/explanations/r").json()["corrections"][0]["author"] == "Kim"
+        for both in ({}, {"id": "r", "part": "R1"}):
+            must_be_problem(client.post("/correct", json={"success": False, "author": "Kim"} | both), 422)
+
+
 def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(stream: Dataset) -> None:
     with serving() as (service, client):
         for i in range(3):

@@ -13,7 +13,7 @@ import pytest
 from sklearn.decomposition import PCA
 
 from dengine import Action, DataEngine, Dataset, Reason, ReplayCell, Source, TraceError, TraceSpec
-from dengine.errors import ReportError, StoreError
+from dengine.errors import ReportError, SettingError, StoreError
 from dengine.folds import audited, content_hash
 from dengine.store import SqlStore
 from tests.support.driving import RECIPE, Counting, evidence, make
@@ -48,9 +48,39 @@ def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data: Datase
     assert asked == [str(c.decision.action) for c in cycles]
     assert {c.decision.action for c in cycles} == set(Action)
     rejected = next(c.decision.id for c in cycles if c.decision.action is Action.REJECT)
-    with pytest.raises(ReportError, match="was a reject; the part went back to the bin"):
-        engine.report(rejected, False)
     assert engine.store.get_decision(rejected).source is None
+
+
+@pytest.mark.parametrize("lacks", [["reject"], ["verify", "proceed"], ["insert", "verify", "proceed", "reject"]])
+def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part(lacks: list[str], data: Dataset) -> None:
+    inserted = []
+
+    class Half:
+        def insert(self) -> np.ndarray:
+            inserted.append(1)
+            return data.X[0]
+
+        verify = proceed = reject = insert
+
+    for name in lacks:
+        setattr(Half, name, None)
+    with pytest.raises(SettingError, match=f"Expected a cell with the methods .*got Half without {' and '.join(lacks)};"):
+        make().run(Half(), 1)
+    assert inserted == []
+
+
+@pytest.mark.parametrize("reducer", ["rocket", "pca", "conv"])
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_a_first_labelled_trace_that_is_not_finite_is_kept_without_a_traceback(
+    reducer: str, broken: float, data: Dataset, caplog: pytest.LogCaptureFixture
+) -> None:
+    engine = DataEngine(reducer, trace=TraceSpec(data.X.shape[1]))
+    first = engine.decide(np.full(data.X.shape[1], broken))
+    engine.report(first.id, True)
+    decision = engine.decide(data.X[0])
+    engine.report(decision.id, bool(data.y[0]))
+    assert (first.reason, decision.reason) == (Reason.NOT_FINITE, Reason.NO_MODEL)
+    assert caplog.records == []
 
 
 def test_the_collector_works_between_decisions_and_leaves_old_objects_alone_until_the_loop_ends(data: Dataset) -> None:

@@ -183,7 +183,7 @@ def test_a_rival_has_its_own_numbers_and_no_neighbours(make_data: Callable[..., 
 def test_an_unknown_id_says_where_the_ids_are(make_data: Callable[..., Dataset]) -> None:
     with DataEngine("pca") as engine:
         engine.decide(np.arange(30.0))
-        with pytest.raises(ReportError, match=r"got 'x', which its store does not hold; `dengine history STORE` lists"):
+        with pytest.raises(ReportError, match=r"got 'x', which is unknown; `dengine history STORE` lists"):
             engine.explain("x")
     with pytest.raises(StoreError, match="Expected a store that an engine has used"):
         explain(SqlStore(), "x")

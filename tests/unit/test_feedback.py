@@ -258,3 +258,67 @@ def test_repeats_that_nobody_names_are_noticed_and_named_ones_or_parts_of_their_
         cycles = play(engine, Dataset(X[order], y[order], part=parts))
         last = [c.retrain for c in cycles if c.retrain is not None][-1]
         assert ("give their numbers" in last.reason) is said
+
+
+def rejected(engine: DataEngine, data: Dataset) -> list[Decision]:
+    """Of the bad traces those that are rejected; nothing is reported."""
+    decisions = [engine.decide(x) for x in data.X[data.y == 0]]
+    return [decision for decision in decisions if decision.action is Action.REJECT]
+
+
+def told(engine: DataEngine) -> dict[str, list]:
+    """What the rule has learned."""
+    return {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
+
+
+@pytest.mark.parametrize("policy", [LOCAL, replace(LOCAL, stops="all"), replace(LOCAL, audit_rate=0.2), POOLED])
+def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told(
+    policy: Policy, stream: Dataset, tmp_path: Path
+) -> None:
+    with make(policy, store=tmp_path / "engine.db") as engine:
+        play(engine, stream)
+        bad = replace(stream, X=stream.X + np.float32(0.001))
+        found = rejected(engine, bad)
+        assert len(found) > 3
+        engine.settle()
+        engine.flush()
+        before = told(engine)
+        n, labels = engine.store.status()["labels"], engine.new_labels
+        engine.report(found[0].id, True)
+        engine.report(found[1].id, False)
+        assert told(engine) == before
+        assert engine.new_labels == labels + 2
+        status = engine.status()
+        assert (status.sources["inspection"], status.labels, status.ever.false_rejects) == (2, n + 2, 1)
+        known = engine.find(found[0].id)
+        assert (known.success, known.source) == (True, Source.INSPECTION)
+        assert {found[0].id} == {
+            past.decision.id for past in engine.history(label="good") if past.source is Source.INSPECTION
+        }
+        assert "turned out good (inspection)" in " ".join(engine.explain(found[0].id).said)
+        with pytest.raises(ReportError, match="success from inspection was reported first"):
+            engine.report(found[0].id, False)
+        assert "failure" in engine.correct(found[0].id, False, "kim").text
+        assert engine.status().ever.false_rejects == 0
+        engine.correct(found[0].id, True, "kim")
+        probe = [engine.decide(x).action for x in stream.X[:40]]
+        engine.flush()
+        rule = told(engine)
+    with DataEngine.open(tmp_path / "engine.db", replaying=True) as engine:
+        assert engine.find(found[0].id).source is Source.INSPECTION
+        assert engine.status().ever.false_rejects == 1
+        assert told(engine) == rule
+        assert [engine.decide(x).action for x in stream.X[:40]] == probe
+
+
+def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_they_are_many(stream: Dataset) -> None:
+    engine = make(replace(LOCAL, audit_rate=0.3))
+    play(engine, stream)
+    found = rejected(engine, stream)
+    n = engine.status().certificate.rejected.n
+    assert "rejected parts were good" not in engine.status().alarm
+    for decision in found:
+        engine.report(decision.id, True)
+    status = engine.status()
+    assert status.certificate.rejected.upper >= len(found) / n
+    assert f"{len(found)} of the {status.newest.rejected} newest rejected parts were good: more than 10.0%." in status.alarm

@@ -104,7 +104,7 @@ def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp
         assert last.hashes.tolist() == hashes
         assert (outcomes.stops, outcomes.audited_accepts, outcomes.audited_accepts_bad) == (1, 1, 1)
         assert (outcomes.accepted, outcomes.confirmed) == ((3, 2) if stops == "all" else (4, 1))
-        assert sources == {"verification": 202, "audit": 1, "stop": 1, "confirmed": outcomes.confirmed}
+        assert sources == {"verification": 202, "audit": 1, "stop": 1, "confirmed": outcomes.confirmed, "inspection": 0}
         assert int(members.sum()) > 0
 
 

@@ -61,7 +61,7 @@ def test_a_report_without_id_part_or_label_queues_nothing_and_the_store_goes_on(
         with pytest.raises(ReportError):
             engine.report(decision.id, value)
     engine.report(decision.id, 1)
-    assert engine.store.status()["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0}
+    assert engine.store.status()["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0, "inspection": 0}
 
 
 class Rival:

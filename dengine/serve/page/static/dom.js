@@ -58,7 +58,7 @@ const REASONS = {
   no_model: "no model yet", no_store: "store away", late: "too late", outside: "outside a window",
 };
 const LABELS = { good: "good", bad: "bad", none: "not known" };
-const SOURCES = { verification: "check", audit: "audit", stop: "system stop", confirmed: "confirmed later" };
+const SOURCES = { verification: "check", audit: "audit", stop: "system stop", confirmed: "confirmed later", inspection: "inspection of a reject" };
 
 export const ACTIONS = ["verify", "accept", "reject"];
 export const REASON_NAMES = [

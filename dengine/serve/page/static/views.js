@@ -127,7 +127,6 @@ function labelActions(decision) {
   const two = (asks) => [true, false].map((good) =>
     act.button(good ? "label-good" : "label-bad", good ? "It was good" : "It was bad", asks(good), source !== null && success === good, icon(labelOf(good))));
   if (source !== null) return [two((good) => act.correct(id, good)), act.button("forget", "Forget the label", act.forget(id), success === null)];
-  if (action === "reject") return [small("It went back to the bin: nothing can be reported of it.")];
   return two((good) => act.report(id, good, action === "accept" && !good));
 }
 
