@@ -120,10 +120,10 @@ def write_output(path: str | os.PathLike[str], content: bytes, force: bool = Fal
 
 @contextmanager
 def output_file(path: str | os.PathLike[str], force: bool = False, *, make_folder: bool = False) -> Iterator[Path]:
-    """Give an empty file to write to, which becomes the one at this path at the end of the block, or is deleted.
+    """Give an empty file to write to, which is synced and renamed to this path when the block has ended well.
 
-    OutputError as `check_output`, and for what the disk says. It has a random name in the same folder, and is synced
-    before it is renamed.  make_folder : make its folder if need be.
+    It has a random name in the same folder. OutputError as `check_output`, and for what the disk says.
+    make_folder : make its folder if need be.
     """
     target = Path(path)
     with _told(target):

@@ -30,7 +30,7 @@ class Verbs(click.Group):
     """A group whose foreseen failures are one line on stderr and exit code 1; 2 where an option would do."""
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Run a verb; a character that the screen or the file has not, as on Windows, becomes a question mark."""
+        """Run a verb; a character that the screen's encoding lacks becomes a question mark."""
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, TextIOWrapper) and not stream.encoding.lower().startswith("utf"):
                 stream.reconfigure(errors="replace")

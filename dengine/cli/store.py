@@ -162,8 +162,8 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
 
 
 NO_JOURNAL = (
-    "The journal of cell {} is not here: what it held is not in this check, and newest entries that were cut off do not "
-    "show. A copy that dengine backup made lacks nothing."
+    "The journal of cell {} is not here: what it held is not in this check, and newest entries that were "
+    "cut off do not show. A copy that dengine backup made lacks nothing."
 )
 WAITING = "The journal of cell {} holds {:,} records that its engine, or the next one, brings into the store."
 EXPECT = "A digest that an earlier check showed: the history must still hold it, or it was cut off or made anew."
@@ -214,8 +214,8 @@ def _lines(report: HistoryReport) -> list[str]:
 def backup(store: str, out: Path) -> None:
     """Copy a store while it is in use.
 
-    The copy is one file with all cells and with what their journals hold, which a plain copy of the file lacks. It
-    opens, and is checked by `dengine verify`, wherever it lies.
+    The copy is one file with all cells and with what their journals hold, which a plain copy of the file
+    lacks. It opens, and is checked by `dengine verify`, wherever it lies.
     """
     from ..store.backup import backup_store
 

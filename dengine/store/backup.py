@@ -3,8 +3,8 @@
     report = backup_store("engine.db", "copy.db")
     report.decisions, report.labels, report.from_journals
 
-A copy of the file alone lacks what lies beside it: the newest transactions, in its `-wal` file, and the newest labels, in the
-journal of each cell.
+A copy of the file alone lacks what lies beside it: the newest transactions, in its `-wal` file, and the
+newest labels, in the journal of each cell.
 """
 
 import os
@@ -30,7 +30,7 @@ class BackupReport:
     """What `backup_store` copied.
 
     decisions, labels : that the copy holds, of all cells.
-    from_journals : records that it has from journals: decisions, labels and events that the store had not taken yet.
+    from_journals : decisions, labels and events in it that the store had not taken from the journals yet.
     without_journal : cells of which no journal was there.
     """
 
@@ -41,9 +41,10 @@ class BackupReport:
 
 
 def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> BackupReport:
-    """Copy a store in a file, whole or not at all, by SQLite's own backup, and have the copy take the journals' records.
+    """Copy a store in a file by SQLite's own backup, and have the copy take what the journals hold.
 
-    Engines may go on meanwhile: whatever they had acknowledged when this was called is in the copy.
+    Engines may go on meanwhile: whatever they had acknowledged when this was called is in the copy. It is
+    written whole or not at all.
 
     Parameters
     ----------
@@ -61,8 +62,8 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
     """
     with reading(os.fspath(url)) as connection:
         if connection.dialect.name != "sqlite":
-            do = "PostgreSQL copies itself: pg_dump, after the engines have ended; the journals of others lie on their machines"
-            raise StoreError(f"Expected a store in a file, got {connection.engine.url.get_backend_name()}; {do}.")
+            do = "pg_dump copies that, once the engines have ended: their journals lie on their machines"
+            raise StoreError(f"Expected a store in a file, got {connection.dialect.name}; {do}.")
         cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Before the store: what leaves a journal meanwhile is in it by then.
@@ -97,7 +98,7 @@ def _take(file: Path, cell: str, records: list[Record]) -> None:
 
 
 def _finish(file: Path) -> tuple[int, int]:
-    """Have it all in one file, which is read wherever it lies; returns how many decisions and labels it holds."""
+    """Have it all in one file, which is read wherever it lies; returns its decisions and labels."""
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")
         decisions, labels = (

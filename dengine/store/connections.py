@@ -75,10 +75,10 @@ class CopyConnection(sqlite3.Connection):
 
 
 def _connect(dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
-    """Connect to a file; to one that cannot be written, or lies where nothing can, as to one that never changes.
+    """Connect to a file; to one that cannot be written, or lies where nothing can, as if it never changes.
 
-    Where the write-ahead log of a killed process lies beside such a file, and nothing else, both are copied: SQLite reads
-    them only where it can make a third file.
+    Where the write-ahead log of a killed process lies beside such a file, and nothing else, both are copied:
+    SQLite reads them only where it can make a third file.
     """
     name = str(arguments[0])
     file, log, shared = Path(name), Path(f"{name}-wal"), Path(f"{name}-shm")

@@ -287,7 +287,10 @@ def newest_known(path: Path) -> set[tuple[int, str]]:
 
 
 def waiting_records(path: Path) -> list[Record]:
-    """Return what a journal holds that its store has not taken, whoever owns it; without decisions that others replace."""
+    """Return what a journal holds that its store has not taken, whoever owns it.
+
+    Of the decisions of one id the last is in the place of those before.
+    """
     journal = Journal(path, owning=False)
     try:
         records = [from_bytes(blob) for _, _, blob in journal.records()]

@@ -1,8 +1,8 @@
-"""A file that one process owns, read and written at offsets; what Windows does in another way is met here.
+"""A file that one process owns, read and written at offsets; what Windows does otherwise is met here.
 
-POSIX locks the file (`flock`) and reads and writes at an offset in one call. Windows locks one byte far behind what is ever
-written, so that others read the rest, and needs the offset set first. Either lock ends with the process, whatever ended
-it, and no child has it.
+POSIX locks the file (`flock`) and reads and writes at an offset in one call. Windows locks one byte far behind
+what is ever written, so that others read the rest, and needs the offset set first. Either lock ends with the
+process, whatever ended it, and no child has it.
 """
 
 import ctypes
@@ -11,6 +11,7 @@ import os
 import threading
 import weakref
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +20,19 @@ LOCKED_BYTE = 2**31 - 2  # the last that the C library of Windows can lock
 
 def _lock_of_system() -> Callable[[int], object]:
     """Return what locks a descriptor at once, or raises a BlockingIOError where somebody has it."""
-    exclusive, at_once = 2, 4  # LOCK_EX and LOCK_NB, on every system that has flock
-    try:
+    exclusive_now = 2 | 4  # LOCK_EX and LOCK_NB, of every system that has flock
+    with suppress(ImportError):
         from fcntl import flock
-    except ImportError:
-        try:
-            import msvcrt
 
-            return _lock_of_windows(msvcrt)
-        except ImportError:  # a Python that was built without either
-            flock = ctypes.CDLL(None, use_errno=True).flock
+        return lambda descriptor: flock(descriptor, exclusive_now)
+    with suppress(ImportError):
+        import msvcrt
+
+        return _lock_of_windows(msvcrt)
+    flock_of_c = ctypes.CDLL(None, use_errno=True).flock  # of a Python that was built without either
 
     def lock(descriptor: int) -> None:
-        if flock(descriptor, exclusive | at_once):
+        if flock_of_c(descriptor, exclusive_now):
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
 
     return lock
@@ -53,7 +54,8 @@ LOCK = _lock_of_system()
 
 def open_plain(path: Path, flags: int) -> int:
     """Open a file, which is made for its owner alone; OSError for a link."""
-    no_follow, binary = getattr(os, "O_NOFOLLOW", 0), getattr(os, "O_BINARY", 0)  # or Windows writes \r\n for \n
+    no_follow = getattr(os, "O_NOFOLLOW", 0)
+    binary = getattr(os, "O_BINARY", 0)  # or Windows writes \r\n for \n
     if not no_follow and path.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
     return os.open(path, flags | no_follow | binary, 0o600)
@@ -95,7 +97,7 @@ class OwnedFile:
             except BaseException:
                 os.close(self._fd)
                 raise
-            os.close(self._fd)  # its owner went, and took the file along, between the opening and the lock: once more
+            os.close(self._fd)  # its owner went, and took the file along, before it was locked: once more
 
     @property
     def closed(self) -> bool:
@@ -108,8 +110,8 @@ class OwnedFile:
         return os.fstat(self._fd).st_size
 
     def in_place(self) -> bool:
-        """Whether it is the file at its path; Windows lets nobody delete, move or replace one that is open."""
-        if os.name == "nt":
+        """Whether it is the file at its path."""
+        if os.name == "nt":  # it lets nobody delete, move or replace a file that is open
             return True
         try:
             return os.path.samestat(os.fstat(self._fd), self.path.lstat())

@@ -46,10 +46,10 @@ class HistoryFault:
 
 @dataclass(frozen=True, slots=True)
 class CellHistory:
-    """A cell's history: entries of its ledger, rows that they chain, and the newest digest, "" without an entry.
+    """A cell's history: entries of its ledger, rows that they chain, and the newest digest, "" without one.
 
-    waiting : decisions, labels and events that its journal holds and the store has not taken; None: no journal of it is
-        there that can be read, so that what it held, and whether the newest entries were cut off, is not known.
+    waiting : decisions, labels and events that its journal holds and the store has not taken; None: no journal
+        of it is there that can be read: what it held, and whether newest entries were cut off, is not known.
     """
 
     cell_id: str
@@ -88,7 +88,8 @@ def verify_history(
     with reading(str(url)) as connection:
         names = _chosen_cells(connection, cell_id)
         journals = {name: journal_path(connection.engine.url, name) for name in names}
-        known, waiting = ({name: read(path) for name, path in journals.items()} for read in (newest_known, _count_waiting))
+        known = {name: newest_known(path) for name, path in journals.items()}
+        waiting = {name: _count_waiting(path) for name, path in journals.items()}
     with reading(str(url)) as connection:  # anew: what the journals knew is in the store as it is now
         pages = integrity(connection) if connection.dialect.name == "sqlite" else []
         faults = [HistoryFault("", "file", "", said) for said in pages]

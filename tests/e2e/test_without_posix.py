@@ -1,4 +1,4 @@
-"""Nobody runs Windows here: what it lacks is hidden from dengine's modules, and the package does its work without.
+"""Nobody runs Windows here: what it lacks is hidden from dengine's modules, which do their work without.
 
 `tests/support/without_posix` says what is hidden; there is a lock as Windows has it, or none of Python's own.
 """
@@ -153,7 +153,7 @@ def test_the_verbs_do_their_work(tmp_path: Path, make_data) -> None:
         ("verify", store),
         ("data", store),
         ("backup", store, "--out", tmp_path / "copy.db"),
-        ("run", "--cell", "replay", "--data", tmp_path / "parts.npz", "--cycles", 5, "--store", store),
+        ("run", "--cell", "replay", "--data", tmp_path / "parts.npz", "--cycles", 5, "--store", tmp_path / "run.db"),
         ("export", store, "--out", tmp_path / "model.ts"),
         ("replay", "--data", tmp_path / "parts.npz", "--reducer", "pca", "--repeats", 1, "--cycles", 40),
     ):

@@ -1,6 +1,6 @@
-"""Hides from dengine's modules what Windows lacks, in a process and in those that it starts: put the folder on PYTHONPATH.
+"""Hides from dengine's modules what Windows lacks, in a process and those that it starts, by PYTHONPATH.
 
-Libraries keep this system. DENGINE_TEST_MSVCRT=1: there is an `msvcrt`, whose `locking` fails as that of Windows does.
+Libraries keep this system. DENGINE_TEST_MSVCRT=1: there is an `msvcrt`, whose `locking` fails as Windows' does.
 """
 
 import builtins
@@ -13,12 +13,19 @@ from typing import Any
 
 MODULES = ("fcntl", "uvloop", "resource", "termios", "tty", "pty", "pwd", "grp", "syslog", "msvcrt")
 HIDDEN = {
-    "os": "fdatasync posix_fallocate posix_fadvise register_at_fork memfd_create pread pwrite preadv pwritev O_NOFOLLOW "
-    "O_CLOEXEC O_DIRECTORY O_NONBLOCK O_SYNC O_DSYNC getuid geteuid getgid getegid getgroups setuid setgid nice getpriority "
-    "sysconf sched_getaffinity sched_setaffinity fork forkpty killpg setsid getsid getpgid fchmod fchown chown lockf statvfs "
-    "fstatvfs mkfifo mknod uname getloadavg wait3 wait4 sendfile",
-    "signal": "SIGHUP SIGQUIT SIGUSR1 SIGUSR2 SIGALRM SIGPIPE SIGSTOP SIGCONT SIGTSTP SIGKILL SIGCHLD SIG_BLOCK SIG_SETMASK "
-    "SIG_UNBLOCK pthread_sigmask pthread_kill sigwait sigpending sigtimedwait alarm setitimer getitimer siginterrupt pause",
+    "os": (
+        "fdatasync posix_fallocate posix_fadvise register_at_fork memfd_create pread "
+        "pwrite preadv pwritev O_NOFOLLOW O_CLOEXEC O_DIRECTORY O_NONBLOCK O_SYNC O_DSYNC "
+        "getuid geteuid getgid getegid getgroups setuid setgid nice getpriority sysconf "
+        "sched_getaffinity sched_setaffinity fork forkpty killpg setsid getsid getpgid "
+        "fchmod fchown chown lockf statvfs fstatvfs mkfifo mknod uname getloadavg wait3 "
+        "wait4 sendfile"
+    ),
+    "signal": (
+        "SIGHUP SIGQUIT SIGUSR1 SIGUSR2 SIGALRM SIGPIPE SIGSTOP SIGCONT SIGTSTP SIGKILL "
+        "SIGCHLD SIG_BLOCK SIG_SETMASK SIG_UNBLOCK pthread_sigmask pthread_kill sigwait "
+        "sigpending sigtimedwait alarm setitimer getitimer siginterrupt pause"
+    ),
 }
 ORIGINAL = builtins.__import__
 
