@@ -9,8 +9,8 @@ import stat
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -112,9 +112,18 @@ def check_output(path: str | os.PathLike[str], force: bool = False) -> None:
 
 
 def write_output(path: str | os.PathLike[str], content: bytes, force: bool = False, *, make_folder: bool = False) -> Path:
-    """Write a file whole or not at all; returns its path. OutputError as `check_output`, and for what the disk says.
+    """Write a file whole or not at all, as `output_file`; returns its path."""
+    with output_file(path, force, make_folder=make_folder) as partial:
+        partial.write_bytes(content)
+    return Path(path)
 
-    It is written under a random name in the same folder, synced, and renamed.  make_folder : make its folder if need be.
+
+@contextmanager
+def output_file(path: str | os.PathLike[str], force: bool = False, *, make_folder: bool = False) -> Iterator[Path]:
+    """Give an empty file to write to, which is synced and renamed to this path when the block has ended well.
+
+    It has a random name in the same folder. OutputError as `check_output`, and for what the disk says.
+    make_folder : make its folder if need be.
     """
     target = Path(path)
     with _told(target):
@@ -122,11 +131,10 @@ def write_output(path: str | os.PathLike[str], content: bytes, force: bool = Fal
             target.parent.mkdir(parents=True, exist_ok=True)
         check_output(target, force)
         partial = target.with_name(f".dengine-{secrets.token_hex(8)}.partial")
-        number = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)  # exclusively: no planted link is followed
+        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # exclusively: no planted link is followed
         try:
-            with os.fdopen(number, "wb") as file:
-                file.write(content)
-                file.flush()
+            yield partial
+            with partial.open("r+b") as file:
                 os.fsync(file.fileno())
             partial.replace(target)
         finally:
@@ -137,7 +145,6 @@ def write_output(path: str | os.PathLike[str], content: bytes, force: bool = Fal
                 os.fsync(folder)
             finally:
                 os.close(folder)
-    return target
 
 
 def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> Path:
@@ -151,5 +158,5 @@ def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> 
 
 def _told(target: Path) -> AbstractContextManager[None]:
     """What the system says, as an OutputError that says what to do."""
-    do = "choose a folder that exists, is writable and has room"
+    do = "choose a folder that exists, is writable and has room, and a file that no program has open"
     return instead(OutputError, f"Cannot write {target}", OSError, ValueError, do=do)  # the latter for a name with a NUL

@@ -6,6 +6,7 @@ Only click is imported before a verb is known, so that `--help` answers at once.
 """
 
 import sys
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,18 @@ from .replay import compare, costs, replay
 from .run import run
 from .serve import serve
 from .status import status
-from .store import correct, forget, import_labels, policy, report, retrain, rollback, verify
+from .store import backup, correct, forget, import_labels, policy, report, retrain, rollback, verify
 
 
 class Verbs(click.Group):
     """A group whose foreseen failures are one line on stderr and exit code 1; 2 where an option would do."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        """Run a verb; a character that the screen's encoding lacks becomes a question mark."""
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, TextIOWrapper) and not stream.encoding.lower().startswith("utf"):
+                stream.reconfigure(errors="replace")
+        return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
         if (here := str(Path.cwd())) not in sys.path:  # where `module:Class` is looked for, last: it shadows nothing
@@ -62,6 +70,6 @@ def main() -> None:
 
 for verb in (
     *(data, replay, compare, costs, train, run, serve, simulate, status, history, explain, verify),
-    *(report, correct, forget, rollback, policy, retrain, export, import_labels),
+    *(report, correct, forget, rollback, policy, retrain, backup, export, import_labels),
 ):
     main.add_command(verb)

@@ -229,7 +229,9 @@ class EndAskedError(Exception):
 @contextmanager
 def steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar whose next step ends the work with EndAskedError where Ctrl-C or SIGTERM asked for that; a second at once."""
-    asked, done, before = False, 0, {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    asked, done = False, 0
+    ending = [each for each in signal.Signals if each.name in ("SIGINT", "SIGTERM", "SIGBREAK")]
+    before = {number: signal.getsignal(number) for number in ending}
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal asked

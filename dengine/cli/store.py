@@ -164,6 +164,11 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
         raise click.ClickException(f"The retrain was {report.reason}.")
 
 
+NO_JOURNAL = (
+    "The journal of cell {} is not here: what it held is not in this check, and newest entries that were "
+    "cut off do not show. A copy that dengine backup made lacks nothing."
+)
+WAITING = "The journal of cell {} holds {:,} records that its engine, or the next one, brings into the store."
 EXPECT = "A digest that an earlier check showed: the history must still hold it, or it was cut off or made anew."
 
 
@@ -188,10 +193,14 @@ def verify(context: click.Context, store: str, cell: str | None, expect: str | N
 
 
 def _lines(report: HistoryReport) -> list[str]:
-    lines = [
-        f"Cell {cell.cell_id}: {cell.entries:,} entries over {cell.rows:,} rows, newest digest {cell.digest or 'none'}"
-        for cell in report.cells
-    ]
+    lines = []
+    for cell in report.cells:
+        digest = cell.digest or "none"
+        lines.append(f"Cell {cell.cell_id}: {cell.entries:,} entries over {cell.rows:,} rows, newest digest {digest}")
+        if cell.waiting is None:
+            lines.append(NO_JOURNAL.format(cell.cell_id))
+        elif cell.waiting:
+            lines.append(WAITING.format(cell.cell_id, cell.waiting))
     for fault in report.faults[:SHOWN]:
         where = " ".join(word for word in (fault.cell_id and f"cell {fault.cell_id}:", fault.table, fault.key) if word)
         lines.append(f"{where} {fault.what}.")
@@ -200,6 +209,25 @@ def _lines(report: HistoryReport) -> list[str]:
     if report.ok:
         return [*lines, "All is as it was written. Keep the digest elsewhere, and ask for it with --expect next time."]
     return [*lines, f"Faults: {len(report.faults)}. This history is not as it was written."]
+
+
+@verb("dengine backup engine.db --out copy.db")
+@click.argument("store", metavar="STORE")
+@click.option("--out", metavar="FILE", required=True, type=options.FILE, help="The copy; a file that is not there yet.")
+def backup(store: str, out: Path) -> None:
+    """Copy a store while it is in use.
+
+    The copy is one file with all cells and with what their journals hold, which a plain copy of the file
+    lacks. It opens, and is checked by `dengine verify`, wherever it lies.
+    """
+    from ..store.backup import backup_store
+
+    report = backup_store(store, out)
+    text = f"{out}: {report.decisions:,} decisions and {report.labels:,} labels"
+    lines = [f"{text}; {report.from_journals:,} records came from journals that lie beside the store."]
+    for cell in report.without_journal:
+        lines.append(f"No journal of cell {cell} lies beside {store}: what it held, if anything, is not in the copy.")
+    tell({"store": store, "out": out} | asdict(report), *lines, f"Check it: dengine verify {out}")
 
 
 @verb("dengine import-labels cell.csv --store engine.db")

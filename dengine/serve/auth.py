@@ -102,7 +102,8 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
         mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(1 << 16)
     # systemd, from 254 on, hands a credential to the service's user by an ACL, which shows as a right of the group.
     credentials = os.environ.get("CREDENTIALS_DIRECTORY", "")
-    if mode & (0o037 if credentials and file.absolute().parent == Path(credentials) else 0o077):
+    has_owners = hasattr(os, "getuid")  # the bits of Windows say nothing of who may read
+    if has_owners and mode & (0o037 if credentials and file.absolute().parent == Path(credentials) else 0o077):
         raise SettingError(f"Expected {file} to be its owner's alone, others may use it ({mode:o}): chmod 600 {file}")
     lines = [line.split() for line in text.decode("utf-8", "replace").splitlines() if line.strip()]
     tokens = tuple(Token(line[0], line[1:2] != ["viewer"], " ".join(line[2:])) for line in lines)

@@ -12,17 +12,19 @@ import multiprocessing
 import os
 import pickle
 import signal
-import sys
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+# The last is Ctrl-Break of Windows.
+ENDING = [each for each in signal.Signals if each.name in ("SIGINT", "SIGTERM", "SIGBREAK")]
 NICE = 10  # decisions first, where cores are scarce
 DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of linux/prctl.h
 T = TypeVar("T")
@@ -37,12 +39,8 @@ class RetrainingProcess(ProcessPoolExecutor):
     def __init__(self) -> None:
         super().__init__(1, multiprocessing.get_context("spawn"), _end_with_parent)
         others = set(multiprocessing.active_children())
-        # What is started here never hears the signals to the whole group: its parent ends it in time.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-        try:
+        with _signals_blocked():
             self.submit(_warm_up)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         (self._process,) = set(multiprocessing.active_children()) - others
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
@@ -53,6 +51,19 @@ class RetrainingProcess(ProcessPoolExecutor):
         """End the process, whatever it is at: a retrain that was worth waiting for, its engine has waited for."""
         self._process.kill()
         super().shutdown(wait, cancel_futures=cancel_futures)
+
+
+@contextmanager
+def _signals_blocked() -> Iterator[None]:
+    """What is started meanwhile never hears the signals to the whole group: its parent ends it in time."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows: `_end_with_parent` ignores them there
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class _Plain:
@@ -94,7 +105,9 @@ def _end_with_parent() -> None:
     """In that process, first of all: have it end when its parent does, be it at work in C++."""
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned
-    if sys.platform == "linux":
+    for number in () if hasattr(signal, "pthread_sigmask") else ENDING:
+        signal.signal(number, signal.SIG_IGN)
+    if hasattr(os, "sched_setaffinity"):  # Linux
         ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
         if os.getppid() != parent.pid:  # it was killed before that
             os._exit(1)
@@ -103,7 +116,8 @@ def _end_with_parent() -> None:
             os.sched_setaffinity(0, {*cores} - {cores[parent.pid % len(cores)]})
     else:
         threading.Thread(target=lambda: (wait([parent.sentinel]), os._exit(1)), daemon=True).start()
-    os.nice(NICE)
+    if hasattr(os, "nice"):
+        os.nice(NICE)
 
 
 def _warm_up() -> None:

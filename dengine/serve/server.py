@@ -23,7 +23,7 @@ from ..errors import SettingError, instead, without_password
 from .auth import Access, in_url, is_loopback, read_tokens
 from .connections import Places
 from .http import Beside, create_app
-from .retraining import RetrainingProcess
+from .retraining import ENDING, RetrainingProcess
 from .robot_calls import Recorder
 from .service import DEADLINE, CellService
 
@@ -84,7 +84,7 @@ def serve(
     recorder: Callable[[], AbstractContextManager[Recorder | None]] = nullcontext,
     **interfaces: bool,
 ) -> None:
-    """Serve a cell until SIGTERM or SIGINT; then what is in line is answered, and the engine closed.
+    """Serve a cell until SIGTERM, SIGINT, or Windows' Ctrl-Break; then what is in line is answered, and the engine closed.
 
     make : opens the engine, given the executor that it retrains in.  store : its name, for what only reads.
     say : told where it listens, once it does.  recorder : makes what records for a robot's program.
@@ -142,7 +142,7 @@ class CellServer(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """SIGTERM and SIGINT ask for an end; uvicorn would raise them again once it has come."""
+        """These signals ask for an end; uvicorn would raise them again once it has come."""
         if threading.current_thread() is not threading.main_thread():  # Python delivers signals to that one alone
             yield
             return
@@ -152,7 +152,7 @@ class CellServer(uvicorn.Server):
             self._service.end_listening()
             self.handle_exit(number, frame)
 
-        before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
+        before = {number: signal.signal(number, end) for number in ENDING}
         try:
             yield
         finally:

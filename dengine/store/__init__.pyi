@@ -1,3 +1,5 @@
+from .backup import BackupReport as BackupReport
+from .backup import backup_store as backup_store
 from .opening import open_store as open_store
 from .records import Change as Change
 from .records import Correction as Correction

@@ -6,11 +6,14 @@ A deleted file, a fork, and a row that the database refuses are each met here.
 import hashlib
 import logging
 import os
+import shutil
 import sqlite3
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -56,6 +59,7 @@ def make_engine(url: str | None) -> sa.Engine:
 
 
 def _sqlite(engine: sa.Engine) -> sa.Engine:
+    sa.event.listen(engine, "do_connect", _connect)
     sa.event.listen(engine, "connect", _set_pragmas)
     sa.event.listen(engine, "begin", _begin)
     return engine
@@ -66,12 +70,55 @@ def _unusable(url: str, said: str) -> StoreError:
     return StoreError(f"Expected a file or a database URL that can be used here, got {got}.")
 
 
+class CopyConnection(sqlite3.Connection):
+    """A connection to a copy of a file; the copy is deleted with it."""
+
+
+def _connect(dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
+    """Connect to a file; to one that cannot be written, or lies where nothing can, as if it never changes.
+
+    Where the write-ahead log of a killed process lies beside such a file, and nothing else, both are copied:
+    SQLite reads them only where it can make a third file.
+    """
+    name = str(arguments[0])
+    file, log, shared = Path(name), Path(f"{name}-wal"), Path(f"{name}-shm")
+    if options.get("uri") or not file.is_file():
+        return dialect.connect(*arguments, **options)
+    if log.exists() or os.access(file, os.W_OK):
+        connection = dialect.connect(*arguments, **options)
+        try:
+            connection.execute("SELECT name FROM sqlite_master").fetchone()
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            if not _is_unwritable(error) or shared.exists():
+                return connection  # what is wrong is said as it is used
+            connection.close()
+        else:
+            return connection
+    if not log.exists():
+        return dialect.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True, **options)
+    folder = TemporaryDirectory(prefix="dengine-", ignore_cleanup_errors=True)
+    for each in (file, log):
+        shutil.copyfile(each, Path(folder.name) / each.name)
+    copy = dialect.connect(str(Path(folder.name) / file.name), factory=CopyConnection, **options)
+    weakref.finalize(copy, folder.cleanup)
+    return copy
+
+
+def _is_unwritable(error: Exception) -> bool:
+    """Whether SQLite says that it cannot write to a file, or make one beside it."""
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # an extended one says more in its higher bits
+    return code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN)
+
+
 def _set_pragmas(connection: Any, record: Any) -> None:
     connection.isolation_level = None  # `_begin` says when a transaction starts, not the driver
     try:
         tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
         if not tables or {"setting", "decision"} <= tables:  # another program's file is refused, and left as it is
             connection.execute("PRAGMA journal_mode = WAL")
+    except sqlite3.OperationalError as error:
+        if not _is_unwritable(error):  # else it stays in the mode that it has, and is read
+            raise
     except UnicodeDecodeError as error:  # SQLite quotes a damaged table's name in what it says
         raise sqlite3.DatabaseError("the database is malformed") from error
     connection.execute("PRAGMA synchronous = FULL")  # a returned commit survives lost power; NORMAL would not
@@ -256,6 +303,10 @@ class Database:
             except StoreError as error:
                 return f"{error}"
         return ""
+
+    def check_writable(self) -> None:
+        """Raise a StoreError where SQLite can read its file, and no more."""
+        self.write(lambda connection: connection.exec_driver_sql("UPDATE setting SET value = value WHERE 0"))
 
     def lease(self) -> None:
         """Write from now on through one connection that holds the cell; StoreError where another engine has it."""

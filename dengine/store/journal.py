@@ -6,14 +6,15 @@ records, and the newest entry of its ledger: a store that was cut off, or put ba
 small file beside it, its head, knows that entry too, for where the journal went with the store.
 """
 
-import fcntl
 import hashlib
 import json
 import os
+import re
 import socket
 import struct
+import sys
 import urllib.parse
-import weakref
+import urllib.request
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
@@ -23,6 +24,7 @@ from typing import Any
 
 from ..errors import StoreError, instead
 from ..records import Decision
+from .owned_file import OwnedFile, open_plain
 from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
 LENGTH = struct.Struct("<I")  # of a record's JSON text, before it; the samples of a trace or a point follow it
@@ -30,9 +32,8 @@ RESERVE = 8 << 20  # bytes: 1,800 traces of 1000 samples, two and a half hours o
 HEADER = 256  # bytes: what this file is, who owns it, and what the store holds of it
 MAGIC = b"dengine journal 2\n"
 MARK = b"\x89rec"  # where a record begins, to find the next one behind a damaged length
+IGNORES_CASE = sys.platform in ("win32", "darwin")  # of names in its usual file systems
 FRAME = struct.Struct("<4sII16s")  # before a record: mark, length, CRC-32, digest
-SYNC = getattr(os, "fdatasync", os.fsync)  # not every system has the quicker one
-
 
 Record = StoredDecision | NewLabel | Event
 
@@ -68,7 +69,9 @@ def from_bytes(blob: bytes) -> Record:
 class Journal:
     """An owned, locked journal; one thread appends, and any may read.
 
-    path : of the file, which is made; a link is refused.  end : offset behind the last record.
+    path : of the file, which is made; a link is refused.
+    owning : whether to lock it; else what is in it now is read, whoever owns it, and nothing is written.
+    end : offset behind the last record.
     drained : offset up to which the store holds the records.
     newest : number and digest of the newest entry of the ledger that was known; None: none yet.  head : as the head has it.
     dropped : bytes of an unfinished record at the end, which a killed process left; they were never acknowledged.
@@ -77,22 +80,22 @@ class Journal:
     Raises StoreError where another process, or another engine of this one, owns it.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, owning: bool = True) -> None:
         self.path = path
         self.drained, self.end, self.dropped, self.damaged = HEADER, HEADER, 0, 0
         self.newest: tuple[int, str] | None = None
         self.head = _head(path)
         self._digest = bytes(16)
-        self._fd = _locked(path)
+        self._owning, self._file = owning, _opened(path, owning)
         try:
             with _using(self.path):
                 self._scan()
-                os.ftruncate(self._fd, self.end)
-                self._begin()
+                if owning:
+                    self._file.truncate(self.end)
+                    self._begin()
         except StoreError:
-            os.close(self._fd)
+            self._file.close()
             raise
-        _OPEN.add(self)
 
     @property
     def empty(self) -> bool:
@@ -110,16 +113,12 @@ class Journal:
             digest = _digest(digest, record)
             framed += FRAME.pack(MARK, len(record), zlib.crc32(record), digest) + record
         with _using(self.path):
-            self._put(framed, self.end)
-            SYNC(self._fd)
-        if not self._in_place():
+            self._file.write(framed, self.end)
+            self._file.sync()
+        if not self._file.in_place():
             raise LostJournalError(f"The journal {self.path} was deleted, moved or replaced while it was open; leave it.")
         self.end, self._digest = self.end + len(framed), digest
         return offsets
-
-    def _put(self, content: bytes | bytearray, offset: int) -> None:
-        if (written := os.pwrite(self._fd, content, offset)) < len(content):  # a disk that is full takes a part
-            raise OSError(f"only {written} of {len(content)} bytes were written")
 
     def read(self, offset: int) -> bytes:
         """Return the record at an offset that `append` gave."""
@@ -135,7 +134,7 @@ class Journal:
                 at, begin = begin, begin + FRAME.size + len(record)
                 yield at, begin, record
                 continue
-            block = os.pread(self._fd, 1 << 20, begin + 1)  # the next one stands behind the damaged one
+            block = self._file.read(1 << 20, begin + 1)  # the next one stands behind the damaged one
             at = block.find(MARK)
             if at < 0 and len(block) < 1 << 20:
                 return
@@ -145,64 +144,45 @@ class Journal:
         """Note what the store holds by now; without a sync, for to give it a record twice is harmless."""
         self.newest = newest
         with _using(self.path):
-            os.pwrite(self._fd, self._header(), 0)
+            self._file.write(self._header(), 0)
         if newest is None:
             return
         with suppress(OSError):  # an older head is no harm
-            fd = os.open(head_path(self.path), os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-            try:
-                os.pwrite(fd, json.dumps(newest).ljust(HEADER).encode(), 0)
-            finally:
-                os.close(fd)
+            with os.fdopen(open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT), "wb") as head:
+                head.write(json.dumps(newest).ljust(HEADER).encode())
 
     def clear(self) -> None:
         """Forget all records; the store holds them now. `reserve` then makes room, on the disk, for others."""
         with _using(self.path):
-            os.ftruncate(self._fd, HEADER)
+            self._file.truncate(HEADER)
             self.drained = self.end = HEADER
             self._digest, self.damaged = bytes(16), 0
-            os.pwrite(self._fd, self._header(), 0)
+            self._file.write(self._header(), 0)
 
     def reserve(self) -> None:
         """Reserve room, and return once that is on the disk."""
         with _using(self.path):
-            try:
-                os.posix_fallocate(self._fd, 0, HEADER + RESERVE)
-            except (AttributeError, OSError):  # no room, or no way to reserve it: then without, as far as it goes
-                os.ftruncate(self._fd, max(self.end, HEADER))
-            os.fsync(self._fd)
+            self._file.reserve(HEADER + RESERVE)
 
     def remake(self) -> None:
         """Make the lost file anew, with what is not drained where it was."""
-        lost, self._fd = self._fd, _locked(self.path)
+        lost, self._file = self._file, _opened(self.path)
         try:
             with _using(self.path):
-                self._put(os.pread(lost, self.end - self.drained, self.drained), self.drained)
+                self._file.write(lost.read(self.end - self.drained, self.drained), self.drained)
                 self._begin()
         except StoreError:
-            lost, self._fd = self._fd, lost
+            lost, self._file = self._file, lost
             raise
         finally:
-            os.close(lost)
+            lost.close()
 
     def close(self) -> None:
         """Give the cell free. The file stays: what it knows of the ledger is compared by the next engine."""
-        if self._fd >= 0:
+        if self._owning and not self._file.closed:
             with _using(self.path):
-                os.ftruncate(self._fd, HEADER if self.empty else self.end)
-            self.let_go()
-
-    def let_go(self) -> None:
-        """Close the file and no more: in a forked child, which owns nothing."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
-
-    def _in_place(self) -> bool:
-        try:
-            return os.path.samestat(os.fstat(self._fd), self.path.lstat())
-        except FileNotFoundError:
-            return False
+                self._file.truncate(HEADER if self.empty else self.end)
+        self._file.close()
 
     def _header(self) -> bytes:
         known = json.dumps({"owner": owner()[:80], "drained": self.drained, "newest": self.newest})
@@ -210,15 +190,15 @@ class Journal:
 
     def _begin(self) -> None:
         """Write the header, and reserve room."""
-        os.pwrite(self._fd, self._header(), 0)
+        self._file.write(self._header(), 0)
         self.reserve()
 
     def _scan(self) -> None:
         """Find the end, and what is damaged on the way; all from where the store has the records."""
-        size = os.fstat(self._fd).st_size
+        size = self._file.size
         if size == 0:
             return
-        head = os.pread(self._fd, HEADER, 0)
+        head = self._file.read(HEADER, 0)
         if not head.startswith(MAGIC):
             raise StoreError(f"Expected a journal of dengine, found another file: {self.path}; move it away.")
         try:
@@ -229,38 +209,27 @@ class Journal:
         begin = self.drained = min(max(self.drained, HEADER), size)
         self.end = size
         for at, end, record in self.records():
-            digest: bytes = FRAME.unpack(os.pread(self._fd, FRAME.size, at))[3]
+            digest: bytes = FRAME.unpack(self._file.read(FRAME.size, at))[3]
             follows = before is None or digest == _digest(before, record)
             self.damaged += at > begin or not follows
             before, begin = digest, end
-        left = os.pread(self._fd, size - begin, begin)
+        left = self._file.read(size - begin, begin)
         self.end, self.dropped, self._digest = begin, len(left.rstrip(b"\0")), before or bytes(16)
 
     def _record(self, offset: int) -> bytes | None:
         """The record at an offset; None where it is not as it was written."""
-        frame = os.pread(self._fd, FRAME.size, offset)
+        frame = self._file.read(FRAME.size, offset)
         if len(frame) < FRAME.size or not frame.startswith(MARK):
             return None
         _, length, crc, _ = FRAME.unpack(frame)
-        if length > os.fstat(self._fd).st_size - offset - FRAME.size:
+        if length > self._file.size - offset - FRAME.size:
             return None
-        record = os.pread(self._fd, length, offset + FRAME.size)
+        record = self._file.read(length, offset + FRAME.size)
         return record if zlib.crc32(record) == crc else None
 
 
 class LostJournalError(StoreError):
     """The journal's file is not at its path any more."""
-
-
-_OPEN: weakref.WeakSet[Journal] = weakref.WeakSet()
-
-
-def _let_all_go() -> None:
-    for journal in list(_OPEN):
-        journal.let_go()
-
-
-os.register_at_fork(after_in_child=_let_all_go)  # or a worker that outlives its engine would keep the cell
 
 
 def _digest(before: bytes, record: bytes) -> bytes:
@@ -272,32 +241,25 @@ def _using(path: Path) -> AbstractContextManager[None]:
     return instead(StoreError, f"Could not use the journal {path}", OSError, do=do)
 
 
-def _locked(path: Path) -> int:
-    """Open and lock a file that is still the one at its path once the lock is held."""
-    while True:
-        with _using(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+def _opened(path: Path, owning: bool = True) -> OwnedFile:
+    """Open a journal's file; StoreError that names its owner, where another engine has it."""
+    with _using(path):
         try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(fd), path.lstat()):
-                return fd
+            return OwnedFile(path, owning)
         except BlockingIOError as error:
-            head = os.pread(fd, HEADER, 0)
-            os.close(fd)
             try:
-                holder = _known(head)[2]
-            except (ValueError, KeyError, TypeError):
+                with path.open("rb") as file:
+                    holder = _known(file.read(HEADER))[2]
+            except (OSError, ValueError, KeyError, TypeError):
                 holder = "another engine"
             raise owned_by(holder, str(path)) from error
-        except FileNotFoundError:
-            pass  # its owner went, and took the file along, between the opening and the lock: once more
-        os.close(fd)
 
 
 def journal_path(url: Any, cell_id: str) -> Path:
     """Where a cell's journal lies: beside an SQLite file, else in the user's folder of state, `XDG_STATE_HOME`."""
     name = urllib.parse.quote(cell_id, safe="")
+    if IGNORES_CASE:  # or cell A and cell a would have one journal
+        name = re.sub("(?<!%)(?<!%[0-9A-F])[A-Z]", lambda letter: f"%{ord(letter[0]):X}", name)
     if url.get_backend_name() == "sqlite":
         return Path(f"{sqlite_file(url)}.{name}.journal")
     state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "dengine"
@@ -308,7 +270,8 @@ def journal_path(url: Any, cell_id: str) -> Path:
 def sqlite_file(url: Any) -> Path:
     """The file of an SQLite database, by whatever link or URI of SQLite's own it is named: one file has one owner."""
     named = str(url.database)
-    return Path(urllib.parse.unquote(urllib.parse.urlsplit(named).path) if named.startswith("file:") else named).resolve()
+    of_uri = named.startswith("file:")
+    return Path(urllib.request.url2pathname(urllib.parse.urlsplit(named).path) if of_uri else named).resolve()
 
 
 def head_path(journal: Path) -> Path:
@@ -321,6 +284,20 @@ def newest_known(path: Path) -> set[tuple[int, str]]:
     with suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as file:
         found.add(_known(file.read(HEADER))[1])
     return {each for each in found if each is not None}
+
+
+def waiting_records(path: Path) -> list[Record]:
+    """Return what a journal holds that its store has not taken, whoever owns it.
+
+    Of the decisions of one id the last is in the place of those before.
+    """
+    journal = Journal(path, owning=False)
+    try:
+        records = [from_bytes(blob) for _, _, blob in journal.records()]
+    finally:
+        journal.close()
+    newest = {each.decision.id: each for each in records if isinstance(each, StoredDecision)}
+    return [each for each in records if not isinstance(each, StoredDecision) or newest[each.decision.id] is each]
 
 
 def _head(journal: Path) -> tuple[int, str] | None:

@@ -138,12 +138,14 @@ def check_schema(connection: sa.Connection, name: str) -> None:
         for table in inspector.get_table_names()
     }
     if found.get(SETTING.name) != set(SETTING.c.keys()):
-        held = f"tables of another program: {', '.join(sorted(found)) or 'none'}"
+        held = f"tables of another program: {', '.join(sorted(found))}" if found else "no tables"
     else:
         query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()  # the one query over all cells
         held = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
     if held != f"schema {SCHEMA}":
         do = "open it with the dengine that wrote it, or name a new file or database"
+        if not found:
+            do = "a plain copy of a store that is in use lacks what it holds: make it by `dengine backup`"
         raise StoreError(f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; {do}.")
     for table in METADATA.tables.values():
         if missing := set(table.c.keys()) - found.get(table.name, set()):

@@ -567,9 +567,12 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Claim the cell for one engine; its journal, None where there is none. StoreError where another engine has it."""
         if self.wait is None:
             return None
+        in_file = self.database.url.get_backend_name() == "sqlite"
+        if in_file:
+            self.database.check_writable()
         journal = Journal(journal_path(self.database.url, self.cell_id))
         try:
-            if self.database.url.get_backend_name() != "sqlite":
+            if not in_file:
                 self.database.lease()
         except StoreError:
             journal.close()

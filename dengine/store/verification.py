@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from .connections import integrity, reading
-from .journal import journal_path, newest_known
+from .journal import journal_path, newest_known, waiting_records
 from .ledger import START, entry_digest, ledger_key, must_have_key, row_sum, rows_digest, settings_faults, state_sum
 from .records import CHUNK
 from .schema import CHAINED, DECISION, LABEL, LEDGER, METADATA, SCHEMA_KEY, SETTING, TRACE, VERSION
@@ -45,12 +46,17 @@ class HistoryFault:
 
 @dataclass(frozen=True, slots=True)
 class CellHistory:
-    """A cell's history: entries of its ledger, rows that they chain, and the newest digest, "" without an entry."""
+    """A cell's history: entries of its ledger, rows that they chain, and the newest digest, "" without one.
+
+    waiting : decisions, labels and events that its journal holds and the store has not taken; None: no journal
+        of it is there that can be read: what it held, and whether newest entries were cut off, is not known.
+    """
 
     cell_id: str
     entries: int
     rows: int
     digest: str
+    waiting: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +87,9 @@ def verify_history(
         raise StoreError(f"Expected a digest of 64 hexadecimal digits, or its first 8 or more, got {expect!r}.")
     with reading(str(url)) as connection:
         names = _chosen_cells(connection, cell_id)
-        known = {name: newest_known(journal_path(connection.engine.url, name)) for name in names}
+        journals = {name: journal_path(connection.engine.url, name) for name in names}
+        known = {name: newest_known(path) for name, path in journals.items()}
+        waiting = {name: _count_waiting(path) for name, path in journals.items()}
     with reading(str(url)) as connection:  # anew: what the journals knew is in the store as it is now
         pages = integrity(connection) if connection.dialect.name == "sqlite" else []
         faults = [HistoryFault("", "file", "", said) for said in pages]
@@ -95,8 +103,17 @@ def verify_history(
     if wanted and not any(digest.startswith(wanted) for check in checks for digest in check.digests):
         what = "is in no entry: the history was cut off before it, or made anew"
         faults.append(HistoryFault(cell_id or "", LEDGER.name, f"digest {wanted}", what))
-    cells = (CellHistory(each.cell_id, len(each.digests), each.rows, "".join(each.digests[-1:])) for each in checks)
+    cells = (
+        CellHistory(each.cell_id, len(each.digests), each.rows, "".join(each.digests[-1:]), waiting[each.cell_id])
+        for each in checks
+    )
     return HistoryReport(tuple(cells), tuple(faults))
+
+
+def _count_waiting(journal: Path) -> int | None:
+    with suppress(StoreError):  # it is damaged, or another user's
+        return len(waiting_records(journal)) if journal.exists() else None
+    return None
 
 
 def _chosen_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:

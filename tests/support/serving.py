@@ -80,11 +80,11 @@ class Process:
 
 
 @contextmanager
-def started(folder: Path, *words: str, wait: bool = True) -> Iterator[Process]:
+def started(folder: Path, *words: str, wait: bool = True, python_path: str = str(REPO)) -> Iterator[Process]:
     """`dengine serve` and words, as they are typed in a folder. wait : until it says where it listens."""
     command = [sys.executable, "-m", "dengine", "serve", "--store", "cell.db", "--port", "0", *words]
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    environment = os.environ | {"PYTHONPATH": str(REPO)}
+    environment = os.environ | {"PYTHONPATH": python_path}
     process = subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True, **pipes)
     try:
         lines, said = [], None

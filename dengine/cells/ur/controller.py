@@ -7,6 +7,7 @@ It keeps to the published protocol as far as a client can see it, steps 500 time
 do what real ones do on bad days: `Trouble`.
 """
 
+import os
 import re
 import socket
 import struct
@@ -109,7 +110,8 @@ CYCLE_S = 0.002
 IDLE_S = 0.0002  # of a cycle at no set speed, while nobody listens
 STATE = {"robot_mode": 7.0, "safety_mode": 1.0, "speed_scaling": 1.0, RUNTIME: float(Runtime.PLAYING)}
 FOREIGN = (OSError, CellError, struct.error, ValueError, KeyError)  # of a client that is gone, or speaks otherwise
-PATIENCE = struct.pack("ll", 5, 0)  # seconds, a timeval: a client that does not read is hung up on
+# A client that does not read for five seconds is hung up on: milliseconds on Windows, else a timeval.
+PATIENCE = 5000 if os.name == "nt" else struct.pack("ll", 5, 0)
 GARBAGE = b"\x00\x01\xff GET / HTTP/1.1"
 TROUBLES = ("drop", "hold", "close", "half", "garbage", "repeat", "reset")
 FIELDS = {  # that it has: patterns of their names, and their types

@@ -34,14 +34,15 @@ from .kinds import ON_DISKS, ON_POSTGRES, ON_SQLITE, SYNC, asked_again
 Fault = Callable[[Outcome, Place], None]
 STORE, ENGINE = "dengine/store/", "dengine/engine/"
 MUTATIONS = (  # what is broken, the file, a text that stands there once, what then stands there, the row that fails
-    ("nothing is synced", STORE + "journal.py", "            SYNC(self._fd)\n", "", "A disk whose syncs fail"),
-    ("a lost journal is not noticed", STORE + "journal.py", "if not self._in_place():", "if False:", "The journal deleted"),
-    ("two engines may share a journal", STORE + "journal.py", "fcntl.LOCK_EX |", "fcntl.LOCK_SH |", "A second engine"),
+    ("nothing is synced", STORE + "journal.py", "            self._file.sync()\n", "", "A disk whose syncs fail"),
+    ("a lost journal is not noticed", STORE + "journal.py", "if not self._file.in_place():", "if False:",
+     "The journal deleted"),
+    ("two engines may share a journal", STORE + "owned_file.py", "exclusive_now = 2 |", "exclusive_now = 1 |", "A second engine"),
     ("a sync may take ten seconds", STORE + "outbox.py", "self.limit if seconds is None else seconds", "10.0",
      "A disk whose syncs hang"),
     ("labels are acknowledged at once", ENGINE + "feedback.py", "        self.outbox.secure()\n", "",
      "A disk whose syncs fail"),
-    ("what is written in part is taken for whole", STORE + "journal.py", "< len(content):", "< 0:",
+    ("what is written in part is taken for whole", STORE + "owned_file.py", "< len(content):", "< 0:",
      "The journal deleted while the store is away, on"),
     ("older labels are not checked", ENGINE + "versions.py", "hold_to_ledger(0)", "hold_to_ledger()", "A label older"),
     ("a link is another store", STORE + "journal.py", "else named).resolve()", "else named).absolute()", "A second engine"),

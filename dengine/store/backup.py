@@ -1,0 +1,107 @@
+"""A copy of a store in one file, with what its journals hold; the store may be in use meanwhile.
+
+    report = backup_store("engine.db", "copy.db")
+    report.decisions, report.labels, report.from_journals
+
+A copy of the file alone lacks what lies beside it: the newest transactions, in its `-wal` file, and the
+newest labels, in the journal of each cell.
+"""
+
+import os
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from ..errors import OutputError, StoreError, instead
+from ..files import output_file
+from .connections import reading
+from .journal import Record, journal_path, waiting_records
+from .records import CHUNK
+from .schema import DECISION, LABEL, SETTING
+from .sql import SqlStore
+
+
+@dataclass(frozen=True, slots=True)
+class BackupReport:
+    """What `backup_store` copied.
+
+    decisions, labels : that the copy holds, of all cells.
+    from_journals : decisions, labels and events in it that the store had not taken from the journals yet.
+    without_journal : cells of which no journal was there.
+    """
+
+    decisions: int
+    labels: int
+    from_journals: int
+    without_journal: tuple[str, ...]
+
+
+def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> BackupReport:
+    """Copy a store in a file by SQLite's own backup, and have the copy take what the journals hold.
+
+    Engines may go on meanwhile: whatever they had acknowledged when this was called is in the copy. It is
+    written whole or not at all.
+
+    Parameters
+    ----------
+    url : str or path
+        A file, or a URL of SQLite.
+    out : str or path
+        A file that is not there yet.
+
+    Raises
+    ------
+    StoreError
+        For what is no store in a file, and for a journal that cannot be read.
+    OutputError
+        Where the copy cannot be written.
+    """
+    with reading(os.fspath(url)) as connection:
+        if connection.dialect.name != "sqlite":
+            do = "pg_dump copies that, once the engines have ended: their journals lie on their machines"
+            raise StoreError(f"Expected a store in a file, got {connection.dialect.name}; {do}.")
+        cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
+        paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
+    # Before the store: what leaves a journal meanwhile is in it by then.
+    waiting = {cell: waiting_records(path) for cell, path in paths.items() if path.exists()}
+    with output_file(out) as partial:
+        try:
+            with instead(OutputError, f"Cannot write {out}", sqlite3.Error, do="choose a folder that has room"):
+                _copy(os.fspath(url), partial)
+                for cell, records in waiting.items():
+                    _take(partial, cell, records)
+                decisions, labels = _finish(partial)
+        finally:
+            for suffix in ("-wal", "-shm"):
+                partial.with_name(partial.name + suffix).unlink(missing_ok=True)
+    without = tuple(cell for cell in cells if cell not in waiting)
+    return BackupReport(decisions, labels, sum(map(len, waiting.values())), without)
+
+
+def _copy(url: str, target: Path) -> None:
+    with reading(url) as connection, closing(sqlite3.connect(target)) as copy:
+        source: Any = connection.connection.driver_connection
+        source.backup(copy)
+
+
+def _take(file: Path, cell: str, records: list[Record]) -> None:
+    """Have the copy take records; those that it holds count as taken."""
+    if not records:
+        return
+    with SqlStore(str(file), cell) as store:
+        for begin in range(0, len(records), CHUNK):
+            store.take(records[begin : begin + CHUNK])
+
+
+def _finish(file: Path) -> tuple[int, int]:
+    """Have it all in one file, which is read wherever it lies; returns its decisions and labels."""
+    with closing(sqlite3.connect(file)) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+        decisions, labels = (
+            connection.execute(f'SELECT count(*) FROM "{table.name}"').fetchone()[0] for table in (DECISION, LABEL)
+        )
+    return decisions, labels

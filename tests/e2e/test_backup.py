@@ -1,0 +1,145 @@
+"""`dengine backup`: a copy that holds what the store and its journals hold, and a plain copy that is not taken for one."""
+
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from dengine import DataEngine, Dataset, SqlStore
+from dengine.errors import StoreError
+from dengine.store import backup_store, verify_history
+from tests.support.command_line import dengine, document, said
+from tests.support.driving import learn
+
+IN_STORE, IN_JOURNAL = 40, 25  # parts
+
+
+@pytest.fixture
+def in_use(tmp_path: Path, data: Dataset) -> Iterator[DataEngine]:
+    """An engine whose newest labels are in its journal alone: another process holds the database."""
+    with DataEngine("pca", retrain_every=1000, store=str(tmp_path / "engine.db")) as engine:
+        learn(engine, data, range(IN_STORE))
+        engine.store.flush()
+        with closing(sqlite3.connect(tmp_path / "engine.db", isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            learn(engine, data, range(IN_STORE, IN_STORE + IN_JOURNAL))
+            yield engine
+            other.execute("ROLLBACK")
+
+
+def labels_of(file: Path) -> list[int]:
+    with SqlStore(str(file)) as store:
+        return store.labelled().labels.tolist()
+
+
+def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_verifies(
+    tmp_path: Path, in_use: DataEngine, data: Dataset
+) -> None:
+    copy, n = tmp_path / "elsewhere" / "copy.db", IN_STORE + IN_JOURNAL
+    copy.parent.mkdir()
+    made = document("backup", tmp_path / "engine.db", "--out", copy)
+    assert (made["decisions"], made["labels"], made["without_journal"]) == (n, n, [])
+    assert made["from_journals"] >= 2 * IN_JOURNAL
+    assert list(copy.parent.iterdir()) == [copy]  # one file, and nothing beside it
+    assert labels_of(copy) == data.y[:n].tolist()
+    assert verify_history(str(copy)).ok
+    learn(in_use, data, range(n, n + 1))  # it goes on meanwhile
+    with DataEngine.open(str(copy)) as engine:
+        assert engine.status().labels == n
+
+
+def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(tmp_path: Path, in_use: DataEngine) -> None:
+    journal = tmp_path / "engine.db.cell.journal"
+    kept = journal.read_bytes()
+    first = backup_store(tmp_path / "engine.db", tmp_path / "first.db")
+    (tmp_path / "first.db.cell.journal").write_bytes(kept)  # what it holds is in that store by now
+    second = backup_store(tmp_path / "first.db", tmp_path / "second.db")
+    assert (second.decisions, second.labels) == (first.decisions, first.labels)
+    assert labels_of(tmp_path / "second.db") == labels_of(tmp_path / "first.db")
+    with SqlStore(str(tmp_path / "second.db")) as store:
+        assert [event.kind for event in store.events() if event.kind == "dead letter"] == []
+
+
+def test_verify_says_what_waits_in_a_journal_and_of_a_plain_copy_that_there_is_none(
+    tmp_path: Path, in_use: DataEngine
+) -> None:
+    store, copy = tmp_path / "engine.db", tmp_path / "plain.db"
+    text = said("verify", store)
+    assert f"The journal of cell cell holds {2 * IN_JOURNAL} records" in text
+    for suffix in ("", "-wal", "-shm"):
+        shutil.copyfile(f"{store}{suffix}", f"{copy}{suffix}")
+    text = said("verify", copy)
+    assert "The journal of cell cell is not here" in text
+    assert "dengine backup" in text
+    assert document("verify", copy)["cells"][0]["waiting"] is None
+    assert document("verify", store)["cells"][0]["waiting"] == 2 * IN_JOURNAL
+
+
+def test_a_plain_copy_of_the_file_alone_is_refused_where_its_tables_are_in_the_log(tmp_path: Path) -> None:
+    with DataEngine("pca", store=str(tmp_path / "engine.db")):
+        shutil.copyfile(tmp_path / "engine.db", tmp_path / "plain.db")
+        result = dengine("verify", tmp_path / "plain.db")
+    assert result.exit_code == 1
+    assert "dengine backup" in result.output
+
+
+def test_a_backup_of_a_copy_says_that_it_has_no_journal(tmp_path: Path, in_use: DataEngine) -> None:
+    backup_store(tmp_path / "engine.db", tmp_path / "copy.db")
+    assert document("backup", tmp_path / "copy.db", "--out", tmp_path / "again.db")["without_journal"] == ["cell"]
+    text = said("backup", tmp_path / "copy.db", "--out", tmp_path / "third.db")
+    assert "No journal of cell cell lies beside" in text
+
+
+@pytest.mark.parametrize(
+    ("store", "out", "words"),
+    [
+        ("engine.db", "engine.db", "is a database"),
+        ("engine.db", "other.db", "is a database"),
+        ("engine.db", "notes.txt", "exists"),
+        ("engine.db", "missing/copy.db", "choose a folder that exists"),
+        ("nothing.db", "copy.db", "found no file"),
+        ("notes.txt", "copy.db", "something else"),
+    ],
+)
+def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, store: str, out: str, words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("engine.db", "other.db"):
+        DataEngine("pca", store=name).close()
+    Path("notes.txt").write_text("mine\n" * 100, encoding="utf-8")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    result = dengine("backup", store, "--out", out)
+    assert result.exit_code == 1
+    assert words in result.output
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_journal_that_cannot_be_read_makes_no_backup(tmp_path: Path) -> None:
+    DataEngine("pca", store=str(tmp_path / "engine.db")).close()
+    (tmp_path / "engine.db.cell.journal").write_bytes(b"no journal at all")
+    with pytest.raises(StoreError, match="found another file"):
+        backup_store(tmp_path / "engine.db", tmp_path / "copy.db")
+    assert not (tmp_path / "copy.db").exists()
+
+
+def test_every_cell_of_a_file_is_in_its_backup(tmp_path: Path, data: Dataset) -> None:
+    file = str(tmp_path / "line.db")
+    engines = [DataEngine("pca", retrain_every=1000, store=SqlStore(file, f"cell {name}")) for name in "AB"]
+    with closing(sqlite3.connect(file, isolation_level=None)) as other:
+        for engine in engines:
+            engine.store.flush()
+        other.execute("BEGIN IMMEDIATE")
+        for engine, rows in zip(engines, (range(10), range(10, 30)), strict=True):
+            learn(engine, data, rows)
+        report = backup_store(file, tmp_path / "copy.db")
+        other.execute("ROLLBACK")
+    for engine in engines:
+        engine.close()
+    assert (report.decisions, report.labels, report.without_journal) == (30, 30, ())
+    for name, n in (("A", 10), ("B", 20)):
+        with SqlStore(str(tmp_path / "copy.db"), f"cell {name}") as store:
+            assert len(store.labelled().labels) == n

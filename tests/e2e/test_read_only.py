@@ -1,0 +1,86 @@
+"""A store in a folder, or a file, that cannot be written is read; who would write to it is refused."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dengine import DataEngine, Dataset
+from tests.support.driving import learn
+from tests.support.serving import REPO
+
+AS_A_USER = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-all", "--ambient-caps=-all"]
+# What is there: all that a closed store leaves, what a killed process leaves, and that without its index of the log.
+LEFT = {"closed": ("",), "killed": ("", "-wal", "-shm"), "copied with its log": ("", "-wal")}
+LOCKED = {"a folder": (0o555, 0o644), "a file": (0o755, 0o444), "both": (0o555, 0o444)}
+CASES = [(left, locked) for left in LEFT for locked in LOCKED]
+
+
+def dengine(*words: object) -> subprocess.CompletedProcess[str]:
+    """A verb, typed by somebody whom permission bits bind."""
+    bound: list[str] = []
+    if os.geteuid() == 0:
+        bound = AS_A_USER
+        if shutil.which("setpriv") is None or subprocess.run([*bound, "true"], capture_output=True, check=False).returncode:
+            pytest.skip("permission bits do not bind root, and setpriv cannot take its rights away")
+    environment = os.environ | {"PYTHONPATH": str(REPO), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [*bound, sys.executable, "-m", "dengine", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+def well(*words: object) -> str:
+    done = dengine(*words)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, make_data) -> dict[str, Path]:
+    """A store in each state."""
+    data: Dataset = make_data(60, samples=80)
+    place = tmp_path_factory.mktemp("made")
+    with DataEngine("pca", retrain_every=30, store=str(place / "engine.db")) as engine:
+        learn(engine, data, range(60))
+        engine.store.flush()
+        for name in ("killed", "copied with its log"):
+            (place / name).mkdir()
+            for suffix in LEFT[name]:
+                shutil.copyfile(place / f"engine.db{suffix}", place / name / f"engine.db{suffix}")
+    (place / "closed").mkdir()
+    shutil.copyfile(place / "engine.db", place / "closed" / "engine.db")
+    return {name: place / name for name in LEFT}
+
+
+@pytest.fixture(params=CASES, ids=lambda case: f"{case[1]} of what was {case[0]}")
+def store(request: pytest.FixtureRequest, made: dict[str, Path], tmp_path: Path) -> Iterator[Path]:
+    left, locked = request.param
+    folder = tmp_path / "archive"
+    shutil.copytree(made[left], folder)
+    of_folder, of_files = LOCKED[locked]
+    for file in folder.iterdir():
+        file.chmod(of_files)
+    folder.chmod(of_folder)
+    yield folder / "engine.db"
+    folder.chmod(0o755)
+
+
+def test_what_only_reads_reads_it_and_leaves_it_as_it_is(store: Path, tmp_path: Path) -> None:
+    before = {file.name: file.read_bytes() for file in store.parent.iterdir() if not file.name.endswith("-shm")}
+    assert '"decisions": 60' in well("status", store, "--json")
+    assert "60" in well("data", store)
+    newest = well("history", store, "--last", 1, "--json")
+    (id_,) = [line.split('"')[3] for line in newest.splitlines() if line.strip().startswith('"id":')]
+    assert id_ in well("explain", store, id_, "--json")
+    assert '"ok": true' in well("verify", store, "--json")
+    assert '"lower_bound"' in well("policy", store, "--json")
+    assert '"labels": 60' in well("backup", store, "--out", tmp_path / "copy.db", "--json")
+    if not store.stat().st_mode & 0o200:  # else SQLite brings the log into it
+        assert {name: (store.parent / name).read_bytes() for name in before} == before
+    refused = dengine("policy", store, "--alpha", "0.2")
+    assert refused.returncode == 1
+    assert "writable" in refused.stderr
+    assert "Traceback" not in refused.stderr
