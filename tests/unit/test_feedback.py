@@ -143,6 +143,98 @@ def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_i
     assert engine.model.rule.evidence.told.sum() == 0
 
 
+HISTORIES = {
+    "local": replace(LOCAL, stops="all"),
+    "pooled": POOLED,
+    "pooled, audits": replace(POOLED, stops="some", audit_rate=0.3),
+    "cost": replace(POOLED, guarantee="cost", prices=(5.0, 40.0, 30.0)),
+    "cost, audits": replace(POOLED, guarantee="cost", stops="some", audit_rate=0.3, prices=(5.0, 40.0, 30.0)),
+}
+
+
+def learned(engine: DataEngine, probes: np.ndarray) -> tuple:
+    """What an engine's rule was told, and what it says of some traces."""
+    rule = {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
+    return rule, engine.model.predict_many(probes), engine.safe_mode, engine.new_labels, engine.version
+
+
+@pytest.mark.parametrize("policy", HISTORIES.values(), ids=HISTORIES)
+def test_in_random_histories_with_overdue_checks_a_reopened_engine_is_the_one_that_ran(
+    stream: Dataset, tmp_path: Path, policy: Policy
+) -> None:
+    rng, compared, folder = np.random.default_rng(0), 0, tmp_path / "running"
+    folder.mkdir()
+    engine = make(replace(policy, label_within=8), store=folder / "e.db")
+    owed: dict[str, bool] = {}
+    labelled: list[str] = []
+
+    def report(id_: str, success: bool) -> None:
+        engine.report(id_, success)
+        labelled.append(id_)
+
+    def check() -> bool:
+        """Whether a copy of the store, opened, is as the engine that runs."""
+        engine.flush()
+        if engine.model is None:
+            return False
+        copied = tmp_path / f"copy {rng.integers(10**9)}"
+        shutil.copytree(folder, copied)
+        with DataEngine.open(copied / "e.db", replaying=True) as again:
+            assert learned(again, stream.X[:20]) == learned(engine, stream.X[:20])
+            assert again._versions.overdue == engine._versions.overdue
+        return bool(engine._versions.overdue)
+
+    for i in range(220):
+        decision, success = engine.decide(stream.X[i]), bool(stream.y[i])
+        if decision.action is Action.ACCEPT and not success and rng.random() < 0.8:
+            report(decision.id, False)
+        elif decision.action is Action.VERIFY and rng.random() < 0.7:
+            report(decision.id, success)
+        elif decision.action is Action.VERIFY:
+            owed[decision.id] = success
+        if owed and rng.random() < 0.05:  # late
+            late = str(rng.choice(list(owed)))
+            report(late, owed.pop(late))
+        if labelled and rng.random() < 0.02:
+            engine.correct(str(rng.choice(labelled)), bool(rng.random() < 0.5))
+        if labelled and rng.random() < 0.01:
+            engine.forget(str(rng.choice(labelled)))
+        if rng.random() < 0.01:
+            engine.set_policy(replace(engine.policy, label_within=int(rng.integers(1, 20))))
+        if rng.random() < 0.02 and engine.version > 1:
+            engine.rollback(int(rng.integers(max(1, engine.version - 2), engine.version)))
+        if rng.random() < 0.05:
+            compared += check()
+        if rng.random() < 0.02:
+            engine.close()
+            engine = DataEngine.open(folder / "e.db", replaying=True)
+    assert compared > 0
+    engine.close()
+
+
+@pytest.mark.parametrize("policy", [replace(LOCAL, stops="all"), POOLED], ids=["local", "pooled"])
+def test_neither_a_restart_nor_a_correction_sends_a_healthy_cell_with_overdue_checks_into_safe_mode(
+    stream: Dataset, tmp_path: Path, policy: Policy
+) -> None:
+    engine, checks = make(replace(policy, label_within=50), store=tmp_path / "e.db"), 0
+    for x, success in zip(stream.X, stream.y.tolist(), strict=True):
+        decision = engine.decide(x)
+        if decision.action is Action.ACCEPT and not success:
+            engine.report(decision.id, False)
+        elif decision.action is Action.VERIFY:
+            checks += 1
+            if checks % 10:
+                engine.report(decision.id, success)
+                last = decision.id, success
+    assert (engine.safe_mode, engine._versions.overdue != set()) == ("", True)
+    engine.close()
+    engine = DataEngine.open(tmp_path / "e.db", replaying=True)
+    assert engine.safe_mode == ""
+    engine.correct(last[0], not last[1])
+    engine.correct(*last)
+    assert engine.safe_mode == ""
+
+
 def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(stream: Dataset) -> None:
     engine = make(POOLED)
     play(engine, stream)
