@@ -21,6 +21,7 @@ from ..files import read_archive
 from ..records import Action, Decision, RetrainReport, Source
 
 SAFE_MODE_BEGAN, SAFE_MODE_ENDED = "safe mode", "safe mode ended"  # kinds of events
+POLICY_CHANGED, SHADOW_CHANGED = "policy", "shadow"  # kinds of events whose data holds the old and the new policy
 T = TypeVar("T")
 NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
 LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)  # what stands, and what comes: silence was no success after all

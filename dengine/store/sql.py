@@ -42,6 +42,8 @@ from .records import (
     CHUNK,
     FORGOTTEN,
     KEEP,
+    POLICY_CHANGED,
+    SHADOW_CHANGED,
     Change,
     Correction,
     Event,
@@ -474,6 +476,15 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Return the newest `limit` events, all where it is None; oldest first."""
         query = sa.select(EVENT).where(EVENT.c.cell_id == self.cell_id).order_by(EVENT.c.number.desc()).limit(limit)
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
+
+    def policy_change_after(self, decision_id: str) -> Event | None:
+        """Return the first change of the policy after a decision, whatever the clock said; None: there was none."""
+        mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.id == decision_id)
+        decided = sa.select(DECISION.c.entry).where(mine).scalar_subquery()  # entries of the ledger are in their order
+        kinds = EVENT.c.kind.in_((POLICY_CHANGED, SHADOW_CHANGED)) & EVENT.c.data.is_not(None)
+        query = sa.select(EVENT).where(EVENT.c.cell_id == self.cell_id, kinds, EVENT.c.entry > decided)
+        rows = self._read(query.order_by(EVENT.c.number).limit(1))
+        return from_row(Event, rows[0]._mapping) if rows else None
 
     def record(self, change: Change) -> int:
         """Commit what a person changed, all or none, together with its event; returns the event's number.
