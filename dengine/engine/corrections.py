@@ -147,7 +147,10 @@ class Corrections:
         since = 0 if versions.answering is None else versions.next_number
         evidence = EvidenceWindow(since, SAFE_MODE.index(versions.newest.safe_mode)) if anew else now.evidence
         settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, evidence=evidence)
-        kind, text = POLICY_CHANGED, "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
+        kind, text = (
+            POLICY_CHANGED,
+            "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items()),
+        )
         if list(new) == ["shadow"]:
             kind, text = SHADOW_CHANGED, SHADOW[policy.shadow]
         event = Change(kind, text, {"old": was, "new": wished}, author, settings=settings.to_store())

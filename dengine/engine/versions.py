@@ -29,8 +29,8 @@ from ..model.base import EngineModel
 from ..recipe import Recipe
 from ..records import ACTIONS, Decision, Reason, RetrainReport
 from ..reducers.base import State
-from ..store.outbox import Outbox
 from ..store.evidence import rule_past
+from ..store.outbox import Outbox
 from ..store.records import (
     Change,
     Evidence,

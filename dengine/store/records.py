@@ -89,8 +89,8 @@ class NewLabel:
     point : (d,) where the trace joined the references of `model_version`; None where it did not.
     silent : accepted parts that went on since the previous label, and of which nothing was heard.
     time : when it was reported, in seconds.  content_hash, decided : of its decision, and when that was.
-    overdue_to : number of the newest decision whose check was overdue when the rule was told of the label; None where that
-        is not known.
+    overdue_to : number of the newest decision whose check was overdue when the rule was told of the
+        label; None where that is not known.
     """
 
     decision_id: str
@@ -171,7 +171,8 @@ class News:
 class Evidence(NamedTuple):
     """What became of a decision, as a rule is told of it.
 
-    seq : number of its label, which is `success`; 0 where a check is overdue.  lower, upper : the bound that it was decided by.
+    seq : number of its label, which is `success`; 0 where a check is overdue.
+    lower, upper : the bound that it was decided by.
     novel : whether it was decided as unlike all that was learned from, `Reason.NOVEL`.
     silent : accepted parts of which nothing was heard between the previous label and this one.
     predicted : position in `Action` of what the model alone would have done.  looked : as `Decision.looked`.

@@ -158,58 +158,87 @@ def learned(engine: DataEngine, probes: np.ndarray) -> tuple:
     return rule, engine.model.predict_many(probes), engine.safe_mode, engine.new_labels, engine.version
 
 
+class RandomHistory:
+    """A cell whose checks come late or never, whose people correct, and which is opened again now and then.
+
+    compared : how often a copy of its store was opened while checks were overdue, and was as the engine that ran.
+    """
+
+    def __init__(self, policy: Policy, folder: Path, probes: np.ndarray, seed: int) -> None:
+        (folder / "running").mkdir()
+        self.rng, self.folder, self.probes, self.compared = np.random.default_rng(seed), folder, probes, 0
+        self.engine = make(replace(policy, label_within=8), store=folder / "running" / "e.db")
+        self.owed: dict[str, bool] = {}
+        self.labelled: list[str] = []
+        self.steps = {
+            self.report_late: 0.05,
+            self.correct: 0.02,
+            self.forget: 0.01,
+            self.change_policy: 0.01,
+            self.roll_back: 0.02,
+            self.compare: 0.05,
+            self.reopen: 0.02,
+        }
+
+    def play(self, x: np.ndarray, success: bool) -> None:
+        """One part, and what happens by chance after it."""
+        decision = self.engine.decide(x)
+        if decision.action is Action.ACCEPT and not success and self.rng.random() < 0.8:
+            self.report(decision.id, False)
+        elif decision.action is Action.VERIFY and self.rng.random() < 0.7:
+            self.report(decision.id, success)
+        elif decision.action is Action.VERIFY:
+            self.owed[decision.id] = success
+        for step, often in self.steps.items():
+            if self.labelled and self.rng.random() < often:
+                step()
+
+    def report(self, id_: str, success: bool) -> None:
+        self.engine.report(id_, success)
+        self.labelled.append(id_)
+
+    def report_late(self) -> None:
+        if self.owed:
+            late = str(self.rng.choice(list(self.owed)))
+            self.report(late, self.owed.pop(late))
+
+    def correct(self) -> None:
+        self.engine.correct(str(self.rng.choice(self.labelled)), bool(self.rng.random() < 0.5))
+
+    def forget(self) -> None:
+        self.engine.forget(str(self.rng.choice(self.labelled)))
+
+    def change_policy(self) -> None:
+        self.engine.set_policy(replace(self.engine.policy, label_within=int(self.rng.integers(1, 20))))
+
+    def roll_back(self) -> None:
+        if self.engine.version > 1:
+            self.engine.rollback(int(self.rng.integers(max(1, self.engine.version - 2), self.engine.version)))
+
+    def compare(self) -> None:
+        self.engine.flush()
+        if self.engine.model is not None:
+            copied = self.folder / f"copy {self.rng.integers(10**9)}"
+            shutil.copytree(self.folder / "running", copied)
+            with DataEngine.open(copied / "e.db", replaying=True) as again:
+                assert learned(again, self.probes) == learned(self.engine, self.probes)
+                assert again._versions.overdue == self.engine._versions.overdue
+            self.compared += bool(self.engine._versions.overdue)
+
+    def reopen(self) -> None:
+        self.engine.close()
+        self.engine = DataEngine.open(self.folder / "running" / "e.db", replaying=True)
+
+
 @pytest.mark.parametrize("policy", HISTORIES.values(), ids=HISTORIES)
 def test_in_random_histories_with_overdue_checks_a_reopened_engine_is_the_one_that_ran(
     stream: Dataset, tmp_path: Path, policy: Policy
 ) -> None:
-    rng, compared, folder = np.random.default_rng(0), 0, tmp_path / "running"
-    folder.mkdir()
-    engine = make(replace(policy, label_within=8), store=folder / "e.db")
-    owed: dict[str, bool] = {}
-    labelled: list[str] = []
-
-    def report(id_: str, success: bool) -> None:
-        engine.report(id_, success)
-        labelled.append(id_)
-
-    def check() -> bool:
-        """Whether a copy of the store, opened, is as the engine that runs."""
-        engine.flush()
-        if engine.model is None:
-            return False
-        copied = tmp_path / f"copy {rng.integers(10**9)}"
-        shutil.copytree(folder, copied)
-        with DataEngine.open(copied / "e.db", replaying=True) as again:
-            assert learned(again, stream.X[:20]) == learned(engine, stream.X[:20])
-            assert again._versions.overdue == engine._versions.overdue
-        return bool(engine._versions.overdue)
-
-    for i in range(220):
-        decision, success = engine.decide(stream.X[i]), bool(stream.y[i])
-        if decision.action is Action.ACCEPT and not success and rng.random() < 0.8:
-            report(decision.id, False)
-        elif decision.action is Action.VERIFY and rng.random() < 0.7:
-            report(decision.id, success)
-        elif decision.action is Action.VERIFY:
-            owed[decision.id] = success
-        if owed and rng.random() < 0.05:  # late
-            late = str(rng.choice(list(owed)))
-            report(late, owed.pop(late))
-        if labelled and rng.random() < 0.02:
-            engine.correct(str(rng.choice(labelled)), bool(rng.random() < 0.5))
-        if labelled and rng.random() < 0.01:
-            engine.forget(str(rng.choice(labelled)))
-        if rng.random() < 0.01:
-            engine.set_policy(replace(engine.policy, label_within=int(rng.integers(1, 20))))
-        if rng.random() < 0.02 and engine.version > 1:
-            engine.rollback(int(rng.integers(max(1, engine.version - 2), engine.version)))
-        if rng.random() < 0.05:
-            compared += check()
-        if rng.random() < 0.02:
-            engine.close()
-            engine = DataEngine.open(folder / "e.db", replaying=True)
-    assert compared > 0
-    engine.close()
+    history = RandomHistory(policy, tmp_path, stream.X[:20], seed=1)
+    for x, success in zip(stream.X[:220], stream.y.tolist(), strict=False):
+        history.play(x, success == 1)
+    assert history.compared > 0
+    history.engine.close()
 
 
 @pytest.mark.parametrize("policy", [replace(LOCAL, stops="all"), POOLED], ids=["local", "pooled"])
