@@ -92,7 +92,7 @@ CORRECTION = _table(  # later words on labels; the newest of a decision counts
     sa.Index("correction_of", "cell_id", "decision_id", "number"),
 )
 CHAINED = {table.name: table for table in (DECISION, TRACE, LABEL, VERSION, EVENT, CORRECTION)}  # rows the ledger chains
-ADDED = (LABEL.c.overdue_to,)  # columns that came after the first schema
+ADDED = {LABEL.c.overdue_to}  # columns that came after the first schema
 LEDGER = sa.Table(  # an entry for every transaction that added rows or changed settings
     "ledger",
     METADATA,
@@ -159,8 +159,6 @@ def check_schema(connection: sa.Connection, name: str) -> None:
         do = "open it with the dengine that wrote it, or name a new file or database"
         raise StoreError(f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; {do}.")
     for table in METADATA.tables.values():
-        if missing := set(table.c.keys()) - found.get(table.name, set()):
-            do = "restore it from a copy"
-            if missing <= {column.name for column in ADDED}:
-                do = "an earlier dengine wrote it: an engine, or `dengine status`, brings it up to date"
-            raise StoreError(f"Expected columns {sorted(missing)} of {table.name} in {name}; {do}.")
+        wanted = {column.name for column in table.c if column not in ADDED}
+        if missing := wanted - found.get(table.name, set()):
+            raise StoreError(f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it from a copy.")

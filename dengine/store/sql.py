@@ -28,6 +28,7 @@ from .peers import must_agree
 from .queries import (
     LABEL_OF_DECISION,
     SAID,
+    SOURCE,
     TRACE_OF_DECISION,
     WITH_LABELS,
     Scope,
@@ -578,9 +579,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         newest = n_decisions(self.cell_id)
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label("aged")
         columns = DECISION.c["action", "predicted", "reason", "audit", "quarantined"]
-        kind = (*columns, aged, SAID.label("success"), LABEL.c.source, sa.func.count().label("n"))
+        kind = (*columns, aged, SAID.label("success"), SOURCE.label("source"), sa.func.count().label("n"))
         times = sa.func.min(DECISION.c.time), sa.func.max(DECISION.c.time), sa.func.max(LABEL.c.time)
-        query = sa.select(*kind, *times).select_from(WITH_LABELS).group_by(*columns, "aged", SAID, LABEL.c.source)
+        query = sa.select(*kind, *times).select_from(WITH_LABELS).group_by(*columns, "aged", SAID, SOURCE)
         query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version)
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
         first, latest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))

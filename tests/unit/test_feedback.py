@@ -1,7 +1,9 @@
 """What becomes of parts: silence, confirmation, late stops, safe mode, parts that come twice, the certificate."""
 
 import shutil
+import sqlite3
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,11 +11,14 @@ import numpy as np
 import pytest
 
 from dengine import Action, DataEngine, Dataset, Decision, Policy, Reason, Recipe, Source, load_dataset
+from dengine.engine import feedback
 from dengine.errors import ReportError, StoreError
 from dengine.folds import content_hash, fold_of, part_hash
 from dengine.history.status import status
 from dengine.model.neighbours import repeats_note
 from dengine.store import SqlStore
+from dengine.store.records import NewLabel
+from dengine.store.verification import verify_history
 from tests.support.driving import drive as play
 
 LOCAL = Policy(alpha=0.1, lower_bound=0.9)
@@ -108,9 +113,16 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     assert beyond(engine) == [0, 0]
     held, labels = engine.store.get_decision(stopped.id), engine.model.index.held("labels")
     assert (held.success, engine.store.labelled().labels[held.label_seq - 1]) == (False, 0)
+    (past,) = [past for past in engine.history() if past.decision.id == stopped.id]
+    assert {held.source, past.source, engine.find(stopped.id).source} == {Source.STOP}
+    assert engine.status().sources["stop"] == engine.status().ever.stops == engine.store.tally().outcomes.stops
+    with pytest.raises(ReportError, match="failure from stop was reported first and stands, now came failure from stop"):
+        engine.report(stopped.id, False)
     assert labels[engine.model.index.held("numbers") == held.label_seq].tolist() == [0]
     assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.stops > 0
     engine.close()
+    with DataEngine.open(tmp_path / "late.db", replaying=True) as engine:
+        assert (engine.find(stopped.id).source, engine.find(stopped.id).success) == (Source.STOP, False)
 
 
 def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_it_is(stream: Dataset, tmp_path) -> None:
@@ -262,6 +274,30 @@ def test_neither_a_restart_nor_a_correction_sends_a_healthy_cell_with_overdue_ch
     engine.correct(last[0], not last[1])
     engine.correct(*last)
     assert engine.safe_mode == ""
+
+
+
+def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_not_know_of_overdue_checks(
+    stream: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feedback, "NewLabel", lambda *given, overdue_to: NewLabel(*given))
+    engine, checks = make(replace(POOLED, label_within=50), store=tmp_path / "e.db"), 0
+    for x, success in zip(stream.X, stream.y.tolist(), strict=True):
+        decision = engine.decide(x)
+        checks += decision.action is Action.VERIFY
+        if not success if decision.action is Action.ACCEPT else checks % 10:
+            engine.report(decision.id, bool(success))
+    engine.close()
+    monkeypatch.undo()
+    with closing(sqlite3.connect(tmp_path / "e.db")) as earlier:
+        earlier.execute("ALTER TABLE label DROP COLUMN overdue_to")
+    assert verify_history(str(tmp_path / "e.db")).ok
+    with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
+        assert (engine.safe_mode, len(engine._versions.overdue) > 5) == ("", True)
+        told = [each.seq for each in engine.store.evidence_since(0, 0, 450)]
+        assert told[-5:] == sorted(told[-5:])  # not last, in one burst
+        engine.report(engine.decide(stream.X[0]).id, True)
+    assert verify_history(str(tmp_path / "e.db")).ok
 
 
 def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(stream: Dataset) -> None:
