@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 from numpy.typing import ArrayLike
 
@@ -23,6 +24,7 @@ RULES = {  # classes of `rule`, by guarantee and by what is known of stops
     "cost": {"some": "PricedRule", "all": "PricedRule"},
 }
 
+NO_WINDOWS = "none"
 LARGEST_RADIUS = 1e18  # radius: squared it is finite in float32, so that a query's own part, infinitely far, is in no ball
 
 
@@ -93,6 +95,17 @@ class Policy:
                 f"Expected audits, or stops='all', beside the {self.guarantee} guarantee, which can claim nothing of parts "
                 "that nobody hears of; set audit_rate=0.1, or stops='all' where every bad accepted part stops the system."
             )
+
+    def to_values(self) -> dict[str, Any]:
+        """Return every setting by its name, windows as their text: "none" where there are none."""
+        return asdict(self) | {"windows": " ".join(map(str, self.windows)) or NO_WINDOWS}
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> Self:
+        """Return the policy of which `to_values` gave these; settings that are missing have their defaults."""
+        known = {each.name: values[each.name] for each in fields(cls) if each.name in values}
+        windows = known.get("windows", NO_WINDOWS)
+        return cls(**known | {"windows": () if windows == NO_WINDOWS else tuple(windows.split())})
 
     @property
     def tolerances(self) -> tuple[float, float]:

@@ -56,6 +56,7 @@ from torch import Tensor, nn
 from ..errors import StoreError
 from ..records import REASONS, Reason
 from .certificate import cusum
+from .code import remember_code
 from .intervals import INTERVALS, SORTING, normal_quantile
 from .references import RadiusIndex
 
@@ -476,4 +477,6 @@ def script(module: nn.Module) -> Any:
 
     with _SCRIPTING, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r".*torch\.jit\..* is deprecated.*")
-        return torch.jit.script(module)
+        scripted = torch.jit.script(module)
+    remember_code(module)
+    return scripted

@@ -19,9 +19,16 @@ from ..decision.rule import SAFE_MODE
 from ..errors import ReportError, SettingError, expect, listed
 from ..records import as_success
 from ..store.outbox import Outbox
-from ..store.records import Change, StoredDecision, nothing_to_correct, unknown_decision
+from ..store.records import (
+    POLICY_CHANGED,
+    SHADOW_CHANGED,
+    Change,
+    StoredDecision,
+    nothing_to_correct,
+    unknown_decision,
+)
 from .feedback import Feedback
-from .settings import EvidenceWindow, SettingsInForce, of_policy
+from .settings import EvidenceWindow, SettingsInForce
 from .trainer import HUNG
 from .versions import ModelVersions
 
@@ -123,7 +130,7 @@ class Corrections:
         """
         expect(isinstance(policy, Policy), "a Policy", policy, "for example Policy(alpha=0.05, lower_bound=0.95)")
         now, versions = self._settings.now, self._versions
-        was, wished = of_policy(now.recipe.policy), of_policy(policy)
+        was, wished = now.recipe.policy.to_values(), policy.to_values()
         new = {name: value for name, value in wished.items() if value != was[name]}
         if not new:
             return self._unchanged("policy", "The policy is in force already")
@@ -140,9 +147,12 @@ class Corrections:
         since = 0 if versions.answering is None else versions.next_number
         evidence = EvidenceWindow(since, SAFE_MODE.index(versions.newest.safe_mode)) if anew else now.evidence
         settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, evidence=evidence)
-        kind, text = "policy", "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
+        kind, text = (
+            POLICY_CHANGED,
+            "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items()),
+        )
         if list(new) == ["shadow"]:
-            kind, text = "shadow", SHADOW[policy.shadow]
+            kind, text = SHADOW_CHANGED, SHADOW[policy.shadow]
         event = Change(kind, text, {"old": was, "new": wished}, author, settings=settings.to_store())
         versions.set_policy(policy if anew else None, evidence, event)
         self._settings.change(settings)

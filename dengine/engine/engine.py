@@ -203,7 +203,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                     raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name another.")
                 self.store.save_settings(self._settings.now.to_store())
                 if opened.product is not None:
-                    self._versions.resume()  # on what the others of its product learned
+                    self._versions.resume(self.policy.label_within, 0)  # on what the others of its product learned
 
     def _start(
         self,
@@ -273,7 +273,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             settings = EngineSettings.from_store(store.settings(), name, reducer, model, allow_import)
             engine._start(*settings.with_template(model), store, **options)
             with engine._closed_on_failure():
-                engine._versions.resume()
+                engine._versions.resume(settings.recipe.policy.label_within, settings.policy_since)
                 engine._feedback.resume()
         engine.resumed = True
         return engine

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from ..errors import StoreError
-from ..records import Action, Decision, Reason, Source, source_of
+from ..records import Action, Reason, Source, source_of
 from ..store.outbox import Outbox
 from ..store.records import LATE_STOP, SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision, already_reported
 from .settings import SettingsInForce
@@ -43,9 +43,8 @@ class Feedback:
         self._went_on: OrderedDict[str, StoredDecision] = OrderedDict()  # accepted, nothing heard of them yet
         self._waiting: dict[str, tuple[StoredDecision, NewLabel]] = {}  # confirmed, not on their way into the store
         self._unsynced: dict[str, bool] = {}  # learned, and not known to be on the disk
-        # Decisions that asked for a check of which nothing was reported, each behind its number.
-        self._owed: OrderedDict[str, tuple[int, Decision]] = OrderedDict()
-        self._decisions = 0
+        # Decisions that asked for a check of which nothing was reported and which is not overdue, oldest first.
+        self._owed: OrderedDict[str, StoredDecision] = OrderedDict()
         self._unobserved = 0
         self._mode = ""
         self.remedy: Callable[[], None] | None = None  # where what the rule was told, or what is stored, did not happen
@@ -61,9 +60,9 @@ class Feedback:
         """Go on from the store: what was accepted and not reported."""
         self._mode = self.versions.newest.safe_mode
         store = self.outbox.store
-        for owing, since in store.owed(self.settings.now.evidence.since):
-            self._owed[owing.decision.id] = -since, owing.decision
-        self._count_overdue()
+        for owed in store.owed(self.settings.now.evidence.since):
+            if owed.number > self.versions.overdue_to:
+                self._owed[owed.decision.id] = owed
         ids = store.unreported_accepts(self.settings.now.policy_since)
         if not self._stops_all:
             self._unobserved = len(ids) - store.silent_total(self.settings.now.policy_since)
@@ -76,7 +75,6 @@ class Feedback:
     def settle(self) -> None:
         """The next trace comes: accepted parts of which nothing was heard went on."""
         self.arrive()
-        self._count_overdue()
         if not self._went_on:
             return
         while self._went_on:
@@ -90,15 +88,16 @@ class Feedback:
 
     def _count_overdue(self) -> None:
         """A check that was not reported in time counts as a wrong decision."""
-        latest = self._decisions - self.settings.now.recipe.policy.label_within
-        while self._owed and next(iter(self._owed.values()))[0] <= latest:
-            self.versions.owe(self._owed.popitem(last=False)[1][1])
+        overdue_to = self.outbox.n_decisions - self.settings.now.recipe.policy.label_within
+        while self._owed and next(iter(self._owed.values())).number <= overdue_to:
+            self.versions.owe(self._owed.popitem(last=False)[1].decision)
+        self.versions.overdue_to = max(overdue_to, self.versions.overdue_to)
 
     def decided(self, known: StoredDecision) -> None:
         """A part was decided on."""
-        self._decisions += 1
-        if known.decision.action is Action.VERIFY and not known.quarantined:
-            self._owed[known.decision.id] = self._decisions, known.decision
+        if known.decision.action is Action.VERIFY and not known.quarantined and known.number:
+            self._owed[known.decision.id] = known
+        self._count_overdue()
         if known.decision.action is Action.ACCEPT:
             self._went_on[known.decision.id] = known
         self._novel += ((known.decision.reason is Reason.NOVEL) - self._novel) / RECENT
@@ -141,13 +140,14 @@ class Feedback:
         self.outbox.labels([(known, label)])
         self._went_on.pop(made.id, None)
         self._owed.pop(made.id, None)
-        overdue = self.versions.overdue.pop(made.id, None) is not None
-        if untrue or overdue:
+        if untrue or made.id in self.versions.overdue:
+            self.versions.overdue.discard(made.id)
             self.remedy = self.remedy or self.versions.tell_anew
         return untrue
 
     def arrive(self) -> None:
         """Do what had to wait for the store: labels that it has numbered train, and the rule is told the truth."""
+        self._count_overdue()
         for id_, seq in self.outbox.arrived():
             self.versions.keep(id_, seq)
         if self.remedy and self.outbox.drained and not self.outbox.fault:
@@ -198,7 +198,7 @@ class Feedback:
             silent = self._unobserved - (counted and made.model_version >= self.settings.now.policy_since)
             self._unobserved = 0
             point = self.versions.learn(known, success, silent)
-        return NewLabel(made.id, success, source, version, point, silent)
+        return NewLabel(made.id, success, source, version, point, silent, overdue_to=self.versions.overdue_to)
 
     def begin_policy(self) -> None:
         """Go on under another policy. What was accepted under the last one and not heard of stays unheard of."""

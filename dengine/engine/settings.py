@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from .. import __version__
-from ..decision.policy import Policy
+from ..decision.policy import NO_WINDOWS, Policy
 from ..decision.rule import script
 from ..errors import ImportRefusedError, SettingError, StoreError, expect, shortened
 from ..model.base import EngineModel, Model, as_engine_model
@@ -25,7 +25,6 @@ log = logging.getLogger("dengine")
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 # What counts for any model.
 LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate", "stops", "windows")
-NO_WINDOWS = "none"
 MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set, as the store has them
 
 
@@ -138,7 +137,7 @@ class EngineSettings:
         if unknown:
             raise SettingError(f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not.")
         wished = {} if recipe is None else flat(chosen_recipe(reducer, recipe, {}))
-        wished |= given | ({} if policy is None else of_policy(policy))
+        wished |= given | ({} if policy is None else policy.to_values())
         wished |= {} if reducer is None else {"reducer": reducer}
         if not isinstance(wished.get("reducer"), str):  # an object was compared when the store was opened
             wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
@@ -212,12 +211,7 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
 
 def flat(recipe: Recipe) -> dict[str, Any]:
     """Every setting of a recipe by its name, the policy's among them."""
-    return {f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name != "policy"} | of_policy(recipe.policy)
-
-
-def of_policy(policy: Policy) -> dict[str, Any]:
-    """Every setting of a policy by its name, windows as their text."""
-    return asdict(policy) | {"windows": " ".join(map(str, policy.windows)) or NO_WINDOWS}
+    return {f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name != "policy"} | recipe.policy.to_values()
 
 
 class SettingsInForce:

@@ -27,11 +27,20 @@ from ..decision.policy import Policy
 from ..errors import StoreError
 from ..model.base import EngineModel
 from ..recipe import Recipe
-from ..records import ACTIONS, Action, Decision, Reason, RetrainReport
+from ..records import ACTIONS, Decision, Reason, RetrainReport
 from ..reducers.base import State
+from ..store.evidence import rule_past
 from ..store.outbox import Outbox
-from ..store.records import Change, Evidence, Labelled, ModelVersion, StoredDecision, without_rule
-from .resume import change, corrected_at, join_since, known_to, refit, restored, tell, tell_all
+from ..store.records import (
+    Change,
+    Evidence,
+    Labelled,
+    ModelVersion,
+    StoredDecision,
+    overdue_evidence,
+    without_rule,
+)
+from .resume import change, join_since, known_to, refit, restored, tell, tell_all
 from .settings import EvidenceWindow
 from .trainer import HUNG, Retrainer, Trained, TrainedOn, Window
 
@@ -104,7 +113,8 @@ class ModelVersions:
         self.store_waiting: Callable[[], None] = lambda: None
         self.journal_cleared: Callable[[], None] = lambda: None
         self.fleet = None if self.store.product is None else Fleet(self.store, self)
-        self.overdue: dict[str, Decision] = {}  # what the rule was told of as wrong: their checks are owed for too long
+        self.overdue: set[str] = set()  # decisions that the rule was told of as wrong: their checks are owed for too long
+        self.overdue_to = 0  # number of the newest decision whose check was looked for by then
         self._trained_on: TrainedOn | None = None
         self._newest = 0  # number that a version ever had; after damage an earlier one may answer
         # What was learned, by decision, and the number that a reference has until the store gives one; 0: it is none.
@@ -125,8 +135,11 @@ class ModelVersions:
         """The model that answers, or the untrained one."""
         return self.answering or self.template
 
-    def resume(self) -> None:
-        """Go on from the store, bit for bit: reference embeddings are read, not recomputed."""
+    def resume(self, within: int, policy_since: int) -> None:
+        """Go on from the store, bit for bit: reference embeddings are read, not recomputed.
+
+        within, policy_since : decisions after which a check is overdue, and the first version that counted so.
+        """
         store, template, since = self.store, self.template, self.evidence.since
         version = store.last_version()  # before the labels: a peer may store both meanwhile
         labelled = store.labelled(self.retrainer.window.capacity)
@@ -135,6 +148,8 @@ class ModelVersions:
         # The later versions may be damaged: what an earlier one's rule learned under an earlier policy is left out.
         state = {} if version is None else version.state if version.version >= since else without_rule(version.state)
         model = None if version is None else restored(self.outbox, template, state)
+        past = rule_past(store, None if model is None else version, since, within, policy_since)
+        self.overdue, self.overdue_to = set(past.overdue), past.overdue_to
         if version is None or model is None:
             if len(labelled.seq) >= 500:  # and no retrain yet: they were imported
                 self._look_ahead(template, labelled)
@@ -147,12 +162,10 @@ class ModelVersions:
             self._look_ahead(model, labelled)
             model.prepare_safely(template)
             self.corrected_to = join_since(model, store, version, self.retrainer.window)
-            told_to = int(version.state.get("told_to", version.last_seq))  # 0: a peer's, who knows nothing of this cell
-            anew = not told_to or not version.state.keys().isdisjoint(("untold", "owed")) or version.version < since
-            if anew or self.corrected_to > corrected_at(version):
-                tell_all(model, self._evidence, self.evidence)
+            if past.told_to:
+                tell(model, lambda: self._evidence(past.told_to))
             else:
-                tell(model, lambda: self._evidence(told_to))
+                tell_all(model, self._evidence, self.evidence)
             self.new_labels = int((labelled.seq > trained_on.counts_from).sum())
             self._trained_on = trained_on
         if self.fleet is not None:
@@ -161,7 +174,7 @@ class ModelVersions:
     def _evidence(self, after: int = 0) -> list[Evidence]:
         """What the rule is told of labels after that number, which are held to the ledger."""
         self.outbox.hold_to_ledger(after)
-        return self.store.evidence_since(after, self.evidence.since)
+        return self.store.evidence_since(after, self.evidence.since, self.overdue_to)
 
     def _look_ahead(self, model: EngineModel, labelled: Labelled) -> None:
         """Compute beside the cell what a retrain on these begins with: an opening need not wait for it."""
@@ -207,11 +220,9 @@ class ModelVersions:
         """Tell the rule that a part was decided wrongly, whichever way: its check was not reported in time."""
         if made.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
-        self.overdue[made.id] = made
-        if made.lower > 0.0:
-            self.newest.tell_safely(made.lower, 1.0, False, False, 0, int(made.predicted is Action.ACCEPT), made.looked)
-        if made.upper < 1.0:
-            self.newest.tell_safely(0.0, made.upper, True, False, 0, 2 * int(made.predicted is Action.REJECT), made.looked)
+        for told in overdue_evidence(made):
+            self.overdue.add(made.id)
+            self.newest.tell_safely(*told[1:])
 
     def unlearn(self, known: StoredDecision) -> None:
         """Take out the reference of a part whose label waits for the store: it was not what happened."""
@@ -231,10 +242,8 @@ class ModelVersions:
 
     def tell_anew(self) -> None:
         """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
-        known = self.outbox.ask(lambda: self.store.evidence_since(0, self.evidence.since))
+        known = self.outbox.ask(lambda: self.store.evidence_since(0, self.evidence.since, self.overdue_to))
         tell_all(self.newest, lambda: known, self.evidence)
-        for made in list(self.overdue.values()):
-            self.owe(made)
 
     def correct(self, own: bool = True) -> None:
         """Learn the store's newest corrections; a rival is trained anew, by the cell that corrected."""
@@ -310,7 +319,8 @@ class ModelVersions:
 
     def _state(self, model: EngineModel, trained_on: TrainedOn) -> State:
         own = {"corrected_to": np.array(self.corrected_to)} | ({} if self.fleet is None else self.fleet.state())
-        own |= {"owed": np.array(True)} if self.overdue else {}  # an opened engine tells the rule anew, and of these last
+        own |= {"overdue_to": np.array(self.overdue_to)}
+        own |= {"owed": np.array(True)} if self.overdue else {}  # an opened engine tells the rule anew
         return model.get_state() | trained_on.to_state() | own
 
     def _begin_counting(self) -> None:

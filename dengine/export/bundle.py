@@ -26,6 +26,7 @@ from typing import Any
 import torch
 
 from .. import __version__
+from ..decision.code import is_code_changed
 from ..decision.policy import RULES
 from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS, DecisionRule
 from ..errors import ExportError, instead
@@ -92,6 +93,10 @@ def prepared(
         rule = f"{type(model.rule).__name__} with the interval {model.rule.interval!r}"
         do = f"use {' or '.join(SCALAR_BOUNDS)}, and a rule that does"
         raise ExportError(f"{rule} does not compile to TorchScript; {do}.")
+    changed = [each for each in (model.rule, model.spaces.module()) if each is not None and is_code_changed(each)]
+    if changed:
+        named = type(changed[0]).__name__
+        raise ExportError(f"The code of {named} was changed after it was compiled; start Python anew, then export.")
     if model.untold:
         raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
     if model.spaces.module() is None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -28,6 +28,7 @@ from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shor
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, Source, TraceSpec, in_html, trace_in
+from ..store.evidence import rule_past
 from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision, VersionError, unknown_decision
 from ..store.views import HistoryFilter, PastLabel
 from ..traces import WindowGate
@@ -106,14 +107,8 @@ def _novelty(stored: ModelVersion, then: StoredDecision | None) -> Novelty | Non
         return Novelty(*gate.scores(torch.from_numpy(then.trace)).tolist())
 
 
-def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Levels | None:
-    if (policy.guarantee, policy.stops) == ("local", "some") and not part(stored.state, "rule."):
-        return policy.lower_bound, policy.lower_bound  # the paper's rule learns nothing
-    rule = _rule(stored, told, policy)
-    return None if rule is None or rule.evidence is None else (float(rule.evidence.open[0]), float(rule.evidence.open[1]))
-
-
-def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> DecisionRule | None:
+def _restored(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
+    """The rule as a version has it; None where it is another one than the policy's, or had missed something."""
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         return None  # nothing is imported because a store says so; an engine that runs here has imported it
     rule = policy.rule()
@@ -121,19 +116,35 @@ def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Decisi
         restore(rule, part(stored.state, "rule."))
     except StoreError:  # the rule was another one, handed in with its model, or had missed something
         return None
+    return rule
+
+
+def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Levels | None:
+    if (policy.guarantee, policy.stops) == ("local", "some") and not part(stored.state, "rule."):
+        return policy.lower_bound, policy.lower_bound  # the paper's rule learns nothing
+    if (rule := _restored(stored, policy)) is None or rule.evidence is None:
+        return None
     for label in told:
         if not label.quarantined and label.source is not Source.INSPECTION:
             rule.observe(label.silent, label.novel)
             rule.tell(label.lower, label.upper, label.success, label.predicted, label.looked)
-    return rule
+    return float(rule.evidence.open[0]), float(rule.evidence.open[1])
 
 
 def rule_now(store: SqlStore, policy: Policy) -> DecisionRule | None:
     """The rule as it stands now; None before the first version, and where it is not kept."""
-    stored = store.last_version()
-    if stored is None or "untold" in stored.state:  # it missed something: an engine that is opened tells it all anew
+    stored, settings = store.last_version(), store.settings()
+    if stored is None or (rule := _restored(stored, policy)) is None:
         return None
-    return _rule(stored, store.past_labels(stored.last_seq), policy)
+    since, began_in, policy_since = (int(settings.get(name, 0)) for name in ("told_since", "began_in", "policy_since"))
+    past = rule_past(store, stored, since, policy.label_within, policy_since)
+    if not past.told_to:  # as an engine that is opened
+        rule = rule.anew()
+        rule.begin_in(began_in)
+    for told in store.evidence_since(past.told_to, since, past.overdue_to):
+        rule.observe(told.silent, told.novel)
+        rule.tell(told.lower, told.upper, told.success, told.predicted, told.looked)
+    return rule
 
 
 # The envelope: a picture for people, not a test. One sample in twenty of an ordinary success lies outside, by its making.
@@ -260,6 +271,7 @@ class Bound:
 class Circumstances:
     """What a decision is explained by: its engine's settings, and what is known of that moment.
 
+    recipe : with the policy of that moment.
     spec : the traces' contract.  model : what a model that was handed in is called.
     levels : that a bound had to reach, None where that is not kept.  novelty : as in `Explanation`.
     safe_mode : why everything was verified, "" where it was not.
@@ -359,7 +371,7 @@ def _not_finite(made: Decision, trace: NDArray[np.float32], found: Circumstances
 def _outside(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
     x, windows = torch.from_numpy(trace), found.recipe.policy.windows
     left = [str(each) for each in windows if WindowGate([each], found.spec)(x)]
-    return f": it leaves an operator's window, {' and '.join(left) or 'which is set no more'}, whatever the model says."
+    return f": it leaves an operator's window, {' and '.join(left) or 'which is not known'}, whatever the model says."
 
 
 WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]] = {
@@ -461,6 +473,7 @@ class Explanation:
     neighbours : the nearest references of the version that answered, nearest first; none where it is not kept.
     radius : of the ball, None where none was drawn.
     envelope : the band of the known successes; None while there are too few.
+    policy : that was in force when it was made.
     """
 
     decision: StoredDecision
@@ -473,6 +486,7 @@ class Explanation:
     neighbours: tuple[Neighbour, ...]
     radius: float | None
     envelope: Envelope | None
+    policy: Policy
 
     def __repr__(self) -> str:
         made = self.decision.decision
@@ -512,6 +526,9 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     if past is None:
         raise unknown_decision(decision_id)
     made, trace, recipe = past.decision, past.trace, Recipe.from_toml(known["recipe"])
+    changed = store.policy_change_after(decision_id)
+    if changed is not None and changed.data is not None:  # the policy that was in force then
+        recipe = replace(recipe, policy=Policy.from_values(changed.data["old"]))
     channels, samples = trace.shape
     answering = as_it_stood(store, made.model_version, recipe, past) if made.model_version else None
     found = Circumstances(
@@ -535,6 +552,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         neighbours=tuple(_nearest(store, around, answering, neighbours)),
         radius=None if around is None else around.radius,
         envelope=_envelope(store, past, answering, found.spec),
+        policy=recipe.policy,
     )
 
 

@@ -8,6 +8,7 @@ coin behind it.
 """
 
 import copy
+import logging
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -23,11 +24,12 @@ from sklearn.base import clone
 from torch import Tensor, nn
 
 from ..decision.classifier import WilsonRadiusClassifier
+from ..decision.code import is_code_changed
 from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
 from ..decision.references import Counts, RadiusIndex
 from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, model_of_another_version, part, restore, script
-from ..errors import ExportError
+from ..errors import ExportError, listed
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
 from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
@@ -36,6 +38,7 @@ from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, a
 from ..traces import TraceGate, as_labels, as_traces
 from .base import Embedding, EngineModel, Exportable, Gate, Looked, Prediction
 
+log = logging.getLogger("dengine")
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
 NEIGHBOURS = 10
 NEAR = 0.12  # of the distance to the tenth neighbour; of parts of their own about one in two hundred is as near
@@ -135,7 +138,7 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
         (
             name,
             type(module),
-            *sorted((key, repr(value)) for key, value in vars(module).items() if is_compiled_in(key, value)),
+            *sorted((key, _as_key(value)) for key, value in vars(module).items() if is_compiled_in(key, value)),
             *((key, tuple(tensor.shape)) for key, tensor in _tensors_of(module)),
         )
         for name, module in eager.named_modules()
@@ -145,6 +148,20 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
 def is_compiled_in(name: str, value: object) -> bool:
     """Whether scripting compiles an attribute into the code, as it does with plain values and functions."""
     return not name.startswith("_") and isinstance(value, CONSTANTS)
+
+
+def _as_key(value: object) -> object:
+    """A value to compare by; a function itself, for another may later have its address."""
+    return value if isinstance(value, FunctionType) else repr(value)
+
+
+def _compiles(*modules: nn.Module) -> bool:
+    """Whether TorchScript compiles these as they are now; what it compiled before it was changed answers in Python."""
+    changed = [type(module).__name__ for module in modules if is_code_changed(module)]
+    if changed:
+        do = "start Python anew to have it compiled"
+        log.warning("the code of %s was changed after it was compiled: it answers in Python; %s", listed(changed), do)
+    return not changed
 
 
 def _tensors_of(module: nn.Module, recurse: bool = False) -> list[tuple[str, Tensor]]:
@@ -263,7 +280,7 @@ class ModelPrediction(EngineModel):
         blank = self.spaces.blank(X)
         with ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,)) as pool:
             ahead = pool.submit(self.spaces.look_ahead, X, numbers)
-            if blank is not None and self.rule.scriptable and "index" not in vars(self):
+            if blank is not None and self.rule.scriptable and "index" not in vars(self) and _compiles(self.rule, blank):
                 shape, own = X.shape[1:], self.classifier
                 gate = NoveltyGate(*shape)
                 gate.asleep = not self.novelty
@@ -280,7 +297,8 @@ class ModelPrediction(EngineModel):
     def _compile(self) -> Any:
         own, encoder, gate = self.classifier, self.spaces.module(), trace_gate(self.trace_shape)
         around = own.around(self.index, self.rule, self.spaces.scores)
-        scale, compiles = torch.from_numpy(self.scale), self.rule.scriptable
+        scale, compiles = torch.from_numpy(self.scale), self.rule.scriptable and _compiles(self.rule)
+        encoder = encoder if encoder is not None and _compiles(encoder) else None
         if encoder is not None and compiles:
             return compiled(Predictor(gate, encoder, scale, self.gate, around).eval(), self.trace_shape)
         encoder = InPython(self.spaces) if encoder is None else script(encoder)

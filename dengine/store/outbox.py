@@ -99,6 +99,7 @@ class Outbox:
         self._appended = self._synced = self._drained = 0  # how many records so far
         self._to_sync = self._to_drain = 0  # places that somebody waits for
         self._tries = 0  # to sync, that failed
+        self.n_decisions = 0  # number of the newest decision that was recorded
         self._jobs: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._sync_began = math.inf
         self._stuck = self._away = self.doubt = ""  # why the journal, why the store, took nothing; what is not as written
@@ -109,6 +110,8 @@ class Outbox:
         elif store.wait is not None:
             self._doubt_it(store.database.damage())
             self.hold_to_ledger()
+        else:
+            self.n_decisions = store.n_decisions()
 
     def _begin(self, journal: Journal) -> None:
         """Have the store take what an earlier process left, and begin."""
@@ -136,6 +139,7 @@ class Outbox:
                 self._note("journal", f"{journal.damaged} records that are not as they were written were left out")
             journal.clear()
             journal.reserve()
+            self.n_decisions = self.store.n_decisions()
             self.store.database.on_entry = self._mark
             self._mark()
             check = threading.Thread(target=lambda: self._doubt_it(self.store.database.damage()), daemon=True)
@@ -231,7 +235,10 @@ class Outbox:
     # What the engine tells
 
     def decided(self, made: StoredDecision) -> StoredDecision:
-        """Record a decision, as the engine makes it, without waiting, in any thread; returns the first one of its id."""
+        """Record a decision, as the engine makes it, without waiting, in any thread; returns the first one of its id.
+
+        It has its number, or 0 where it is not recorded.
+        """
         id_ = made.decision.id
         with self._changed:
             if (first := self._recent.get(id_)) is not None:
@@ -240,6 +247,8 @@ class Outbox:
             if len(self._unwritten) >= UNWRITTEN:
                 self._unrecorded.add(id_)
             else:
+                self.n_decisions += 1
+                made = replace(made, number=self.n_decisions)
                 self._append([made])
         return made
 
@@ -249,7 +258,7 @@ class Outbox:
             first = self._recent[item.decision.id]
             if not isinstance(self._decisions.get(item.decision.id), StoredDecision):
                 return first
-            made = replace(item, time=first.time, trace=first.trace)
+            made = replace(item, time=first.time, trace=first.trace, number=first.number)
             self._append([made])
         return made
 

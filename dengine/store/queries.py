@@ -123,9 +123,22 @@ def how_looked() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
 SAID: sa.ColumnElement[int | None] = sa.func.nullif(counted(), FORGOTTEN)  # as it counts now; NULL: none, or forgotten
 
 
+# Where a label comes from, as it counts now: an accepted part that was confirmed, and is known to be
+# bad, is one of a stop, which came late.
+_CONFIRMED, _STOP, _BAD = (sa.literal_column(text) for text in ("'confirmed'", "'stop'", "0"))
+SOURCE: sa.ColumnElement[str | None] = sa.case(
+    ((LABEL.c.source == _CONFIRMED) & (counted() == _BAD), _STOP), else_=LABEL.c.source
+)
+
+
 def past_query(cell_id: str) -> sa.Select[Any]:
     """Decisions with their labels, without traces; the columns of `read_decision`."""
-    labels = (SAID.label("success"), LABEL.c.source, LABEL.c.seq.label("label_seq"), LABEL.c.time.label("label_time"))
+    labels = (
+        SAID.label("success"),
+        SOURCE.label("source"),
+        LABEL.c.seq.label("label_seq"),
+        LABEL.c.time.label("label_time"),
+    )
     return sa.select(*DECISION.c, *labels).select_from(WITH_LABELS).where(DECISION.c.cell_id == cell_id)
 
 

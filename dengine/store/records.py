@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from ..decision.certificate import Outcomes as Outcomes  # counted by every store
 from ..errors import DataError, ReportConflictError, ReportError, StoreError, UnknownDecisionError, instead, shortened
 from ..files import read_archive
-from ..records import Decision, RetrainReport, Source
+from ..records import Action, Decision, RetrainReport, Source
 
 SAFE_MODE_BEGAN, SAFE_MODE_ENDED = "safe mode", "safe mode ended"  # kinds of events
+POLICY_CHANGED, SHADOW_CHANGED = "policy", "shadow"  # kinds of events whose data holds the old and the new policy
 T = TypeVar("T")
 NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
 LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)  # what stands, and what comes: silence was no success after all
@@ -28,7 +29,7 @@ FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
 CHUNK = 500  # rows sent or fetched at a time
 KEEP = 5  # newest versions that keep their states
 # Beginnings of names in a version's state: what its maker's parts taught its rule.
-RULE = ("rule.", "untold", "told_to", "owed")
+RULE = ("rule.", "untold", "told_to", "owed", "overdue_to")
 OF_DECISION = ("content_hash", "quarantined", "time")  # of a `StoredDecision`, beside the decision itself
 
 
@@ -88,6 +89,8 @@ class NewLabel:
     point : (d,) where the trace joined the references of `model_version`; None where it did not.
     silent : accepted parts that went on since the previous label, and of which nothing was heard.
     time : when it was reported, in seconds.  content_hash, decided : of its decision, and when that was.
+    overdue_to : number of the newest decision whose check was overdue when the rule was told of the
+        label; None where that is not known.
     """
 
     decision_id: str
@@ -99,6 +102,7 @@ class NewLabel:
     time: float = 0.0
     content_hash: int = 0
     decided: float = 0.0
+    overdue_to: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +117,7 @@ class StoredDecision:
     success, source : the label as it counts, if one was reported: of a corrected one the newest correction's, of a
         forgotten one None, beside the source that it had.
     label_seq, label_time : number of the label, and when it came.
+    number : of the decision, 1, 2, ... in each cell; 0 where that is not known.
     """
 
     decision: Decision = field(metadata={"flat": True})
@@ -124,6 +129,7 @@ class StoredDecision:
     source: Source | None = None
     label_seq: int | None = None
     label_time: float | None = None
+    number: int = field(default=0, repr=False, compare=False, metadata={"apart": True})
 
     when = property(_when)
 
@@ -165,7 +171,8 @@ class News:
 class Evidence(NamedTuple):
     """What became of a decision, as a rule is told of it.
 
-    seq : number of its label, which is `success`.  lower, upper : the bound that it was decided by.
+    seq : number of its label, which is `success`; 0 where a check is overdue.
+    lower, upper : the bound that it was decided by.
     novel : whether it was decided as unlike all that was learned from, `Reason.NOVEL`.
     silent : accepted parts of which nothing was heard between the previous label and this one.
     predicted : position in `Action` of what the model alone would have done.  looked : as `Decision.looked`.
@@ -179,6 +186,18 @@ class Evidence(NamedTuple):
     silent: int
     predicted: int
     looked: float
+
+
+def overdue_evidence(decision: Decision) -> list[Evidence]:
+    """Return what a rule is told of a check that was not reported in time: the decision was wrong, whichever it was."""
+    told = []
+    if decision.lower > 0.0:
+        accepts = int(decision.predicted is Action.ACCEPT)
+        told.append(Evidence(0, decision.lower, 1.0, False, False, 0, accepts, decision.looked))
+    if decision.upper < 1.0:
+        rejects = 2 * int(decision.predicted is Action.REJECT)
+        told.append(Evidence(0, 0.0, decision.upper, True, False, 0, rejects, decision.looked))
+    return told
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,6 +92,7 @@ CORRECTION = _table(  # later words on labels; the newest of a decision counts
     sa.Index("correction_of", "cell_id", "decision_id", "number"),
 )
 CHAINED = {table.name: table for table in (DECISION, TRACE, LABEL, VERSION, EVENT, CORRECTION)}  # rows the ledger chains
+ADDED = {LABEL.c.overdue_to}  # columns that came after the first schema
 LEDGER = sa.Table(  # an entry for every transaction that added rows or changed settings
     "ledger",
     METADATA,
@@ -122,12 +123,24 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
     found = set(sa.inspect(connection).get_table_names())
     # A file belongs to one program; a PostgreSQL database may hold other tables beside ours.
     if found & set(METADATA.tables) or (found and connection.dialect.name == "sqlite"):
+        _add_columns(connection)
         check_schema(connection, name)
     else:
         METADATA.create_all(connection)
     entered = sa.select(SETTING).where(SETTING.c.cell_id == cell_id, SETTING.c.key == SCHEMA_KEY)
     if connection.execute(entered).first() is None:
         connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": SCHEMA_KEY, "value": SCHEMA})
+
+
+def _add_columns(connection: sa.Connection) -> None:
+    """Add the columns that an earlier dengine did not write; they are empty in its rows, whose sums leave them out."""
+    inspector = sa.inspect(connection)
+    for column in ADDED:
+        table = column.table.name
+        names = {each["name"] for each in inspector.get_columns(table)} if inspector.has_table(table) else set()
+        if names >= {"cell_id", "sum"} and column.name not in names:
+            kind = column.type.compile(connection.dialect)
+            connection.execute(sa.text(f'ALTER TABLE "{table}" ADD COLUMN "{column.name}" {kind}'))
 
 
 def check_schema(connection: sa.Connection, name: str) -> None:
@@ -148,5 +161,6 @@ def check_schema(connection: sa.Connection, name: str) -> None:
             do = "a plain copy of a store that is in use lacks what it holds: make it by `dengine backup`"
         raise StoreError(f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; {do}.")
     for table in METADATA.tables.values():
-        if missing := set(table.c.keys()) - found.get(table.name, set()):
+        wanted = {column.name for column in table.c if column not in ADDED}
+        if missing := wanted - found.get(table.name, set()):
             raise StoreError(f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it from a copy.")

@@ -10,7 +10,7 @@ what it decides: that goes into a journal first, and from there, by `take`, into
 import math
 import os
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
@@ -28,6 +28,7 @@ from .peers import must_agree
 from .queries import (
     LABEL_OF_DECISION,
     SAID,
+    SOURCE,
     TRACE_OF_DECISION,
     WITH_LABELS,
     Scope,
@@ -42,6 +43,8 @@ from .records import (
     CHUNK,
     FORGOTTEN,
     KEEP,
+    POLICY_CHANGED,
+    SHADOW_CHANGED,
     Change,
     Correction,
     Event,
@@ -61,6 +64,7 @@ from .records import (
     from_row,
     keeps_state,
     nothing_to_correct,
+    overdue_evidence,
     read_decision,
     to_npz,
     to_row,
@@ -274,31 +278,56 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
     # What became of decisions
 
-    def evidence_since(self, seq: int, since_version: int = 0) -> list[Evidence]:
+    def evidence_since(self, seq: int, since_version: int = 0, overdue_to: int = 0) -> list[Evidence]:
         """Return what a rule is told of the labels after number `seq`, in their order, of this cell alone.
 
         It is not told of rejected parts, of which those come back that somebody chose.
+        overdue_to : number of the newest decision whose check is overdue; each such check comes where the running engine
+            told the rule of it, which the labels after it know.
         A level that other cells' streams certify says nothing certain of this one's, and a watch that counts them would
         notice too late that this cell has changed.
         """
         label = counted()
         novel = DECISION.c.reason == Reason.NOVEL.value
         of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label == 1, novel, LABEL.c.silent, *how_looked())
+        # A label that does not know came right after its decision, as most do.
+        known_overdue = sa.func.coalesce(LABEL.c.overdue_to, DECISION.c.number)
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > int(seq))
         mine &= LABEL.c.source != Source.INSPECTION.value
-        query = sa.select(*of).select_from(LABEL.join(DECISION, LABEL_OF_DECISION)).where(mine, label != FORGOTTEN)
-        rows = self._read(query.where(DECISION.c.model_version >= since_version).order_by(LABEL.c.seq))
-        return [Evidence(*row) for row in rows]
+        query = sa.select(*of, known_overdue).select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
+        query = query.where(mine, label != FORGOTTEN, DECISION.c.model_version >= since_version)
+        rows = self._read(query.order_by(LABEL.c.seq))
+        overdue = deque(each for each in self.owed(since_version) if each.number <= overdue_to) if overdue_to else deque()
+        told: list[Evidence] = []
+        for *values, known in rows:
+            while overdue and overdue[0].number <= known:
+                told += overdue_evidence(overdue.popleft().decision)
+            told.append(Evidence(*values))
+        return told + [each for owed in overdue for each in overdue_evidence(owed.decision)]
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first, without the quarantined ones."""
         return [row.id for row in self._read(self._unheard_of(Action.ACCEPT, since_version, DECISION.c.id))]
 
-    def owed(self, since_version: int = 0) -> list[tuple[StoredDecision, int]]:
-        """Return the decisions whose checks were not reported, oldest first, and how many came since each."""
-        newer = (n_decisions(self.cell_id) - DECISION.c.number).label("newer")
-        rows = self._read(self._unheard_of(Action.VERIFY, since_version, *DECISION.c, newer))
-        return [(read_decision(row), row.newer) for row in rows]
+    def owed(self, since_version: int = 0) -> list[StoredDecision]:
+        """Return the decisions whose checks were not reported, oldest first."""
+        return [read_decision(row) for row in self._read(self._unheard_of(Action.VERIFY, since_version, *DECISION.c))]
+
+    def overdue_to(self, within: int, since_version: int = 0) -> int:
+        """Return the number of the newest decision whose check is overdue, as far as the labels and the decisions tell.
+
+        within : decisions after which it is.  since_version : the first version since `within` is in force.
+        """
+        newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(DECISION.c.cell_id == self.cell_id)
+        last = self._read(newest.order_by(DECISION.c.number.desc()).limit(1))
+        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(LABEL.c.cell_id == self.cell_id)
+        known = self._read(of_labels)[0][0] or 0
+        counted_since = bool(last) and last[0].model_version >= since_version
+        return max(known, last[0].number - within) if counted_since else known
+
+    def n_decisions(self) -> int:
+        """Return the number of the newest decision; 0 before the first."""
+        return self._read(sa.select(n_decisions(self.cell_id)))[0][0] or 0
 
     def _unheard_of(self, action: Action, since_version: int, *columns: Any) -> sa.Select[Any]:
         query = sa.select(*columns).select_from(WITH_LABELS).where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
@@ -451,6 +480,15 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = sa.select(EVENT).where(EVENT.c.cell_id == self.cell_id).order_by(EVENT.c.number.desc()).limit(limit)
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
 
+    def policy_change_after(self, decision_id: str) -> Event | None:
+        """Return the first change of the policy after a decision, whatever the clock said; None: there was none."""
+        mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.id == decision_id)
+        decided = sa.select(DECISION.c.entry).where(mine).scalar_subquery()  # entries of the ledger are in their order
+        kinds = EVENT.c.kind.in_((POLICY_CHANGED, SHADOW_CHANGED)) & EVENT.c.data.is_not(None)
+        query = sa.select(EVENT).where(EVENT.c.cell_id == self.cell_id, kinds, EVENT.c.entry > decided)
+        rows = self._read(query.order_by(EVENT.c.number).limit(1))
+        return from_row(Event, rows[0]._mapping) if rows else None
+
     def record(self, change: Change) -> int:
         """Commit what a person changed, all or none, together with its event; returns the event's number.
 
@@ -543,9 +581,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         newest = n_decisions(self.cell_id)
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label("aged")
         columns = DECISION.c["action", "predicted", "reason", "audit", "quarantined"]
-        kind = (*columns, aged, SAID.label("success"), LABEL.c.source, sa.func.count().label("n"))
+        kind = (*columns, aged, SAID.label("success"), SOURCE.label("source"), sa.func.count().label("n"))
         times = sa.func.min(DECISION.c.time), sa.func.max(DECISION.c.time), sa.func.max(LABEL.c.time)
-        query = sa.select(*kind, *times).select_from(WITH_LABELS).group_by(*columns, "aged", SAID, LABEL.c.source)
+        query = sa.select(*kind, *times).select_from(WITH_LABELS).group_by(*columns, "aged", SAID, SOURCE)
         query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version)
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
         first, latest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))

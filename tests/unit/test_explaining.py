@@ -209,3 +209,28 @@ def test_a_planted_excess_is_found_where_and_how_far_it_is() -> None:
     assert found.not_finite == 3
     assert sorted((each.from_s, each.to_s, each.above) for each in found.excesses) == [(10, 11, True), (12, 14, False)]
     assert envelope_of(X[:19], trace, 1.0) is envelope_of(X, trace[:, :49], 1.0) is None
+
+
+@pytest.mark.parametrize("clock_goes", [1.0, 0.0, -1.0], ids=["on", "not", "back"])
+def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_made(
+    make_data, tmp_path: Path, clock_goes: float
+) -> None:
+    times = iter(np.arange(1e6) * clock_goes + 1e9)
+    data, window = make_data(260, samples=60), "0:0.1:-1000:1000"
+    engine = played(SqlStore(str(tmp_path / "e.db"), clock=lambda: float(next(times))), data, RECIPES["local"])
+    (past,) = engine.history(last=1, action="accept")
+    trace, policies, ids = engine.find(past.decision.id).trace, [engine.policy], [past.decision.id]
+    changes = [{"lower_bound": 0.95}, {"shadow": True}, {"shadow": False, "windows": (window,)}, {"alpha": 0.3}]
+    for change in changes:
+        engine.set_policy(replace(engine.policy, **change))
+        policies.append(engine.policy)
+        ids.append(engine.decide(trace).id)
+    engine.close()
+    with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
+        assert [engine.explain(id_).policy for id_ in ids] == policies
+        first = engine.explain(ids[0])
+        assert first.bound.accept_at == 0.9
+        assert first.bound.successes_needed == 0
+        assert "lower must be at least 0.9 (" in said_of(first)
+        assert "present settings" not in said_of(first)
+        assert engine.explain(ids[1]).bound.accept_at == 0.95

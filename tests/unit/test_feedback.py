@@ -1,7 +1,9 @@
 """What becomes of parts: silence, confirmation, late stops, safe mode, parts that come twice, the certificate."""
 
 import shutil
+import sqlite3
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,11 +11,14 @@ import numpy as np
 import pytest
 
 from dengine import Action, DataEngine, Dataset, Decision, Policy, Reason, Recipe, Source, load_dataset
+from dengine.engine import feedback
 from dengine.errors import ReportError, StoreError
 from dengine.folds import content_hash, fold_of, part_hash
 from dengine.history.status import status
 from dengine.model.neighbours import repeats_note
 from dengine.store import SqlStore
+from dengine.store.records import NewLabel
+from dengine.store.verification import verify_history
 from tests.support.driving import drive as play
 
 LOCAL = Policy(alpha=0.1, lower_bound=0.9)
@@ -108,9 +113,16 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     assert beyond(engine) == [0, 0]
     held, labels = engine.store.get_decision(stopped.id), engine.model.index.held("labels")
     assert (held.success, engine.store.labelled().labels[held.label_seq - 1]) == (False, 0)
+    (past,) = [past for past in engine.history() if past.decision.id == stopped.id]
+    assert {held.source, past.source, engine.find(stopped.id).source} == {Source.STOP}
+    assert engine.status().sources["stop"] == engine.status().ever.stops == engine.store.tally().outcomes.stops
+    with pytest.raises(ReportError, match="failure from stop was reported first and stands, now came failure from stop"):
+        engine.report(stopped.id, False)
     assert labels[engine.model.index.held("numbers") == held.label_seq].tolist() == [0]
     assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.stops > 0
     engine.close()
+    with DataEngine.open(tmp_path / "late.db", replaying=True) as engine:
+        assert (engine.find(stopped.id).source, engine.find(stopped.id).success) == (Source.STOP, False)
 
 
 def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_it_is(stream: Dataset, tmp_path) -> None:
@@ -141,6 +153,150 @@ def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_i
     engine.flush()
     engine.decide(stream.X[0])
     assert engine.model.rule.evidence.told.sum() == 0
+
+
+HISTORIES = {
+    "local": replace(LOCAL, stops="all"),
+    "pooled": POOLED,
+    "pooled, audits": replace(POOLED, stops="some", audit_rate=0.3),
+    "cost": replace(POOLED, guarantee="cost", prices=(5.0, 40.0, 30.0)),
+    "cost, audits": replace(POOLED, guarantee="cost", stops="some", audit_rate=0.3, prices=(5.0, 40.0, 30.0)),
+}
+
+
+def learned(engine: DataEngine, probes: np.ndarray) -> tuple:
+    """What an engine's rule was told, and what it says of some traces."""
+    rule = {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
+    return rule, engine.model.predict_many(probes), engine.safe_mode, engine.new_labels, engine.version
+
+
+class RandomHistory:
+    """A cell whose checks come late or never, whose people correct, and which is opened again now and then.
+
+    compared : how often a copy of its store was opened while checks were overdue, and was as the engine that ran.
+    """
+
+    def __init__(self, policy: Policy, folder: Path, probes: np.ndarray, seed: int) -> None:
+        (folder / "running").mkdir()
+        self.rng, self.folder, self.probes, self.compared = np.random.default_rng(seed), folder, probes, 0
+        self.engine = make(replace(policy, label_within=8), store=folder / "running" / "e.db")
+        self.owed: dict[str, bool] = {}
+        self.labelled: list[str] = []
+        self.steps = {
+            self.report_late: 0.05,
+            self.correct: 0.02,
+            self.forget: 0.01,
+            self.change_policy: 0.01,
+            self.roll_back: 0.02,
+            self.compare: 0.05,
+            self.reopen: 0.02,
+        }
+
+    def play(self, x: np.ndarray, success: bool) -> None:
+        """One part, and what happens by chance after it."""
+        decision = self.engine.decide(x)
+        if decision.action is Action.ACCEPT and not success and self.rng.random() < 0.8:
+            self.report(decision.id, False)
+        elif decision.action is Action.VERIFY and self.rng.random() < 0.7:
+            self.report(decision.id, success)
+        elif decision.action is Action.VERIFY:
+            self.owed[decision.id] = success
+        for step, often in self.steps.items():
+            if self.labelled and self.rng.random() < often:
+                step()
+
+    def report(self, id_: str, success: bool) -> None:
+        self.engine.report(id_, success)
+        self.labelled.append(id_)
+
+    def report_late(self) -> None:
+        if self.owed:
+            late = str(self.rng.choice(list(self.owed)))
+            self.report(late, self.owed.pop(late))
+
+    def correct(self) -> None:
+        self.engine.correct(str(self.rng.choice(self.labelled)), bool(self.rng.random() < 0.5))
+
+    def forget(self) -> None:
+        self.engine.forget(str(self.rng.choice(self.labelled)))
+
+    def change_policy(self) -> None:
+        self.engine.set_policy(replace(self.engine.policy, label_within=int(self.rng.integers(1, 20))))
+
+    def roll_back(self) -> None:
+        if self.engine.version > 1:
+            self.engine.rollback(int(self.rng.integers(max(1, self.engine.version - 2), self.engine.version)))
+
+    def compare(self) -> None:
+        self.engine.flush()
+        if self.engine.model is not None:
+            copied = self.folder / f"copy {self.rng.integers(10**9)}"
+            shutil.copytree(self.folder / "running", copied)
+            with DataEngine.open(copied / "e.db", replaying=True) as again:
+                assert learned(again, self.probes) == learned(self.engine, self.probes)
+                assert again._versions.overdue == self.engine._versions.overdue
+            self.compared += bool(self.engine._versions.overdue)
+
+    def reopen(self) -> None:
+        self.engine.close()
+        self.engine = DataEngine.open(self.folder / "running" / "e.db", replaying=True)
+
+
+@pytest.mark.parametrize("policy", HISTORIES.values(), ids=HISTORIES)
+def test_in_random_histories_with_overdue_checks_a_reopened_engine_is_the_one_that_ran(
+    stream: Dataset, tmp_path: Path, policy: Policy
+) -> None:
+    history = RandomHistory(policy, tmp_path, stream.X[:20], seed=1)
+    for x, success in zip(stream.X[:220], stream.y.tolist(), strict=False):
+        history.play(x, success == 1)
+    assert history.compared > 0
+    history.engine.close()
+
+
+@pytest.mark.parametrize("policy", [replace(LOCAL, stops="all"), POOLED], ids=["local", "pooled"])
+def test_neither_a_restart_nor_a_correction_sends_a_healthy_cell_with_overdue_checks_into_safe_mode(
+    stream: Dataset, tmp_path: Path, policy: Policy
+) -> None:
+    engine, checks = make(replace(policy, label_within=50), store=tmp_path / "e.db"), 0
+    for x, success in zip(stream.X, stream.y.tolist(), strict=True):
+        decision = engine.decide(x)
+        if decision.action is Action.ACCEPT and not success:
+            engine.report(decision.id, False)
+        elif decision.action is Action.VERIFY:
+            checks += 1
+            if checks % 10:
+                engine.report(decision.id, success)
+                last = decision.id, success
+    assert (engine.safe_mode, engine._versions.overdue != set()) == ("", True)
+    engine.close()
+    engine = DataEngine.open(tmp_path / "e.db", replaying=True)
+    assert engine.safe_mode == ""
+    engine.correct(last[0], not last[1])
+    engine.correct(*last)
+    assert engine.safe_mode == ""
+
+
+def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_not_know_of_overdue_checks(
+    stream: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feedback, "NewLabel", lambda *given, overdue_to: NewLabel(*given))
+    engine, checks = make(replace(POOLED, label_within=50), store=tmp_path / "e.db"), 0
+    for x, success in zip(stream.X, stream.y.tolist(), strict=True):
+        decision = engine.decide(x)
+        checks += decision.action is Action.VERIFY
+        if not success if decision.action is Action.ACCEPT else checks % 10:
+            engine.report(decision.id, bool(success))
+    engine.close()
+    monkeypatch.undo()
+    with closing(sqlite3.connect(tmp_path / "e.db")) as earlier:
+        earlier.execute("ALTER TABLE label DROP COLUMN overdue_to")
+    assert verify_history(str(tmp_path / "e.db")).ok
+    with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
+        assert (engine.safe_mode, len(engine._versions.overdue) > 5) == ("", True)
+        told = [each.seq for each in engine.store.evidence_since(0, 0, 450)]
+        assert told[-5:] == sorted(told[-5:])  # not last, in one burst
+        engine.report(engine.decide(stream.X[0]).id, True)
+    assert verify_history(str(tmp_path / "e.db")).ok
 
 
 def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(stream: Dataset) -> None:

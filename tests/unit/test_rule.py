@@ -1,7 +1,10 @@
 """The decision rule: one formula in every form it takes, and an object that is asked, told and restored."""
 
+import importlib
+import linecache
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from hypothesis import strategies as st
 from dengine import INTERVALS, Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, export_torchscript
 from dengine.decision.rule import SCALAR_BOUNDS, DecisionRule, action_of
 from dengine.errors import ExportError, SettingError
+from dengine.model.neighbours import ModelPrediction
 
 counts = st.integers(0, 5000)
 alphas = st.sampled_from([0.01, 0.05, 0.1, 0.2, 0.5])
@@ -148,3 +152,92 @@ def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(outsi
 def test_a_rule_that_cannot_be_had_is_named(name: str, message: str) -> None:
     with pytest.raises(SettingError, match=message):
         DataEngine(recipe=recipe_with("local").with_policy(guarantee=name))
+
+
+RULE = """
+import torch
+from torch import nn
+from dengine.decision.rule import DecisionRule
+import {limits}
+
+
+def helper(x: float) -> float:
+    return x
+
+
+class Part(nn.Module):
+    def forward(self, x: float) -> float:
+        return x
+
+
+class MyRule(DecisionRule):
+    def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
+        super().__init__(alpha, lower_bound, interval)
+        self.part = Part()
+
+    def action(self, lower: float, upper: float) -> int:
+        return {accept} if helper(self.part(lower)) >= {limits}.LIMIT else 0
+"""
+
+
+def lower_by_one(self: object, x: float) -> float:
+    return x - 1.0
+
+
+def rejects(self: object, lower: float, upper: float) -> int:
+    return 2
+
+
+CHANGES = {  # of a rule's module, whose rule accepts: what is replaced, by what, and the action then
+    "a constant of a module": (lambda rules: rules.limits, "LIMIT", 2.0, Action.VERIFY),
+    "a function": (lambda rules: rules, "helper", lambda x: x - 1.0, Action.VERIFY),
+    "a helper's method": (lambda rules: rules.Part, "forward", lower_by_one, Action.VERIFY),
+    "its own method": (lambda rules: rules.MyRule, "action", rejects, Action.REJECT),
+}
+
+
+def rule_module(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, accept: int = 1) -> ModuleType:
+    """A module of an outside author with `MyRule`, and beside it the constant that it reads."""
+    monkeypatch.syspath_prepend(str(folder))
+    (folder / f"limits_{name}.py").write_text("LIMIT = 0.5\n", encoding="utf-8")
+    (folder / f"{name}.py").write_text(RULE.format(limits=f"limits_{name}", accept=accept), encoding="utf-8")
+    module = importlib.import_module(name)
+    module.limits = getattr(module, f"limits_{name}")
+    return module
+
+
+def says(rule: type[DecisionRule], data: Dataset) -> tuple[Action, ModelPrediction]:
+    """What a model under this rule decides on a trace whose neighbours are good."""
+    model = ModelPrediction("pca", rule=rule(0.2, 0.8), novelty=0.0).fit(data.X, np.ones(len(data), dtype=int))
+    return model.decide(good(data)[None])[0], model
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_rule_whose_code_was_changed_in_this_process_is_asked_as_it_is_now_and_not_exported_as_it_was(
+    data: Dataset, tmp_path: Path, monkeypatch, what: str
+) -> None:
+    owner, name, value, action = CHANGES[what]
+    rules = rule_module(tmp_path, monkeypatch, f"rules_{list(CHANGES).index(what)}")
+    assert says(rules.MyRule, data)[0] is Action.ACCEPT
+    monkeypatch.setattr(owner(rules), name, value)
+    found, model = says(rules.MyRule, data)
+    assert found is action
+    with pytest.raises(ExportError, match="MyRule was changed after it was compiled; start Python anew"):
+        export_torchscript(model, tmp_path / "model.ts")
+
+
+def test_two_rules_of_one_name_and_a_notebook_cell_that_is_run_again_are_each_asked_for_themselves(
+    data: Dataset, tmp_path: Path, monkeypatch
+) -> None:
+    accepts, rejects = (rule_module(tmp_path, monkeypatch, name, action) for name, action in (("rule_a", 1), ("rule_b", 2)))
+    assert [says(module.MyRule, data)[0] for module in (accepts, rejects)] == [Action.ACCEPT, Action.REJECT]
+    said = []
+    for number, action in enumerate((1, 2, 0)):
+        cell, named = RULE.format(limits="math", accept=action).replace("math.LIMIT", "0.5"), f"<cell {number}>"
+        monkeypatch.setitem(linecache.cache, named, (len(cell), None, cell.splitlines(keepends=True), named))
+        notebook: dict[str, type[DecisionRule]] = {"__name__": "__main__"}
+        exec(compile(cell, named, "exec"), notebook)  # as a notebook does
+        found, model = says(notebook["MyRule"], data)
+        assert model.is_compiled
+        said.append(found)
+    assert said == [Action.ACCEPT, Action.REJECT, Action.VERIFY]
