@@ -225,8 +225,10 @@ def backup(store: str, out: Path) -> None:
     report = backup_store(store, out)
     text = f"{out}: {report.decisions:,} decisions and {report.labels:,} labels"
     lines = [f"{text}; {report.from_journals:,} records came from journals that lie beside the store."]
-    for cell in report.without_journal:
-        lines.append(f"No journal of cell {cell} lies beside {store}: what it held, if anything, is not in the copy.")
+    lines += [
+        f"No journal of cell {cell} lies beside {store}: what it held, if anything, is not in the copy."
+        for cell in report.without_journal
+    ]
     tell({"store": store, "out": out} | asdict(report), *lines, f"Check it: dengine verify {out}")
 
 

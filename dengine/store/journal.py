@@ -147,9 +147,10 @@ class Journal:
             self._file.write(self._header(), 0)
         if newest is None:
             return
-        with suppress(OSError):  # an older head is no harm
-            with os.fdopen(open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT), "wb") as head:
-                head.write(json.dumps(newest).ljust(HEADER).encode())
+        path = head_path(self.path)
+        # An older head is no harm.
+        with suppress(OSError), os.fdopen(open_plain(path, os.O_WRONLY | os.O_CREAT), "wb") as head:
+            head.write(json.dumps(newest).ljust(HEADER).encode())
 
     def clear(self) -> None:
         """Forget all records; the store holds them now. `reserve` then makes room, on the disk, for others."""

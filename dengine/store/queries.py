@@ -125,7 +125,9 @@ SAID: sa.ColumnElement[int | None] = sa.func.nullif(counted(), FORGOTTEN)  # as 
 
 # Where a label comes from, as it counts now: an accepted part that was confirmed, and is known to be
 # bad, is one of a stop, which came late.
-_CONFIRMED, _STOP, _BAD = (sa.literal_column(text) for text in ("'confirmed'", "'stop'", "0"))
+_CONFIRMED: sa.ColumnElement[str] = sa.literal_column("'confirmed'")
+_STOP: sa.ColumnElement[str] = sa.literal_column("'stop'")
+_BAD: sa.ColumnElement[int] = sa.literal_column("0")
 SOURCE: sa.ColumnElement[str | None] = sa.case(
     ((LABEL.c.source == _CONFIRMED) & (counted() == _BAD), _STOP), else_=LABEL.c.source
 )

@@ -15,7 +15,7 @@ FILES = {".".join(file.relative_to(REPO).with_suffix("").parts): file for file i
 MODULES = {name: ast.parse(file.read_text("utf-8")) for name, file in FILES.items()}  # a family's is named NAME.__init__
 
 
-NODES = 215_000
+NODES = 240_000
 KNOWN = {name.removesuffix(".__init__") for name in MODULES} - {"dengine"}
 
 
