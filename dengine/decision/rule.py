@@ -6,40 +6,21 @@
 It compiles to TorchScript: the engine, the scikit-learn classifier and the exported file run the same lines. A rule is
 asked (`forward`), told what became of a decision (`tell`) and restored (its buffers, by `state_dict`).
 
-*Local.* The paper's rule, of the ball around one trace; it learns nothing.
+*Local.* The paper's rule, about the neighbourhood of one trace. It learns nothing.
 
-*Pooled.* A score sorts traces: it need only be fixed before the part's own label. Levels of it go down from LB in steps of
-half the tolerance. One of them is aimed at: the lowest of which the parts that reached it were good enough, by all that was
-told. *Members* are the parts that reached the level aimed at, accepted or checked. While a bettor's capital against "the
-members' mean failure probability is beyond the tolerance" is at least 1 / alpha, parts that reach the level are accepted.
+*Pooled.* With confidence 1 - alpha, whenever the rule accepts a part, the members so far (the parts whose score reached the
+level aimed at, accepted or checked) have failed with a mean probability of at most 1 - LB. The rule accepts only while the
+capital of a bet against the opposite is at least 1 / alpha. Statement, assumptions, proof and references:
+docs/explanation/pooled_proof.md.
 
-That spends alpha once, whatever the truth does, and whatever chose the levels. Let F be all that was told before a part, p
-its failure probability given F, x = 1 if it is bad and its outcome is asked for, and q the probability of that, given F. A
-member has the factor 1 + l (theta - x / q), of mean 1 + l (theta - p) given F; with a constant l, the product over members
-of factor / (1 + l (theta - p)) is a martingale M from 1, for who is a member is known from F. The logarithm is concave: at
-every n at which the running mean of the members' p is theta or more, the product of 1 + l (theta - p) is at most 1, so that
-capital <= M, and by Ville's inequality M ever reaches 1 / alpha with probability alpha at most. A mixture of several l is a
-mixture of such M. Constant l is what makes it the plain mean: an audit, of q below 1, bets l / q, a part that was checked
-only l, and who stays silent nothing. (Waudby-Smith and Ramdas, 2024, JRSS B 86(1); inverse probability weights in
-bets: Waudby-Smith et al., 2024, arXiv:2210.10768; thresholds by bets on audits: Xu et al., 2024, arXiv:2406.10490.)
+*Priced.* An account of the members, in false accepts, replaces the bet: what accepting them all would have cost beyond
+checking them all. The rule accepts while it stands at `ADVANCE` or less; see the same page.
 
-So under `stops="some"` a stop or a confirmation, which came unasked, is no evidence. What came before a level was aimed
-at does not help a level that came later. Rejections are the mirror image; where audits do not weigh, nobody looks at what
-is rejected: its members are those checked, and no claim is made of what was rejected. Beside it, the newest 50 told of a
-level may hold at most so many wrong ones, or it is not aimed at: a mean of all members is slow to notice drift.
-
-*Priced.* Levels from where an error is expected to cost as much as a check upwards, `Policy.tolerances`; and an account in
-place of the bet. With theta = check / escape, it is the sum of x / q - theta over the members that were asked for: what
-accepting them all would have cost beyond checking them all, in escapes. Parts that reach the level are accepted while it
-stands at `ADVANCE` or less. Where every outcome is known (q = 1), that is no statement of chance: at each accept the
-members before it had cost at most so many escapes more than their checks, whatever the truth does. Where audits tell, it is
-so of an unbiased estimate. A bet must be won before anything is accepted, and the parts checked for it cost more than its
-certainty is worth. What rejecting costs is counted likewise, without an advance.
-
-*Safe mode.* A claim on the mean of all members is slow to notice drift. So what is accepted is watched by a restarting
-test, a CUSUM against twice the tolerance (`certificate.cusum`), and so is the share of novel traces. At an alarm everything
-is verified, and what held must be shown anew, by members decided since: by each side for itself. The safe mode lasts until
-the side that alarmed has done so, and after too many novel traces until these are few and either side has.
+*Safe mode.* A mean over all members reacts late to drift. So a restarting test, a CUSUM against twice the tolerance
+(`certificate.cusum`), watches what is accepted and what is rejected, and another one the share of novel traces. After an
+alarm everything is verified until members decided since show again that the tolerance is kept, each side for itself. The
+safe mode ends when the side that alarmed has shown it; after too many novel traces, when these are few again and either
+side has.
 """
 
 import math
