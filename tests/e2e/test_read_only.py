@@ -1,11 +1,13 @@
 """A store in a folder, or a file, that cannot be written is read; who would write to it is refused."""
 
+import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,22 +22,20 @@ LOCKED = {"a folder": (0o555, 0o644), "a file": (0o755, 0o444), "both": (0o555, 
 CASES = [(left, locked) for left in LEFT for locked in LOCKED]
 
 
-def dengine(*words: object) -> subprocess.CompletedProcess[str]:
-    """A verb, typed by somebody whom permission bits bind."""
+def dengine(*commands: Sequence[object]) -> list[dict[str, Any]]:
+    """Verbs, typed by somebody whom permission bits bind; the result of each."""
     bound: list[str] = []
     if os.geteuid() == 0:
         bound = AS_A_USER
         if shutil.which("setpriv") is None or subprocess.run([*bound, "true"], capture_output=True, check=False).returncode:
             pytest.skip("permission bits do not bind root, and setpriv cannot take its rights away")
     environment = os.environ | {"PYTHONPATH": str(REPO), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [*bound, sys.executable, "-m", "dengine", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-
-
-def well(*words: object) -> str:
-    done = dengine(*words)
+    words = json.dumps([[str(word) for word in command] for command in commands])
+    command = [*bound, sys.executable, "-m", "tests.support.verbs", words]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
-    return done.stdout
+    results: list[dict[str, Any]] = json.loads(done.stdout)
+    return results
 
 
 @pytest.fixture(scope="module")
@@ -70,17 +70,27 @@ def store(request: pytest.FixtureRequest, made: dict[str, Path], tmp_path: Path)
 
 def test_what_only_reads_reads_it_and_leaves_it_as_it_is(store: Path, tmp_path: Path) -> None:
     before = {file.name: file.read_bytes() for file in store.parent.iterdir() if not file.name.endswith("-shm")}
-    assert '"decisions": 60' in well("status", store, "--json")
-    assert "60" in well("data", store)
-    newest = well("history", store, "--last", 1, "--json")
+    *results, refused = dengine(
+        ("status", store, "--json"),
+        ("data", store),
+        ("history", store, "--last", 1, "--json"),
+        ("explain", store, "last", "--json"),
+        ("verify", store, "--json"),
+        ("policy", store, "--json"),
+        ("backup", store, "--out", tmp_path / "copy.db", "--json"),
+        ("policy", store, "--alpha", "0.2"),
+    )
+    assert all(result["exit_code"] == 0 for result in results), results
+    status, data, newest, explained, verified, policy, copied = (result["output"] for result in results)
+    assert '"decisions": 60' in status
+    assert "60" in data
     (id_,) = [line.split('"')[3] for line in newest.splitlines() if line.strip().startswith('"id":')]
-    assert id_ in well("explain", store, id_, "--json")
-    assert '"ok": true' in well("verify", store, "--json")
-    assert '"lower_bound"' in well("policy", store, "--json")
-    assert '"labels": 60' in well("backup", store, "--out", tmp_path / "copy.db", "--json")
+    assert id_ in explained
+    assert '"ok": true' in verified
+    assert '"lower_bound"' in policy
+    assert '"labels": 60' in copied
     if not store.stat().st_mode & 0o200:  # else SQLite brings the log into it
         assert {name: (store.parent / name).read_bytes() for name in before} == before
-    refused = dengine("policy", store, "--alpha", "0.2")
-    assert refused.returncode == 1
-    assert "writable" in refused.stderr
-    assert "Traceback" not in refused.stderr
+    assert refused["exit_code"] == 1
+    assert "writable" in refused["output"]
+    assert not refused["unforeseen"]

@@ -3,6 +3,7 @@
 `tests/support/without_posix` says what is hidden; there is a lock as Windows has it, or none of Python's own.
 """
 
+import json
 import os
 import signal
 import subprocess
@@ -146,7 +147,7 @@ def test_the_verbs_do_their_work(tmp_path: Path, make_data) -> None:
     data = make_data(60, samples=80)
     np.savez(tmp_path / "parts.npz", X=data.X, y=data.y)
     store = tmp_path / "engine.db"
-    for words in (
+    commands = [
         ("train", "--data", tmp_path / "parts.npz", "--store", store, "--reducer", "pca"),
         ("status", store),
         ("history", store, "--last", 3),
@@ -156,5 +157,8 @@ def test_the_verbs_do_their_work(tmp_path: Path, make_data) -> None:
         ("run", "--cell", "replay", "--data", tmp_path / "parts.npz", "--cycles", 5, "--store", tmp_path / "run.db"),
         ("export", store, "--out", tmp_path / "model.ts"),
         ("replay", "--data", tmp_path / "parts.npz", "--reducer", "pca", "--repeats", 1, "--cycles", 40),
-    ):
-        python("-m", "dengine", *words)
+    ]
+    words = json.dumps([[str(word) for word in command] for command in commands])
+    results = json.loads(python("-m", "tests.support.verbs", words).splitlines()[-1])
+    assert [result for result in results if result["exit_code"] != 0] == []
+    python("-m", "dengine", "status", store)  # as it is typed

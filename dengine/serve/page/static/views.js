@@ -144,9 +144,9 @@ function detail(found, level) {
   ];
 }
 
-async function explanation(get, id) {
-  const found = await get(`explanations/${encodeURIComponent(id)}`);
-  return { ...found, windows: found.policy.windows };
+// The picture shows the windows that are set now, over parts of before too.
+async function explanation(get, id, doing) {
+  return { ...await get(`explanations/${encodeURIComponent(id)}`), windows: doing.recipe.policy.windows };
 }
 
 // The views: each is asked with `get`, the query of the address, and the status, and gives its title and its elements
@@ -158,7 +158,7 @@ async function now(get, _, doing) {
       el("p", {}, "As soon as the robot sends a trace, the decision on it stands here."));
     return { title: "Now", shown: [waiting] };
   }
-  const found = await explanation(get, decisions[0].id);
+  const found = await explanation(get, decisions[0].id, doing);
   const { decision } = found;
   const name = decision.part === null ? "Part without a number" : `Part ${decision.part}`;
   const card_ = el("section", { class: `decision ${decision.action}`, id: "now-decision", "data-part": true, "aria-labelledby": "decision",
@@ -244,7 +244,7 @@ async function overview(get, query, doing) {
 
 async function map(get, query, doing) {
   const chosen = query.get("id") ?? "";
-  const [found, part] = await Promise.all([get("embedding"), chosen ? explanation(get, chosen).catch(() => null) : null]);
+  const [found, part] = await Promise.all([get("embedding"), chosen ? explanation(get, chosen, doing).catch(() => null) : null]);
   const legend = [["good", "●", "good"], ["bad", "✕", "bad"], ["none", "■", "not known"], ["", "○", "newest parts"]].map(([kind, sign, text]) =>
     el("li", { class: kind && `label ${kind}` }, el("span", { "aria-hidden": "true" }, sign), text));
   if (found.radius !== null) legend.push(el("li", {}, el("span", { class: "swatch ring", "aria-hidden": "true" }), "ball in which labels are counted"));
@@ -261,7 +261,7 @@ async function map(get, query, doing) {
 }
 
 async function part(get, query, doing) {
-  const found = await explanation(get, query.get("id") ?? "");
+  const found = await explanation(get, query.get("id") ?? "", doing);
   const name = nameOf(found.decision.part, found.decision.id);
   return { title: `Part ${name}`, shown: [el("article", { class: "card part", id: "part", "data-part": true }, el("h1", {}, `Part ${name}`), detail(found, 2))] };
 }
