@@ -118,10 +118,8 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
         end_interrupted(f"Interrupted: {there}; the same command goes on from there.")
     asked: dict[str, Any] = {"recipe": choice.if_asked(), "allow_import": allow_import}
     with DataEngine.open_or_create(store, wait=UNHURRIED, **asked) as engine:
-        name, record = (
-            short_name(engine.recipe.name),
-            {"store": store, "faults": data.faults, "notes": data.notes, "import": imported},
-        )
+        name = short_name(engine.recipe.name)
+        record = {"store": store, "faults": data.faults, "notes": data.notes, "import": imported}
         if not (imported.imported or engine.new_labels) and engine.version:
             said = f"{store} knows all of {data.name}, nothing was done. Version {engine.version} of {name} answers."
             tell(record | {"retrain": None}, said)

@@ -66,7 +66,8 @@ def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
 
     if pd.api.types.is_numeric_dtype(cells):
         return cells.to_numpy(dtype=np.float64, na_value=np.nan), []
-    values, wrong = np.full(len(cells), np.nan), []
+    values = np.full(len(cells), np.nan)
+    wrong = []
     for i, (index, cell) in enumerate(cells.items()):
         try:
             values[i] = float(cell)
@@ -144,12 +145,16 @@ def clock_of(frame: pd.DataFrame, time: str | None = None, told: Sequence[str] =
     place = place_of_clock(frame, time)
     if place is None or len(frame) < 2:
         return None
-    column, name = frame.iloc[:, place], str(frame.columns[place])
-    seconds, odd, said = _parts_of_seconds(frame, name), list[int](), ""
+    column = frame.iloc[:, place]
+    name = str(frame.columns[place])
+    seconds = _parts_of_seconds(frame, name)
+    odd = list[int]()
+    said = ""
     if seconds is None:
         seconds, odd, said = seconds_of(column, name, told[place] if told else "")
     if odd:
-        wanted, got = "in seconds or as 2026-03-01T12:00:00.002", excerpt(str(column[odd[0]]))
+        wanted = "in seconds or as 2026-03-01T12:00:00.002"
+        got = excerpt(str(column[odd[0]]))
         what = f"Expected a time in column {name}, {wanted}, got {got}; a stated rate (rate_hz) needs none"
         raise UnreadableError(what, odd[0])
     if time is None and not is_time(name):
@@ -270,7 +275,8 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
         what = f"Expected a step of {step:.3g} s in time, got a gap of {steps[where]:.3g} s"
         raise UnreadableError(what, lines[where + 1])
     usual = float(steps[steps <= LATE * step].mean())  # a clock of whole milliseconds steps 4, 4, 5
-    rate, span = 1.0 / (step if abs(usual - step) < 0.005 * step else usual), float(clock.seconds[-1])
+    rate = 1.0 / (step if abs(usual - step) < 0.005 * step else usual)
+    span = float(clock.seconds[-1])
     if not (RATES[0] <= rate <= RATES[1] and SPANS[0] <= span <= SPANS[1]):
         wanted = f"{RATES[0]:g} Hz to {RATES[1] / 1e6:g} MHz over {1e3 * SPANS[0]:g} ms to {SPANS[1] / 3600:g} h"
         got = f"{rate:.4g} Hz over {span:.3g} s"

@@ -50,7 +50,8 @@ def _other(mark: str) -> str:
 
 def _deciding(mark: str) -> re.Pattern[str]:
     """Cells, a line each, in which a mark is the decimal one for certain."""
-    m, other = re.escape(mark), re.escape(_other(mark))
+    m = re.escape(mark)
+    other = re.escape(_other(mark))
     alone = rf"(?:0\d*|\d{{4,}}){m}\d*|{m}\d+|\d+{m}(?:\d{{0,2}}|\d{{4,}})|\d+{m}\d+[eE][+\-−]?\d+"
     behind = rf"\d{{1,3}}(?:(?:[{other}'’]|[^\S\n])\d{{3}})+{m}\d*"  # 1,043.5
     beside = rf"\d{{1,3}}(?:{other}\d{{3}}){{2,}}"  # 1,043,500

@@ -79,7 +79,8 @@ def factor(unit: str, other: str) -> float | None:
     """What turns numbers in one unit into those in another; None where nothing does."""
     if unit == other:
         return 1.0
-    one, two = parse(unit), parse(other)
+    one = parse(unit)
+    two = parse(other)
     return None if one is None or two is None or one[0] != two[0] else float(f"{one[1] / two[1]:.12g}")
 
 
@@ -89,7 +90,8 @@ def split(name: str) -> tuple[str, str]:
     if match := CLOSED.fullmatch(plain):
         return (match["name"], match["unit"]) if parse(match["unit"]) else (plain, "")
     if match := SLASHED.fullmatch(plain):
-        before, unit = match["name"] or match["other"], match["unit"] or match["such"]
+        before = match["name"] or match["other"]
+        unit = match["unit"] or match["such"]
         return (before, unit) if parse(unit) else (plain, "")
     match = ENDING.fullmatch(plain)
     unit = match["unit"] if match else ""

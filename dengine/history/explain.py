@@ -29,7 +29,7 @@ from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, Source, TraceSpec, in_html, trace_in
 from ..store.evidence import rule_past
-from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision, VersionError, unknown_decision
+from ..store.records import SAFE_MODE_BEGAN, Evidence, ModelVersion, StoredDecision, VersionError, unknown_decision
 from ..store.views import HistoryFilter, PastLabel
 from ..traces import WindowGate
 
@@ -126,8 +126,7 @@ def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Leve
         return None
     for label in told:
         if not label.quarantined and label.source is not Source.INSPECTION:
-            rule.observe(label.silent, label.novel)
-            rule.tell(label.lower, label.upper, label.success, label.predicted, label.looked)
+            _update(rule, label)
     return float(rule.evidence.open[0]), float(rule.evidence.open[1])
 
 
@@ -141,10 +140,15 @@ def rule_now(store: SqlStore, policy: Policy) -> DecisionRule | None:
     if not past.told_to:  # as an engine that is opened
         rule = rule.anew()
         rule.begin_in(began_in)
-    for told in store.evidence_since(past.told_to, since, past.overdue_to):
-        rule.observe(told.silent, told.novel)
-        rule.tell(told.lower, told.upper, told.success, told.predicted, told.looked)
+    for evidence in store.evidence_since(past.told_to, since, past.overdue_to):
+        _update(rule, evidence)
     return rule
+
+
+def _update(rule: DecisionRule, outcome: PastLabel | Evidence) -> None:
+    """Update a rule with what became of a part."""
+    rule.observe(outcome.silent, outcome.novel)
+    rule.tell(outcome.lower, outcome.upper, outcome.success, outcome.predicted, outcome.looked)
 
 
 # The envelope: a picture for people, not a test. One sample in twenty of an ordinary success lies outside, by its making.

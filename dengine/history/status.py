@@ -155,16 +155,20 @@ class Status:
     @property
     def alarm(self) -> str:
         """What somebody should look at, the worst first; "" where there is nothing."""
-        accepts, errors, late = self.newest.bad_accepts, self.newest.errors, self.newest.false_rejects
-        rejects = _judged(self.newest.rejected, late, self.recipe.policy.tolerances[1])
-        found_good = f"{late} of the {rejects.n} newest rejected parts were good: more than {rejects.tolerance:.1%}."
+        accepts = self.newest.bad_accepts
+        errors = self.newest.errors
+        false_rejects = self.newest.false_rejects
+        rejects = _judged(self.newest.rejected, false_rejects, self.recipe.policy.tolerances[1])
+        found_good = (
+            f"{false_rejects} of the {rejects.n} newest rejected parts were good: more than {rejects.tolerance:.1%}."
+        )
         failing = "" if self.version or len(self.retrains) < FAILING else self.retrains[-1].report.reason
         broken = f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
             (accepts.verdict == "broken", broken),
-            (late and rejects.verdict == "broken", found_good),
+            (false_rejects and rejects.verdict == "broken", found_good),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
             (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),

@@ -9,13 +9,13 @@
     tower 2     -> conv, G groups of 8 kernels at each dilation, at Q places of the trace and of its differences
                 -> how often each of a group answers most, and least; roots                      (B, 4*D*G*8)
     products    -> of every two of the four leading principal components of tower 1              (B, 16)
-    all three   -> principal components and heads, one logit of them; see features.py            (B, K, d)
+    all three   -> principal components and heads, one logit of them: `FeatureEmbedding`         (B, K, d)
 
 A network trained on labels would exist K times, each on few labels. The encoder is drawn, not trained, and shared by all K
 spaces. As in MiniRocket the kernels of tower 1 have fixed weights, and thresholds are drawn from what they give on the
 first traces; instead of a hard share of positive values it counts by a ramp two deviations wide. It tells how large a force
 is, and when. In tower 2 kernels compete, as in Hydra, but one that answers nearly most counts in part: so no rounding
-decides who wins where a trace is flat. It tells which shapes are frequent. What was measured: docs/explanation/measured.md.
+decides who wins where a trace is flat. It tells which shapes are frequent.
 
 Sources: Dempster, Schmidt and Webb (2021), MiniRocket, KDD, arXiv:2012.08791, for kernels, dilations and thresholds; by the
 same (2023), Hydra, Data Min. Knowl. Disc. 37, for competing kernels; Tan, Dempster, Bergmeir and Webb (2022), MultiRocket,
@@ -60,7 +60,8 @@ TAPS = 9  # of MiniRocket's kernels; 84 = 9 choose 3 ways to place its three 2s 
 MIN_TRACES = 20  # that an engine's first model is trained on
 FIRST_STEPS = 3  # of heads that start from nothing, however late: without any, they would hold all parts for alike
 TRAIN_TRACES = 4000  # that the heads are fitted to at most, so that it ends in time however many references there are
-GROWN, FITS = 1.5, 20  # the components are found anew where traces have grown so, and at every so many-th fit
+GROWN = 1.5  # the components are found anew once there are so many times as many traces,
+FITS = 20  # and at every 20th fit
 # Variance of all components of a tower together: what a ridge is weighed against.
 VARIANCES = 40.0, 5.0
 PAIRS = 10.0  # of the products
@@ -106,26 +107,33 @@ class RocketEncoder(nn.Module):
         if samples < 2:
             raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
         frames = samples // average
-        places, few = max(1, min(frames, PLACES[0]) // regions) * regions, min(frames, PLACES[1])
+        places = max(1, min(frames, PLACES[0]) // regions) * regions
+        few = min(frames, PLACES[1])
         taps = _taps(frames, dilations, places)
         widths = len(taps) * regions * kernels, 4 * len(taps) * groups * RIVALS
         ends = np.cumsum([0, *(widths if groups else widths[:1])]).tolist()
-        self.towers = [slice(*each) for each in pairwise(ends)]
+        self.towers = [slice(first, end) for first, end in pairwise(ends)]
         # A channel becomes scale * x + shift, a feature gain * f + offset: one pass each.
         self.register_buffer("shift", torch.zeros(channels, 1))
         self.register_buffer("scale", torch.ones(channels, 1))
         self.register_buffer("offset", torch.zeros(ends[-1]))
         self.register_buffer("gain", torch.ones(ends[-1]))
-        self.average, self.head = average, samples % average  # left out at the start: the end of an insertion tells most
-        self.n_dilations, self.n_regions, self.n_kernels, self.n_places = len(taps), regions, kernels, places
-        self.n_groups, self.n_few = groups, few
+        self.average = average
+        self.head = samples % average  # left out at the start: the end of an insertion tells most
+        self.n_dilations = len(taps)
+        self.n_regions = regions
+        self.n_kernels = kernels
+        self.n_places = places
+        self.n_groups = groups
+        self.n_few = few
         self.n_taps = taps.size  # of the first tower
         if groups:  # the differences stand behind the trace
             sparse = _taps(frames, dilations, few)
             both = np.concatenate([sparse, np.where(sparse < frames - 1, frames + sparse, 2 * frames - 1)])
             taps = np.concatenate([taps.ravel(), both.ravel()])
         self.register_buffer("taps", torch.from_numpy(taps.ravel()))
-        self.whole, self.length = WHOLE / regions, places // regions
+        self.whole = WHOLE / regions
+        self.length = places // regions
         self.register_buffer("even", torch.full((self.length,), 1.0 / self.length), persistent=False)
         self.register_buffer("mix", torch.eye(regions) + self.whole, persistent=False)
         self.register_buffer("kernel", torch.zeros(self.n_dilations, kernels, channels * TAPS))
@@ -147,7 +155,8 @@ class RocketEncoder(nn.Module):
         if len(X) > LEARNED:
             X = X[torch.from_numpy(rng.permutation(len(X))[:LEARNED])]
         wide = X.double()
-        centre, deviation = wide.mean((0, 2)), wide.std((0, 2), unbiased=False)
+        centre = wide.mean((0, 2))
+        deviation = wide.std((0, 2), unbiased=False)
         scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
         self.scale.copy_(scale[:, None])
         self.shift.copy_((-centre * scale)[:, None])
@@ -166,7 +175,9 @@ class RocketEncoder(nn.Module):
     def raw(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, P)."""
         a = self.averaged(x)
-        seen, n, b = self.seen(a), self.n_taps, a.size(0)
+        seen = self.seen(a)
+        n = self.n_taps
+        b = a.size(0)
         ramps = self.ramps(self.windows(seen.narrow(1, 0, n), self.n_dilations), b)
         if self.n_groups == 0:
             return ramps
@@ -189,7 +200,8 @@ class RocketEncoder(nn.Module):
 
     def windows(self, seen: Tensor, n: int) -> Tensor:
         """(C, n*9*P, B) -> (n, C*9, P*B): what each place of each dilation sees, so that a convolution is a product."""
-        channels, places = seen.size(0), seen.size(1) // (n * 9) * seen.size(2)  # where n = 0, -1 could not be inferred
+        channels = seen.size(0)
+        places = seen.size(1) // (n * 9) * seen.size(2)  # where n = 0, -1 could not be inferred
         if channels == 1:
             return seen.reshape(n, 9, places)
         return seen.reshape(channels, n, 9, places).transpose(0, 1).reshape(n, channels * 9, places)
@@ -226,9 +238,9 @@ class RocketEncoder(nn.Module):
         quantiles = 0.05 + 0.9 * (np.arange(1, n + 1) * (np.sqrt(5.0) + 1.0) / 2.0 % 1.0)
         for d, rows in enumerate(self.windows(seen[:, : self.n_taps], self.n_dilations)):  # (C*9, P*n)
             given = (kernels @ rows).numpy()
-            own = quantiles[d * self.n_kernels : (d + 1) * self.n_kernels]
-            places = (own * (given.shape[1] - 1)).astype(np.int64)
-            chosen = [np.partition(each, place)[place] for each, place in zip(given, places, strict=True)]
+            of_dilation = quantiles[d * self.n_kernels : (d + 1) * self.n_kernels]
+            places = (of_dilation * (given.shape[1] - 1)).astype(np.int64)
+            chosen = [np.partition(row, place)[place] for row, place in zip(given, places, strict=True)]
             slope = 1.0 / (2.0 * torch.from_numpy(given.std(1)) + 1e-6)  # a ramp two deviations wide
             self.kernel[d] = kernels * slope[:, None]
             self.threshold[d, :, 0] = 0.5 - torch.tensor(chosen) * slope
@@ -245,7 +257,8 @@ class InChunks(nn.Module):
 
     def __init__(self, features: RocketEncoder) -> None:
         super().__init__()
-        self.features, self.chunk = features, CHUNK  # a scripted method reads no global
+        self.features = features
+        self.chunk = CHUNK  # a scripted method reads no global
 
     def forward(self, x: Tensor, out: Tensor) -> None:
         """(n, C, T) -> out (n, P), n whole chunks."""
@@ -279,7 +292,11 @@ class FeatureEmbedding(nn.Module):
 
     def __init__(self, features: RocketEncoder, folds: int, dim: int, leading: int) -> None:
         super().__init__()
-        self.features, self.folds, self.dim, self.leading, self.n_scores = features, folds, dim, leading, folds * dim
+        self.features = features
+        self.folds = folds
+        self.dim = dim
+        self.leading = leading
+        self.n_scores = folds * dim
         # Axis 2 is the same in every space; its copies cost less than an op to spread it. Leading components come last.
         self.register_buffer("weight", torch.zeros(len(features.gain), folds * dim + leading))
         self.register_buffer("bias", torch.zeros(folds * dim + leading))
@@ -304,18 +321,55 @@ def products(g: Tensor) -> Tensor:
 
 
 def fit_heads(
-    g: Tensor, y: Tensor, outside: Tensor, w: Tensor, l2: float, max_iter: int, stop: StopRule | None, least: int = 0
+    g: Tensor,
+    y: Tensor,
+    outside: Tensor,
+    w: Tensor,
+    l2: float,
+    max_iter: int,
+    stop: StopRule | None,
+    least: int = 0,
 ) -> tuple[Tensor, Tensor, list[int], int]:
-    """K ridge logistic regressions by Newton's method with a line search, from where they start.
+    """Fit K ridge logistic regressions by Newton's method with a line search.
 
-    g (n, W) features, y (n,) labels, outside (K, n) bool: which rows train head k.  w (K, W+1) float64: where each starts,
-    its bias last.  Each minimises its log loss + l2/2 |w|^2: convex, so it ends at one place wherever it starts. A head
-    that says held-out labels worse than their base rate does says the base rate: its own gate, for a common one would let
-    fold k's labels choose head k.  At most `max_iter` steps, the first `least` however late.
-    Returns w, the logit of each row by each head without it (K, n), the heads that say the base rate, and the steps taken.
+    Each minimises its log loss plus ``l2 / 2 * |w| ** 2``. That is convex, so it ends at the same
+    weights wherever it starts. A head whose leave-one-out loss is above that of its base rate
+    predicts the base rate. Each head decides this alone: a common decision would let the labels
+    of fold k choose head k.
+
+    Parameters
+    ----------
+    g : Tensor of float32, shape (n, W)
+        Features.
+    y : Tensor of int64, shape (n,)
+        Labels, 1 or 0.
+    outside : Tensor of bool, shape (K, n)
+        Which rows train head k.
+    w : Tensor of float64, shape (K, W + 1)
+        Where the heads start, the bias last.
+    l2 : float
+        Ridge.
+    max_iter : int
+        Steps at most.
+    stop : StopRule, optional
+        Asked before each step after the first `least`.
+    least : int, default 0
+        Steps that are taken however late it is.
+
+    Returns
+    -------
+    w : Tensor of float64, shape (K, W + 1)
+    left_out : Tensor of float64, shape (K, n)
+        Leave-one-out logits of each row by each head.
+    at_base_rate : list of int
+        Heads that predict their base rate.
+    n_steps : int
+        Steps that were taken.
     """
     small = torch.cat([g, torch.ones(len(g), 1)], 1)
-    g, y, mask = small.double(), y.double(), outside.double()
+    g = small.double()
+    y = y.double()
+    mask = outside.double()
     ridge = torch.full_like(w, l2)
     ridge[:, -1] = 1e-3  # the base rate is not shrunk
 
@@ -323,22 +377,26 @@ def fit_heads(
         s = w @ g.T
         return (mask * (F.softplus(s) - y * s)).sum(1) + 0.5 * (ridge * w * w).sum(1)
 
-    def triangle(k: int, p: Tensor) -> Tensor:
-        """Cholesky factor of head k's Hessian, (W+1, W+1); p (n,) what it says."""
+    def cholesky_of_hessian(k: int, p: Tensor) -> Tensor:
+        """Factor the Hessian of head k, (W+1, W+1); p (n,) are its predicted probabilities."""
         curvature = (mask[k] * p * (1.0 - p)).float()
         product = (small * curvature[:, None]).T @ small  # a step need not be exact
-        found: Tensor = torch.linalg.cholesky(product.double() + torch.diag(ridge[k]))
-        return found
+        factor: Tensor = torch.linalg.cholesky(product.double() + torch.diag(ridge[k]))
+        return factor
 
-    # Every head takes part in every product, done or not: of another shape it would round otherwise, and so tell head k
-    # of fold k's labels by the last step of another head. Its factor is its own affair for the same reason.
-    done, before, step = torch.zeros(len(w), dtype=torch.bool), objective(w), 0
-    factors = [triangle(k, torch.sigmoid(w[k] @ g.T)) for k in range(len(w))]
-    stale, last = done, torch.ones(len(w), dtype=torch.float64)
+    # Every head takes part in every product, whether it has converged or not: a product of another
+    # shape rounds differently, and would so let the labels of fold k reach head k. For the same
+    # reason each head decides alone when its factor is computed anew.
+    done = torch.zeros(len(w), dtype=torch.bool)
+    before = objective(w)
+    step = 0
+    factors = [cholesky_of_hessian(k, torch.sigmoid(w[k] @ g.T)) for k in range(len(w))]
+    stale = done
+    last = torch.ones(len(w), dtype=torch.float64)
     while step < max_iter and not done.all() and not (stop is not None and stop.exhausted(step, least)):
         p = torch.sigmoid(w @ g.T)
         for k in stale.nonzero().flatten().tolist():
-            factors[k] = triangle(k, p[k])
+            factors[k] = cholesky_of_hessian(k, p[k])
         slope = (mask * (p - y)) @ g + ridge * w
         d = torch.cholesky_solve(slope[..., None], torch.stack(factors))[..., 0]
         d[done] = 0.0
@@ -349,17 +407,47 @@ def fit_heads(
                 break
             d[rises] /= 2.0
         d[rises] = 0.0
-        w, before, step = w - d, torch.where(rises, before, after), step + 1
-        size, fresh = d.abs().amax(1), stale | (step == 1)
-        done |= (size * (size / last).clamp(max=1.0) < 2e-4) & (fresh | ~rises)  # about what the next step would be
+        w = w - d
+        before = torch.where(rises, before, after)
+        step += 1
+        size = d.abs().amax(1)
+        done |= (size * (size / last).clamp(max=1.0) < 2e-4) & (
+            stale | (step == 1) | ~rises
+        )  # about what the next step would be
         # A step with a former factor costs a tenth: a new one where that serves no more.
-        stale, last = ~done & (rises | (size > (last / 4.0).clamp(max=0.3))), size
+        stale = ~done & (rises | (size > (last / 4.0).clamp(max=0.3)))
+        last = size
     left_out = leave_one_out(small, y, w @ g.T, torch.stack(factors))
+    return *base_rate_if_better(w, left_out, y, mask), step
+
+
+def base_rate_if_better(w: Tensor, left_out: Tensor, y: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, list[int]]:
+    """Set heads to their base rate where that has the smaller log loss on held-out labels.
+
+    Parameters
+    ----------
+    w : Tensor of float64, shape (K, W + 1)
+        Heads, the bias last; they stay as they are.
+    left_out : Tensor of float64, shape (K, n)
+        Their leave-one-out logits.
+    y : Tensor of float64, shape (n,)
+        Labels, 1 or 0.
+    mask : Tensor of float64, shape (K, n)
+        1 for the rows that train head k, else 0.
+
+    Returns
+    -------
+    w, left_out : Tensor
+        As the arguments, with the base rate where it is better.
+    at_base_rate : list of int
+        The heads that were set to it.
+    """
     rate = torch.logit((mask @ y) / mask.sum(1))[:, None].expand_as(left_out)
     worse = masked_loss(left_out, y, mask) > masked_loss(rate, y, mask)
-    w = torch.where(worse[:, None], 0.0, w)  # anew: who has the former heads keeps them
+    w = torch.where(worse[:, None], 0.0, w)
     w[worse, -1] = rate[worse, 0]
-    return w, torch.where(worse[:, None], rate, left_out), worse.nonzero().flatten().tolist(), step
+    left_out = torch.where(worse[:, None], rate, left_out)
+    return w, left_out, worse.nonzero().flatten().tolist()
 
 
 def leave_one_out(x: Tensor, y: Tensor, s: Tensor, factors: Tensor) -> Tensor:
@@ -368,7 +456,7 @@ def leave_one_out(x: Tensor, y: Tensor, s: Tensor, factors: Tensor) -> Tensor:
     x (n, W+1), y (n,).  s (K, n) logits by the heads.  factors (K, W+1, W+1) of the Hessians.
     """
     p = torch.sigmoid(s)
-    lever = torch.stack([((x @ each) * x).sum(1) for each in torch.cholesky_inverse(factors).float()])
+    lever = torch.stack([((x @ inverse) * x).sum(1) for inverse in torch.cholesky_inverse(factors).float()])
     return s + lever * (p - y) / (1.0 - lever * p * (1.0 - p)).clamp(min=0.05)
 
 
@@ -390,10 +478,12 @@ class Tower(NamedTuple):
         centred = f - f.mean(0)
         # In float32, in half the time: components are told from noise to 1e-6.
         sizes, axes = torch.linalg.eigh(centred.T @ centred / len(f))
-        sizes, axes = (each[..., -width:].flip(-1) for each in (sizes.clamp(min=0.0), axes))
+        sizes = sizes.clamp(min=0.0)[-width:].flip(-1)
+        axes = axes[:, -width:].flip(-1)
         axes = axes * (sizes > 1e-6 * sizes[0])
         size = (variance / sizes.sum().clamp(min=1e-9)).sqrt()
-        w, scaled = torch.cat([(axes.T @ weights / size).T, scores[:, None]], 1).double(), axes * size
+        w = torch.cat([(axes.T @ weights / size).T, scores[:, None]], 1).double()
+        scaled = axes * size
         return cls(scaled, -(f.mean(0) @ scaled), w)
 
     def components(self, f: Tensor) -> Tensor:
@@ -402,7 +492,8 @@ class Tower(NamedTuple):
 
     def heads(self) -> tuple[Tensor, Tensor]:
         """Weights (P, K) and biases (K,) on the features."""
-        w, bias = self.w[:, :-1], self.w[:, -1]
+        w = self.w[:, :-1]
+        bias = self.w[:, -1]
         return (self.axes.double() @ w.T).float(), (bias + w @ self.centre.double()).float()
 
 
@@ -476,7 +567,7 @@ class RocketReducer(Reducer):
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
         """Fit the heads from their present weights, on features that the first training set; see `Reducer.train`."""
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first")
-        raw = self.raw_features(self._begun(X), numbers)
+        raw = self.raw_features(self._checked(X), numbers)
         self._fit_heads(raw, binary_labels(y, len(X), type(self).__name__), folds, stop, numbers)
         with torch.inference_mode():
             places = in_chunks(lambda some: self.net_.places(self.net_.features.clipped(some)), raw, 16 * CHUNK)
@@ -484,16 +575,16 @@ class RocketReducer(Reducer):
 
     def blank(self, X: Floats) -> FeatureEmbedding:
         new: Self = self if len(X) >= MIN_TRACES or "net_" in vars(self) else clone(self)
-        new._begun(X)
+        new._checked(X)
         return new.net_
 
     def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
         """Compute the features of traces that a store brings: in the first retrain it would take too long."""
         if len(X) >= MIN_TRACES:
-            self.raw_features(self._begun(X), numbers)
+            self.raw_features(self._checked(X), numbers)
 
-    def _begun(self, X: Floats) -> Floats:
-        """The traces, checked, once there are features for them: the first ones that come set these."""
+    def _checked(self, X: Floats) -> Floats:
+        """Return the traces (n, C, T), checked; the first ones set the scales and the filters."""
         if "net_" not in vars(self):
             self._start(self.check_traces(X, reset=True))
         return self.check_traces(X)
@@ -530,45 +621,55 @@ class RocketReducer(Reducer):
                 rows = np.sort(np.argpartition(draw, TRAIN_TRACES)[:TRAIN_TRACES])
                 raw = raw[rows]
             outside = self.trained_on(folds[rows])
-            for k, some in enumerate(outside):
-                if (classes := len(np.unique(labels[rows][some]))) < 2:
-                    raise one_class_outside(k, int(some.sum()), classes)
-            f, y, rows_of = self.net_.features.clipped(raw), torch.from_numpy(labels[rows]), torch.from_numpy(outside)
-            towers, said = [], []
-            for tower, seen in zip(self.towers_, self._seen(f), strict=True):
-                w, *rest = fit_heads(tower.components(seen), y, rows_of, tower.w, self.l2, self.max_iter, stop, least)
+            for k, training in enumerate(outside):
+                classes = len(np.unique(labels[rows][training]))
+                if classes < 2:
+                    raise one_class_outside(k, int(training.sum()), classes)
+            f = self.net_.features.clipped(raw)
+            y = torch.from_numpy(labels[rows])
+            rows_of = torch.from_numpy(outside)
+            towers = []
+            fits = []  # of each tower: leave-one-out logits, heads that say the base rate, steps
+            for tower, columns in zip(self.towers_, self._tower_features(f), strict=True):
+                w, *rest = fit_heads(tower.components(columns), y, rows_of, tower.w, self.l2, self.max_iter, stop, least)
                 towers.append(tower._replace(w=w))
-                said.append(rest)
-            left_out, unsure, steps = zip(*said, strict=True)
+                fits.append(rest)
+            left_out, unsure, steps = zip(*fits, strict=True)
             # Leave-one-out logits of rows outside fold k alone weigh the towers of head k, one after the other.
-            mixed, own, tried = left_out[0], [torch.ones(self.folds)], torch.linspace(0.0, 1.0, SHARES).double()
-            for i, each in enumerate(left_out[1:], 1):
-                losses = masked_loss(each + tried[:, None, None] * (mixed - each), y, rows_of.double())
+            mixed = left_out[0]
+            shares = [torch.ones(self.folds)]
+            tried = torch.linspace(0.0, 1.0, SHARES).double()
+            for i, logits in enumerate(left_out[1:], 1):
+                losses = masked_loss(logits + tried[:, None, None] * (mixed - logits), y, rows_of.double())
                 doubt = DOUBT if i == len(self.net_.features.towers) else 0.0  # of products
                 share = tried[(losses + doubt * (1.0 - tried)[:, None] / rows_of.sum(1)).argmin(0)]
-                mixed = each + share[:, None] * (mixed - each)
-                own = [*(share.float() * former for former in own), 1.0 - share.float()]
-            self._answer_by(towers, own)
+                mixed = logits + share[:, None] * (mixed - logits)
+                shares = [*(share.float() * former for former in shares), 1.0 - share.float()]
+            self._answer_by(towers, shares)
             losses = masked_loss(mixed, y, rows_of.double())
-        self.towers_, self.n_iter_ = towers, max(steps)
-        self.holdout_losses_, self.n_fits_ = losses.numpy(), self.n_fits_ + 1
+        self.towers_ = towers
+        self.n_iter_ = max(steps)
+        self.holdout_losses_ = losses.numpy()
+        self.n_fits_ = self.n_fits_ + 1
         heads = ", ".join(map(str, sorted(set.intersection(*map(set, unsure)))))
         self.note_ = f"head {heads} says the base rate: it would have done worse" if heads else ""
 
     def _answer_by(self, towers: list[Tower], shares: list[Tensor]) -> None:
         """Put the towers' heads into what answers, each head in its share (K,) of the logit."""
-        net, first = self.net_, slice(0, self.net_.n_scores, self.n_components)
+        net = self.net_
+        first = slice(0, self.net_.n_scores, self.n_components)
         net.bias[first] = 0.0
         weights = [*(net.weight[columns] for columns in net.features.towers), net.of_pairs]
-        for tower, own, held in zip(towers, shares, weights, strict=False):
+        for tower, share, columns in zip(towers, shares, weights, strict=False):
             weight, bias = tower.heads()
-            held[:, first] = own * weight
-            net.bias[first] += own * bias
+            columns[:, first] = share * weight
+            net.bias[first] += share * bias
 
-    def _seen(self, f: Tensor) -> list[Tensor]:
-        """What each tower sees of features (n, P): its own ones, the last of all products of leading components."""
-        seen = [f[:, columns] for columns in self.net_.features.towers]
-        return [*seen, products(self.towers_[0].components(seen[0])[:, : self.net_.leading])]
+    def _tower_features(self, f: Tensor) -> list[Tensor]:
+        """Return what each tower reads of features (n, P): its own ones; the last, products of leading components."""
+        features = [f[:, columns] for columns in self.net_.features.towers]
+        leading = self.towers_[0].components(features[0])[:, : self.net_.leading]
+        return [*features, products(leading)]
 
     def trained_on(self, folds: Ints) -> NDArray[np.bool_]:
         """(n,) -> (K, n): fold k never trains head k, or its labels would count themselves."""
@@ -576,30 +677,37 @@ class RocketReducer(Reducer):
 
     def _compress(self, raw: Tensor) -> None:
         """Find the principal components of raw features (n, P), and what the heads, if any, come to on these."""
-        net, self.n_seen_ = self.net_, len(raw)
+        net = self.net_
+        self.n_seen_ = len(raw)
         some = raw[:: 1 + (len(raw) - 1) // 1000]
-        f, gain, former = net.features.clipped(some), net.features.gain.clone(), self.towers_
+        f = net.features.clipped(some)
+        gain = net.features.gain.clone()
+        former = self.towers_
         net.features.standardise(some)
         now = net.features.clipped(some)
         self.towers_ = []
         for i, (columns, variance) in enumerate(zip(net.features.towers, VARIANCES, strict=False)):
-            weights, scores = torch.zeros(len(gain[columns]), self.folds), torch.zeros(self.folds)
+            weights = torch.zeros(len(gain[columns]), self.folds)
+            scores = torch.zeros(self.folds)
             if former:
                 weights, biases = former[i].heads()
                 scores = torch.addmm(biases, f[:, columns], weights).mean(0)
                 weights = weights * (gain / net.features.gain)[columns, None]
             self.towers_.append(Tower.over(now[:, columns], self.width, variance, weights, scores))
-        columns, n, first = net.features.towers[0], net.n_scores, self.towers_[0]
+        columns = net.features.towers[0]
+        n = net.n_scores
+        first = self.towers_[0]
         # The heads of the products begin anew: they are products of other components now.
         blank = torch.zeros(net.leading**2, self.folds), torch.zeros(self.folds)
-        self.towers_.append(Tower.over(self._seen(now)[-1], self.width, PAIRS, *blank))
+        self.towers_.append(Tower.over(self._tower_features(now)[-1], self.width, PAIRS, *blank))
         net.weight[columns, n:] = first.axes[:, : net.leading]
         net.bias[n:] = first.centre[: net.leading]
         if self.n_components == 2:  # the second axis is the first component, of one deviation at both sides in the sigmoid
             axis = first.axes[:, 0]
             second = 2.0 * axis / (now[:, columns] @ axis).std().clamp(min=1e-12)
             second = second if second @ net.weight[columns, 1] >= 0 else -second  # its sign as it was
-            net.weight[columns, 1:n:2], net.bias[1:n:2] = second[:, None], -(now[:, columns].mean(0) @ second)
+            net.weight[columns, 1:n:2] = second[:, None]
+            net.bias[1:n:2] = -(now[:, columns].mean(0) @ second)
 
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """(n, C, T) -> (n, P), not standardised: computed once a label's number, and forgotten once that is not given."""
@@ -609,18 +717,23 @@ class RocketReducer(Reducer):
             at = np.searchsorted(self._numbers, numbers)
             new = np.append(self._numbers, -1)[at] != numbers
             if new.all():
-                at, self._raw = np.arange(len(at)), self._computed(traces)
+                at = np.arange(len(at))
+                self._raw = self._computed(traces)
             elif new.any():
                 at[new] = len(self._raw) + np.arange(new.sum())
                 self._raw = torch.cat([self._raw, self._computed(traces[new])])
             joined = len(at) > 0 and (np.diff(at) == 1).all()  # as long as nothing is forgotten: then none is moved
-            self._numbers, self._raw = numbers, self._raw[at[0] : at[-1] + 1] if joined else self._raw[torch.from_numpy(at)]
+            self._numbers = numbers
+            self._raw = self._raw[at[0] : at[-1] + 1] if joined else self._raw[torch.from_numpy(at)]
         return self._raw
 
     def _computed(self, traces: Floats) -> Tensor:
         """(n, C, T) -> (n, P), the same to the bit whatever is beside a trace: each chunk is full, or filled up."""
-        features, x, n = self.net_.features, torch.from_numpy(traces), len(traces)
-        whole, out = n // CHUNK * CHUNK, torch.empty(n, len(features.gain))
+        features = self.net_.features
+        x = torch.from_numpy(traces)
+        n = len(traces)
+        whole = n // CHUNK * CHUNK
+        out = torch.empty(n, len(features.gain))
         rest = torch.zeros(CHUNK, *x.shape[1:])
         rest[: n - whole] = x[whole:]
         out[whole:] = features.raw(rest)[: n - whole]
@@ -667,21 +780,25 @@ class RocketReducer(Reducer):
     def get_state(self) -> dict[str, NDArray[Any]]:
         check_is_fitted(self, "net_")
         counts = np.array([*self.trace_shape_, self.average_, self.n_fits_, self.n_seen_, self.n_iter_])
-        own = {"counts": counts, "losses": self.holdout_losses_}
-        own |= {f"{name}.{i}": v.numpy() for i, each in enumerate(self.towers_) for name, v in each._asdict().items()}
-        return own | {f"net.{name}": value.numpy().copy() for name, value in self.net_.state_dict().items()}
+        state = {"counts": counts, "losses": self.holdout_losses_}
+        for i, tower in enumerate(self.towers_):
+            state |= {f"{name}.{i}": value.numpy() for name, value in tower._asdict().items()}
+        return state | {f"net.{name}": value.numpy().copy() for name, value in self.net_.state_dict().items()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         channels, samples, self.average_, n_fits, n_seen, self.n_iter_ = (int(v) for v in state["counts"])
-        self.trace_shape_, self.n_features_in_ = (channels, samples), channels * samples
+        self.trace_shape_ = (channels, samples)
+        self.n_features_in_ = channels * samples
         self._build(channels, samples)
         restore(self.net_, part(state, "net."))
-        held = (part(state, f"{name}.") for name in Tower._fields)
+        by_field = [part(state, f"{name}.").values() for name in Tower._fields]
         self.towers_ = [
-            Tower(*(torch.from_numpy(np.array(v)) for v in each))
-            for each in zip(*(each.values() for each in held), strict=True)
+            Tower(*(torch.from_numpy(np.array(value)) for value in values)) for values in zip(*by_field, strict=True)
         ]
-        self.n_fits_, self.n_seen_, self.holdout_losses_, self.note_ = n_fits, n_seen, np.array(state["losses"]), ""
+        self.n_fits_ = n_fits
+        self.n_seen_ = n_seen
+        self.holdout_losses_ = np.array(state["losses"])
+        self.note_ = ""
         return self
 
     def check(self) -> None:
