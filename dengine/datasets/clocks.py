@@ -88,7 +88,7 @@ def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
             raise UnreadableError(f"Expected a column {time} of times, found {listed(names)}")
         return places[0]
     if places := [i for i, name in enumerate(names) if is_time(name)]:
-        return max(places, key=lambda i: _rises(head.iloc[:, i]))  # a date beside the time of day does not
+        return max(places, key=lambda i: _rising_share(head.iloc[:, i]))  # a date beside the time of day does not
     return next((i for i in range(len(names)) if _is_clock(head.iloc[:, i], names[i])), None)
 
 
@@ -98,7 +98,7 @@ def rising(frame: pd.DataFrame) -> list[int]:
     return [i for i in range(frame.shape[1]) if is_rising(floats(head.iloc[:, i])[0])]
 
 
-def _rises(cells: pd.Series) -> float:
+def _rising_share(cells: pd.Series) -> float:
     """The share of a column's steps that rise."""
     times, odd = floats(cells)
     steps = np.diff(_stamps(cells)[0] if 2 * len(odd) >= len(cells) else times)
@@ -115,20 +115,22 @@ def is_rising(times: NDArray[np.float64]) -> bool:
 
 
 def _is_clock(cells: pd.Series, name: str) -> bool:
-    """Whether a column is a clock by its values: stamps, a time since 1970, or an index without a name that is no count."""
+    """Whether a column is a clock by its values: times as text, times since 1970, or an unnamed column that rises
+    steadily by other steps than 1.
+    """
     times, odd = floats(cells)
     if len(cells) < 3:
         return False
     if 2 * len(odd) >= len(cells):
-        return bool(STAMP.fullmatch(str(cells.iloc[0]).strip())) and _rises(cells) == 1.0
+        return bool(STAMP.fullmatch(str(cells.iloc[0]).strip())) and _rising_share(cells) == 1.0
     if not is_rising(times):
         return False
     counted = bool((np.diff(times) == 1).all())
     unnamed = name == "" or name == "index" or re.fullmatch(r"Unnamed: \d+", name) is not None
-    return (unnamed and not counted) or _epoch(times) is not None
+    return (unnamed and not counted) or _unix_time_unit(times) is not None
 
 
-def _epoch(times: NDArray[np.float64]) -> float | None:
+def _unix_time_unit(times: NDArray[np.float64]) -> float | None:
     """The seconds of one, where numbers are times since 1970."""
     for least, unit in EPOCHS:
         if least <= np.abs(times[0]) and np.abs(times[0]) * unit < LATEST:
@@ -136,10 +138,10 @@ def _epoch(times: NDArray[np.float64]) -> float | None:
     return None
 
 
-def clock_of(frame: pd.DataFrame, time: str | None = None, told: Sequence[str] = ()) -> Clock | None:
+def clock_of(frame: pd.DataFrame, time: str | None = None, units_row: Sequence[str] = ()) -> Clock | None:
     """The clock of a table's rows; None where none is known.
 
-    time : its column, where it was stated.  told : the units of all columns, where a row says them.
+    time : its column, where it was stated.  units_row : the units of all columns, where a row says them.
     UnreadableError where a cell of it tells no time.
     """
     place = place_of_clock(frame, time)
@@ -151,7 +153,7 @@ def clock_of(frame: pd.DataFrame, time: str | None = None, told: Sequence[str] =
     odd = list[int]()
     said = ""
     if seconds is None:
-        seconds, odd, said = seconds_of(column, name, told[place] if told else "")
+        seconds, odd, said = seconds_of(column, name, units_row[place] if units_row else "")
     if odd:
         wanted = "in seconds or as 2026-03-01T12:00:00.002"
         got = excerpt(str(column[odd[0]]))
@@ -184,7 +186,7 @@ def seconds_of(column: pd.Series, name: str, unit: str = "") -> tuple[NDArray[np
     """(n,) seconds since the first of a column's times; which cells tell none; and what was taken for granted."""
     import pandas as pd
 
-    if pd.api.types.is_numeric_dtype(column) or not pd.api.types.is_datetime64_any_dtype(column):
+    if not pd.api.types.is_datetime64_any_dtype(column):
         times, odd = floats(column)
         if 2 * len(odd) < max(len(times), 1):
             scale, said = _scale(times, name, unit)
@@ -234,12 +236,12 @@ def _scale(times: NDArray[np.float64], name: str, unit: str) -> tuple[float, str
     known = times[~np.isnan(times)]
     if len(known) < 2:
         return 1.0, ""
-    since_1970 = _epoch(known)
+    since_1970 = _unix_time_unit(known)
     if since_1970 is not None:
         return since_1970, ""
     step = float(np.median(np.abs(np.diff(known))))
     low, high = EXCEL_DAYS
-    if low < known[0] < high and 0 < step * DAY < 1.0 and step < 1.0 / DAY:
+    if low < known[0] < high and 0 < step * DAY < 1.0:
         return DAY, f"The clock {name} is read as days, as Excel counts them"
     scale = next((scale for scale in (1.0, 1e-3, 1e-6) if step * scale < SLOW), 1e-9)
     words = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
@@ -267,13 +269,15 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     lines : of the file, one a time.
     """
     steps = np.diff(clock.seconds)
-    for where in np.flatnonzero(~(steps > 0))[:1].tolist():
+    backwards = np.flatnonzero(~(steps > 0))
+    if len(backwards):
         what = "Expected a later time than that of the row before, or a stated rate (rate_hz)"
-        raise UnreadableError(what, lines[where + 1])
+        raise UnreadableError(what, lines[int(backwards[0]) + 1])
     step = float(np.median(steps))
-    for where in np.flatnonzero(steps > GAP * step)[:1].tolist():
-        what = f"Expected a step of {step:.3g} s in time, got a gap of {steps[where]:.3g} s"
-        raise UnreadableError(what, lines[where + 1])
+    gaps = np.flatnonzero(steps > GAP * step)
+    if len(gaps):
+        what = f"Expected a step of {step:.3g} s in time, got a gap of {steps[gaps[0]]:.3g} s"
+        raise UnreadableError(what, lines[int(gaps[0]) + 1])
     usual = float(steps[steps <= LATE * step].mean())  # a clock of whole milliseconds steps 4, 4, 5
     rate = 1.0 / (step if abs(usual - step) < 0.005 * step else usual)
     span = float(clock.seconds[-1])

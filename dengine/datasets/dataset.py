@@ -258,7 +258,9 @@ class Collected:
             self.faults.append(Fault(source, line or getattr(error, "line", 0), str(error).rstrip(".")))
 
     def must_mean_something(self) -> None:
-        """DataError where most labels are words that nobody said the meaning of, or a tenth beside labels of one kind."""
+        """Raise DataError if more labels are unknown words than known labels, or if all known labels are of one kind and
+        more than a tenth of all are unknown words.
+        """
         kinds, n = {each.label for each in self.read}, sum(self.unknown.values())
         if n <= (len(self.read) / 9 if len(kinds) == 1 else len(self.read)):
             return
@@ -328,7 +330,7 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
 def _in_one_unit(found: Collected, asked: Asked) -> str:
     """Convert recordings to the unit of most, or to the one that was asked for, a channel at a time; returns the units.
 
-    One whose unit nothing turns into it, or that tells none where others do, is a fault.
+    A recording whose unit cannot be converted, or that states none although others do, becomes a fault.
     """
     n = max((len(each.units) for each in found.read), default=0)
     stated = asked.unit.split(",") if asked.unit and len(asked.unit.split(",")) == n else [asked.unit or ""] * n
@@ -364,7 +366,8 @@ def _in_one_unit(found: Collected, asked: Asked) -> str:
 def _at_one_rate(found: Collected, asked: Asked) -> tuple[Asked, float | None]:
     """Leave out recordings at another rate than the others, or resample all; returns how to fit them, and the rate.
 
-    Resampled ones that last as long fit by stretching; of others only what came at the same time is compared: padded.
+    If all resampled recordings last equally long, they are stretched to one length. Otherwise they are padded, so that
+    equal sample numbers mean equal times.
     """
     rates = np.array([each.rate_hz or np.nan for each in found.read])
     known = rates[~np.isnan(rates)]

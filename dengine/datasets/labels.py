@@ -168,18 +168,23 @@ def in_column(paths: Mapping[str, Path], column: str, asked: Asked) -> Labels:
     return Labels(find, f"column {column} has none; name another column (label)")
 
 
-class _Verdict(NamedTuple):
-    """A label in a path, at `start`. decides : a word elsewhere than at an end only contradicts, as in OK_then_NOK."""
+class _FoundLabel(NamedTuple):
+    """A word in a path that is a label.
+
+    text : the word.  start : its place in the path.  is_user_word : whether a label map has it.
+    decides : False for a word in the middle of a file's name, which cannot give the label but is an error if it
+        contradicts one, as in OK_then_NOK.
+    """
 
     text: str
     label: int
     start: int
     decides: bool = True
-    own: bool = False
+    is_user_word: bool = False
 
 
 def _find(name: str, words: Words) -> Known:
-    verdicts = _verdicts(name, words)
+    verdicts = _found_labels(name, words)
     deciding = [each for each in verdicts if each.decides]
     if not deciding:
         raise NoLabelError([_last_word(text) for text, _ in _components(name)])
@@ -205,7 +210,7 @@ def likely(names: Sequence[str], words: Words = NONE) -> Iterator[tuple[str, str
 
 
 def _rest(name: str, words: Words) -> str:
-    for each in sorted(_verdicts(name, words), key=lambda verdict: -verdict.start):
+    for each in sorted(_found_labels(name, words), key=lambda verdict: -verdict.start):
         name = name[: each.start] + name[each.start + len(each.text) :] if each.decides else name
     return name
 
@@ -217,47 +222,47 @@ def _components(name: str) -> list[tuple[str, int]]:
     return [(COPY.sub("", PurePosixPath(file).stem), len(name) - len(file)), *reversed(places)]
 
 
-def _verdicts(name: str, words: Words) -> list[_Verdict]:
+def _found_labels(name: str, words: Words) -> list[_FoundLabel]:
     """All labels in a path. Where one's own words decide, others that are not at an end do not count."""
     (file, at), *folders = _components(name)
     found = _in_file(file, at, words)
     for folder, place in folders:
         found += _in_folder(folder, place, words)
-    return [each for each in found if each.decides] if any(each.own for each in found) else found
+    return [each for each in found if each.decides] if any(each.is_user_word for each in found) else found
 
 
-def _in_file(file: str, at: int, words: Words) -> list[_Verdict]:
+def _in_file(file: str, at: int, words: Words) -> list[_FoundLabel]:
     digit = re.search(r"(?:^|(?<=[_\- ]))\d+$", file)
-    numbers = [_Verdict(digit[0], int(words[digit[0]]), at + digit.start())] if digit and digit[0] in words else []
-    if own := _own(file, at, words):
-        return [own, *numbers]
+    numbers = [_FoundLabel(digit[0], int(words[digit[0]]), at + digit.start())] if digit and digit[0] in words else []
+    if user_word := _find_user_word(file, at, words):
+        return [user_word, *numbers]
     inside = [match for match in IN_NAME.finditer(file) if _bare(match["word"]) in (*GOOD, *BAD)]
-    hints = [_Verdict(match[0], _meaning(match), at + match.start(), decides=False) for match in inside]
+    hints = [_FoundLabel(match[0], _meaning(match), at + match.start(), decides=False) for match in inside]
     for numbered, text in enumerate(_endings(file)):
         match = AT_END.search(text)
         if match and not (numbered and _bare(match[0]) == "no"):  # part_no_7
-            return [_Verdict(match[0], _meaning(match), at + match.start()), *hints, *numbers]
+            return [_FoundLabel(match[0], _meaning(match), at + match.start()), *hints, *numbers]
     return [*numbers, *hints]
 
 
-def _in_folder(folder: str, at: int, words: Words) -> list[_Verdict]:
+def _in_folder(folder: str, at: int, words: Words) -> list[_FoundLabel]:
     if folder in words and folder.isdecimal():
-        return [_Verdict(folder, int(words[folder]), at)]
-    if own := _own(folder, at, words):
-        return [own]
+        return [_FoundLabel(folder, int(words[folder]), at)]
+    if user_word := _find_user_word(folder, at, words):
+        return [user_word]
     match = AT_END.search(re.sub(r"[\W_]+$", "", folder))
     if match is None or (match.start() and _bare(match[0]) not in (*GOOD, *BAD)):
         return []
-    return [_Verdict(match[0], _meaning(match), at + match.start())]
+    return [_FoundLabel(match[0], _meaning(match), at + match.start())]
 
 
-def _own(text: str, at: int, words: Words) -> _Verdict | None:
+def _find_user_word(text: str, at: int, words: Words) -> _FoundLabel | None:
     """The longest of one's own words that a name ends in."""
     for ending in _endings(text):
         for word in sorted((word for word in words if not word.isdecimal()), key=len, reverse=True):
             bare = re.sub(r"[\W_]+$", "", word)
             if bare and (match := re.search(f"{BEGIN}(?i:{re.escape(bare)})$", ending)):
-                return _Verdict(match[0], int(words[word]), at + match.start(), own=True)
+                return _FoundLabel(match[0], int(words[word]), at + match.start(), is_user_word=True)
     return None
 
 
@@ -290,7 +295,8 @@ class _Row(NamedTuple):
 def listed(path: str | os.PathLike[str], part: str, names: Sequence[str], words: Words = NONE) -> Labels:
     """A labels file: CSV with a column of files and one of labels. DataError where it cannot be read as one.
 
-    A recording is listed by its path, its end, or longer by a folder; without suffix, in any case.
+    A row names a recording by its full path, by the end of it, or by a path with more leading folders. The suffix may
+    be left out, and case is ignored.
     part : the column of parts' numbers.  names : of all recordings.  words : as of `label_of`.
     A file without a header, which names a .csv in its first line, has files, labels in this order. A column of files that
     is called otherwise is known by the recordings' names in it.
@@ -402,7 +408,7 @@ def collect(places: Mapping[str, Any], read: Callable[[Any], Timed], labels: Lab
 
     for name, place in places.items():
         found.take(name, partial(recorded, name, place))
-    words = _telling(unlabelled.values(), [each.source for each in found.read])
+    words = _likely_label_words(unlabelled.values(), [each.source for each in found.read])
     found.unknown.update(words)
     if len(unlabelled) - len(words) > len(places) / 2:
         why = next(fault for fault in reversed(found.faults) if fault.source in unlabelled)
@@ -411,7 +417,7 @@ def collect(places: Mapping[str, Any], read: Callable[[Any], Timed], labels: Lab
     return found
 
 
-def _telling(unlabelled: Collection[Sequence[str]], labelled: Sequence[str]) -> list[str]:
+def _likely_label_words(unlabelled: Collection[Sequence[str]], labelled: Sequence[str]) -> list[str]:
     """The words of names without a label, or of their folders, that tell them apart from each other or from labelled ones.
 
     unlabelled : of each name the words that may be its label.  labelled : the other names, which have none of these words.

@@ -48,8 +48,8 @@ def _other(mark: str) -> str:
     return MARKS.replace(mark, "")
 
 
-def _deciding(mark: str) -> re.Pattern[str]:
-    """Cells, a line each, in which a mark is the decimal one for certain."""
+def _certain_pattern(mark: str) -> re.Pattern[str]:
+    """Compile the pattern of cells, a line each, that prove a mark to be the decimal one."""
     m = re.escape(mark)
     other = re.escape(_other(mark))
     alone = rf"(?:0\d*|\d{{4,}}){m}\d*|{m}\d+|\d+{m}(?:\d{{0,2}}|\d{{4,}})|\d+{m}\d+[eE][+\-−]?\d+"
@@ -58,12 +58,13 @@ def _deciding(mark: str) -> re.Pattern[str]:
     return re.compile(rf"^{SIGN}(?:{alone}|{behind}|{beside}){EXPONENT}$", re.MULTILINE)
 
 
-def _undecided(mark: str) -> re.Pattern[str]:
+def _ambiguous_pattern(mark: str) -> re.Pattern[str]:
+    """Compile the pattern of cells, a line each, in which a mark may be the decimal one or group thousands."""
     return re.compile(rf"^{SIGN}[1-9]\d{{0,2}}{re.escape(mark)}\d{{3}}$", re.MULTILINE)
 
 
-DECIDING = {mark: _deciding(mark) for mark in MARKS}
-UNDECIDED = {mark: _undecided(mark) for mark in MARKS}
+DECIDING = {mark: _certain_pattern(mark) for mark in MARKS}
+UNDECIDED = {mark: _ambiguous_pattern(mark) for mark in MARKS}
 SMALL = re.compile(rf"^{SIGN}[1-9]\d{{0,2}}$", re.MULTILINE)
 LARGE = re.compile(rf"^{SIGN}[1-9]\d{{3,}}$", re.MULTILINE)
 
@@ -122,8 +123,8 @@ def as_python(
     A number in another format than the file's is wrong.
     decimal, thousands : the marks, as somebody stated them; None: as the cells tell.
     """
-    cells_of = (frame.iloc[:, i].tolist() for i in range(frame.shape[1]))
-    columns = {i: cells for i, cells in enumerate(cells_of) if is_numeric(cells)}
+    cell_lists = (frame.iloc[:, i].tolist() for i in range(frame.shape[1]))
+    columns = {i: cells for i, cells in enumerate(cell_lists) if is_numeric(cells)}
     texts = {i: "\n".join(cells) for i, cells in columns.items()}
     if decimal is None and thousands in (".", ","):
         decimal = _other(str(thousands))

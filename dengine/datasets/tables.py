@@ -92,11 +92,11 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
     """The recordings of a folder, a file each, as `recordings_in` names them; DataError where none can be read."""
     if asked.labels is None and asked.part != "part":
         raise DataError(f"Expected a file of labels with a column {asked.part}: a folder's names tell no parts' numbers.")
-    told, column = _labels_of(named, asked)
+    label_source, column = _labels_of(named, asked)
     found = Collected(name, asked.channels or _usual_channel(named.values(), asked, column))
     if column is not None:
         found.notes[f"The labels are those in column {column} of each file"] += 1
-    found.ordered = sorted(named, key=natural) == sorted(named, key=lambda each: natural(told.rest(each)))
+    found.ordered = sorted(named, key=natural) == sorted(named, key=lambda name: natural(label_source.rest(name)))
     found.notes.update(_left_aside(folder, named, asked))
     mark = cache(partial(_mark_of, list(named.values()), asked))
 
@@ -113,7 +113,7 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
         return recording
 
     try:
-        labels.collect(named, read, told, found).must_mean_something()
+        labels.collect(named, read, label_source, found).must_mean_something()
     except DataError as error:
         advice = None
         if not (asked.label or asked.labels):
@@ -137,7 +137,9 @@ def _labels_of(named: Mapping[str, Path], asked: Asked) -> tuple[labels.Labels, 
     else:
         usual = [known for known in labels.LABEL_COLUMNS if known not in labels.SIGNALS]
         place = labels.column_among(header, usual)
-        column = None if place is None or set(_told(named, labels.named(None, asked.words))) != {None} else header[place]
+        column = (
+            None if place is None or set(_count_labels(named, labels.named(None, asked.words))) != {None} else header[place]
+        )
     if column is not None:
         return labels.in_column(named, column, asked), column
     return labels.named(asked.label, asked.words), None
@@ -146,25 +148,25 @@ def _labels_of(named: Mapping[str, Path], asked: Asked) -> tuple[labels.Labels, 
 def _one_label_each(named: Mapping[str, Path], asked: Asked) -> bool:
     """Whether a column of the files tells labels, and the first file has one in it, as a recording has."""
     with suppress(DataError):
-        told, column = _labels_of(named, asked)
-        return column is not None and _told([next(iter(named))], told)[None] == 0
+        source, column = _labels_of(named, asked)
+        return column is not None and _count_labels([next(iter(named))], source)[None] == 0
     return False
 
 
-def _told(names: Iterable[str], told: labels.Labels) -> Counter[Any]:
-    """How often each label is told of names, each word that may be one, and None where there is nothing."""
-    found = Counter[Any]()
+def _count_labels(names: Iterable[str], source: labels.Labels) -> Counter[Any]:
+    """Count the labels of names, the words that may be labels, "" for an empty one, and None for no label at all."""
+    counts = Counter[Any]()
     for name in names:
         try:
-            found[told.find(name)[0]] += 1
+            counts[source.find(name)[0]] += 1
         except UnknownWordError as error:
-            found[error.word] += 1
+            counts[error.word] += 1
         except (UnreadableError, OSError) as error:
-            found["" if isinstance(error, UnlabelledError) else None] += 1
-    return found
+            counts["" if isinstance(error, UnlabelledError) else None] += 1
+    return counts
 
 
-def _tells(found: Counter[Any]) -> bool:
+def _look_like_labels(found: Counter[Any]) -> bool:
     """Whether most are labels, or words so few that a person can say their meaning."""
     words = set(+found) - {None, ""}
     return found.total() > 2 * found[None] and (words <= {0, 1} or 2 <= len(words) <= MOST_WORDS)
@@ -178,21 +180,24 @@ def _listing(folder: Path, named: Mapping[str, Path], asked: Asked) -> str | Non
         if words.isdisjoint(stems - {path.stem.lower()}):
             continue
         with suppress(DataError):
-            if _tells(_told(named, labels.listed(path, asked.part, list(named), asked.words))):
+            if _look_like_labels(_count_labels(named, labels.listed(path, asked.part, list(named), asked.words))):
                 return f"{path.name} names files: give it, labels={str(path)!r}"
     return None
 
 
 def _advice(named: Mapping[str, Path], asked: Asked) -> str | None:
     """How to say where the labels of recordings are, if that was tried on them and tells most; else None."""
-    likely = [(_told(named, told), f"{why}, say so: {do}") for why, do, told in labels.likely(list(named), asked.words)]
+    likely = [
+        (_count_labels(named, source), f"{why}, say so: {do}")
+        for why, do, source in labels.likely(list(named), asked.words)
+    ]
     found, advice = max(likely, key=lambda each: -each[0][None])
-    if _tells(found) and found[0] and found[1]:
+    if _look_like_labels(found) and found[0] and found[1]:
         return advice
     some = dict(list(named.items())[:: max(len(named) // FEW, 1)])
     columns = [name for name in _top(next(iter(named.values())), asked)[0] if name and not is_time(name)]
-    known = {name: _told(some, labels.in_column(some, name, asked)) for name in columns}
-    telling = [name for name, found in known.items() if not found[None] and _tells(found) and len(+found) > 1]
+    known = {name: _count_labels(some, labels.in_column(some, name, asked)) for name in columns}
+    telling = [name for name, found in known.items() if not found[None] and _look_like_labels(found) and len(+found) > 1]
     if telling:
         column = min(telling, key=lambda name: len(set(known[name]) - {0, 1, ""}))
         return f"if column {column} tells them, name it: label={column!r}"
@@ -257,46 +262,52 @@ def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
     """CSV and Parquet files of one form, one after the other. DataError where their columns are not the same."""
     found = Collected(name, ())
     tables: dict[str, pd.DataFrame] = {}
-    told_by = dict[str, list[str]]()
+    units_by = dict[str, list[str]]()
     for source, path in named.items():
         try:
             is_text = path.suffix.lower() in TEXTS
-            frame, faults, _, told, _ = read_table(path, asked, found.notes) if is_text else _parquet(path)
+            frame, faults, _, units_row, _ = read_table(path, asked, found.notes) if is_text else _parquet(path)
         except UnreadableError as error:
             raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
         if frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
         found.faults += [replace(fault, source=source) for fault in faults]
         tables[source] = frame
-        told_by[source] = told
+        units_by[source] = units_row
         found.beside = next((str(p) for p in path.parent.glob("*.csv") if p not in named.values()), found.beside)
-    first, *others = told_by
+    first, *others = units_by
     for source in others:
-        if told_by[source] != told_by[first]:
-            one, two = (", ".join(told_by[each]) or "none" for each in (first, source))
+        if units_by[source] != units_by[first]:
+            one, two = (", ".join(units_by[name]) or "none" for name in (first, source))
             raise DataError(f"Expected the same units in {first} and in {source}, got {one} and {two}; convert one.")
-    return _from_tables(tables, asked, found, told_by[first])
+    return _from_tables(tables, asked, found, units_by[first])
 
 
 def _parquet(path: Path) -> Sheet:
     import pandas as pd
 
     with reading(path, "a Parquet file", "pyarrow", "files"):
-        return Sheet(_counted(pd.read_parquet(path)), [], 0, [], "")
+        return Sheet(_with_row_numbers(pd.read_parquet(path)), [], 0, [], "")
 
 
-def _counted(frame: pd.DataFrame) -> pd.DataFrame:
+def _with_row_numbers(frame: pd.DataFrame) -> pd.DataFrame:
     """With names that are texts, and rows from 1."""
     return frame.set_axis(list(map(str, frame.columns)), axis=1).set_axis(range(1, len(frame) + 1))
 
 
 def from_frame(frame: pd.DataFrame, asked: Asked) -> Dataset:
     """A table in memory, whose rows count from 1."""
-    return _from_tables({"row": _counted(frame)}, asked, Collected("data", ()))
+    return _from_tables({"row": _with_row_numbers(frame)}, asked, Collected("data", ()))
 
 
-def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected, told: Sequence[str] = ()) -> Dataset:
-    """Tables of one form, by the names of their files, whose lines are their index. told : the units of their columns."""
+def _from_tables(
+    tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected, units_row: Sequence[str] = ()
+) -> Dataset:
+    """Check tables of one form, and read them as wide or as long ones.
+
+    tables : by the names of their files, or "row" for a frame in memory; their index numbers the lines.
+    units_row : the units of their columns.
+    """
     first, *_ = tables
     for source, frame in tables.items():
         for name in frame.columns:
@@ -311,7 +322,7 @@ def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collec
             raise DataError(f"Expected the same columns in {first} and in {source}, only one of them has {apart}.")
     if asked.time is not None or asked.labels is not None:
         return _from_long(
-            _one_long(tables, asked), asked, found, first, dict(zip(tables[first].columns, told, strict=False))
+            _one_long(tables, asked), asked, found, first, dict(zip(tables[first].columns, units_row, strict=False))
         )
     if advice := _long_columns(tables[first], asked, found.beside):
         have = listed(tables[first].columns)
@@ -345,16 +356,17 @@ def _take_rows(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
         if line in wrong:
             raise UnreadableError(wrong[line])
         number = str(part).removesuffix(".0").strip() or None
-        return Recorded(_ended(trace), labels.label_of(word, asked.words), f"{source}, line {line}", number)
+        return Recorded(_without_trailing_nan(trace), labels.label_of(word, asked.words), f"{source}, line {line}", number)
 
     for row in zip(frame.index, values.reshape(len(frame), len(columns), -1), frame[label].tolist(), parts, strict=True):
         found.take(source, partial(recorded, *row), row[0])
 
 
 def _one_long(tables: Mapping[str, pd.DataFrame], asked: Asked) -> pd.DataFrame:
-    """Long tables as one. A number that comes again in another file is another part's, called by its file too.
+    """Concatenate long tables.
 
-    Only the last of a file, if the next one begins with it, goes on there.
+    The same part's number in two files means two parts: the file's name is then put before it. Exception: a part that ends
+    one file and begins the next is one part.
     """
     import pandas as pd
 
@@ -390,7 +402,6 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str,
     parts = {str(part): rows for part, rows in frame.assign(**{ORDER: order}).groupby(asked.part, sort=False)}
 
     places = [frame.columns.get_loc(name) for name in found.channels]
-
     how = replace(asked, time=time)
 
     def read(rows: pd.DataFrame) -> Timed:
@@ -401,10 +412,10 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str,
     def find(part: str) -> labels.Known:
         return labels.agreed(parts[part][label], str(label), asked.words), None
 
-    told = labels.Labels(find, "name the column of labels (label)")
+    source_of_labels = labels.Labels(find, "name the column of labels (label)")
     if asked.labels is not None:
-        told = labels.listed(asked.labels, "part", list(parts), asked.words)
-    return as_dataset(labels.collect(parts, read, told, found), asked)
+        source_of_labels = labels.listed(asked.labels, "part", list(parts), asked.words)
+    return as_dataset(labels.collect(parts, read, source_of_labels, found), asked)
 
 
 def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.DataFrame:
@@ -432,7 +443,9 @@ def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
         return ""
     part = asked.part if asked.part in frame and frame[asked.part].duplicated().any() else ""
     time = asked.time or next((name for name in frame.columns if is_time(name)), "")
-    time = time or next((name for name in frame.columns if part and name != part and _rises(frame, part, name)), "")
+    time = time or next(
+        (name for name in frame.columns if part and name != part and _rises_within_parts(frame, part, name)), ""
+    )
     if not (time or part):
         return ""
     rows = frame.mask(frame == "").bfill()  # a label may stand in a part's last row alone
@@ -441,16 +454,16 @@ def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
     few = [name for name, n in changes.items() if 2 <= n <= len(frame) / 5]
     if not (part or few):
         return ""
-    told = [] if part else [f"part={(part := max(few, key=changes.__getitem__))!r}"]
+    hints = [] if part else [f"part={(part := max(few, key=changes.__getitem__))!r}"]
     if not asked.time:
-        told.append(f"time={time!r}" if time else "the column of times (time)")
+        hints.append(f"time={time!r}" if time else "the column of times (time)")
     if not (asked.label or asked.labels):
         label = min(few, key=lambda name: (name.lower() not in labels.LABEL_COLUMNS, changes[name]), default=part)
-        told.append(f"label={label!r}" if label != part else _parts_listing(frame[part], beside, asked))
-    return f"the columns that tell which part it is, when, and the label, as in {', '.join(told)}" if told else ""
+        hints.append(f"label={label!r}" if label != part else _parts_listing(frame[part], beside, asked))
+    return f"the columns that tell which part it is, when, and the label, as in {', '.join(hints)}" if hints else ""
 
 
-def _rises(frame: pd.DataFrame, part: str, name: str) -> bool:
+def _rises_within_parts(frame: pd.DataFrame, part: str, name: str) -> bool:
     """Whether a column's numbers, or times as text, rise from row to row of each part."""
     with suppress(ValueError, TypeError):
         values, odd, _ = seconds_of(frame[name], name)
@@ -463,7 +476,7 @@ def _parts_listing(parts: pd.Series, beside: str, asked: Asked) -> str:
     """How to name a file of parts and labels: the one beside the table, if it has most of them."""
     named = [str(part) for part in parts.unique()]
     with suppress(DataError):
-        if _tells(_told(named, labels.listed(beside, "part", named, asked.words))):
+        if _look_like_labels(_count_labels(named, labels.listed(beside, "part", named, asked.words))):
             return f"labels={beside!r}, a file of parts and labels"
     return "and a CSV file of parts and labels (labels)"
 
@@ -480,7 +493,7 @@ def _chosen(have: Sequence[str], asked: Asked) -> tuple[str, ...]:
     return chosen
 
 
-def _ended(trace: NDArray[np.float32]) -> NDArray[np.float32]:
+def _without_trailing_nan(trace: NDArray[np.float32]) -> NDArray[np.float32]:
     """(C, T) without the last samples that no channel has; whole where there is none at all."""
     known = np.flatnonzero(~np.isnan(trace).all(axis=0))
     return trace[:, : known[-1] + 1] if len(known) else trace
@@ -521,11 +534,13 @@ def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:
         raise DataError(f"Expected samples in numbered columns, as FZ_0, FZ_1, ..., found {listed(names)}.")
     for those in several.values():
         steps = np.diff([number for number, _ in those])
-        for i in np.flatnonzero(steps != np.median(steps))[:1].tolist():
+        odd = np.flatnonzero(steps != np.median(steps))
+        if len(odd):
+            i = int(odd[0])
             after = f"after {those[i][1]} comes {those[i + 1][1]}"
             raise DataError(f"Expected columns that are numbered one by one, {after}.")
     chosen = _chosen(list(several), asked)
     if len({len(several[name]) for name in chosen}) > 1:
-        each = ", ".join(f"{name} {len(several[name])}" for name in chosen)
-        raise DataError(f"Expected as many samples of each channel, got {each}.")
+        counts = ", ".join(f"{name} {len(several[name])}" for name in chosen)
+        raise DataError(f"Expected as many samples of each channel, got {counts}.")
     return {name: [column for _, column in several[name]] for name in chosen}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -89,7 +89,7 @@ def _split(line: str, delimiter: str) -> list[str]:
 def _delimiter(lines: Sequence[str]) -> str:
     """What parts the most cells into numbers and times, as many in each line and in the header."""
     few = [units.LEADING.sub("", line) for line in lines[-SAMPLED:]]
-    top = [units.LEADING.sub("", line) for line in lines[: len(lines) - 1][:100]]
+    top = [units.LEADING.sub("", line) for line in lines[:-1][:100]]
 
     def score(delimiter: str) -> float:
         rows = [_split(line, delimiter) for line in few]
@@ -99,7 +99,9 @@ def _delimiter(lines: Sequence[str]) -> str:
         named = width if rows[0][-1:] != [""] else width - 1  # a delimiter at the end of the data alone
         cells = [cell for row in rows if len(row) == width for cell in row[:CELLS]]
         values = sum(map(_is_value, cells))
-        heads = (row for row in (_ended(_split(line, delimiter)) for line in top) if len(row) in (named, width))
+        heads = (
+            row for row in (_without_trailing_empty(_split(line, delimiter)) for line in top) if len(row) in (named, width)
+        )
         headed = any(2 * sum(map(_is_value, row[:CELLS])) <= min(len(row), CELLS) for row in heads)
         return values / len(cells) * times / len(rows) * (1.0 if headed else 0.5)
 
@@ -115,7 +117,7 @@ def _is_value(cell: str) -> bool:
     return is_numeral(cell) or STAMP.fullmatch(cell) is not None or cell.lower() in NOTHING
 
 
-def _ended(row: list[str]) -> list[str]:
+def _without_trailing_empty(row: list[str]) -> list[str]:
     """A row without the empty cells at its end."""
     n = len(row)
     while n and not row[n - 1]:
@@ -130,31 +132,40 @@ def _is_unit(cell: str) -> bool:
 def _from_header(lines: dict[int, list[str]], delimiter: str, columns: list[str]) -> Cells:
     """The cells from the header on, without what a recorder writes above it; and the row of units below it.
 
-    A row of data has numbers in most columns that have them in the last rows. A first line that may be the header is one,
-    if only one other line is above the data: that is damaged data. UnreadableError where there is none.
+    A row is data if it has numbers in most of the columns that are numeric in the last 20 rows. If two lines stand above
+    the data and the first can be the header, it is the header, and the second is a damaged row. UnreadableError where
+    there is no header.
     """
-    places, rows = list(lines), list(lines.values())
-    numbers: Callable[[list[str]], frozenset[int]]
-    numbers = lambda row: frozenset(i for i, word in enumerate(row) if is_numeral(word) or word.lower() == "nan")  # noqa: E731
-    usual = Counter(map(numbers, (rows if columns else rows[1:])[-20:])).most_common(1)
-    data = next((k for k, row in enumerate(rows) for some, _ in usual if 2 * len(numbers(row) & some) > len(some)), 0)
+    places = list(lines)
+    rows = list(lines.values())
+    usual = Counter(map(_numeric_columns, (rows if columns else rows[1:])[-20:])).most_common(1)
+    numeric = usual[0][0] if usual else frozenset()
+    data = next((k for k, row in enumerate(rows) if 2 * len(_numeric_columns(row) & numeric) > len(numeric)), 0)
     above = [_without_mark(row, delimiter) for row in rows[: max(data, 1)]]
     in_units = [any(row) and all(map(_is_unit, row)) for row in above]
     header = max(data - 1 - (data > 1 and in_units[-1]), 0)
     if header == 1 and len(rows[0]) >= len(rows[data]) and not in_units[0]:
         header = data = 0
-    said = above[header + 1] if header + 1 < data else []
+    units_row = above[header + 1] if header + 1 < data else []
     if columns:
-        told = {i: row for k, (i, row) in enumerate(zip(places, rows, strict=True)) if k >= data}
-        return Cells(columns, 0, _stripped(said, len(columns)), told, delimiter)
+        data_rows = dict(zip(places[data:], rows[data:], strict=True))
+        return Cells(columns, 0, _stripped(units_row, len(columns)), data_rows, delimiter)
     names = above[header] if above else []
-    for row in [names] if names else []:  # whole numbers may be names
-        if 2 * len(numbers(row)) > len(row) and not all(row[i].isdecimal() for i in numbers(row)):
-            raise UnreadableError(f"Expected a header, its first line is of numbers; {_named(rows)}", places[header])
-    told = {i: rows[k] for k, i in enumerate(places) if k >= max(data, 1)}
-    if names[-1:] and names[-1].lower() in COMMENTS and all(len(row) < len(names) for row in told.values()):
+    numbered = _numeric_columns(names)
+    # Whole numbers may be names.
+    if 2 * len(numbered) > len(names) and not all(names[i].isdecimal() for i in numbered):
+        advice = _columns_advice(rows)
+        raise UnreadableError(f"Expected a header, its first line is of numbers; {advice}", places[header])
+    first = max(data, 1)
+    data_rows = dict(zip(places[first:], rows[first:], strict=True))
+    if names[-1:] and names[-1].lower() in COMMENTS and all(len(row) < len(names) for row in data_rows.values()):
         names = names[:-1]  # LabVIEW's, of which its rows say nothing
-    return Cells(names, places[header] if places else 0, _stripped(said, len(names)), told, delimiter)
+    return Cells(names, places[header] if places else 0, _stripped(units_row, len(names)), data_rows, delimiter)
+
+
+def _numeric_columns(row: list[str]) -> frozenset[int]:
+    """Where a row has numbers, or nan."""
+    return frozenset(i for i, word in enumerate(row) if is_numeral(word) or word.lower() == "nan")
 
 
 def _without_mark(row: list[str], delimiter: str) -> list[str]:
@@ -163,12 +174,12 @@ def _without_mark(row: list[str], delimiter: str) -> list[str]:
     return row[1:] if not first and delimiter == " " else [first, *row[1:]]  # `# time fx` has a word too many
 
 
-def _stripped(said: list[str], n: int) -> list[str]:
-    """A row of units as one a column, without brackets."""
-    return [cell.strip("[](){} ") for cell in said][:n] + [""] * (n - len(said))
+def _stripped(units_row: list[str], n: int) -> list[str]:
+    """A row of units as n units, one for each column, without brackets."""
+    return [cell.strip("[](){} ") for cell in units_row][:n] + [""] * (n - len(units_row))
 
 
-def _named(rows: list[list[str]]) -> str:
+def _columns_advice(rows: list[list[str]]) -> str:
     """How to name the columns of a file without a header."""
     some = [row for row in rows[:200] if len(row) == len(rows[0])]
     try:
@@ -212,7 +223,7 @@ def read_table(
         notes[f"Text is read as {encoding}, not UTF-8"] += 1
     if not cells.header:
         raise UnreadableError("Expected a header and rows, it is empty")
-    header = _ended(cells.header)  # a delimiter at its end
+    header = _without_trailing_empty(cells.header)  # a delimiter at its end
     if not header:
         raise UnreadableError("Expected a header, the first line names no column", cells.line)
     n = len(header)
@@ -247,29 +258,29 @@ def read_recording(
 
     notes, decimal : as of `read_table`.
     """
-    frame, faults, line, told, _ = read_table(path, asked, notes, decimal)
+    frame, faults, line, units_row, _ = read_table(path, asked, notes, decimal)
     places = [place_of(name, list(frame.columns), line) for name in channels]
     if faults:
         raise UnreadableError(faults[0].what, faults[0].line)
     if frame.empty:
         raise UnreadableError("Expected samples below the header, found none", line)
-    said = tuple(told[i] or units.split(str(frame.columns[i]))[1] for i in places)
-    return recording_of(frame, places, asked, notes, told)._replace(units=said)
+    of_channels = tuple(units_row[i] or units.split(str(frame.columns[i]))[1] for i in places)
+    return recording_of(frame, places, asked, notes, units_row)._replace(units=of_channels)
 
 
 def recording_of(
-    rows: pd.DataFrame, places: Sequence[int], asked: Asked, notes: Counter[str], told: Sequence[str] = ()
+    rows: pd.DataFrame, places: Sequence[int], asked: Asked, notes: Counter[str], units_row: Sequence[str] = ()
 ) -> Timed:
     """Rows, a sample each, as (C, T), and their rate, unless it was stated. places : of the channels' columns.
 
     An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
-    told : the units of all columns.  With `fit="resample"` the samples are put on even times by the clock.
+    units_row : the units of all columns.  With `fit="resample"` the samples are put on even times by the clock.
     """
     values, wrong = numbers(rows.iloc[:, places])
     if wrong:
         raise UnreadableError(wrong[min(wrong)], min(wrong))
     trace = np.ascontiguousarray(values.T)
-    clock = None if asked.rate_hz is not None else clock_of(rows, asked.time, told)
+    clock = None if asked.rate_hz is not None else clock_of(rows, asked.time, units_row)
     if clock is None:
         known = set(range(rows.shape[1])) if asked.rate_hz is not None else set(places)
         offered = [str(rows.columns[i]) for i in rising(rows) if i not in known]
@@ -297,7 +308,7 @@ def place_of(name: str, header: Sequence[str], line: int = 1) -> int:
     if not places:
         raise UnreadableError(f"Expected a column {name}, got {have}", line)
     if len(places) > 1:
-        anew = ",".join(f"{word}_{i}" if word in header[:i] else word for i, word in enumerate(header, start=0))
+        anew = ",".join(f"{word}_{i}" if word in header[:i] else word for i, word in enumerate(header))
         do = f"name them anew, columns={anew!r}"
         raise UnreadableError(f"Expected a column {name}, got it twice or more in {have}; {do}", line)
     return places[0]

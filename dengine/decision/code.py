@@ -21,16 +21,16 @@ _COMPILED: WeakKeyDictionary[Any, str] = WeakKeyDictionary()  # what classes and
 
 def remember_code(module: nn.Module) -> None:
     """Note the code of a module, and of all in it, as compiled."""
-    for unit in _units(module):
+    for unit in _user_code(module):
         _COMPILED.setdefault(unit, _code_of(unit))
 
 
 def is_code_changed(module: nn.Module) -> bool:
     """Return whether the code of a module, or of one in it, is another than was compiled in this process."""
-    return any(_COMPILED.get(unit, code := _code_of(unit)) != code for unit in _units(module))
+    return any(unit in _COMPILED and _COMPILED[unit] != _code_of(unit) for unit in _user_code(module))
 
 
-def _units(module: nn.Module) -> Iterator[Any]:
+def _user_code(module: nn.Module) -> Iterator[Any]:
     """The user's classes and functions that a module is made of."""
     for part in module.modules():
         for unit in (type(part), *(value for value in vars(part).values() if isinstance(value, FunctionType))):

@@ -73,8 +73,8 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
             with instead(OutputError, f"Cannot write {out}", sqlite3.Error, do="choose a folder that has room"):
                 _copy(os.fspath(url), partial)
                 for cell, records in waiting.items():
-                    _take(partial, cell, records)
-                decisions, labels = _finish(partial)
+                    _add_records(partial, cell, records)
+                decisions, labels = _fold_wal_and_count(partial)
         finally:
             for suffix in ("-wal", "-shm"):
                 partial.with_name(partial.name + suffix).unlink(missing_ok=True)
@@ -88,8 +88,8 @@ def _copy(url: str, target: Path) -> None:
         source.backup(copy)
 
 
-def _take(file: Path, cell: str, records: list[Record]) -> None:
-    """Have the copy take records; those that it holds count as taken."""
+def _add_records(file: Path, cell: str, records: list[Record]) -> None:
+    """Add records to the copy; those that it has already change nothing."""
     if not records:
         return
     with SqlStore(str(file), cell) as store:
@@ -97,8 +97,8 @@ def _take(file: Path, cell: str, records: list[Record]) -> None:
             store.take(records[begin : begin + CHUNK])
 
 
-def _finish(file: Path) -> tuple[int, int]:
-    """Have it all in one file, which is read wherever it lies; returns its decisions and labels."""
+def _fold_wal_and_count(file: Path) -> tuple[int, int]:
+    """Leave write-ahead logging, so that all is in one file that can be read anywhere; returns its decisions and labels."""
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")
         decisions, labels = (

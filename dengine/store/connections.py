@@ -75,10 +75,10 @@ class CopyConnection(sqlite3.Connection):
 
 
 def _connect(dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
-    """Connect to a file; to one that cannot be written, or lies where nothing can, as if it never changes.
+    """Connect to a file; open one as immutable if neither it nor its folder can be written.
 
-    Where the write-ahead log of a killed process lies beside such a file, and nothing else, both are copied:
-    SQLite reads them only where it can make a third file.
+    If a `-wal` lies beside such a file without a `-shm`, both are copied to a temporary folder: SQLite has to create the
+    `-shm` to read them.
     """
     name = str(arguments[0])
     file, log, shared = Path(name), Path(f"{name}-wal"), Path(f"{name}-shm")

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 class RulePast:
     """What a rule was told until its engine ended.
 
-    told_to : number of the newest label that the rule in the version's state knows; 0 where it must be told all anew: a
-        label was corrected since, or a check is overdue, which counts only until its label comes.
+    told_to : number of the newest label that the rule in the version's state knows. 0 means that it must be told
+        everything again: a label was corrected since, a check is overdue (it counts as wrong until its label comes), the
+        state is incomplete, or the version is of an earlier policy or a peer's.
     overdue_to : number of the newest decision whose check was overdue.  overdue : ids of those that the rule was told of.
     """
 
@@ -52,6 +53,6 @@ def rule_past(
     if version is None:
         return RulePast(0, overdue_to, overdue)
     told_to = int(state.get("told_to", version.last_seq))  # 0: a peer's, who knows nothing of this cell
-    anew = bool(overdue) or not state.keys().isdisjoint(("untold", "owed")) or version.version < since_version
+    must_retell = bool(overdue) or not state.keys().isdisjoint(("untold", "owed")) or version.version < since_version
     corrected = bool(store.corrections(int(state.get("corrected_to", 0))))
-    return RulePast(0 if anew or corrected else told_to, overdue_to, overdue)
+    return RulePast(0 if must_retell or corrected else told_to, overdue_to, overdue)

@@ -290,7 +290,7 @@ def newest_known(path: Path) -> set[tuple[int, str]]:
 def waiting_records(path: Path) -> list[Record]:
     """Return what a journal holds that its store has not taken, whoever owns it.
 
-    Of the decisions of one id the last is in the place of those before.
+    If several decisions share an id, only the last is returned.
     """
     journal = Journal(path, owning=False)
     try:

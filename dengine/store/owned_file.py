@@ -39,6 +39,8 @@ def _lock_of_system() -> Callable[[int], object]:
 
 
 def _lock_of_windows(msvcrt: Any) -> Callable[[int], object]:
+    """Return what locks a descriptor by Windows, with a BlockingIOError as `flock` has it; it moves the offset."""
+
     def lock(descriptor: int) -> None:
         os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
         try:
@@ -82,10 +84,10 @@ class OwnedFile:
     def __init__(self, path: Path, owning: bool = True) -> None:
         self.path = path
         self._seeking = threading.Lock()
-        self._fd = self._opened() if owning else open_plain(path, os.O_RDONLY)
+        self._fd = self._open_and_lock() if owning else open_plain(path, os.O_RDONLY)
         _OPEN.add(self)
 
-    def _opened(self) -> int:
+    def _open_and_lock(self) -> int:
         """Open and lock the file that is still at its path once the lock is held."""
         while True:
             self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -282,9 +282,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Return what a rule is told of the labels after number `seq`, in their order, of this cell alone.
 
         It is not told of rejected parts, of which those come back that somebody chose.
-        overdue_to : number of the newest decision whose check is overdue; each such check comes where the running engine
-            told the rule of it, which the labels after it know.
-        A level that other cells' streams certify says nothing certain of this one's, and a watch that counts them would
+        overdue_to : number of the newest decision whose check is overdue. Overdue checks are inserted where the running
+            engine told the rule of them; every later label stores that position.
+        Only this cell's labels count: evidence from other cells certifies nothing here, and a watch that counts it would
         notice too late that this cell has changed.
         """
         label = counted()
