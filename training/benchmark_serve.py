@@ -144,7 +144,7 @@ def syncs(folder: Path, times: int = 500) -> list[float]:
 
         def sync() -> None:
             file.write(bytes(4096))
-            os.fdatasync(file.fileno())
+            getattr(os, "fdatasync", os.fsync)(file.fileno())
 
         return [wall_time(sync)[0] for _ in range(times)]
 

@@ -237,14 +237,15 @@ def _digest(before: bytes, record: bytes) -> bytes:
     return blake2b(before + record, digest_size=16).digest()
 
 
-def _using(path: Path) -> AbstractContextManager[None]:
+def _using(path: Path, owning: bool = True) -> AbstractContextManager[None]:
     do = "free some space there, or make its folder writable"
+    do = do if owning else "read it as the user that its cell runs as"
     return instead(StoreError, f"Could not use the journal {path}", OSError, do=do)
 
 
 def _opened(path: Path, owning: bool = True) -> OwnedFile:
     """Open a journal's file; StoreError that names its owner, where another engine has it."""
-    with _using(path):
+    with _using(path, owning):
         try:
             return OwnedFile(path, owning)
         except BlockingIOError as error:

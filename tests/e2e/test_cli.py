@@ -191,6 +191,16 @@ def test_rivals_are_compared_under_their_names_which_the_help_says_and_leave_no_
     assert found["costs"]["core_seconds"] > 0
 
 
+def test_a_character_that_the_screen_has_not_is_a_question_mark(trained: Path, tmp_path: Path) -> None:
+    shutil.copy(trained, tmp_path / "Łódź.db")
+    environment = os.environ | {"PYTHONIOENCODING": "cp1252", "PYTHONUTF8": "0"}  # as a screen of Windows
+    for store, code, text in (("Łódź.db", 0, "?ód?.db: overview"), ("Gdańsk.db", 1, "Gda?sk.db")):
+        command = [sys.executable, "-m", "dengine", "status", store]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=False)
+        shown = (done.stdout + done.stderr).decode("cp1252")
+        assert (done.returncode, text in shown) == (code, True), shown
+
+
 def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained: Path, data: Path) -> None:
     again = document("train", "--data", data, "--store", trained)
     nothing = {"imported": 0, "quarantined": 0, "known": 160, "resumed": True, "cut": 0, "contradicted": 0, "aside": ""}

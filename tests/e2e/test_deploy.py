@@ -47,6 +47,19 @@ def parse(words: list[str]) -> click.Context:
         return main.commands[words[0]].make_context(words[0], list(words[1:]), parent=parent)
 
 
+def test_the_recipe_for_windows_installs_extras_and_runs_tests_and_verbs_that_there_are() -> None:
+    recipe = (DEPLOY / "windows.yml").read_text(encoding="utf-8")
+    paths = re.findall(r"\btests/[\w/.]+", recipe)
+    assert [path for path in paths if not (REPO / path).exists()] == []
+    (extras,) = re.findall(r'"\.\[([\w,]+)\]"', recipe)
+    assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
+    commands = re.findall(r"run: dengine (.+)", recipe)
+    assert len(commands) >= 4
+    for command in commands:
+        parse(shlex.split(command))
+    assert "://" not in recipe  # no index is named
+
+
 def test_what_the_container_copies_is_there_and_its_parts_are_those_of_the_project() -> None:
     copied = [path for step in steps("COPY") for path in step.split()[:-1]]
     assert {"constraints.txt", "pyproject.toml", "dengine"} <= set(copied)

@@ -68,6 +68,18 @@ def store(request: pytest.FixtureRequest, made: dict[str, Path], tmp_path: Path)
     folder.chmod(0o755)
 
 
+def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(made: dict[str, Path], tmp_path: Path) -> None:
+    store, journal = tmp_path / "engine.db", tmp_path / "engine.db.cell.journal"
+    shutil.copy(made["closed"] / "engine.db", store)
+    journal.write_bytes(b"another user's")
+    journal.chmod(0o000)
+    assert '"waiting": null' in well("verify", store, "--json")
+    refused = dengine("backup", store, "--out", tmp_path / "copy.db")
+    assert refused.returncode == 1
+    assert "read it as the user that its cell runs as" in " ".join(refused.stderr.split())
+    assert not (tmp_path / "copy.db").exists()
+
+
 def test_what_only_reads_reads_it_and_leaves_it_as_it_is(store: Path, tmp_path: Path) -> None:
     before = {file.name: file.read_bytes() for file in store.parent.iterdir() if not file.name.endswith("-shm")}
     *results, refused = dengine(

@@ -16,7 +16,11 @@ import pytest
 
 pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
 
+from sqlalchemy import make_url
+
 from dengine import DataEngine, Recipe
+from dengine.store import journal
+from dengine.store.journal import journal_path
 from tests.support.serving import REPO, WAIT, started
 
 HIDING = f"{REPO / 'tests' / 'support' / 'without_posix'}{os.pathsep}{REPO}"
@@ -63,6 +67,18 @@ def python(*words: object, code: int = 0) -> str:
 
 def test_every_module_imports() -> None:
     python("-c", EVERY_MODULE)
+
+
+def test_names_that_differ_in_capitals_alone_have_a_journal_each_where_files_do_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal, "IGNORES_CASE", True)
+    url = make_url("sqlite:///line.db")
+    names = ["a", "A", "%41", "b:B", "B:b", "é", "É"]
+    found = [journal_path(url, name).name for name in names]
+    assert len({each.lower() for each in found}) == len(names)
+    assert found[0] == "line.db.a.journal"
+    assert not set('<>:"/\\|?*') & set("".join(found))
 
 
 @pytest.mark.merge
