@@ -269,10 +269,14 @@ class HttpApi:
         return Response(body, media_type=kind)
 
     async def healthz(self) -> Response:
-        """Whether the engine answers: ok; degraded (200): its store cannot be written; down (503). It asks for no token."""
+        """Whether the engine answers: ok; degraded (200); down (503). It asks for no token.
+
+        Degraded: the store cannot be written, or retrains are dropped again and again.
+        """
         engine, alive = self.service.engine, self.service.silent < HUNG
-        state = "down" if not alive else "degraded" if engine.store_fault else "ok"
-        return api.answered(api.Health(state, engine.store_fault, self.service.waiting), 200 if alive else 503)
+        faults = engine.store_fault, engine.retrain_fault
+        state = "down" if not alive else "degraded" if any(faults) else "ok"
+        return api.answered(api.Health(state, *faults, self.service.waiting), 200 if alive else 503)
 
     async def openapi(self) -> Json:
         """The OpenAPI document."""
