@@ -175,7 +175,10 @@ class HttpApi:
         return await self._change(author, begin)
 
     async def export(self, author: str = "") -> Response:
-        """The model that answers now, as a TorchScript file with its checksum, in an archive."""
+        """The model that answers now, as a TorchScript file with its checksum, in an archive.
+
+        An accepted part that waits for its confirmation is not in it: that stays with the engine.
+        """
 
         def copied(engine: DataEngine) -> Exportable:
             found = engine.exported()
