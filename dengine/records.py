@@ -56,6 +56,7 @@ class Reason(StrEnum):
     NO_STORE = "no_store"  # the journal takes nothing, or whether the id is new cannot be looked up
     LATE = "late"  # the answer would have come too late: whoever asked verifies already
     OUTSIDE = "outside"  # it leaves one of the operator's windows, whatever the model says
+    TOO_LARGE = "too_large"  # a sample beyond 1e18 either way, whose square float32 cannot sum
 
 
 ACTIONS, REASONS = tuple(Action), tuple(Reason)  # by position: the integers of exported files

@@ -30,7 +30,10 @@ ALONE = {
 AFTER_T = {f"t {word}" for word in (*ALONE, "s", "rel", "abs", "start")}
 AFTER_NAME = re.compile(r"\s*([\[({<].*|(/|\bin )\s*[a-zµμ]{1,4}|\.\d+)$", re.IGNORECASE)  # a unit, or pandas' number
 WORDS = re.compile(r"[A-Z]+(?![a-zµ])|[A-Z]?[^\W\d_A-Z]+")
-NOT_FINITE, CONSTANT, SATURATED = (REASONS.index(r) for r in (Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED))
+NOT_FINITE, CONSTANT, SATURATED, TOO_LARGE = (
+    REASONS.index(r) for r in (Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED, Reason.TOO_LARGE)
+)
+LARGEST = 1e18  # a sample: squares of larger ones overflow float32, or their sum over a trace does
 
 
 def as_trace(trace: Any, spec: TraceSpec | None) -> NDArray[np.float32]:
@@ -179,6 +182,34 @@ def _as_agreed(x: NDArray[np.float32], spec: TraceSpec) -> NDArray[np.float32]:
     return np.asarray(fitted(torch.from_numpy(np.array(x, order="C")), spec.samples, FITS.index(spec.fit)))
 
 
+RARE, FAR, MOST = 0.1, 64.0, 1e15  # of `without_extremes`
+
+
+def without_extremes(traces: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Clip what lies absurdly far out, so that one labelled trace cannot spoil a training.
+
+    Parameters
+    ----------
+    traces : array of float32, shape (n, C, T)
+
+    Returns
+    -------
+    array of float32, shape (n, C, T)
+        The traces themselves where nothing had to be clipped. Each channel has a limit of its own, a
+        power of four, at least 64 times what nine in ten traces keep, and at most 1e15, whose squares
+        float32 can sum.
+    """
+    if not len(traces):
+        return traces
+    peaks = np.maximum(traces.max(axis=2), -traces.min(axis=2)).astype(np.float64)  # (n, C)
+    usual = np.quantile(peaks, 1.0 - RARE, axis=0, method="lower")
+    with np.errstate(divide="ignore"):  # a channel that is silent in nearly all has the largest limit
+        limits = np.where(usual > 0.0, 4.0 ** np.ceil(np.log2(FAR * usual) / 2.0), MOST).clip(max=MOST)
+    if (peaks <= limits).all():
+        return traces
+    return np.clip(traces, -limits[:, None], limits[:, None]).astype(np.float32)
+
+
 class TraceGate(nn.Module):
     """A trace's faults and its content hash, scripted: one implementation for the engine and the exported file."""
 
@@ -190,6 +221,7 @@ class TraceGate(nn.Module):
         self.limit = float("inf") if spec.limit is None else float(spec.limit)
         self.clamp = float(CLAMP)
         self.not_finite, self.constant, self.saturated = NOT_FINITE, CONSTANT, SATURATED
+        self.too_large, self.largest = TOO_LARGE, LARGEST
         self.register_buffer("quantum", torch.tensor(QUANTUM))  # a plain number becomes one at each product
         self.register_buffer("weights", torch.from_numpy(hash_weights(spec.channels * spec.samples)))
 
@@ -210,6 +242,8 @@ class TraceGate(nn.Module):
             reason = self.constant
         elif max(high, -low) >= limit:
             reason = self.saturated
+        elif max(high, -low) > self.largest:
+            reason = self.too_large
         if not max(high, -low) <= self.clamp:  # a NaN among them tells nothing of the others
             x = x.clamp(-self.clamp, self.clamp)
         steps = (x.view(-1) * self.quantum).floor_().to(torch.int64)  # exact in float32: the quantum is a power of two

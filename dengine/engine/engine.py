@@ -31,7 +31,7 @@ from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
 from ..history.explain import Explanation, explain
-from ..history.status import NEWEST, Status, as_frame, history, status
+from ..history.status import NEWEST, Status, as_frame, history, retrain_fault, status
 from ..model.base import EngineModel, Exportable, Model
 from ..recipe import Recipe
 from ..records import (
@@ -611,6 +611,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def store_lag(self) -> float:
         """Age in seconds of the oldest record in the journal that the store has not taken; 0.0 where it has all."""
         return self._outbox.lag
+
+    @property
+    def retrain_fault(self) -> str:
+        """What is wrong where retrains are dropped again and again; "" where they are not."""
+        return retrain_fault(self._versions.dropped, self.version)
 
     def certificate(self) -> Certificate:
         """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""

@@ -123,6 +123,7 @@ class ModelVersions:
         self._news: RetrainReport | None = None
         self._candidate: Candidate | None = None
         self._continues = True  # the last retrain was accepted
+        self.dropped: list[str] = []  # reasons of the retrains that were dropped since the last accepted one
         self._ahead: Future[None] | None = None  # features of stored traces, which the next retrain waits for
 
     @property
@@ -144,7 +145,10 @@ class ModelVersions:
         version = store.last_version()  # before the labels: a peer may store both meanwhile
         labelled = store.labelled(self.retrainer.window.capacity)
         self.retrainer.window.refill(labelled)
-        self._newest = max((report.version for report in store.retrains()), default=0)
+        reports = store.retrains()
+        self._newest = max((report.version for report in reports), default=0)
+        for report in reports:
+            self._note_outcome(report)
         # The later versions may be damaged: what an earlier one's rule learned under an earlier policy is left out.
         state = {} if version is None else version.state if version.version >= since else without_rule(version.state)
         model = None if version is None else restored(self.outbox, template, state)
@@ -315,6 +319,7 @@ class ModelVersions:
         state = self._state(model, trained_on)
         self.store.record(replace(event, version=(report, self.retrainer.window.newest_seq, state)))
         self.answering, self.version, self._news = model, report.version, report
+        self._note_outcome(report)
         self._newest, self._trained_on = report.version, trained_on
 
     def _state(self, model: EngineModel, trained_on: TrainedOn) -> State:
@@ -406,6 +411,7 @@ class ModelVersions:
             report, self._candidate, self._continues = candidate.report, None, False
             self.new_labels += report.n_traces  # its labels are as many new ones, so that the next retrain is soon
             self._news = replace(report, version=self.version, accepted=False, reason=f"dropped: not stored: {error}")
+            self._note_outcome(self._news)
             return
         try:
             self.store_waiting()  # what was confirmed since is to be among its references
@@ -451,12 +457,16 @@ class ModelVersions:
     def _swap(self, candidate: Candidate) -> None:
         model, self._news = candidate.model, candidate.report
         self._continues = model is not None
+        self._note_outcome(candidate.report)
         if model is not None:
             model.untold = model.untold or self.newest.untold
             self.answering, self.version = model, candidate.report.version  # one reference is swapped
             self._newest, self._trained_on = self.version, candidate.trained_on
             if self.fleet is not None:
                 self.fleet.swapped(model)
+
+    def _note_outcome(self, report: RetrainReport) -> None:
+        self.dropped = [] if report.accepted else [*self.dropped, report.reason]
 
     def take_news(self) -> RetrainReport | None:
         """The newest retrain, once."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..datasets import Dataset, Fault
 from ..folds import content_hash, own_hash
 from ..model.neighbours import NEWEST, near_repeats
-from ..traces import as_traces
+from ..traces import LARGEST, as_traces
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,8 @@ class Survey:
     """What is known of a data set.
 
     seconds, rate_hz, lengths, rates : as recorded, None where not known.  faults : what was left out.
-    not_finite, constant : traces that the engine verifies and never learns from.  not_finite_in : their files, or rows.
+    not_finite, constant, too_large : traces that the engine verifies and never learns from.
+    not_finite_in : files, or rows, of those that are not finite.
     duplicates : traces equal to an earlier one, sample by sample; contradicting : of these, with another label.
     near_repeats : of the newest `looked_at` that can be learned from, traces much nearer to another part's than parts are
     to each other.  parts : how many, where known.  unlabelled : left out, since nobody has checked them yet.
@@ -69,6 +70,7 @@ class Survey:
     not_finite: int
     not_finite_in: tuple[str, ...]
     constant: int
+    too_large: int
     duplicates: int
     contradicting: int
     near_repeats: int
@@ -82,14 +84,15 @@ def survey(data: Dataset) -> Survey:
     X, good = as_traces(data.X), int(data.y.sum())
     finite = np.isfinite(X).all(axis=(1, 2))
     constant = finite & (X.min(axis=(1, 2)) == X.max(axis=(1, 2)))
-    usable, hashes = finite & ~constant, content_hash(X)
+    too_large = finite & ~constant & (np.abs(X).max(axis=(1, 2)) > LARGEST)
+    usable, hashes = finite & ~constant & ~too_large, content_hash(X)
     parts: list[str | None] = [None] * len(data) if data.part is None else data.part.tolist()
     own = np.array([own_hash(*each) for each in zip(hashes.tolist(), parts, strict=True)], dtype=np.int64)
     first: dict[int, int] = {}  # the label of each content's first trace
     labels = zip(hashes[usable].tolist(), data.y[usable].tolist(), strict=True)
     again = [(first.setdefault(content, label), label) for content, label in labels]
     names = data.channels or tuple(f"channel {i + 1}" for i in range(X.shape[1]))
-    means = np.where(usable[:, None], levels(np.where(np.isfinite(X), X, 0)), np.nan).T
+    means = np.where(usable[:, None], levels(np.where(usable[:, None, None], X, 0)), np.nan).T
     quantities = zip(("good", *names), [data.y.astype(np.float64), *means], strict=True)
     return Survey(
         **{name: getattr(data, name) for name in ("name", "rate_hz", "unit", "fit", "unlabelled", "faults")},
@@ -103,6 +106,7 @@ def survey(data: Dataset) -> Survey:
         not_finite=int((~finite).sum()),
         not_finite_in=() if data.source is None else tuple(data.source[~finite].tolist()),
         constant=int(constant.sum()),
+        too_large=int(too_large.sum()),
         duplicates=len(again) - len(first),
         contradicting=sum(before != label for before, label in again),
         near_repeats=near_repeats(X[usable], own[usable]),

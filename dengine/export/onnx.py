@@ -28,7 +28,7 @@ from ..errors import ExportError, instead
 from ..model.base import Exportable
 from ..model.neighbours import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
-from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
+from ..traces import CONSTANT, LARGEST, NOT_FINITE, SATURATED, TOO_LARGE, as_trace, as_traces
 from .bundle import METADATA, KeyFile, checked_bytes, checked_schema, describe, prepared, write_export
 from .decision import FIELDS
 from .torchscript import TOLERANCE, ExportedDecision, golden_trace
@@ -145,7 +145,8 @@ class Twin(nn.Module):
         """(C, T) float32 -> action, reason, lower, upper, n_success, n_failure, embedding (K, d)."""
         low, high = trace.min(), trace.max()
         finite = (trace.abs() < float("inf")).all()
-        saturated = torch.where(torch.maximum(high, -low) >= self.limit, SATURATED, 0)
+        highest = torch.maximum(high, -low)
+        saturated = torch.where(highest >= self.limit, SATURATED, torch.where(highest > LARGEST, TOO_LARGE, 0))
         fault = torch.where(finite, torch.where(low == high, CONSTANT, saturated), NOT_FINITE)  # as of `TraceGate`
         good = fault == 0
         x = torch.where(good, trace, torch.zeros_like(trace))

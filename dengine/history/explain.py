@@ -31,7 +31,7 @@ from ..records import Action, Decision, Reason, Source, TraceSpec, in_html, trac
 from ..store.evidence import rule_past
 from ..store.records import SAFE_MODE_BEGAN, Evidence, ModelVersion, StoredDecision, VersionError, unknown_decision
 from ..store.views import HistoryFilter, PastLabel
-from ..traces import WindowGate
+from ..traces import LARGEST, WindowGate
 
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
@@ -386,6 +386,9 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
     Reason.NOT_FINITE: _not_finite,
     Reason.CONSTANT: lambda made, trace, found: f": every sample is {trace.flat[0]:g} {found.spec.unit}: a dead sensor.",
     Reason.SATURATED: _saturated,
+    Reason.TOO_LARGE: lambda made, trace, found: (
+        f": a sample of {np.abs(trace).max():g} {found.spec.unit}; beyond {LARGEST:g} nothing can be computed from it."
+    ),
     Reason.MODEL_ERROR: lambda *_: ": the model raised an error, which the log of that time tells.",
     Reason.NOVEL: lambda made, trace, found: (
         f": unlike all that was learned from{'' if found.novelty is None else f': {found.novelty}'}. "

@@ -8,7 +8,7 @@ for past in history(store, last=50, action="accept", label="bad"): ...
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 PAGE, MOST = 500, 10**9  # decisions read at a time, and that can be asked for
 NEWEST = 500  # decisions that are looked at apart
-FAILING = 3  # retrains, none of them accepted: the first may come before there are enough labels
+FAILING = 3  # retrains in a row that were dropped: the first may come before there are enough labels
 EVENTS = 5  # newest ones that a status shows
 
 
@@ -162,19 +162,39 @@ class Status:
         found_good = (
             f"{false_rejects} of the {rejects.n} newest rejected parts were good: more than {rejects.tolerance:.1%}."
         )
-        failing = "" if self.version or len(self.retrains) < FAILING else self.retrains[-1].report.reason
+        reports = [retrain.report for retrain in self.retrains]
+        newest_accepted = max((i for i, report in enumerate(reports, 1) if report.accepted), default=0)
+        failing = retrain_fault([report.reason for report in reports[newest_accepted:]], self.version)
         broken = f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
             (accepts.verdict == "broken", broken),
             (false_rejects and rejects.verdict == "broken", found_good),
+            (failing, failing),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
             (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),
-            (failing, f"No retrain was accepted yet, so nothing is decided; the last was {failing}."),
         )
         return next((text for wrong, text in alarms if wrong), "")
+
+
+def retrain_fault(dropped: Sequence[str], version: int) -> str:
+    """Return what somebody should look at where retrains are dropped again and again, else "".
+
+    Parameters
+    ----------
+    dropped : sequence of str
+        Reasons of the retrains that were dropped since the last one that was accepted.
+    version : int
+        Of the model that answers; 0 before the first.
+    """
+    if len(dropped) < FAILING:
+        return ""
+    last = f"the last was {dropped[-1].rstrip('.')}."
+    if not version:
+        return f"No retrain was accepted yet, so nothing is decided; {last}"
+    return f"The last {len(dropped)} retrains were dropped, so nothing new is learned; {last}"
 
 
 def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:

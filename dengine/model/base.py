@@ -20,6 +20,7 @@ from ..errors import ExportError, SettingError, shortened
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec, Window
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
+from ..traces import without_extremes
 
 log = logging.getLogger("dengine")
 
@@ -247,7 +248,7 @@ class RivalAdapter(EngineModel):
         self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
 
     def train(self, X: Floats, y: NDArray[Any], *_: object, **__: object) -> Self:
-        self.model.fit(X.copy(), y)  # the window's own, which a rival may write to
+        self.model.fit(without_extremes(X).copy(), y)  # the window's own, which a rival may write to
         return self
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:

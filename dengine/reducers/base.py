@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 State = dict[str, NDArray[Any]]
+FAR_OUT, FEW = 50.0, 0.05  # times the median distance from the middle, and the share of such points
 
 
 @dataclass
@@ -201,10 +202,17 @@ def own_places(Z: Floats, folds: Ints) -> Floats:
 
 
 def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
-    """(K,) root mean square radius of each fold's points in its own space; 1 where a fold is empty or has no spread."""
+    """(K,) root mean square radius of each fold's points in its own space; 1 where a fold is empty or has no spread.
+
+    A few points that lie absurdly far out are left out: one of them would draw all others together.
+    """
     scale = np.ones(n_spaces, dtype=np.float32)
     for k in range(n_spaces):
         own = points[folds == k]
+        if len(own):
+            distances = np.abs(own - np.median(own, axis=0)).max(axis=1)
+            near = distances <= FAR_OUT * np.median(distances)
+            own = own[near] if (~near).sum() <= max(1.0, FEW * len(own)) else own
         rms = float(np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean())) if len(own) else 0.0
         scale[k] = rms if np.isfinite(rms) and rms > 1e-12 else 1.0
     return scale

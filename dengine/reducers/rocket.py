@@ -189,7 +189,7 @@ class RocketEncoder(nn.Module):
         if self.average > 1:
             x = x[..., self.head :] if self.head > 0 else x
             x = nn.functional.avg_pool2d(x, [1, self.average])  # half the time of a mean over an axis
-        return torch.addcmul(self.shift, x, self.scale)
+        return torch.addcmul(self.shift, x, self.scale).clamp_(-1e6, 1e6)  # or their products would overflow
 
     def seen(self, a: Tensor) -> Tensor:
         """(B, C, L) -> (C, taps, B): what each tap reads, traces last: it then moves a row of them at once."""

@@ -185,10 +185,14 @@ def _shape(kind: Any) -> Any:
 
 
 class Health(Struct):
-    """Whether the engine answers.  store_fault : why the store cannot be written.  waiting : requests in line."""
+    """Whether the engine answers.  store_fault : why the store cannot be written.  waiting : requests in line.
+
+    retrain_fault : that retrains are dropped again and again, and why.
+    """
 
     status: Annotated[str, Meta(extra_json_schema={"enum": ["ok", "degraded", "down"]})]
     store_fault: str
+    retrain_fault: str
     waiting: int
 
 

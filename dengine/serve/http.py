@@ -31,6 +31,7 @@ from .. import __version__
 from ..decision.policy import Policy
 from ..engine.corrections import Changed
 from ..engine.engine import DataEngine
+from ..errors import expect
 from ..history.explain import explain, of_part
 from ..history.map import part_map
 from ..history.status import NEWEST, course, paged
@@ -56,6 +57,7 @@ BADS, AMONG = 10, 200  # newest bad parts that an explanation is drawn with, of 
 STATIC = Path(__file__).parent / "page" / "static"
 VIEWS = ("/", "/overview", "/map", "/part", "/history", "/actions")  # one file: its script shows the one that is asked for
 Limit = Annotated[int, Meta(ge=1, le=200)]
+SHORTEST = 0.0003  # hours of a stretch
 Hours = Annotated[float, Meta(ge=0.0, le=1e7)]
 Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
 
@@ -173,7 +175,10 @@ class HttpApi:
         return await self._change(author, begin)
 
     async def export(self, author: str = "") -> Response:
-        """The model that answers now, as a TorchScript file with its checksum, in an archive."""
+        """The model that answers now, as a TorchScript file with its checksum, in an archive.
+
+        An accepted part that waits for its confirmation is not in it: that stays with the engine.
+        """
 
         def copied(engine: DataEngine) -> Exportable:
             found = engine.exported()
@@ -229,9 +234,11 @@ class HttpApi:
     async def course(self, hours: Hours = 0.0, start: Hours = 0.0, batch: Annotated[str, Meta(max_length=9)] = "") -> Json:
         """How decisions went from the first to the newest, in stretches, and the retrains and safe modes meanwhile.
 
-        hours : of a shift, which is a stretch then, the newest of them; start : when one begins, in hours since 1970.
+        hours : of a shift, which is a stretch then, the newest of them, or 0; start : when one begins, in hours since 1970.
         batch : likewise what parts' numbers begin with: so many characters, or up to the last of these, "-/".
         """
+        whole = hours == 0.0 or hours >= SHORTEST
+        expect(whole, f"hours of 0, or of {SHORTEST} or more, a second", hours)
         recipe, by = self.service.engine.recipe, {"seconds": 3600.0 * hours, "start": 3600.0 * start, "batch": batch}
         by = by if hours or batch else {}
         return answer("Course", await self.service.look(lambda store: course(store, recipe, AMONG, **by)))
@@ -269,10 +276,14 @@ class HttpApi:
         return Response(body, media_type=kind)
 
     async def healthz(self) -> Response:
-        """Whether the engine answers: ok; degraded (200): its store cannot be written; down (503). It asks for no token."""
+        """Whether the engine answers: ok; degraded (200); down (503). It asks for no token.
+
+        Degraded: the store cannot be written, or retrains are dropped again and again.
+        """
         engine, alive = self.service.engine, self.service.silent < HUNG
-        state = "down" if not alive else "degraded" if engine.store_fault else "ok"
-        return api.answered(api.Health(state, engine.store_fault, self.service.waiting), 200 if alive else 503)
+        faults = engine.store_fault, engine.retrain_fault
+        state = "down" if not alive else "degraded" if any(faults) else "ok"
+        return api.answered(api.Health(state, *faults, self.service.waiting), 200 if alive else 503)
 
     async def openapi(self) -> Json:
         """The OpenAPI document."""
@@ -314,7 +325,8 @@ def _explained(store: SqlStore, id_: str) -> Json:
     trace, band = found.trace, found.envelope
     bads = labelled.traces[labelled.labels == 0][-BADS:]
     bads = bads if bads.shape[1:] == trace.shape else np.zeros((0, *trace.shape))
-    digits = 4 - int(np.log10(np.ptp(np.nan_to_num(trace, posinf=0.0, neginf=0.0)) or 1.0))  # what lies around is a picture
+    finite = np.nan_to_num(trace, posinf=0.0, neginf=0.0).astype(np.float64)  # float32's own range overflows
+    digits = 4 - int(np.log10(np.ptp(finite) or 1.0))  # what lies around is a picture
     around = {name: getattr(band, name, None) for name in ("low", "median", "high")} | {"bads": bads}
     drawn = {name: None if each is None else np.round(each.astype(np.float64), digits) for name, each in around.items()}
     corrections = [each for each in store.corrections() if each.decision_id == found.decision.decision.id]

@@ -1,17 +1,23 @@
 """One contract over every entry of `REDUCERS`, and over reducers that come from outside: whoever joins keeps it."""
 
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from torch import nn
 
-from dengine import REDUCERS, DataEngine, ModelPrediction, make_reducer, replay
+from dengine import REDUCERS, DataEngine, ModelPrediction, Policy, Reason, SqlStore, make_reducer, replay
 from dengine.errors import SettingError
-from dengine.reducers import Reducer
+from dengine.reducers import Reducer, TorchReducer
+from dengine.store import StoredDecision
 from dengine.testing import REDUCER_CHECKS, check_reducer, toy_traces
+from tests.support.stores import decision, labelled
 
 QUICK: dict[str, dict[str, Any]] = {
     "umap-learn": {"n_epochs": 40, "n_neighbors": 8},
@@ -153,3 +159,71 @@ def test_a_reducer_that_fails_at_every_retrain_is_told_with_its_reason(make_data
     log = replay(make_data(120), Unsaid())
     assert "retrains dropped, the last dropped: AttributeError" in repr(log)
     assert log.summary()["retrains_dropped"] == len(log.retrains) > 0
+
+
+class Linear(nn.Module):
+    """The smallest network of somebody else's."""
+
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Flatten(), nn.Linear(channels * samples, 8), nn.ReLU())
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.layers(x)
+        return features
+
+
+EXTREME = {  # what a labelled trace may hold; the last two only in a store of before they were a fault
+    "1e17": lambda x: np.where(np.arange(len(x)) == 7, 1e17, x),
+    "the largest that is no fault": lambda x: np.where(np.arange(len(x)) == 7, -1e18, x),
+    "alternating": lambda x: np.resize([1e16, -1e16], len(x)),
+    "all of it": lambda x: 3e16 * x,
+    "denormal": lambda x: 1e-40 * x,
+    "3e38": lambda x: np.where(np.arange(len(x)) == 7, 3e38, x),
+    "1e19": lambda x: np.where(np.arange(len(x)) == 7, 1e19, x),
+}
+TEACHABLE = {
+    **{name: (lambda name=name: new(name)) for name in REDUCERS},
+    "a network of one's own": lambda: TorchReducer(network=Linear, folds=2, steps=4, fit_steps=30, random_state=0),
+    "PCA": lambda: PCA(2, random_state=0),
+    "LDA": LinearDiscriminantAnalysis,
+}
+
+
+@pytest.mark.parametrize("first", [True, False], ids=["before the first retrain", "after it"])
+@pytest.mark.parametrize("name", TEACHABLE)
+def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_still_tells_parts_apart(
+    name: str, first: bool, tmp_path: Path
+) -> None:
+    X, y = toy_traces(180)
+    X = X.reshape(len(X), -1)
+    policy, options = Policy(alpha=0.4, lower_bound=0.7), {"replaying": True, "retrain_every": 1000}
+    engine = DataEngine(TEACHABLE[name](), policy=policy, store=tmp_path / "e.db", **options)
+
+    def learn(rows: range) -> None:
+        for i in rows:
+            engine.report(engine.decide(X[i]).id, bool(y[i]))
+
+    if not first:
+        learn(range(150))
+        assert engine.retrain().accepted
+    engine.decide(X[0])  # it sets the contract
+    engine.close()
+    with closing(SqlStore(str(tmp_path / "e.db"))) as store:  # as an engine stored them that found no fault
+        for i, damaged in enumerate(EXTREME.values()):
+            trace = np.asarray(damaged(X[150 + i]), dtype=np.float32)[None]
+            item = StoredDecision(decision(f"extreme {i}"), trace, 1 + i, False, store.clock())
+            store.take(labelled(item, bool(y[150 + i])))
+    engine = DataEngine.open(tmp_path / "e.db", reducer=TEACHABLE[name](), replaying=True)
+    if first:
+        learn(range(150))
+    reports = [engine.retrain() for _ in range(3)]
+    assert [each.reason for each in reports if not each.accepted] == []
+    said = [engine.decide(x) for x in X[160:]]
+    assert not {Reason.MODEL_ERROR, Reason.NOVEL} & {each.reason for each in said}
+    middle = [
+        np.mean([each.n_success - each.n_failure for each, good in zip(said, y[160:], strict=True) if good == k])
+        for k in (0, 1)
+    ]
+    assert middle[0] < middle[1]
+    engine.close()

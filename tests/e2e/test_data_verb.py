@@ -394,15 +394,15 @@ def test_a_row_a_signal_and_an_array_of_channels_are_the_traces_that_they_were(m
 def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset]) -> None:
     data = make_data(120, samples=60)
     X, y = data.X.copy(), data.y.copy()
-    X[3, 5], X[4] = np.nan, 2.0
+    X[3, 5], X[4], X[5, 5] = np.nan, 2.0, -3e38
     X[50], y[50] = X[10], y[10]
     X[51], y[51] = X[11], 1 - y[11]
     X[52:60] = X[20:28] + np.float32(1e-3)
     found = survey(replace(data, X=X, y=y))
-    assert (found.not_finite, found.constant) == (1, 1)
+    assert (found.not_finite, found.constant, found.too_large) == (1, 1, 1)
     assert (found.duplicates, found.contradicting) == (2, 1)
     assert 14 <= found.near_repeats <= 20
-    assert found.looked_at == 118
+    assert found.looked_at == 117
     assert (found.good + found.bad, found.lengths) == (120, None)
     assert survey(make_data(120, samples=60)).near_repeats <= 3
 

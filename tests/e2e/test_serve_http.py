@@ -595,3 +595,69 @@ def test_what_runs_beside_has_to_start_too_or_one_line_says_why(tmp_path: Path) 
         port = str(taken.getsockname()[1])
         refused_in_a_line(port, *words, "--opcua", port)
     refused_in_a_line("127.0.0.1", *words, "--robot", f"127.0.0.1:{port}")
+
+
+NUMBERS = (
+    "0",
+    "-1",
+    "1",
+    "1e-9",
+    "5e-324",
+    "1e-300",
+    "1e7",
+    "1e19",
+    "1e308",
+    "1e400",
+    "nan",
+    "inf",
+    "-inf",
+    "9" * 30,
+    "0x1",
+    "",
+    "-0.0",
+)
+QUERIES = {  # every query parameter that takes a number
+    "/course": ("hours", "start", "batch"),
+    "/decisions": ("limit", "since", "until"),
+    "/events": ("limit",),
+    "/status": ("last",),
+}
+
+
+@pytest.mark.parametrize(("path", "names"), QUERIES.items())
+def test_whatever_number_a_query_holds_it_is_answered_or_refused_with_its_name(path: str, names, stream: Dataset) -> None:
+    with serving() as (_, client):
+        for i, x in enumerate(stream.X[:30]):
+            client.post("/decide", **forms(x, f"order-{i}")["JSON"]).raise_for_status()
+        asked = [{"hours": "1", name: value} if name == "start" else {name: value} for name in names for value in NUMBERS]
+        answers = [(each, client.get(path, params=each)) for each in asked]
+        assert [(each, found.text) for each, found in answers if found.status_code not in (200, 422)] == []
+        refused = must_be_problem(client.get("/course", params={"hours": "5e-324"}), 422)
+        assert "hours" in refused["detail"]
+
+
+def test_a_trace_of_any_finite_numbers_is_explained(stream: Dataset) -> None:
+    x = stream.X[0].copy()
+    sizes = {
+        "largest": 3.4e38,
+        "large": 1e18,
+        "small": 1e-30,
+        "smallest": 1e-45,
+        "not a number": np.nan,
+        "infinite": np.inf,
+    }
+    with serving() as (_, client):
+        for i in range(60):
+            client.post("/decide", **forms(stream.X[i], f"order-{i}")["float32"]).raise_for_status()
+            client.post("/report", json={"id": f"order-{i}", "success": bool(stream.y[i])}).raise_for_status()
+        for name, size in sizes.items():
+            for form, trace in (
+                ("two samples", np.where(np.arange(len(x)) == 7, -size, x)),
+                ("all", np.resize([size, -size], len(x))),
+            ):
+                trace[9] = size
+                id_ = f"{name} {form}"
+                client.post("/decide", **forms(trace.astype(np.float32), id_)["float32"]).raise_for_status()
+                found = client.get(f"/explanations/{id_}")
+                assert found.status_code == 200, (id_, found.text)
+                assert len(found.json()["trace"][0]) == len(x)

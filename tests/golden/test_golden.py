@@ -95,7 +95,7 @@ def test_a_restart_changes_no_decision() -> None:
 def test_what_is_kept_has_met_everything_that_it_stands_for() -> None:
     stories = {name: kept(name) for name, story in STORIES.items() if not isinstance(story, Replayed)}
     reasons = set(np.concatenate([each["reason"] for each in stories.values()]))
-    never = {Reason.SATURATED, Reason.MODEL_ERROR, Reason.NO_STORE, Reason.LATE, Reason.OUTSIDE}
+    never = {Reason.SATURATED, Reason.MODEL_ERROR, Reason.NO_STORE, Reason.LATE, Reason.OUTSIDE, Reason.TOO_LARGE}
     assert reasons == {str(each) for each in set(Reason) - never}
     assert all(set(each["action"]) == {str(each) for each in Action} for each in stories.values())
     assert all(each["action"].shape == each["lower"].shape for each in stories.values())

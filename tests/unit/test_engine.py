@@ -162,12 +162,17 @@ FAULTS = [
     (Reason.NOT_FINITE, lambda x: np.where(np.arange(len(x)) == 7, np.inf, x)),
     (Reason.CONSTANT, lambda x: np.full_like(x, 3.0)),
     (Reason.SATURATED, lambda x: np.where(np.arange(len(x)) == 7, -200.0, x)),
+    *[
+        (Reason.TOO_LARGE, lambda x, size=size: np.where(np.arange(len(x)) == 7, size, x))
+        for size in (3e38, -3e38, 1e19, 1.1e18)
+    ],
 ]
 
 
 @pytest.mark.parametrize(("reason", "damage"), FAULTS)
 def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(reason, damage, data: Dataset) -> None:
-    engine = make(trace=TraceSpec(samples=100, limit=150.0))
+    limit = None if reason is Reason.TOO_LARGE else 150.0
+    engine = make(trace=TraceSpec(samples=100, limit=limit))
     play(engine, data, 0, 100)
     before = engine.version, engine.new_labels, len(engine.model.index)
     x = damage(good(data).astype(np.float64))
@@ -259,6 +264,30 @@ def test_a_dropped_candidate_leaves_the_old_version_answering(data: Dataset) -> 
     assert "PCA needs more than 500 traces" in report.reason
     assert evidence(engine.decide(good(data))) == before
     assert [r.accepted for r in engine.store.retrains()][-1] is False
+
+
+def test_retrains_that_are_dropped_three_times_in_a_row_are_an_alarm_until_one_is_accepted(
+    data: Dataset, tmp_path: Path
+) -> None:
+    engine = make(store=tmp_path / "e.db")
+    play(engine, data, 0, 120)
+    sound, engine.model.spaces.n_components = engine.model.spaces.n_components, 500
+    said = []
+    for _ in range(3):
+        assert not engine.retrain().accepted
+        said.append((engine.retrain_fault, engine.status().alarm))
+    alarm = (
+        "The last 3 retrains were dropped, so nothing new is learned; the last was dropped: PCA needs more than 500 traces"
+    )
+    assert said[:2] == [("", ""), ("", "")]
+    assert said[2][0] == said[2][1]
+    assert said[2][0].startswith(alarm)
+    engine.close()
+    with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
+        assert (engine.retrain_fault, engine.status().alarm) == said[2]
+        assert engine.model.spaces.n_components == sound
+        assert engine.retrain().accepted
+        assert (engine.retrain_fault, engine.status().alarm) == ("", "")
 
 
 @pytest.mark.parametrize("second", [True, False])

@@ -55,14 +55,14 @@ export const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
 const REASONS = {
   not_finite: "samples missing", constant: "dead sensor", saturated: "sensor at its limit",
-  no_model: "no model yet", no_store: "store away", late: "too late", outside: "outside a window",
+  too_large: "impossible values", no_model: "no model yet", no_store: "store away", late: "too late", outside: "outside a window",
 };
 const LABELS = { good: "good", bad: "bad", none: "not known" };
 const SOURCES = { verification: "check", audit: "audit", stop: "system stop", confirmed: "confirmed later", inspection: "inspection of a reject" };
 
 export const ACTIONS = ["verify", "accept", "reject"];
 export const REASON_NAMES = [
-  "certain", "uncertain", "no_model", "audit", "not_finite", "constant", "saturated", "model_error", "novel", "safe_mode", "no_store", "late", "outside",
+  "certain", "uncertain", "no_model", "audit", "not_finite", "constant", "saturated", "model_error", "novel", "safe_mode", "no_store", "late", "outside", "too_large",
 ];
 export const LABEL_NAMES = Object.keys(LABELS);
 export const reasonOf = (name) => REASONS[name] ?? name.replace("_", " ");

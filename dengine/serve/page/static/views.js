@@ -34,7 +34,7 @@ export function warnings(doing) {
   if (doing.store_fault) said.push(`The store cannot be written: ${doing.store_fault}`);
   if (doing.safe_mode) said.push(`Safe mode: every part is verified until fresh evidence keeps the tolerance (${doing.safe_mode})`);
   if (doing.shadow) said.push("Verify everything: every part is verified, the model only says what it would have done");
-  if (!said.length && doing.alarm) said.push(doing.alarm);
+  if (doing.alarm && !doing.store_fault && !doing.safe_mode) said.unshift(doing.alarm); // else it says the same
   return said.map((text) => el("p", { class: "banner" }, icon("shield"), el("span", {}, text)));
 }
 
