@@ -92,7 +92,7 @@ class EngineSettings:
         """
         if "recipe" not in known:
             raise StoreError(f"Expected a store that an engine has used, {name} is empty; make a DataEngine with it.")
-        recipe = Recipe.from_toml(known["recipe"], f"the recipe in {name}")
+        recipe = Recipe.from_store(known, f"the recipe in {name}")
         made_with = known.get("described")
         if "model" in known and model is None:
             raise SettingError(f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...).")

@@ -121,7 +121,7 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     positions = replay.position[-last:]
     z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]  # zeros where a reducer has but one dimension
-    known, probability = np.isfinite(z).all(axis=1), has_own_unit(recipe)
+    known, probability = np.isfinite(z).all(axis=1), has_own_unit(recipe.reducer)
     first, second = (f"embedding {i} [root mean square radius = 1]" for i in (1, 2))
     if probability:
         first, second = "predicted probability of success", "embedding 2 [for the eye, small against the radius]"

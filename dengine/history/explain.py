@@ -493,7 +493,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     if past is None:
         got = f"{decision_id!r}, which its store does not hold; `dengine history STORE` lists the ids, newest last"
         raise UnknownDecisionError(f"Expected the id of a decision of cell {store.cell_id!r}, got {got}.")
-    made, trace, recipe = past.decision, past.trace, Recipe.from_toml(known["recipe"])
+    made, trace, recipe = past.decision, past.trace, Recipe.from_store(known)
     channels, samples = trace.shape
     answering = as_it_stood(store, made.model_version, recipe, past) if made.model_version else None
     found = Circumstances(

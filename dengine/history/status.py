@@ -177,7 +177,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     settings = store.settings()
     if "recipe" not in settings:
         raise StoreError(f"Expected a store that an engine has used, cell {store.cell_id!r} of this one is empty.")
-    recipe, counts, retrains = Recipe.from_toml(settings["recipe"]), store.status(), store.versions(own=True)
+    recipe, counts, retrains = Recipe.from_store(settings), store.status(), store.versions(own=True)
     every, policy, events = store.tally(), recipe.policy, store.events()
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
     outcomes, since = every.outcomes, int(settings.get("policy_since", 0))

@@ -94,7 +94,7 @@ def test_an_axis_that_is_a_probability_says_so_and_the_other_is_for_the_eye() ->
     assert "for the eye" in left.get_ylabel()
     assert [ball.get_radius() for ball in left.patches] == [0.05]
     asked = ("rocket", ConvReducer(), "dengine.reducers.conv:ConvReducer", PCA(2), "sklearn.decomposition:PCA")
-    assert [has_own_unit(Recipe(reducer)) for reducer in asked] == [True, True, True, False, False]
+    assert [has_own_unit(reducer) for reducer in asked] == [True, True, True, False, False]
 
 
 def log_of(clock_s: np.ndarray | None) -> Replay:
