@@ -1,7 +1,7 @@
 """`dengine status`: how an engine is doing by its store, what the store holds, and who shares it."""
 
 from contextlib import closing
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
 TITLES = {"stops": "accepted, and bad"}
+CHECKED = "certain but checked"  # what is called an audit, where none was asked for: the shadow mode
 APART = ("newest", "ever", "recipe", "trace", "certificate", "retrains", "events", "settings", "last")
 ELSEWHERE = ("retraining", "store_lag")  # of an engine that runs
 LAST = "The newest so many decisions, looked at apart."
@@ -58,9 +59,11 @@ def _tables(store: str, found: "Status") -> list[Any]:
     """A column each for the newest decisions and for all; and what is of now."""
     columns, both = ("", f"last {found.newest.decisions:,}", "since birth"), (found.newest, found.ever)
     names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "stops")  # what is bad comes first
-    spans = [[TITLES.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
+    titles = TITLES if found.recipe.policy.audit_rate else TITLES | {"audits": CHECKED}
+    spans = [[titles.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
     now = [("look at", found.alarm)] if found.alarm else []
-    now += [("cell", found.cell), *rows_of(found, "cell", *APART, *ELSEWHERE)]
+    shown = replace(found, **{name: _called(getattr(found, name), titles) for name in ("reasons", "sources")})
+    now += [("cell", found.cell), *rows_of(shown, "cell", *APART, *ELSEWHERE)]
     if found.model is None:  # of one that was handed in the recipe has no effect: to show it would be a lie
         now += rows_of(found.recipe)
     now += [("trace", "none yet: the first trace sets it" if found.trace is None else written("", found.trace))]
@@ -72,10 +75,18 @@ def _tables(store: str, found: "Status") -> list[Any]:
     return [facts(f"{store}: overview", spans, columns), facts("What it is", now)]
 
 
+def _called(counts: dict[str, int], titles: dict[str, str]) -> dict[str, int]:
+    return {titles.get(f"{name}s", name): n for name, n in counts.items()}
+
+
 def _of_span(name: str, span: "Span") -> str:
     value = getattr(span, name)
     if name in ("first", "last"):
         return when(value)
+    if name == "bad_accepts" and not span.accepted:
+        return "none was accepted"
+    if name == "would_accept" and value.known and span.bad_accepts.by == value.by:
+        return "as bad accepts, below"  # the same parts
     return _held(value, span.stops if name == "bad_accepts" else 0) if hasattr(value, "verdict") else written(name, value)
 
 

@@ -38,7 +38,7 @@ class Judged:
     """Parts that the model was certain of, and how many of them it was wrong about, as far as that is known.
 
     n : parts.  known : those of them that the claim rests on.  wrong : of these.
-    by : what tells: "every outcome", "audits", or "" where nothing does.
+    by : what tells: "every outcome", "audits", "checks", as of the shadow mode, or "" where nothing does.
     lower, upper : Wilson interval of the share of wrong ones, at one look; 0 and 1 where nothing is known.
     tolerance : 1 - LB.  verdict : kept, broken or open, as far as the interval goes.
     """
@@ -61,8 +61,8 @@ class Span:
     outside : left an operator's window, and were verified or rejected without the model.
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
     accepted, rejected : by the model, without a check.  stops : of the accepted, those known to be bad.
-    bad_accepts : parts that it let pass or would have, by the policy's alpha.
-    would_accept, would_reject : by audits alone, in the shadow mode every part; at 95 %, whatever the policy's alpha.
+    bad_accepts : what it let pass, and what it would have but for an audit; nothing where none passed.
+    would_accept, would_reject : by audits alone, in the shadow mode every part. All three at the policy's alpha.
     unlabelled : verified, of which no result was reported.
     retrains : all.  dropped : reasons of those that were dropped, with how often.
     """
@@ -147,19 +147,21 @@ class Status:
     _repr_html_ = in_html
 
     def __repr__(self) -> str:
-        n, at = self.ever, f"{self.cell}: version {self.version}, {self.ever.decisions} decisions"
+        n = self.ever
+        at = f"{self.cell}: version {self.version}, {n.decisions} decision{'' if n.decisions == 1 else 's'}"
         return f"<Status of {at}, {n.verified} verified, {n.accepted} accepted, {n.stops} known bad, {n.rejected} rejected>"
 
     @property
     def alarm(self) -> str:
         """What somebody should look at, the worst first; "" where there is nothing."""
-        accepts, errors = self.newest.bad_accepts, self.newest.errors
+        accepts, would, errors = self.newest.bad_accepts, self.newest.would_accept, self.newest.errors
         failing = "" if self.version or len(self.retrains) < FAILING else self.retrains[-1].report.reason
         broken = f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
             (accepts.verdict == "broken", broken),
+            (self.shadow and would.verdict == "broken", f"It would break the tolerance of {would.tolerance:.1%}."),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
             (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),
@@ -213,6 +215,9 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
     outcomes, first, n, reasons = tally.outcomes, tally.first, tally.count(), tally.by("reason")
     here = [each.report for each in retrains if first is not None and each.time >= first]
     verified = tally.by("action")[Action.VERIFY]
+    by = "audits" if policy.audit_rate else "checks"
+    accepts = (outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0])
+    rejects = (outcomes.audited_rejects, outcomes.audited_rejects_good, policy.tolerances[1])
     return Span(
         decisions=n,
         first=first,
@@ -227,8 +232,8 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         accepted=outcomes.accepted,
         rejected=outcomes.rejected,
         stops=outcomes.stops,
-        would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0]),
-        would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy.tolerances[1]),
+        would_accept=_judged(*accepts, policy.alpha, by=by),
+        would_reject=_judged(*rejects, policy.alpha, by=by),
         bad_accepts=bad_accepts(outcomes, policy),
         unlabelled=tally.count(lambda kind: kind.action is Action.VERIFY and kind.success is None),
         retrains=len(here),
@@ -238,7 +243,7 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
     )
 
 
-def _judged(known: int, wrong: int, most: float, alpha: float = 0.05, n: int | None = None, by: str = "audits") -> Judged:
+def _judged(known: int, wrong: int, most: float, alpha: float, n: int | None = None, by: str = "audits") -> Judged:
     low, high = wilson_interval(known - wrong, wrong, alpha)
     lower, upper = 1.0 - high, 1.0 - low
     by = by if known else ""
@@ -254,7 +259,10 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
 
     Under `stops="all"` a part whose silence is not over is left out. Audits speak for all: their coin knows no outcome.
     Stops are known beside them: the lower end is at least that of the stops if all others were good, the upper their share.
+    Where no part passed, as in the shadow mode, nothing is said of what did.
     """
+    if not outcomes.accepted:
+        return _judged(0, 0, policy.tolerances[0], policy.alpha)
     n, heard = outcomes.accepted + outcomes.audited_accepts, outcomes.stops + outcomes.confirmed
     if heard and (policy.stops == "all" or outcomes.accepted == heard):
         return _judged(heard, outcomes.stops, policy.tolerances[0], policy.alpha, n, "every outcome")
