@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from inspect import signature
 from pathlib import Path
-from typing import Any, Generic, TypeVar, overload
+from typing import Any
 
 import numpy as np
 
@@ -37,10 +37,9 @@ WHOLE = {  # the least and the most; beyond the latter no machine goes, and an e
     "window": (10, 10**8),
 }
 OBJECT = "object "  # before the class of a reducer that TOML cannot say
-T = TypeVar("T", int, float)
 
 
-class OwnDefault(Generic[T]):
+class OwnDefault:
     """A field of `Recipe` whose default belongs to the reducer: None reads as what the reducer's class says.
 
     It is looked up when it is read, so that naming a reducer imports nothing.
@@ -60,20 +59,16 @@ class OwnDefault(Generic[T]):
     def __set_name__(self, owner: type, field_name: str) -> None:
         self.field_name = field_name
 
-    @overload
-    def __get__(self, recipe: None, owner: type) -> None: ...
-    @overload
-    def __get__(self, recipe: Recipe, owner: type) -> T: ...
-    def __get__(self, recipe: Recipe | None, owner: type) -> T | None:
+    def __get__(self, recipe: Recipe | None, owner: type) -> Any:
         if recipe is None:
             return None  # the default, as `dataclass` reads it
         value = vars(recipe)[self.field_name]
         if value is None:
             value = own_default(recipe.reducer, self.name)
             self.check(value)
-        return value  # type: ignore[no-any-return]
+        return value
 
-    def __set__(self, recipe: Recipe, value: T | None) -> None:
+    def __set__(self, recipe: Recipe, value: Any) -> None:
         if value is not None:
             self.check(value)  # or every retrain would fail, one by one
         vars(recipe)[self.field_name] = value
@@ -105,9 +100,9 @@ class Recipe:
     reducer: Any = "conv"
     params: Params = field(default_factory=dict)
     policy: Policy = field(default_factory=Policy)
-    radius: OwnDefault[float] = OwnDefault("default_radius", check_radius)
+    radius: float = OwnDefault("default_radius", check_radius)  # type: ignore[assignment]
     folds: int = 5
-    retrain_every: OwnDefault[int] = OwnDefault("default_retrain_every", _check_retrain_every)
+    retrain_every: int = OwnDefault("default_retrain_every", _check_retrain_every)  # type: ignore[assignment]
     budget: float = 0.45
     max_steps: int | None = None
     window: int = 10_000

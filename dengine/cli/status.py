@@ -62,7 +62,7 @@ def _tables(store: str, found: "Status") -> list[Any]:
     titles = TITLES if found.recipe.policy.audit_rate else TITLES | {"audits": CHECKED}
     spans = [[titles.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
     now = [("look at", found.alarm)] if found.alarm else []
-    shown = replace(found, **{name: _called(getattr(found, name), titles) for name in ("reasons", "sources")})
+    shown = replace(found, reasons=_called(found.reasons, titles), sources=_called(found.sources, titles))
     now += [("cell", found.cell), *rows_of(shown, "cell", *APART, *ELSEWHERE)]
     if found.model is None:  # of one that was handed in the recipe has no effect: to show it would be a lie
         now += rows_of(found.recipe)

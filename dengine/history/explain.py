@@ -348,7 +348,7 @@ def _saturated(made: Decision, trace: NDArray[np.float32], found: Circumstances)
         return ": the trace touched the sensor's range."
     channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
     first = f"first after {sample / spec.rate_hz:.3f} s (channel {channel + 1})"
-    return f": {len(touching)} samples touch the sensor's range of {spec.limit:g} {spec.unit}, {first}."
+    return f": {len(touching)} samples touch the sensor's range of {spec.limit:g} {spec.units[channel]}, {first}."
 
 
 def _not_finite(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
@@ -368,7 +368,9 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
     Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was.",
     Reason.AUDIT: _audit,
     Reason.NOT_FINITE: _not_finite,
-    Reason.CONSTANT: lambda made, trace, found: f": every sample is {trace.flat[0]:g} {found.spec.unit}: a dead sensor.",
+    Reason.CONSTANT: lambda made, trace, found: (
+        f": every sample is {trace.flat[0]:g} {found.spec.units[0]}: a dead sensor."
+    ),
     Reason.SATURATED: _saturated,
     Reason.MODEL_ERROR: lambda *_: ": the model raised an error, which the log of that time tells.",
     Reason.NOVEL: lambda made, trace, found: (

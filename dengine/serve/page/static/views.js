@@ -1,7 +1,7 @@
 // What each view shows. A view asks the server, and gives its elements; those with `data-part` are exchanged one by one.
 
 import * as act from "./actions.js";
-import { boundChart, courseChart, judgedChart, mapChart, traceCharts, traceLegend } from "./charts.js";
+import { boundChart, courseChart, isForce, judgedChart, mapChart, traceCharts, traceLegend } from "./charts.js";
 import {
   ACTIONS, LABEL_NAMES, REASON_NAMES, capital, chip, clock, duration, el, icon, label, labelOf, labelWord, moment, nameOf, number,
   partAddress, percent, reasonOf, sourceOf, table,
@@ -181,7 +181,7 @@ async function now(get, _, doing) {
     pace(decisions), saved(doing),
   ];
   const shown = el("div", { class: "now" }, card_,
-    card("trace", "The force, and what good and bad parts look like", traceCharts(found), traceLegend(found)),
+    card("trace", `The ${isForce(found.spec) ? "force" : "trace"}, and what good and bad parts look like`, traceCharts(found), traceLegend(found)),
     card("bound", "Bound", bound(found)), card("near", "Neighbours", counts(decision), neighbours(found)),
     el("div", { class: "figures" }, figures), strip, card("why", "Why", why(found)));
   return { title: "Now", shown: [el("h1", { class: "visually-hidden" }, "Now"), shown] };
@@ -251,7 +251,7 @@ async function map(get, query, doing) {
   const rows = found.marks.slice(-40).reverse().map((mark) => [el("a", { href: partAddress(mark.id, "map") }, nameOf(mark.part, mark.id)), label(mark.success)]);
   const picture = el("section", { class: "card", id: "map", "data-part": true, "aria-label": "Map of the parts" }, found.marks.length === 0
     ? el("p", { class: "waiting" }, "The map is drawn once the first model is trained.")
-    : [small("Parts whose force looks alike to the model lie together. Choose one to see its force and its history."),
+    : [small("Parts whose traces look alike to the model lie together. Choose one to see its trace and its history."),
       mapChart(found, chosen), el("ul", { class: "legend" }, legend),
       el("details", { id: "map-list" }, el("summary", {}, "The newest parts of the map as a list"), table([["Part"], ["Label"]], rows))]);
   const beside = el("section", { class: "card part", id: "part", "data-part": true, "aria-labelledby": "part-title" }, part
