@@ -8,21 +8,25 @@ most of it, through a file in memory, which is written and read without the lock
 from __future__ import annotations
 
 import ctypes
+import logging
 import multiprocessing
 import os
 import pickle
 import signal
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
+from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+log = logging.getLogger("dengine")
 NICE = 10  # decisions first, where cores are scarce
 DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of linux/prctl.h
 T = TypeVar("T")
@@ -40,7 +44,8 @@ class RetrainingProcess(ProcessPoolExecutor):
         # What is started here never hears the signals to the whole group: its parent ends it in time.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
         try:
-            self.submit(_warm_up)
+            log.info("the process that retrains starts; the first retrain waits until it has imported torch")
+            self.submit(_warm_up).add_done_callback(partial(_tell_ready, time.monotonic()))
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         (self._process,) = set(multiprocessing.active_children()) - others
@@ -104,6 +109,11 @@ def _end_with_parent() -> None:
     else:
         threading.Thread(target=lambda: (wait([parent.sentinel]), os._exit(1)), daemon=True).start()
     os.nice(NICE)
+
+
+def _tell_ready(began: float, started: Future[None]) -> None:
+    if not started.cancelled() and started.exception() is None:
+        log.info("the process that retrains is ready after %.1f s", time.monotonic() - began)
 
 
 def _warm_up() -> None:
