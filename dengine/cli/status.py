@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from ..history.status import Judged, Span, Status
 
 WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
-TITLES = {"stops": "accepted, and bad"}
-CHECKED = "certain but checked"  # what is called an audit, where none was asked for: the shadow mode
+# Parts of the shadow mode are no audits, though they have their reason.
+TITLES = {"stops": "accepted, and bad", "audits": "certain but checked"}
 APART = ("newest", "ever", "recipe", "trace", "certificate", "retrains", "events", "settings", "last")
 ELSEWHERE = ("retraining", "store_lag")  # of an engine that runs
 LAST = "The newest so many decisions, looked at apart."
@@ -59,10 +59,11 @@ def _tables(store: str, found: "Status") -> list[Any]:
     """A column each for the newest decisions and for all; and what is of now."""
     columns, both = ("", f"last {found.newest.decisions:,}", "since birth"), (found.newest, found.ever)
     names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "stops")  # what is bad comes first
-    titles = TITLES if found.recipe.policy.audit_rate else TITLES | {"audits": CHECKED}
-    spans = [[titles.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
+    spans = [[TITLES.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
     now = [("look at", found.alarm)] if found.alarm else []
-    shown = replace(found, reasons=_called(found.reasons, titles), sources=_called(found.sources, titles))
+    shown = found
+    if not found.recipe.policy.audit_rate:
+        shown = replace(found, reasons=_without_audits(found.reasons), sources=_without_audits(found.sources))
     now += [("cell", found.cell), *rows_of(shown, "cell", *APART, *ELSEWHERE)]
     if found.model is None:  # of one that was handed in the recipe has no effect: to show it would be a lie
         now += rows_of(found.recipe)
@@ -75,8 +76,8 @@ def _tables(store: str, found: "Status") -> list[Any]:
     return [facts(f"{store}: overview", spans, columns), facts("What it is", now)]
 
 
-def _called(counts: dict[str, int], titles: dict[str, str]) -> dict[str, int]:
-    return {titles.get(f"{name}s", name): n for name, n in counts.items()}
+def _without_audits(counts: dict[str, int]) -> dict[str, int]:
+    return {TITLES["audits"] if name == "audit" else name: n for name, n in counts.items()}
 
 
 def _of_span(name: str, span: "Span") -> str:

@@ -202,7 +202,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self._start(settings, template, opened, executor, replaying, clock, on_safe_mode)
             with self._closed_on_failure():
                 if opened.settings():  # now that the cell is owned: nobody begins it meanwhile
-                    raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name another.")
+                    raise StoreError(
+                        "The store is not empty; use DataEngine.open(url) to go on with it, or name another store."
+                    )
                 self.store.save_settings(self._settings.now.to_store())
                 if opened.product is not None:
                     self._versions.resume()  # on what the others of its product learned

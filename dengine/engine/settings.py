@@ -149,7 +149,9 @@ class EngineSettings:
         other = sorted(name for name in wished if name in counts and wished[name] != have[name])
         if other:
             stored, got = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished))
-            raise SettingError(f"Expected the store's own settings ({stored}), got {got}; leave them out, or name another.")
+            raise SettingError(
+                f"Expected the store's own settings ({stored}), got {got}; leave them out, or name another store."
+            )
 
 
 def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recipe:

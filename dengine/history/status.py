@@ -61,8 +61,9 @@ class Span:
     outside : left an operator's window, and were verified or rejected without the model.
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
     accepted, rejected : by the model, without a check.  stops : of the accepted, those known to be bad.
-    bad_accepts : what it let pass, and what it would have but for an audit; nothing where none passed.
-    would_accept, would_reject : by audits alone, in the shadow mode every part. All three at the policy's alpha.
+    bad_accepts : parts that it let pass, and would have but for an audit, by the policy's alpha; of
+        no part where none passed, as in the shadow mode.
+    would_accept, would_reject : by audits alone, in the shadow mode every part; at 95 %, whatever the policy's alpha.
     unlabelled : verified, of which no result was reported.
     retrains : all.  dropped : reasons of those that were dropped, with how often.
     """
@@ -232,8 +233,8 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         accepted=outcomes.accepted,
         rejected=outcomes.rejected,
         stops=outcomes.stops,
-        would_accept=_judged(*accepts, policy.alpha, by=by),
-        would_reject=_judged(*rejects, policy.alpha, by=by),
+        would_accept=_judged(*accepts, by=by),
+        would_reject=_judged(*rejects, by=by),
         bad_accepts=bad_accepts(outcomes, policy),
         unlabelled=tally.count(lambda kind: kind.action is Action.VERIFY and kind.success is None),
         retrains=len(here),
@@ -243,7 +244,7 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
     )
 
 
-def _judged(known: int, wrong: int, most: float, alpha: float, n: int | None = None, by: str = "audits") -> Judged:
+def _judged(known: int, wrong: int, most: float, alpha: float = 0.05, n: int | None = None, by: str = "audits") -> Judged:
     low, high = wilson_interval(known - wrong, wrong, alpha)
     lower, upper = 1.0 - high, 1.0 - low
     by = by if known else ""
@@ -259,7 +260,7 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
 
     Under `stops="all"` a part whose silence is not over is left out. Audits speak for all: their coin knows no outcome.
     Stops are known beside them: the lower end is at least that of the stops if all others were good, the upper their share.
-    Where no part passed, as in the shadow mode, nothing is said of what did.
+    Where no part passed nothing is said of what did: `would_accept` counts those of the shadow mode.
     """
     if not outcomes.accepted:
         return _judged(0, 0, policy.tolerances[0], policy.alpha)
