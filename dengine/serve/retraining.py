@@ -44,7 +44,6 @@ class RetrainingProcess(ProcessPoolExecutor):
         # What is started here never hears the signals to the whole group: its parent ends it in time.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
         try:
-            log.info("the process that retrains starts; the first retrain waits until it has imported torch")
             self.submit(_warm_up).add_done_callback(partial(_tell_ready, time.monotonic()))
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -113,7 +112,7 @@ def _end_with_parent() -> None:
 
 def _tell_ready(began: float, started: Future[None]) -> None:
     if not started.cancelled() and started.exception() is None:
-        log.info("the process that retrains is ready after %.1f s", time.monotonic() - began)
+        log.info("ready to retrain, in a process of its own, after %.1f s", time.monotonic() - began)
 
 
 def _warm_up() -> None:

@@ -1,7 +1,8 @@
 """Every command and snippet of the README and of the site runs, page by page, as a newcomer would type it; only smaller.
 
-Each page has a desk, stores and folders of its own, and runs from top to bottom. A long command gets options behind its own, of
-which the last counts. `make test` runs four pages, `make test-merge` three in one folder, `make test-all` every one.
+Each page has a desk, stores and folders of its own, and runs from top to bottom. A long command gets options
+behind its own, of which the last counts. `make test` runs four pages, `make test-merge` three in one folder,
+`make test-all` every one.
 """
 
 import json
