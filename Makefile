@@ -52,7 +52,7 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 demo: $(VENV)/.demo
 	$(RUN) compare --data insertion --reducers conv,umap --alpha 0.1 --lower-bound 0.9 --repeats 1 --n-jobs 2 --out $(OUT) --force
-	@echo 'Go on with:  . $(VENV)/bin/activate && dengine run --cycles 600 --alpha 0.1 --lower-bound 0.9 --store cell.db'
+	@echo 'Go on with:  . $(VENV)/bin/activate && dengine run --cycles 600 --alpha 0.1 --lower-bound 0.9 --store demo.db'
 
 test: $(VENV)/.dev
 	$(PYTEST) -m "not slow" tests/unit tests/contract tests/e2e tests/golden

@@ -12,7 +12,7 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from inspect import signature
 from pathlib import Path
@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 
 from .decision.policy import Policy, check_radius
-from .errors import SettingError, expect, instead, listed
+from .errors import SettingError, StoreError, expect, instead, listed
 from .records import is_number, is_whole
+from .reducers import make_reducer, own_default, reducer_class
 
 Params = Mapping[str, bool | int | float | str]
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
@@ -32,11 +33,50 @@ NOVELTY = 1.5
 LARGEST = 2**20  # bytes of a recipe's file
 WHOLE = {  # the least and the most; beyond the latter no machine goes, and an error now is better than one at each retrain
     "folds": (2, 1000),
-    "retrain_every": (1, 10**9),
     "max_steps": (0, 10**9),
     "window": (10, 10**8),
 }
 OBJECT = "object "  # before the class of a reducer that TOML cannot say
+
+
+class OwnDefault:
+    """A field of `Recipe` whose default belongs to the reducer: None reads as what the reducer's class says.
+
+    It is looked up when it is read, so that naming a reducer imports nothing.
+
+    Parameters
+    ----------
+    name : str
+        Attribute of the reducer's class, `default_radius` say; see `Reducer`.
+    check : callable
+        Raises SettingError for a value out of range.
+    """
+
+    def __init__(self, name: str, check: Callable[[Any], None]) -> None:
+        self.name = name
+        self.check = check
+
+    def __set_name__(self, owner: type, field_name: str) -> None:
+        self.field_name = field_name
+
+    def __get__(self, recipe: Recipe | None, owner: type) -> Any:
+        if recipe is None:
+            return None  # the default, as `dataclass` reads it
+        value = vars(recipe)[self.field_name]
+        if value is None:
+            value = own_default(recipe.reducer, self.name)
+            self.check(value)
+        return value
+
+    def __set__(self, recipe: Recipe, value: Any) -> None:
+        if value is not None:
+            self.check(value)  # or every retrain would fail, one by one
+        vars(recipe)[self.field_name] = value
+
+
+def _check_retrain_every(value: Any) -> None:
+    at_least = "retrain_every to be an integer of at least 1"
+    expect(is_whole(value, 1, 10**9), at_least, value, "at most 1,000,000,000")
 
 
 @dataclass(frozen=True)
@@ -46,9 +86,10 @@ class Recipe:
     reducer : a name in `REDUCERS`, `module:Class` of your own, or a scikit-learn transformer as it is.
     params : the reducer's own settings, where it is a name.
     policy : the user's two numbers, the interval, the rule, the audit rate.
-    radius : of the ball whose labels count, in units of the scaled embedding.
+    radius : of the ball whose labels count, in units of the scaled embedding; None: the reducer's
+        own, `default_radius`.
     folds : K of honest counting, for a reducer that uses labels.
-    retrain_every : new labels between two retrains.
+    retrain_every : new labels between two retrains; None: the reducer's own, `default_retrain_every`.
     budget : seconds of wall time that a retrain may take in a live engine.
     max_steps : optimiser steps of a retrain at most; None: the reducer's own. A replay stops on steps alone.
     window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
@@ -59,9 +100,9 @@ class Recipe:
     reducer: Any = "conv"
     params: Params = field(default_factory=dict)
     policy: Policy = field(default_factory=Policy)
-    radius: float = 0.3
+    radius: float = OwnDefault("default_radius", check_radius)  # type: ignore[assignment]
     folds: int = 5
-    retrain_every: int = 50
+    retrain_every: int = OwnDefault("default_retrain_every", _check_retrain_every)  # type: ignore[assignment]
     budget: float = 0.45
     max_steps: int | None = None
     window: int = 10_000
@@ -82,7 +123,6 @@ class Recipe:
         named = isinstance(self.reducer, str) or all(hasattr(self.reducer, each) for each in ("fit", "get_params"))
         expect(named, "a reducer's name, or a scikit-learn transformer with fit and get_params", self.reducer)
         expect(isinstance(self.policy, Policy), "policy to be a Policy", self.policy)
-        check_radius(self.radius)  # or every retrain would fail, one by one
 
     @property
     def name(self) -> str:
@@ -99,18 +139,14 @@ class Recipe:
     def load(cls, recipe: Any) -> Recipe:
         """A recipe by its name in `RECIPES`, from a TOML file's path, for a reducer of your own, or as it is.
 
-        A reducer of your own is `module:Class`, or a scikit-learn transformer; it gets the default settings.
+        A reducer of your own is `module:Class`, or a scikit-learn transformer.
         """
         if isinstance(recipe, Recipe):
             return recipe
         if not isinstance(recipe, str | os.PathLike):
             fits = callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type)
             expect(fits, "a recipe, its name, or a scikit-learn transformer", recipe)
-            # A reducer of ours keeps the radius of its own recipe: it means something else in each.
-            modules = [kind.__module__.removeprefix("dengine.reducers.").replace("_", "-") for kind in type(recipe).__mro__]
-            names = ["conv" if module == "torch-reducer" else module for module in modules]
-            base = next((RECIPES[name] for name in names if name in RECIPES), cls())
-            return replace(base, reducer=recipe, params={})
+            return cls(recipe)
         if str(recipe) in RECIPES:
             return RECIPES[str(recipe)]
         text = _text_of(Path(recipe))
@@ -131,13 +167,25 @@ class Recipe:
         expect(isinstance(reducer, str), f"in {where} reducer to be a name, or module:Class", reducer)
         expect(isinstance(policy, Mapping), f"in {where} policy to be a table, [policy]", policy)
         _must_be_known(policy, Policy, f"{where}, policy,")
-        base = RECIPES.get(reducer, cls())
         if isinstance(table.get("params"), Mapping):
             table["params"] = _without_none(table["params"])
         try:
-            return replace(base, **_without_none(table), policy=replace(base.policy, **policy))
+            return cls(**_without_none(table), policy=Policy(**policy))
         except (TypeError, SettingError) as error:
             raise SettingError(f"{where}: {str(error).rstrip('.')}.") from error
+
+    @classmethod
+    def from_store(cls, settings: Mapping[str, str], where: str = "the recipe in the store") -> Recipe:
+        """Parse the recipe that a store keeps, without importing a class that it names.
+
+        Raises StoreError where such a class would have to be asked for its radius: the store is damaged.
+        """
+        recipe = cls.from_toml(settings["recipe"], where)
+        missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
+        if missing and str(recipe.reducer) not in RECIPES:
+            got = f"a recipe of {recipe.name} without {listed(missing)}"
+            raise StoreError(f"Expected {where} to hold every setting, got {got}; restore the store from a copy.")
+        return recipe
 
     def to_toml(self) -> str:
         """The recipe as TOML; None is written as "none".
@@ -159,6 +207,18 @@ class Recipe:
     def with_policy(self, **changes: Any) -> Recipe:
         """The same with another alpha, lower_bound, interval or audit_rate."""
         return replace(self, policy=replace(self.policy, **changes))
+
+    def make_reducer(self, seed: int) -> Any:
+        """Return the reducer: an object as it is, or one made by its name.
+
+        One that is made gets the seed and the folds, where it takes them.
+        """
+        if not isinstance(self.reducer, str):
+            return self.reducer
+        known = signature(reducer_class(self.reducer)).parameters
+        # A reducer that cross-fits by itself takes the folds; any other is cross-fitted from outside.
+        own = {name: value for name, value in (("random_state", seed), ("folds", self.folds)) if name in known}
+        return make_reducer(self.reducer, **own | dict(self.params))
 
 
 def _must_be_known(table: Mapping[str, Any], of: Any, where: str) -> None:
@@ -224,12 +284,7 @@ def _value(value: Any) -> str:
 
 
 RECIPES: dict[str, Recipe] = {
-    # The radius of conv and rocket is that of a probability. Small retrains of conv often beat large ones seldom.
-    "conv": Recipe("conv", radius=0.07, retrain_every=10),
-    "umap": Recipe("umap"),
-    "umap-learn": Recipe("umap-learn"),
-    "pca": Recipe("pca", radius=0.2),
-    "rocket": Recipe("rocket", radius=0.07),
+    **{name: Recipe(name) for name in ("conv", "umap", "umap-learn", "pca", "rocket")},
     # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored; it asks nothing else of a trace.
     "paper": Recipe("umap", policy=Policy(alpha=0.1, lower_bound=0.9), novelty=0.0),
 }

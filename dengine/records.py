@@ -88,7 +88,8 @@ FITS = ("strict", "cut", "pad", "resample")  # in exported files the position he
 class TraceSpec:
     """The contract of a trace. SettingError for values that no trace can keep to.
 
-    samples : per channel.  rate_hz : sampling rate in hertz.  unit : of the samples, for people only.
+    samples : per channel.  rate_hz : sampling rate in hertz.
+    unit : of the samples, for people only; one for all, or one a channel, ("kN", "mm") or "kN, mm".
     channels : their number; a one-channel trace may come as `(samples,)`.
     limit : the sensor's range in `unit`; a sample at or beyond ±limit is saturated. None: not checked.
     fit : of a trace of another length (`traces.fitted`). strict: TraceError. cut: a longer one loses its end. pad: that,
@@ -99,7 +100,7 @@ class TraceSpec:
     samples: int
     rate_hz: float = 500.0
     channels: int = 1
-    unit: str = "N"
+    unit: str | tuple[str, ...] = "N"
     limit: float | None = None
     fit: str = "strict"
     columns: tuple[str, ...] = ()
@@ -112,13 +113,24 @@ class TraceSpec:
         form = (self.samples, self.channels, self.rate_hz)
         held = is_whole(self.samples, 1, MOST) and is_whole(self.channels, 1, MOST) and rated
         expect(held, "a trace of at least 1 sample and 1 channel at a rate above 0 Hz", form)
-        texts = all(isinstance(text, str) for text in (self.unit, *self.columns))
+        several = isinstance(self.unit, tuple | list)
+        said: Any = tuple(self.unit) if several else (self.unit,)
+        texts = all(isinstance(text, str) for text in (*said, *self.columns))
         expect(texts, "unit and columns of text", (self.unit, self.columns))
+        expect(not several or len(said) == self.channels, f"{self.channels} units, one a channel", self.unit)
+        units = said if several else tuple(text.strip() for text in said[0].split(","))
+        if len(units) == self.channels:
+            object.__setattr__(self, "unit", units if len(set(units)) > 1 else units[0])
         limited = self.limit is None or (is_number(self.limit) and self.limit > 0)
         expect(limited, "a limit above 0 in the trace's unit, or None", self.limit)
         expect(self.fit in FITS, f"fit to be one of {', '.join(FITS)}", self.fit)
         different = not self.columns or len(set(self.columns)) == self.channels
         expect(different, f"{self.channels} different columns, one a channel", self.columns)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each channel."""
+        return (self.unit,) * self.channels if isinstance(self.unit, str) else self.unit
 
 
 @dataclass(frozen=True, slots=True)

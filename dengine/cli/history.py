@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 WIDEST = 120  # columns
-SHORTEST = 12  # characters of a part's number that are shown, its last
-SHORT = "%y-%m-%d %H:%M:%S"
+SHORTEST = 10  # characters of a part's number that are shown, its last
+SHORT = "%Y-%m-%d %H:%M:%S"
 MOST = 5  # excesses that are named
 NEIGHBOUR = ("decision_id", "part", "success", "source", "distance", "space", "inside")
 

@@ -157,7 +157,8 @@ def written(name: str, value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{part} {written(part, each)}" for part, each in value.items() if each != 0) or "none"
     if isinstance(value, list | tuple):
-        return ", ".join(written(name, each) for each in value)
+        titles = PLACES.get(name, ("",) * len(value))
+        return ", ".join(f"{title} {written(name, each)}".strip() for title, each in zip(titles, value, strict=True))
     if isinstance(value, bool):
         return "yes" if value else "no"
     if math.isnan(value):
@@ -189,6 +190,7 @@ def size(n_bytes: float) -> str:
     return decimal(int(n_bytes))
 
 
+PLACES = {"prices": ("check", "escape", "false reject")}  # of a field that is a tuple: what stands at each place
 UNITS: dict[str, Callable[[float], str]] = {  # by the ending of a field's name
     **dict.fromkeys(("_s", "seconds", "budget"), duration),
     **dict.fromkeys(("_time", "last_seen"), when),

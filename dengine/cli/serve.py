@@ -88,7 +88,9 @@ def serve(
     with ExitStack() as stack:
         if demo:
             if store is not None and Path(store).exists():
-                raise SettingError(f"Expected a new file to keep the demonstration in, {store} is there; name another one.")
+                raise SettingError(
+                    f"Expected a new file to keep the demonstration in, {store} is there; name another file."
+                )
             data = load_dataset("insertion", **{name: value for name, value in form.items() if name != "channel"})
             how["beside"] = [partial(playing, data=data, speed=speed, seed=seed or 0)]
             how["deadline"] = max(how["deadline"], PATIENT)

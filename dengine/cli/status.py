@@ -1,7 +1,7 @@
 """`dengine status`: how an engine is doing by its store, what the store holds, and who shares it."""
 
 from contextlib import closing
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from ..history.status import Judged, Span, Status
 
 WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
-TITLES = {"stops": "accepted, and bad"}
+# Parts of the shadow mode are no audits, though they have their reason.
+TITLES = {"stops": "accepted, and bad", "audits": "certain but checked"}
 APART = ("newest", "ever", "recipe", "trace", "certificate", "retrains", "events", "settings", "last")
 ELSEWHERE = ("retraining", "store_lag")  # of an engine that runs
 LAST = "The newest so many decisions, looked at apart."
@@ -60,7 +61,10 @@ def _tables(store: str, found: "Status") -> list[Any]:
     names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "stops")  # what is bad comes first
     spans = [[TITLES.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
     now = [("look at", found.alarm)] if found.alarm else []
-    now += [("cell", found.cell), *rows_of(found, "cell", *APART, *ELSEWHERE)]
+    shown = found
+    if not found.recipe.policy.audit_rate:
+        shown = replace(found, reasons=_without_audits(found.reasons), sources=_without_audits(found.sources))
+    now += [("cell", found.cell), *rows_of(shown, "cell", *APART, *ELSEWHERE)]
     if found.model is None:  # of one that was handed in the recipe has no effect: to show it would be a lie
         now += rows_of(found.recipe)
     now += [("trace", "none yet: the first trace sets it" if found.trace is None else written("", found.trace))]
@@ -72,10 +76,18 @@ def _tables(store: str, found: "Status") -> list[Any]:
     return [facts(f"{store}: overview", spans, columns), facts("What it is", now)]
 
 
+def _without_audits(counts: dict[str, int]) -> dict[str, int]:
+    return {TITLES["audits"] if name == "audit" else name: n for name, n in counts.items()}
+
+
 def _of_span(name: str, span: "Span") -> str:
     value = getattr(span, name)
     if name in ("first", "last"):
         return when(value)
+    if name == "bad_accepts" and not span.accepted:
+        return "none was accepted"
+    if name == "would_accept" and value.known and span.bad_accepts.by == value.by:
+        return "as bad accepts, below"  # the same parts
     return _held(value, span.stops if name == "bad_accepts" else 0) if hasattr(value, "verdict") else written(name, value)
 
 

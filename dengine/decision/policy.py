@@ -108,6 +108,11 @@ class Policy:
         return cls(**known | {"windows": () if windows == NO_WINDOWS else tuple(windows.split())})
 
     @property
+    def summary(self) -> str:
+        """Its two numbers and its guarantee: "alpha 0.05, LB 95 %, local"."""
+        return f"alpha {self.alpha:g}, LB {100 * self.lower_bound:g} %, {self.guarantee}"
+
+    @property
     def tolerances(self) -> tuple[float, float]:
         """The share of the accepted that may be bad, and of the rejected that may be good."""
         if self.guarantee != "cost":

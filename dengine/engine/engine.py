@@ -48,6 +48,7 @@ from ..records import (
     in_html,
     source_of,
 )
+from ..reducers.base import Reducer
 from ..store.opening import UNHURRIED, opening
 from ..store.outbox import CLOSE, Outbox
 from ..store.records import StoredDecision
@@ -154,7 +155,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
     policy : the user's two numbers.  trace : the traces' contract; None: the first sound trace sets it.
-    radius, folds, retrain_every, budget : as in `Recipe`; None: the recipe decides.
+    radius, folds, retrain_every, budget : as in `Recipe`; None: the recipe decides, or the reducer.
     store : None (memory), a file or URL (SQLite, PostgreSQL), an `SqlStore`. One that is not empty wants `DataEngine.open`.
     seed : of the reducer and of the audits' coin.
     recipe : a `Recipe`, a name or a TOML file, for all settings that are not given beside it; it names its own reducer.
@@ -191,7 +192,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         if model is not None:
             refuse_idle(reducer, beside)
         if model is not None and recipe is None:
-            recipe = Recipe()  # the schedule of conv is its own
+            # The schedule of conv is its own.
+            recipe = Recipe(retrain_every=Reducer.default_retrain_every)
         settings = EngineSettings(chosen_recipe(reducer, recipe, beside), seed, trace=trace)
         settings, template = settings.with_template(model)  # before a store is made: a wrong setting leaves none behind
         with opening(store) as opened:
@@ -200,7 +202,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self._start(settings, template, opened, executor, replaying, clock, on_safe_mode)
             with self._closed_on_failure():
                 if opened.settings():  # now that the cell is owned: nobody begins it meanwhile
-                    raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name another.")
+                    raise StoreError(
+                        "The store is not empty; use DataEngine.open(url) to go on with it, or name another store."
+                    )
                 self.store.save_settings(self._settings.now.to_store())
                 if opened.product is not None:
                     self._versions.resume(self.policy.label_within, 0)  # on what the others of its product learned
@@ -648,11 +652,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return replace(found, **{name: getattr(self, name) for name in live})
 
     def __repr__(self) -> str:
-        recipe, policy = self.recipe, self.policy
-        two = f"alpha {policy.alpha:g}, LB {100 * policy.lower_bound:g} %, {policy.guarantee}"
+        of = f"{self.recipe.name}: version {self.version}, {self.policy.summary}"
         form = "no trace yet" if self.trace is None else f"traces {self.trace.channels} x {self.trace.samples}"
         rest = ", safe mode" if self.safe_mode else ", shadow mode" if self.shadow else ""
-        return f"<DataEngine {recipe.name}: version {self.version}, {two}, {form}, {self.new_labels} new labels{rest}>"
+        return f"<DataEngine {of}, {form}, {self.new_labels} new labels{rest}>"
 
     _repr_html_ = in_html
 

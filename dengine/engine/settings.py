@@ -91,7 +91,7 @@ class EngineSettings:
         """
         if "recipe" not in known:
             raise StoreError(f"Expected a store that an engine has used, {name} is empty; make a DataEngine with it.")
-        recipe = Recipe.from_toml(known["recipe"], f"the recipe in {name}")
+        recipe = Recipe.from_store(known, f"the recipe in {name}")
         made_with = known.get("described")
         if "model" in known and model is None:
             raise SettingError(f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...).")
@@ -148,7 +148,9 @@ class EngineSettings:
         other = sorted(name for name in wished if name in counts and wished[name] != have[name])
         if other:
             stored, got = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished))
-            raise SettingError(f"Expected the store's own settings ({stored}), got {got}; leave them out, or name another.")
+            raise SettingError(
+                f"Expected the store's own settings ({stored}), got {got}; leave them out, or name another store."
+            )
 
 
 def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recipe:

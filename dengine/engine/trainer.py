@@ -155,6 +155,8 @@ class Retrainer:
         if self.executor is None:
             return False
         data = self.window.snapshot()
+        if not self._began:
+            log.info("the first retrain begins, on %d labels", len(data.seq))
         try:
             self.future = self.executor.submit(train_candidate, current.successor(), data, self.limits, self.clock)
         except RuntimeError as error:  # it is broken or shut down, and the caller's: it cannot be made anew here

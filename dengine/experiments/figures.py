@@ -121,7 +121,7 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     positions = replay.position[-last:]
     z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]  # zeros where a reducer has but one dimension
-    known, probability = np.isfinite(z).all(axis=1), has_own_unit(recipe)
+    known, probability = np.isfinite(z).all(axis=1), has_own_unit(recipe.reducer)
     first, second = (f"embedding {i} [root mean square radius = 1]" for i in (1, 2))
     if probability:
         first, second = "predicted probability of success", "embedding 2 [for the eye, small against the radius]"
@@ -339,7 +339,7 @@ def explained_picture(found: Explanation) -> Figure:
     for i, (axes, channel) in enumerate(zip(panels, channels, strict=True)):
         _draw_trace(axes, found, channel)
         name = spec.columns[channel] if spec.columns else "trace" if spec.channels == 1 else f"channel {channel + 1}"
-        finish(axes, legend=0 if i else 3, ylabel=f"{name} [{spec.unit}]")
+        finish(axes, legend=0 if i else 3, ylabel=f"{name} [{spec.units[channel]}]")
     panels[-1].set(xlabel="time [s]")
     left, right = below.subplots(1, 2, width_ratios=(1.15, 1.0))
     _draw_distances(left, found)
@@ -411,7 +411,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
     names = data.channels or tuple(f"channel {i + 1}" if X.shape[1] > 1 else "trace" for i in range(X.shape[1]))
     time, axis = np.arange(X.shape[2]) / (data.rate_hz or 1.0), "time [s]" if data.rate_hz else "sample"
-    unit = f" [{data.unit}]" if X.shape[1] == 1 else ""
+    labels = [f"{name} [{unit}]" for name, unit in zip(names, data.spec.units, strict=True)]
     above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
     for i, axes in enumerate(above.subplots(1, min(X.shape[1], 3), squeeze=False)[0]):
         for label, name, colour, line, _ in KINDS:
@@ -420,7 +420,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
                 low, median, high = np.quantile(some, (0.1, 0.5, 0.9), axis=0)
                 axes.fill_between(time, low, high, color=colour, alpha=0.18, linewidth=0)
                 axes.plot(time, median, line, color=colour, linewidth=1.2, label=f"{name} ({len(some)})")
-        finish(axes, legend=3 if shown.any() and not i else 0, xlabel=axis, ylabel=f"{names[i]}{unit}")
+        finish(axes, legend=3 if shown.any() and not i else 0, xlabel=axis, ylabel=labels[i])
     share, level = below.subplots(2, 1, sharex=True)
     window, x = max(1, len(y) // 10), np.arange(1, len(y) + 1)
     full = x >= window  # a share of the first few jumps
@@ -430,5 +430,5 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     for label, name, colour, _, _ in KINDS:
         some = shown & (y == label)
         level.scatter(x[some], levels(X[some, :1])[:, 0], s=8, color=colour, alpha=0.5, linewidths=0, label=name)
-    finish(level, xlabel="recording, in the order in which they were made", ylabel=f"mean {names[0]}{unit}")
+    finish(level, xlabel="recording, in the order in which they were made", ylabel=f"mean {labels[0]}")
     return figure

@@ -19,9 +19,10 @@ from ..cells.base import Cell
 from ..cells.replay import ReplayCell
 from ..datasets import load_dataset
 from ..engine.engine import DataEngine
-from ..errors import DataError, expect
+from ..errors import DataError, SettingError, expect
 from ..recipe import RECIPES, Recipe
 from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, in_html
+from ..reducers.base import Reducer
 from .metrics import VERIFY_SECONDS, Costs
 from .rivals import RIVALS, make_rival
 
@@ -58,7 +59,9 @@ class Contender:
         if isinstance(asked, Contender):
             return asked
         if isinstance(asked, str) and asked in RIVALS:
-            return cls(asked, Recipe(), asked, RIVALS[asked].tries[RIVALS[asked].chosen])
+            # The schedule of conv is its own.
+            recipe = Recipe(retrain_every=Reducer.default_retrain_every)
+            return cls(asked, recipe, asked, RIVALS[asked].tries[RIVALS[asked].chosen])
         recipe = Recipe.load(asked)
         by_name = isinstance(asked, str | os.PathLike) and (str(asked) in RECIPES or Path(asked).is_file())
         return cls(Path(asked).stem if by_name else recipe.name, recipe)
@@ -121,7 +124,8 @@ class Replay:
         counts, where = self.stretch(), f" on {self.dataset}, seed {self.seed}" if self.dataset else ""
         told = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
         told += f"; {len(self.dropped)} retrains dropped, the last {self.dropped[-1]}" if self.dropped else ""
-        return f"<Replay of {self.name or 'a run'}{where}: {len(self)} cycles, {told}>"
+        cycles = f"{self.recipe.policy.summary}, {len(self)} cycles"
+        return f"<Replay of {self.name or 'a run'}{where}: {cycles}, {told}>"
 
     _repr_html_ = in_html
 
@@ -298,6 +302,8 @@ def replay(
     seed: int = 0,
     cycles: int | None = None,
     *,
+    alpha: float | None = None,
+    lower_bound: float | None = None,
     shuffle: bool = True,
     confirm: bool = False,
     on_cycle: Callable[[int], None] | None = None,
@@ -308,12 +314,20 @@ def replay(
     recipe : anything `Recipe.load` takes, the name of a rival method (`experiments.rivals.RIVALS`), a `Contender`, or a
         fresh engine, by which a model of your own comes in.
     seed : of the shuffle and of the engine; the same seed gives the same decisions.
+    alpha, lower_bound : of the policy; None: the recipe's, by default 0.05 and 0.95.
     shuffle : False plays the stream as it was recorded, drift and all.
     confirm : whether accepted good parts are confirmed by the cell; by default only stops are seen. With
         `Policy(stops="all")` the engine takes the silence after them for as much.
     on_cycle : called with the number of cycles done, for a progress bar.
     """
-    data, who = load_dataset(dataset), None if isinstance(recipe, DataEngine) else Contender.load(recipe)
+    numbers = {"alpha": alpha, "lower_bound": lower_bound}
+    numbers = {name: value for name, value in numbers.items() if value is not None}
+    data, who = load_dataset(dataset), None
+    if not isinstance(recipe, DataEngine):
+        who = Contender.load(recipe).with_policy(**numbers)
+    elif numbers:
+        got = f"{' and '.join(numbers)} beside an engine, which has its own"
+        raise SettingError(f"Expected the policy of an engine on the engine, got {got}; make it with them.")
     n = len(data) if cycles is None else cycles
     expect(1 <= n <= len(data), f"1 to {len(data)} cycles from {data.name}", n)
     order = (np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data)))[:n]

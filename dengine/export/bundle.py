@@ -101,7 +101,8 @@ def prepared(
         raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
     if model.spaces.module() is None:
         raise ExportError(
-            f"{model.name} cannot be exported: it gives no module that TorchScript takes; see `Reducer.module`."
+            f"{model.name} cannot be exported, for it has no module: give it `module()`, which returns the embedding "
+            "as an nn.Module (see `Reducer.module`)."
         )
     size = model.n_spaces, model.index.dim
     coin = source.audit_rate, source.seed

@@ -13,7 +13,7 @@ from ..traces import TraceGate, WindowGate, fitted
 
 One = tuple[int, int, float, float, int, int, Tensor]
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
-METHODS = ("decide", "learn", "stop", "settle", "safe_mode", "restore", "predicted", "drop", "n_references")
+METHODS = ("forward", "decide", "learn", "stop", "settle", "safe_mode", "restore", "predicted", "drop", "n_references")
 AUDIT, OUTSIDE = REASONS.index(Reason.AUDIT), REASONS.index(Reason.OUTSIDE)
 NOBODY = -1  # waits for a label
 
@@ -61,6 +61,10 @@ class DecisionModule(nn.Module):
         action, reason, lower, upper, _, _, z = one
         self.wait(action if fault == 0 else self.nobody, alone, part, content, reason, lower, upper, z)
         return one
+
+    def forward(self, trace: Tensor, part: int = 0) -> One:
+        """`decide`, by the name that a plain `torch.jit.load` calls a module by."""
+        return self.decide(trace, part)
 
     def look(self, x: Tensor, part: int, fault: int, content: int) -> tuple[One, int]:
         """(C, T) and what the gate says -> the decision, which changes nothing; what the model alone would have done."""

@@ -42,7 +42,9 @@ def export_sources(folder: str | os.PathLike[str]) -> Path:
     target = Path(folder)
     with instead(ExportError, f"Cannot write {target}", OSError, do="choose a folder that is writable"):
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            raise ExportError(f"Expected a new or an empty folder for the sources, {target} holds something; name another.")
+            raise ExportError(
+                f"Expected a new or an empty folder for the sources, {target} holds something; name another folder."
+            )
         shutil.copytree(Path(__file__).parent / "cpp", target, dirs_exist_ok=True)
         (target / "VERSION").write_text(f"{__version__}\n", encoding="utf-8")
     return target

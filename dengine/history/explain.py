@@ -364,7 +364,7 @@ def _saturated(made: Decision, trace: NDArray[np.float32], found: Circumstances)
         return ": the trace touched the sensor's range."
     channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
     first = f"first after {sample / spec.rate_hz:.3f} s (channel {channel + 1})"
-    return f": {len(touching)} samples touch the sensor's range of {spec.limit:g} {spec.unit}, {first}."
+    return f": {len(touching)} samples touch the sensor's range of {spec.limit:g} {spec.units[channel]}, {first}."
 
 
 def _not_finite(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
@@ -384,10 +384,13 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
     Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was.",
     Reason.AUDIT: _audit,
     Reason.NOT_FINITE: _not_finite,
-    Reason.CONSTANT: lambda made, trace, found: f": every sample is {trace.flat[0]:g} {found.spec.unit}: a dead sensor.",
+    Reason.CONSTANT: lambda made, trace, found: (
+        f": every sample is {trace.flat[0]:g} {found.spec.units[0]}: a dead sensor."
+    ),
     Reason.SATURATED: _saturated,
     Reason.TOO_LARGE: lambda made, trace, found: (
-        f": a sample of {np.abs(trace).max():g} {found.spec.unit}; beyond {LARGEST:g} nothing can be computed from it."
+        f": a sample of {np.abs(trace).max():g} {found.spec.units[np.abs(trace).max(axis=1).argmax()]}; beyond "
+        f"{LARGEST:g} nothing can be computed from it."
     ),
     Reason.MODEL_ERROR: lambda *_: ": the model raised an error, which the log of that time tells.",
     Reason.NOVEL: lambda made, trace, found: (
@@ -532,7 +535,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     past = store.get_decision(decision_id) or store.get_decision(of_part(store, decision_id))
     if past is None:
         raise unknown_decision(decision_id)
-    made, trace, recipe = past.decision, past.trace, Recipe.from_toml(known["recipe"])
+    made, trace, recipe = past.decision, past.trace, Recipe.from_store(known)
     changed = store.policy_change_after(decision_id)
     if changed is not None and changed.data is not None:  # the policy that was in force then
         recipe = replace(recipe, policy=Policy.from_values(changed.data["old"]))

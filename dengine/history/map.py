@@ -56,7 +56,7 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     newest = list(_newest(store, [made.id for made in recent[-NEWEST:] if made.model_version == version]))
     shown, parts = {mark.id for mark in newest}, {made.id: made.part for made in recent}
     known = [mark for mark in _known(store, recipe, version, parts) if mark.id not in shown] if version else []
-    return PartMap(version, (*known, *newest), recipe.radius if newest else None, has_own_unit(recipe))
+    return PartMap(version, (*known, *newest), recipe.radius if newest else None, has_own_unit(recipe.reducer))
 
 
 def _newest(store: "SqlStore", ids: list[str]) -> Iterator[Mark]:

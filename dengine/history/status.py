@@ -38,7 +38,7 @@ class Judged:
     """Parts that the model was certain of, and how many of them it was wrong about, as far as that is known.
 
     n : parts.  known : those of them that the claim rests on.  wrong : of these.
-    by : what tells: "every outcome", "audits", or "" where nothing does.
+    by : what tells: "every outcome", "audits", "checks", as of the shadow mode, or "" where nothing does.
     lower, upper : Wilson interval of the share of wrong ones, at one look; 0 and 1 where nothing is known.
     tolerance : 1 - LB.  verdict : kept, broken or open, as far as the interval goes.
     """
@@ -62,7 +62,8 @@ class Span:
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
     accepted, rejected : by the model, without a check.  stops : of the accepted, those known to be bad.
     false_rejects : of the rejected, those that were looked at and found good.
-    bad_accepts : parts that it let pass or would have, by the policy's alpha.
+    bad_accepts : parts that it let pass, and would have but for an audit, by the policy's alpha; of
+        no part where none passed, as in the shadow mode.
     would_accept, would_reject : by audits alone, in the shadow mode every part; at 95 %, whatever the policy's alpha.
     unlabelled : verified, of which no result was reported.
     retrains : all.  dropped : reasons of those that were dropped, with how often.
@@ -149,7 +150,8 @@ class Status:
     _repr_html_ = in_html
 
     def __repr__(self) -> str:
-        n, at = self.ever, f"{self.cell}: version {self.version}, {self.ever.decisions} decisions"
+        n = self.ever
+        at = f"{self.cell}: version {self.version}, {n.decisions} decision{'' if n.decisions == 1 else 's'}"
         return f"<Status of {at}, {n.verified} verified, {n.accepted} accepted, {n.stops} known bad, {n.rejected} rejected>"
 
     @property
@@ -162,16 +164,19 @@ class Status:
         found_good = (
             f"{false_rejects} of the {rejects.n} newest rejected parts were good: more than {rejects.tolerance:.1%}."
         )
+        would_accept = self.newest.would_accept
         reports = [retrain.report for retrain in self.retrains]
         newest_accepted = max((i for i, report in enumerate(reports, 1) if report.accepted), default=0)
         failing = retrain_fault([report.reason for report in reports[newest_accepted:]], self.version)
         broken = f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."
+        would_break = f"It would break the tolerance of {would_accept.tolerance:.1%}."
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
             (accepts.verdict == "broken", broken),
             (false_rejects and rejects.verdict == "broken", found_good),
             (failing, failing),
+            (self.shadow and would_accept.verdict == "broken", would_break),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
             (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),
@@ -206,7 +211,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     settings = store.settings()
     if "recipe" not in settings:
         raise StoreError(f"Expected a store that an engine has used, cell {store.cell_id!r} of this one is empty.")
-    recipe, counts, retrains = Recipe.from_toml(settings["recipe"]), store.status(), store.versions(own=True)
+    recipe, counts, retrains = Recipe.from_store(settings), store.status(), store.versions(own=True)
     every, policy, events = store.tally(), recipe.policy, store.events()
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
     outcomes, since = every.outcomes, int(settings.get("policy_since", 0))
@@ -242,6 +247,9 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
     outcomes, first, n, reasons = tally.outcomes, tally.first, tally.count(), tally.by("reason")
     here = [each.report for each in retrains if first is not None and each.time >= first]
     verified = tally.by("action")[Action.VERIFY]
+    by = "audits" if policy.audit_rate else "checks"
+    accepts = (outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0])
+    rejects = (outcomes.audited_rejects, outcomes.audited_rejects_good, policy.tolerances[1])
     return Span(
         decisions=n,
         first=first,
@@ -257,8 +265,8 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         rejected=outcomes.rejected,
         stops=outcomes.stops,
         false_rejects=outcomes.false_rejects,
-        would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0]),
-        would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy.tolerances[1]),
+        would_accept=_judged(*accepts, by=by),
+        would_reject=_judged(*rejects, by=by),
         bad_accepts=bad_accepts(outcomes, policy),
         unlabelled=tally.count(lambda kind: kind.action is Action.VERIFY and kind.success is None),
         retrains=len(here),
@@ -284,7 +292,10 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
 
     Under `stops="all"` a part whose silence is not over is left out. Audits speak for all: their coin knows no outcome.
     Stops are known beside them: the lower end is at least that of the stops if all others were good, the upper their share.
+    Where no part passed nothing is said of what did: `would_accept` counts those of the shadow mode.
     """
+    if not outcomes.accepted:
+        return _judged(0, 0, policy.tolerances[0], policy.alpha)
     n, heard = outcomes.accepted + outcomes.audited_accepts, outcomes.stops + outcomes.confirmed
     if heard and (policy.stops == "all" or outcomes.accepted == heard):
         return _judged(heard, outcomes.stops, policy.tolerances[0], policy.alpha, n, "every outcome")

@@ -33,7 +33,7 @@ from ..errors import ExportError, listed
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
 from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
-from ..reducers import make_reducer, reducer_of
+from ..reducers import make_reducer, own_default
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, space_scale
 from ..traces import TraceGate, as_labels, as_traces, without_extremes
 from .base import Embedding, EngineModel, Exportable, Gate, Looked, Prediction
@@ -182,6 +182,7 @@ class ModelPrediction(EngineModel):
 
     reducer : a name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned, never fitted itself.
     classifier : a `WilsonRadiusClassifier` holding radius and policy; it is cloned, never fitted itself.
+        None: of the reducer's own radius.
     folds : K, for a label-using transformer that does not cross-fit by itself.
     rule : what turns counts into an action; None: the classifier's policy.
     novelty : how far beyond its references a trace may lie, as in `Recipe`; 0: anywhere.
@@ -201,7 +202,7 @@ class ModelPrediction(EngineModel):
     ) -> None:
         self.novelty = novelty
         self.reducer = make_reducer(reducer) if isinstance(reducer, str) else reducer
-        self.classifier = classifier or WilsonRadiusClassifier()
+        self.classifier = classifier or WilsonRadiusClassifier(own_default(self.reducer, "default_radius"))
         self.folds, self.name = folds, type(self.reducer).__name__
         self.rule = rule or self.classifier.policy().rule()
         self.spaces: Reducer = as_reducer(clone(self.reducer), folds)
@@ -214,7 +215,7 @@ class ModelPrediction(EngineModel):
         policy = recipe.policy
         own = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         classifier = WilsonRadiusClassifier(recipe.radius, **own, capacity=recipe.window)
-        return cls(reducer_of(recipe, seed), classifier, recipe.folds, policy.rule(), recipe.novelty)
+        return cls(recipe.make_reducer(seed), classifier, recipe.folds, policy.rule(), recipe.novelty)
 
     @property
     def user_model(self) -> "ModelPrediction":  # itself: an attribute would be a circle

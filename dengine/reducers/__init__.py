@@ -9,7 +9,6 @@ import lazy_loader
 import numpy as np
 
 from ..errors import SettingError, expect
-from ..recipe import Recipe
 from ..records import find_class, is_number, is_whole
 
 if TYPE_CHECKING:
@@ -69,20 +68,18 @@ def _must_be_like(default: Any, key: str, value: Any) -> None:
     expect(what is None or fits[type(default)], f"{what} as the reducer's {key}, as {default!r}", value)
 
 
-def reducer_of(recipe: Recipe, seed: int) -> Any:
-    """A recipe's reducer: an object as it is, or one made by name with the seed and the folds, where it knows them."""
-    if not isinstance(recipe.reducer, str):
-        return recipe.reducer
-    known = signature(reducer_class(recipe.reducer)).parameters
-    # A reducer that cross-fits by itself takes the folds; any other is cross-fitted from outside.
-    own = {name: value for name, value in (("random_state", seed), ("folds", recipe.folds)) if name in known}
-    return make_reducer(recipe.reducer, **own | dict(recipe.params))
+def own_default(reducer: Any, name: str) -> Any:
+    """Return what a reducer's class says of itself, `default_radius` say; `reducer` is a name, a class or an object.
+
+    scikit-learn's transformers say nothing of it, so they have the default of `Reducer`.
+    """
+    kind = reducer_class(reducer) if isinstance(reducer, str) else reducer
+    return getattr(kind, name, getattr(__getattr__("Reducer"), name))
 
 
-def has_own_unit(recipe: Recipe) -> bool:
-    """Whether a recipe's embedding is never scaled, its first axis a predicted probability; see `Reducer.own_unit`."""
-    kind = reducer_class(recipe.reducer) if isinstance(recipe.reducer, str) else recipe.reducer
-    return bool(getattr(kind, "own_unit", False))  # scikit-learn's transformers say nothing of a unit
+def has_own_unit(reducer: Any) -> bool:
+    """Whether a reducer's embedding is never scaled, its first axis a predicted probability; see `Reducer.own_unit`."""
+    return bool(own_default(reducer, "own_unit"))
 
 
 REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _NAMED}

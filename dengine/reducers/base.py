@@ -76,12 +76,17 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     scores : whether the first axis is the predicted probability of success.
     own_unit : whether the embedding has a unit of its own, a probability say, that must not be scaled away.
     min_traces : how many labelled traces the first training in an engine waits for.
+    default_radius : radius of the ball whose labels count, where a recipe names none. The embedding is scaled to a root
+        mean square radius of 1 first, unless it has a unit of its own.
+    default_retrain_every : new labels between two retrains, where a recipe names none.
     """
 
     uses_labels = False
     scores = False
     own_unit = False
     min_traces = 1
+    default_radius = 0.3
+    default_retrain_every = 50
 
     @abstractmethod
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:

@@ -22,6 +22,8 @@ class PcaReducer(Reducer):
     Source: Halko, Martinsson and Tropp (2011), SIAM Review 53(2).
     """
 
+    default_radius = 0.2
+
     n_components: int = 2
     random_state: Any = 0
 

@@ -534,7 +534,8 @@ class RocketReducer(Reducer):
     uses_labels = True
     scores = True
     min_traces = MIN_TRACES
-    own_unit = True  # a radius of 0.07 is seven in a hundred, never rescaled
+    own_unit = True
+    default_radius = 0.07  # of a probability: seven in a hundred, never rescaled
 
     n_components: int = 2
     folds: int = 5

@@ -5,7 +5,7 @@ A retrain goes on from the last one: it takes some AdamW steps on augmented batc
 exponential average of the weights answers, with the statistics of batch normalisation taken anew.
 
     >>> reducer = TorchReducer(network=MyNetwork)      # MyNetwork(channels, samples) is an nn.Module
-    >>> DataEngine(reducer=reducer, radius=0.07, retrain_every=10)
+    >>> DataEngine(reducer=reducer)
 
 References
 ----------
@@ -133,6 +133,8 @@ class TorchReducer(Reducer):
     scores = True
     own_unit = True
     min_traces = MIN_TRACES
+    default_radius = 0.07  # of a probability
+    default_retrain_every = 10  # small retrains often beat large ones seldom
 
     network: NetworkFactory
     n_components: int = 2

@@ -57,6 +57,7 @@ DECODERS: Mapping[str, Callable[..., Any]] = {JSON: msgspec.json.decode, MSGPACK
 STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # of a JSON object; those before a colon are its keys
 FIELD = re.compile(r"(?:^ *|  )((?:\w+, )*\w+) : ", re.MULTILINE)  # "name, name : what it is", in a docstring
 REF = "#/components/schemas/{name}"
+FEWEST, WILD, SOME = 32, 1e9, 0.025  # words, times the largest of the others, and the share that is so: of float64
 PROBLEMATIC = {PROBLEM: {"schema": {"$ref": REF.format(name="Problem")}}}
 
 # What is asked
@@ -139,7 +140,11 @@ def as_samples(value: Any, channels: int = 1) -> NDArray[np.float32]:
         if len(value) % (4 * channels):
             held = f"float32, little-endian, channel after channel, {channels} of them"
             raise TraceError(f"Expected {held}, got {len(value)} bytes.")
-        x = np.frombuffer(value, dtype="<f4").reshape(channels, -1)
+        words = np.frombuffer(value, dtype="<f4")
+        if _are_halves(words):
+            got = f"{len(value)} bytes, twice as many bytes as float32 takes: float64?"
+            raise TraceError(f"Expected raw float32, little-endian, got {got} Convert the trace to float32.")
+        x = words.reshape(channels, -1)
     else:
         try:
             with np.errstate(over="ignore"):
@@ -149,6 +154,19 @@ def as_samples(value: Any, channels: int = 1) -> NDArray[np.float32]:
     if not x.size:
         raise TraceError("Expected at least one sample, got none.")
     return x
+
+
+def _are_halves(words: NDArray[np.float32]) -> bool:
+    """Whether these are numbers of float64, read as float32: every other word is the end of a fraction, or nothing."""
+    if len(words) % 2 or len(words) < FEWEST:
+        return False
+    low, high = words[0::2], words[1::2]
+    if not low.view(np.uint32).any():  # whole numbers, or halves
+        return bool(high.view(np.uint32).any())
+    low = low[np.isfinite(low)]
+    most = float(np.abs(high[np.isfinite(high)]).max(initial=1.0))
+    n_wild = int((np.abs(low) > WILD * most).sum())
+    return n_wild >= SOME * len(words)
 
 
 # What is answered

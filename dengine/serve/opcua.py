@@ -185,7 +185,7 @@ class AddressSpace:
         if not 1 <= channels <= MOST_CHANNELS or len(trace) % channels or not trace:
             raise SettingError(f"Expected as many samples of each channel, got {len(trace)} of {channels} channels.")
         x = np.array(trace, dtype=np.float32).reshape(channels, -1)
-        answer = await self._calls.decide_on(x, request or "", part or "")
+        answer = await self._calls.decide_on(x, request, part)
         return [answer[name] for name in ("action", "id", "reason", "lower", "upper", "version")]
 
     async def report(self, decision_id: str, success: bool) -> list[Any]:
@@ -227,10 +227,11 @@ class AddressSpace:
 
         @wraps(call)
         async def method(parent: ua.NodeId, *arguments: ua.Variant) -> Any:
-            wrong, said = _wrong(arguments, taken), f"Expected {listed}."
+            wrong, got = _wrong(arguments, taken)
+            said = f"Expected {listed}{got}."
             if wrong is None:
                 try:
-                    answer = await call(*(each.Value for each in arguments))
+                    answer = await call(*map(_value, arguments, taken))
                     return [ua.Variant(value, type_) for value, (_, type_, _, _) in zip(answer, given, strict=True)]
                 except DengineError as error:
                     wrong, said = StatusCodes.BadInvalidArgument, as_options(str(error))
@@ -249,15 +250,26 @@ class AddressSpace:
         return ua.QualifiedName(text, self._index)
 
 
-def _wrong(arguments: tuple[ua.Variant, ...], taken: list[Argument]) -> int | None:
-    """What is wrong with a call's arguments, a status; None where nothing is."""
-    if len(arguments) != len(taken):
-        return StatusCodes.BadArgumentsMissing if len(arguments) < len(taken) else StatusCodes.BadTooManyArguments
-    fits = all(
-        each.VariantType is type_ and isinstance(each.Value, list) is array and (array or each.Value is not None)
-        for each, (_, type_, array, _) in zip(arguments, taken, strict=True)
-    )
-    return None if fits else StatusCodes.BadInvalidArgument
+def _wrong(arguments: tuple[ua.Variant, ...], taken: list[Argument]) -> tuple[int | None, str]:
+    """What is wrong with a call's arguments, a status, and what came; None and "" where nothing is wrong."""
+    if len(arguments) < len(taken):
+        return StatusCodes.BadArgumentsMissing, f", got {len(arguments)} of {len(taken)} arguments"
+    if len(arguments) > len(taken):
+        return StatusCodes.BadTooManyArguments, f", got {len(arguments)} arguments"
+    for given, argument in zip(arguments, taken, strict=True):
+        name, type_, array, _ = argument
+        empty = given.Value is None
+        if empty and type_ is VariantType.String and given.VariantType in (VariantType.String, VariantType.Null):
+            continue  # controllers send an empty text as null
+        if given.VariantType is not type_ or empty or isinstance(given.Value, list) is not array:
+            form = "null" if empty else f"{given.VariantType.name}{' array' * isinstance(given.Value, list)}"
+            return StatusCodes.BadInvalidArgument, f", got {name} as {form}"
+    return None, ""
+
+
+def _value(given: ua.Variant, argument: Argument) -> Any:
+    """An argument's value; a null String is an empty one."""
+    return "" if given.Value is None and argument[1] is VariantType.String else given.Value
 
 
 def _status(code: int) -> ua.StatusCode:

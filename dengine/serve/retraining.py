@@ -8,15 +8,18 @@ most of it, through a file in memory, which is written and read without the lock
 from __future__ import annotations
 
 import ctypes
+import logging
 import multiprocessing
 import os
 import pickle
 import signal
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,6 +28,7 @@ import numpy as np
 
 # The last is Ctrl-Break of Windows.
 ENDING = [each for each in signal.Signals if each.name in ("SIGINT", "SIGTERM", "SIGBREAK")]
+log = logging.getLogger("dengine")
 NICE = 10  # decisions first, where cores are scarce
 DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of linux/prctl.h
 T = TypeVar("T")
@@ -40,7 +44,7 @@ class RetrainingProcess(ProcessPoolExecutor):
         super().__init__(1, multiprocessing.get_context("spawn"), _end_with_parent)
         others = set(multiprocessing.active_children())
         with _signals_blocked():
-            self.submit(_warm_up)
+            self.submit(_warm_up).add_done_callback(partial(_tell_ready, time.monotonic()))
         (self._process,) = set(multiprocessing.active_children()) - others
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
@@ -118,6 +122,11 @@ def _end_with_parent() -> None:
         threading.Thread(target=lambda: (wait([parent.sentinel]), os._exit(1)), daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(NICE)
+
+
+def _tell_ready(began: float, started: Future[None]) -> None:
+    if not started.cancelled() and started.exception() is None:
+        log.info("ready to retrain, in a process of its own, after %.1f s", time.monotonic() - began)
 
 
 def _warm_up() -> None:

@@ -175,7 +175,7 @@ def quick_switches() -> Iterator[None]:
 @contextmanager
 def bound(host: str, port: int) -> Iterator[socket.socket]:
     """A socket that listens there; SettingError, in one line, where it cannot."""
-    said, do = f"Cannot listen at {host}, port {port}", "name another with --port or --host"
+    said, do = f"Cannot listen at {host}, port {port}", "name another port or address, --port or --host"
     with instead(SettingError, said, OSError, OverflowError, UnicodeError, do=do):
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         listening = socket.create_server(address[:2], family=family, backlog=128)

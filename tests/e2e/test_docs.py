@@ -1,7 +1,8 @@
 """Every command and snippet of the README and of the site runs, page by page, as a newcomer would type it; only smaller.
 
-Each page has a desk of its own and runs from top to bottom. A long command gets options behind its own, of which the last
-counts. `make test` runs four pages, `make test-all` every one.
+Each page has a desk, stores and folders of its own, and runs from top to bottom. A long command gets options
+behind its own, of which the last counts. `make test` runs four pages, `make test-merge` three in one folder,
+`make test-all` every one.
 """
 
 import json
@@ -163,6 +164,11 @@ def typed_pages() -> list:
 
 @pytest.mark.parametrize("page", typed_pages())
 def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(page: Path, desk: Path) -> None:
+    type_page(page, desk)
+
+
+def type_page(page: Path, desk: Path) -> None:
+    """All blocks of a page, from top to bottom."""
     for block in blocks(page):
         if block.language == "python":
             snippet(block, desk)
@@ -173,3 +179,21 @@ def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(page: Path,
 def test_every_shortened_command_is_on_a_page() -> None:
     commands = [command for page in PAGES for block in blocks(page) if block.language == "sh" for command in block.commands]
     assert [beginning for beginning in SMALLER if not any(c.startswith(beginning) for c in commands)] == []
+
+
+@pytest.mark.slow
+@pytest.mark.merge
+def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(desk: Path) -> None:
+    (suggested,) = re.findall(r"Go on with:.*&& (dengine .*)'", (REPO / "Makefile").read_text("utf-8"))
+    shell(suggested.replace("--cycles 600", "--cycles 80"), desk)
+    for page in ("README.md", "docs/tutorials/first_part.md", "docs/howto/production.md"):
+        type_page(REPO / page, desk)
+
+
+def test_each_page_has_stores_and_folders_of_its_own() -> None:
+    written = (
+        r"[\w./-]+\.db\b|(?<=--out )(?!recordings\b|screw_driving)\S+|(?<=--keep )\S+"  # two are made alike by several
+    )
+    names = {name(page): set(re.findall(written, "\n".join(each.text for each in blocks(page)))) for page in PAGES}
+    twice = [(a, b, names[a] & names[b]) for a in names for b in names if a < b and names[a] & names[b]]
+    assert twice == []

@@ -18,8 +18,9 @@ from dengine import DataEngine, Dataset, ModelPrediction, Recipe, TraceSpec, exp
 from dengine.decision.rule import SAFE_MODE, DecisionRule
 from dengine.errors import ExportError, OutputError, TraceError
 from dengine.export import read_metadata
+from dengine.export.decision import FIELDS, METHODS
 from dengine.folds import content_fold
-from dengine.records import Action, Reason
+from dengine.records import ACTIONS, REASONS, Action, Reason
 from tests.support.exports import LIMIT, SAMPLES, WINDOWS, bad_traces, fitted, recipe, row, trained, wild_traces
 
 
@@ -74,6 +75,24 @@ def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[t
             x = np.ascontiguousarray(x[::-1] + 30.0 * np.sin(np.arange(SAMPLES, dtype=np.float32)))
         changed = 0.6 * n < i < 0.75 * n and rng.random() < 0.4
         yield x, bool(y) != changed, part
+
+
+def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fields(
+    file: Path, many: np.ndarray, repo: Path
+) -> None:
+    plain, other, exported = torch.jit.load(str(file)), torch.jit.load(str(file)), load_exported(file)
+    for x in many[:40]:
+        called = plain(torch.from_numpy(x))
+        assert str(called) == str(other.decide(torch.from_numpy(x), 0))
+        fields = dict(zip(FIELDS, called, strict=True))
+        expected = exported.decide(x)
+        assert (ACTIONS[fields["action"]], REASONS[fields["reason"]]) == (expected.action, expected.reason)
+        assert tuple(called[2:6]) == expected[2:6]
+    page = (repo / "docs" / "howto" / "controller.md").read_text("utf-8")
+    table = page.partition("### By torch alone")[2].partition("\n## ")[0]
+    assert [name for name in (*FIELDS, *METHODS) if f"`{name}" not in table] == []
+    for known in (ACTIONS, REASONS):
+        assert ", ".join(f"{i} {each}" for i, each in enumerate(known)) in " ".join(table.split())
 
 
 @pytest.mark.parametrize(
@@ -302,7 +321,7 @@ def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Datase
     missed = fitted(data)
     missed.untold = True
     for what, words in (
-        (fitted(data, PCA(2)), r"PCA cannot be exported: it gives no module that TorchScript takes"),
+        (fitted(data, PCA(2)), r"PCA cannot be exported, for it has no module: give it `module\(\)`, .* nn\.Module"),
         (fitted(data, interval="jeffreys"), "use wilson or binomial"),
         (missed, "missed what became of a part"),
         (DataEngine("pca"), "Nothing was trained yet"),

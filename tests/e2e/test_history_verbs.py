@@ -1,5 +1,7 @@
 """`dengine history`, `explain` and `status`: what they print, of a store that has seen a little of everything."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -181,3 +183,24 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     n, words = len(certain), said("status", store, "--check-seconds", "60")
     assert f"It would have decided {n} of the {told['ever']['verified']} parts that were verified: {60 * n} s of" in words
     assert "shadow yes" in said("status", store)
+    assert told["ever"]["bad_accepts"]["known"] == 0  # nothing was accepted, so none of it is known to be bad
+    words = said("status", store)
+    assert f"certain but checked {n} {n}" in words
+    assert words.count("bad accepts none was accepted none was accepted") == 1
+    assert "audits" not in words
+    assert f"reasons uncertain {told['reasons']['uncertain']}" in words
+    assert f"certain but checked {n}, " in words
+
+
+def test_each_figure_has_one_interval_prices_have_names_and_dates_are_iso(stream: Dataset, tmp_path: Path) -> None:
+    policy = replace(RECIPE.policy, audit_rate=0.3)
+    with DataEngine(recipe=RECIPE.with_settings(policy=policy), store=(store := tmp_path / "engine.db")) as engine:
+        drive(engine, stream, 0, 300)
+    words = said("status", store)
+    ever = document("status", store)["ever"]
+    assert ever["accepted"] > 0
+    assert ever["would_accept"]["known"] == ever["bad_accepts"]["known"] > 0
+    assert words.count(f"{ever['bad_accepts']['wrong']} of {ever['bad_accepts']['known']} by audits") == 2  # newest, ever
+    assert "prices check 5, escape 120, false reject 47.5" in words
+    listed = succeed("history", store, "--last", 3, "--events")
+    assert len(re.findall(r"(?m)^20\d\d-\d\d-\d\d \d\d:\d\d:\d\d ", listed)) >= 3

@@ -17,10 +17,11 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 
-from dengine import Action, Dataset, Decision, Policy, load_exported
+from dengine import Action, DataEngine, Dataset, Decision, Policy, TraceSpec, load_exported
 from dengine.recipe import Recipe
 from dengine.store.sql import SqlStore
 from dengine.store.views import HistoryFilter
+from tests.support.driving import RECIPE
 from tests.support.serving import a_service, served, started
 
 CHROMIUM = shutil.which("chromium")
@@ -291,6 +292,7 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     page.get_by_label("Part's number").fill(f" {part} ")  # as a scanner, or a copy, gives it
     page.get_by_role("button", name="Show", exact=True).click()
     expect(page.locator("#history tbody tr")).to_have_count(1)
+    expect(page.locator("#history")).to_contain_text("1 decision shown.")
     page.locator("#history").get_by_role("link", name=part).click()
     confirmed(page, "It was bad")
     expect(page.locator("#said")).to_have_text("It is recorded: bad.", timeout=PATIENT)
@@ -368,6 +370,37 @@ def test_what_is_said_of_several_channels_is_said_by_their_names(browser: Browse
         opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
         caption = page.locator("#trace figcaption").nth(1)
         expect(caption).to_contain_text(re.compile(r"Channel 2 over .*of all channels lies outside the band"))
+
+
+def test_each_channel_is_drawn_in_its_own_unit_and_is_no_force_for_being_drawn(
+    browser: Browser, tmp_path: Path, stream: Dataset
+) -> None:
+    file, spec = tmp_path / "cell.db", TraceSpec(stream.X.shape[-1], channels=2, unit=("kN", "mm"), columns=("FZ", "SZ"))
+    DataEngine(recipe=RECIPE, store=file, trace=spec).close()
+    with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
+        played(service, Dataset(np.stack([stream.X, stream.X[::-1]], axis=1), stream.y), 40)
+        opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
+        expect(page.locator("#trace h2")).to_have_text("The trace, and what good and bad parts look like")
+        for i, (name, unit) in enumerate([("FZ", "kN"), ("SZ", "mm")]):
+            expect(page.locator("#trace figcaption").nth(i)).to_contain_text(re.compile(rf"{name} over .* {unit}\. "))
+        must_be_above_the_fold(page)
+
+
+def must_be_above_the_fold(page: Page) -> None:
+    """Of a screen of 1280 x 720, as the fixture has it: every figure is seen whole without scrolling."""
+    boxes = [page.locator(f"#{name}").bounding_box() for name in ("verified", "accepted", "bad", "pace", "saved")]
+    assert max(box["y"] + box["height"] for box in boxes) <= 720
+
+
+def test_the_key_figures_are_above_the_fold_and_the_magnifier_stands_for_verify_alone(page: Page, demo: DemoCell) -> None:
+    with_a_model(page, demo)
+    opened(page, demo)
+    must_be_above_the_fold(page)
+    shapes = {
+        name: page.locator(f"{name} path").first.get_attribute("d") for name in (".recent .verify", "#bad .verdict.open")
+    }
+    assert len(set(shapes.values())) == 2
+    expect(page.locator(".decision .came")).to_have_text(re.compile("It was good|It was bad|No result reported yet"))
 
 
 @pytest.mark.slow

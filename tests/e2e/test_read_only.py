@@ -73,10 +73,10 @@ def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(made:
     shutil.copy(made["closed"] / "engine.db", store)
     journal.write_bytes(b"another user's")
     journal.chmod(0o000)
-    assert '"waiting": null' in well("verify", store, "--json")
-    refused = dengine("backup", store, "--out", tmp_path / "copy.db")
-    assert refused.returncode == 1
-    assert "read it as the user that its cell runs as" in " ".join(refused.stderr.split())
+    verified, refused = dengine(["verify", store, "--json"], ["backup", store, "--out", tmp_path / "copy.db"])
+    assert '"waiting": null' in verified["out"]
+    assert refused["code"] == 1
+    assert "read it as the user that its cell runs as" in " ".join(refused["err"].split())
     assert not (tmp_path / "copy.db").exists()
 
 

@@ -1,7 +1,9 @@
 """The process in which a served engine retrains, and what goes there and back."""
 
 import copy
+import logging
 import os
+import re
 import signal
 import time
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
@@ -60,6 +62,15 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(data: Dataset) -> 
             assert engine.version == 1
             decided.append([(each.embedding, each.lower, each.upper) for each in map(engine.decide, data.X[40:60])])
     assert decided[0] == decided[1]  # bit for bit
+
+
+def test_the_log_tells_when_the_process_is_ready_and_when_the_first_retrain_begins(data: Dataset, caplog) -> None:
+    caplog.set_level(logging.INFO, "dengine")
+    with RetrainingProcess() as process:
+        process.submit(os.getpid).result(300)
+        assert re.search(r"ready to retrain, in a process of its own, after \d+\.\d s", caplog.text)
+        learn_and_settle(DataEngine(recipe=CONV, executor=process), data)
+    assert caplog.text.count("the first retrain begins, on 30 labels") == 1
 
 
 def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retrains_in_line(data: Dataset) -> None:

@@ -19,12 +19,16 @@ pytest.importorskip("uvicorn", reason='the server is not installed: pip install 
 httpx = pytest.importorskip("httpx", reason="the tests' HTTP client is not installed: pip install httpx")
 jsonschema = pytest.importorskip("jsonschema")
 
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from msgspec import msgpack
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.routing import Route
 
-from dengine import DataEngine, Dataset
+from dengine import DataEngine, Dataset, TraceSpec
 from dengine.errors import BusyError
+from dengine.serve.api import as_samples
 from dengine.serve.auth import Access, Token
 from dengine.serve.http import create_app
 from dengine.serve.service import CellService
@@ -121,6 +125,31 @@ def test_a_trace_is_the_same_in_every_form(client: Client, service: CellService,
     known = asyncio.run(service.find(f"form {form}"))
     assert np.array_equal(known.trace[0], stream.X[7])
     assert known.decision.part == "P1"
+
+
+@pytest.mark.parametrize("form", ["whole", "fine", "of float32", "integers"])
+@pytest.mark.parametrize("fit", ["strict", "cut", "pad", "resample", "first"])
+def test_bytes_of_float64_are_named_whatever_the_contract_takes(stream: Dataset, fit: str, form: str) -> None:
+    n = stream.X.shape[-1]
+    spec = None if fit == "first" else TraceSpec(n, fit=fit)
+    x = {
+        "whole": np.round(stream.X[0].astype(np.float64), 2),
+        "fine": stream.X[0] + np.random.default_rng(0).normal(0.0, 1e-3, n),
+        "of float32": stream.X[0].astype(np.float64),
+        "integers": np.round(stream.X[0].astype(np.float64)),
+    }[form]
+    made = CellService(lambda: DataEngine(recipe=RECIPE, trace=spec), None, 60.0)
+    with closing(made) as service, running(service) as client:
+        answer = client.post("/decide", content=x.astype("<f8").tobytes(), headers={"content-type": RAW})
+        assert "twice as many bytes as float32 takes: float64?" in must_be_problem(answer, 422)["detail"]
+        answer = client.post("/decide", content=x.astype("<f4").tobytes(), headers={"content-type": RAW})
+        assert answer.status_code == 200, answer.text
+
+
+@given(arrays(np.float32, st.integers(1, 60), elements=st.floats(-1e4, 1e4, width=32)))
+def test_no_bytes_of_float32_are_taken_for_float64_unless_every_other_sample_is_nothing(x: np.ndarray) -> None:
+    if x[0::2].any() or len(x) % 2:
+        assert np.array_equal(as_samples(x.astype("<f4").tobytes())[0], x)
 
 
 def test_a_sample_that_is_missing_is_null_and_the_part_is_verified(client: Client, stream: Dataset) -> None:

@@ -1,6 +1,7 @@
 """OPC UA by a real client: what a PLC calls, what a SCADA reads, and what strangers get."""
 
 import asyncio
+import runpy
 from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dengine import Dataset
+from dengine import Dataset, Recipe
 from dengine.errors import SettingError
 from dengine.serve.service import CellService
+from dengine.store.views import HistoryFilter
 from tests.support.serving import a_service, certificate
 
 pytest.importorskip("asyncua", reason="OPC UA needs the extra `opcua`")
@@ -119,6 +121,58 @@ async def test_the_variables_and_methods_are_as_they_are_described_and_read_only
             node = await plant.node(f"Cell.{method}").get_child(f"0:{name}")
             said = [(each.Name, each.DataType.Identifier, each.ValueRank) for each in await node.read_value()]
             assert said == [(name, type_.value, 1 if array else -1) for name, type_, array, _ in arguments]
+
+
+@pytest.mark.parametrize("empty", [None, ""])
+async def test_the_example_client_plays_a_shift_with_a_controllers_types_and_empty_texts(
+    tmp_path: Path, repo: Path, empty: str | None
+) -> None:
+    play = runpy.run_path(str(repo / "training" / "opcua_client.py"))["play"]
+    with a_service(tmp_path / "cell.db", Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7)) as service:
+        async with opcua.opcua_server(service, port=0) as server:
+            counts, *variables = await play(f"opc.tcp://127.0.0.1:{server.bserver.port}/dengine", 120, empty)
+            await service.ask(lambda engine: engine.flush())
+        known = [past.decision for past in service.reading.decisions(HistoryFilter(), 1000)]
+    n = {action: sum(each.action == action for each in known) for action in ("verify", "accept", "reject")}
+    assert counts == ", ".join(f"{count} {action}" for action, count in n.items())
+    assert (sum(n.values()), n["accept"] > 0) == (120, True)
+    assert sum(each.part is None for each in known) == 60  # an empty text, or none, is no part's number
+    assert all(len(each.id) > 3 for each in known)  # nor an id of the caller's
+    assert [line.partition(": ")[0] for line in variables][:2] == ["Decisions", "VerifiedShare"]
+
+
+async def test_a_null_text_is_an_empty_one_of_whatever_form(plant: Plant, stream: Dataset) -> None:
+    for null in (ua.Variant(None, TEXT), ua.Variant(None, ua.VariantType.Null)):
+        action, id_, *_ = await plant.call(
+            "Decide", ua.Variant(stream.X[3].tolist(), FLOAT), ua.Variant(1, COUNT), null, null
+        )
+        assert (action in (0, 1, 2), id_ != "") == (True, True)
+        assert (await plant.service.find(id_)).decision.part is None
+
+
+TYPES = {
+    "Trace": [([1.0] * 60, "Double", "Double array"), (1.0, "Float", "Float"), (None, "Null", "null")],
+    "Channels": [(1, "Int32", "Int32"), (1, "UInt16", "UInt16"), ([1], "UInt32", "UInt32 array"), (None, "Null", "null")],
+    "Request": [(7, "UInt32", "UInt32"), (["a"], "String", "String array"), (b"a", "ByteString", "ByteString")],
+    "Part": [(True, "Boolean", "Boolean")],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind", "called"), [(name, *each) for name, some in TYPES.items() for each in some]
+)
+async def test_a_wrong_type_is_named(plant: Plant, name: str, value: Any, kind: str, called: str) -> None:
+    given = {
+        "Trace": ua.Variant([1.0] * 60, FLOAT),
+        "Channels": ua.Variant(1, COUNT),
+        "Request": ua.Variant("", TEXT),
+        "Part": ua.Variant("", TEXT),
+    } | {name: ua.Variant(value, getattr(ua.VariantType, kind))}
+    with pytest.raises(ua.uaerrors.BadInvalidArgument):
+        await plant.call("Decide", *given.values())
+    refused = await plant.value("LastRefused")
+    assert refused.startswith("Expected Trace (Float array), Channels (UInt32), Request (String), Part (String), got ")
+    assert refused.endswith(f", got {name} as {called}.")
 
 
 def wrong_calls() -> list[tuple[str, tuple[Any, ...], type]]:

@@ -10,8 +10,16 @@ import pytest
 from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
 
-from dengine import ConvReducer, Policy, Recipe, RetrainReport
-from dengine.experiments.figures import curves, embedding_map, run_picture, save, window_curves
+from dengine import ConvReducer, DataEngine, Dataset, Policy, Recipe, RetrainReport
+from dengine.experiments.figures import (
+    curves,
+    data_picture,
+    embedding_map,
+    explained_picture,
+    run_picture,
+    save,
+    window_curves,
+)
 from dengine.experiments.replay import Replay, gather
 from dengine.experiments.tables import frame_of, pool, pooled_table, promise_lines
 from dengine.reducers import has_own_unit
@@ -94,7 +102,7 @@ def test_an_axis_that_is_a_probability_says_so_and_the_other_is_for_the_eye() ->
     assert "for the eye" in left.get_ylabel()
     assert [ball.get_radius() for ball in left.patches] == [0.05]
     asked = ("rocket", ConvReducer(), "dengine.reducers.conv:ConvReducer", PCA(2), "sklearn.decomposition:PCA")
-    assert [has_own_unit(Recipe(reducer)) for reducer in asked] == [True, True, True, False, False]
+    assert [has_own_unit(reducer) for reducer in asked] == [True, True, True, False, False]
 
 
 def log_of(clock_s: np.ndarray | None) -> Replay:
@@ -143,3 +151,13 @@ def test_every_figure_is_written_as_a_png_without_pyplot_and_no_legend_lies_on_i
         box = legend.get_window_extent()
         assert [box.overlaps(axes.get_window_extent()) for axes in figure.axes] == [False] * len(figure.axes)
         assert box.x1 <= max(axes.get_window_extent().x1 for axes in figure.axes)  # or the axes would have to shrink
+
+
+def test_every_channel_is_drawn_in_its_own_unit(data: Dataset) -> None:
+    both = np.stack([data.X, data.X[::-1]], axis=1)
+    named = Dataset(both, data.y, unit="kN, mm", channels=("FZ", "SZ"))
+    assert [axes.get_ylabel() for axes in data_picture(named, "x").axes[:2]] == ["FZ [kN]", "SZ [mm]"]
+    with DataEngine(recipe=RECIPE, trace=named.spec) as engine:
+        explained = explained_picture(engine.explain(engine.decide(both[0]).id))
+    labels = [axes.get_ylabel() for axes in explained.axes]
+    assert [label for label in labels if "[" in label][:2] == ["FZ [kN]", "SZ [mm]"]

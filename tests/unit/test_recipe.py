@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sklearn.decomposition import PCA
 
-from dengine import INTERVALS, Policy, Recipe
-from dengine.errors import SettingError
+from dengine import INTERVALS, ConvReducer, DataEngine, Policy, Recipe, Reducer, TorchReducer
+from dengine.errors import SettingError, StoreError
+from dengine.experiments.replay import Contender
+from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
 
 values = st.one_of(st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), st.text())
@@ -62,6 +65,84 @@ def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path: Path) -> None
     assert Recipe.load("pca") is base
     with pytest.raises(SettingError, match=r"conv, umap, umap-learn, pca, rocket, paper.*covn is none"):
         Recipe.load("covn")
+
+
+class Wide(Reducer):
+    """A reducer of a user's, with numbers of its own."""
+
+    default_radius = 0.9
+    default_retrain_every = 17
+
+    def fit(self, X, y=None):
+        return self
+
+    def transform(self, X):
+        return np.asarray(X)[:, :2]
+
+
+class Narrow(TorchReducer):
+    """One that is derived from ours."""
+
+    default_radius = 0.01
+
+
+class Wrong(Wide):
+    default_radius = -1.0
+
+
+OWN = [  # a reducer, its radius, its retrain_every
+    ("conv", 0.07, 10),
+    ("umap", 0.3, 50),
+    ("umap-learn", 0.3, 50),
+    ("pca", 0.2, 50),
+    ("rocket", 0.07, 50),
+    (ConvReducer(), 0.07, 10),
+    (TorchReducer(network=ConvReducer().network), 0.07, 10),
+    (PCA(2), 0.3, 50),
+    (Wide(), 0.9, 17),
+    (Narrow(network=ConvReducer().network), 0.01, 10),
+]
+
+
+@pytest.mark.parametrize(("reducer", "radius", "retrain_every"), OWN)
+def test_radius_and_retrain_every_are_the_reducers_own_wherever_none_is_given(reducer, radius, retrain_every) -> None:
+    toml = f'reducer = "{reducer}"\nradius = "none"\n' if isinstance(reducer, str) else ""
+    ways = [
+        Recipe(reducer),
+        Recipe(reducer, radius=None, retrain_every=None).with_policy(alpha=0.2),
+        Recipe.load(reducer),
+        Contender.load(reducer).recipe,
+        DataEngine(reducer).recipe,
+        DataEngine(recipe=Recipe(reducer), radius=None).recipe,
+        *([Recipe.from_toml(toml), Recipe.from_toml(f'reducer = "{reducer}"')] if toml else []),
+    ]
+    assert {(recipe.radius, recipe.retrain_every) for recipe in ways} == {(radius, retrain_every)}
+    assert ModelPrediction(reducer).classifier.radius == radius
+    assert Recipe(reducer, radius=0.5).radius == 0.5
+
+
+def test_a_class_by_its_name_and_what_is_wrong_with_its_own_radius_are_read(tmp_path: Path, monkeypatch) -> None:
+    code = "from dengine import ConvReducer\nclass Own(ConvReducer):\n    default_radius = 0.05\n"
+    (tmp_path / "own_radius_of_test_recipe.py").write_text(code, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    by_name = Recipe.load("own_radius_of_test_recipe:Own")
+    assert (by_name.radius, by_name.retrain_every) == (0.05, 10)
+    with pytest.raises(SettingError, match="radius > 0"):
+        DataEngine(Wrong())
+
+
+def test_a_model_that_was_handed_in_keeps_the_general_schedule() -> None:
+    with DataEngine(model=ModelPrediction("pca")) as engine:
+        assert engine.recipe.retrain_every == 50
+    assert Contender.load("knn").recipe.retrain_every == 50
+
+
+def test_a_stored_recipe_imports_nothing_to_learn_a_radius() -> None:
+    text = 'reducer = "nobody_has_this:Class"\n'
+    with pytest.raises(StoreError, match="radius, retrain_every; restore the store"):
+        Recipe.from_store({"recipe": text})
+    whole = Recipe.from_store({"recipe": text + "radius = 0.3\nretrain_every = 50\n"})
+    assert whole.radius == 0.3
 
 
 @pytest.mark.parametrize(

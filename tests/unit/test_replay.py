@@ -50,6 +50,17 @@ def test_fewer_cycles_are_the_beginning_of_the_same_pass_told_one_by_one(data: D
             replay(data, RECIPE, cycles=cycles)
 
 
+def test_a_replays_repr_shows_its_policy_whose_two_numbers_may_be_given_directly(data: Dataset) -> None:
+    plain = replay(data, "pca", cycles=30)
+    assert "alpha 0.05, LB 95 %, local" in repr(plain)
+    found = replay(data, "pca", cycles=30, alpha=0.3, lower_bound=0.7)
+    same(found, replay(data, Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7), cycles=30))
+    assert "alpha 0.3, LB 70 %" in repr(found)
+    assert "alpha 0.3, LB 95 %" in repr(replay(data, "knn", cycles=30, alpha=0.3))
+    with pytest.raises(SettingError, match="alpha beside an engine"):
+        replay(data, DataEngine("pca"), cycles=30, alpha=0.3)
+
+
 class Silent:
     """A cell as real ones are: it tells nothing but what it is asked for."""
 

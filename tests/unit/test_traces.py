@@ -1,6 +1,9 @@
 """Where a trace enters: shapes and types are the caller's, faults are the world's."""
 
+import json
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +24,8 @@ from dengine import (
     load_exported,
 )
 from dengine.decision.rule import script
-from dengine.records import FITS
+from dengine.errors import SettingError
+from dengine.records import FITS, trace_in
 from dengine.traces import REASONS, TraceGate, as_trace, fits, fitted, spec_of
 from tests.support.driving import learn
 
@@ -35,6 +39,31 @@ def ramp(samples: int = 100, channels: int = 1) -> np.ndarray:
 def reason_of(x: np.ndarray, limit: float | None = None, compiled: bool = False) -> Reason:
     gate = TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0], limit=limit))
     return REASONS[(script(gate) if compiled else gate)(torch.from_numpy(x))[0]]
+
+
+@pytest.mark.parametrize(
+    ("unit", "channels", "stored", "units"),
+    [
+        ("N", 1, "N", ("N",)),
+        ("N", 2, "N", ("N", "N")),
+        (("kN", "mm"), 2, ("kN", "mm"), ("kN", "mm")),
+        (["kN", "mm"], 2, ("kN", "mm"), ("kN", "mm")),  # as JSON brings it back
+        ("kN, mm", 2, ("kN", "mm"), ("kN", "mm")),
+        (("N", "N"), 2, "N", ("N", "N")),
+        (("N",), 1, "N", ("N",)),
+        ("mixed units", 3, "mixed units", ("mixed units",) * 3),
+    ],
+)
+def test_each_channel_has_a_unit(unit: Any, channels: int, stored: Any, units: tuple[str, ...]) -> None:
+    spec = TraceSpec(10, channels=channels, unit=unit)
+    assert (spec.unit, spec.units) == (stored, units)
+    assert trace_in({"trace": json.dumps(asdict(spec))}) == spec
+
+
+@pytest.mark.parametrize("unit", [("kN",), ("kN", "mm", "V"), (), 5, (1, 2)])
+def test_units_that_are_no_text_or_too_many_are_refused(unit: Any) -> None:
+    with pytest.raises(SettingError, match="unit"):
+        TraceSpec(10, channels=2, unit=unit)
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4", ">f8", "i1", "i2", ">i2", "i4", "i8", "u2", "?"])

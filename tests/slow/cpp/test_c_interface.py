@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import dengine
 from dengine import Dataset, export_torchscript, load_exported
 from dengine.errors import ExportError
 from dengine.export import export_sources, import_journal
-from dengine.records import ACTIONS, Action
+from dengine.records import ACTIONS, REASONS, Action
 from tests.support.command_line import dengine as command
 from tests.support.exports import trained
 
@@ -55,6 +56,22 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
     stops = sum(d.action is Action.ACCEPT for d in expected[::10])
     assert report.imported + report.quarantined == stops + sum(d.action is Action.VERIFY for d in expected)
     assert report.quarantined == 2
+
+
+def test_libtorch_alone_decides_by_calling_the_module(
+    programs: Path, repo: Path, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    with trained(make_data(400, SAMPLES)) as engine:
+        file = export_torchscript(engine, tmp_path / "model.ts")
+    X = make_data(60, SAMPLES, seed=9).X
+    X.tofile(tmp_path / "traces.f32")
+    build, where = tmp_path / "build", f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
+    run("cmake", "-S", repo / "tests" / "slow" / "cpp" / "plain", "-B", build, where, "-DCMAKE_BUILD_TYPE=Debug")
+    run("cmake", "--build", build)
+    lines = run(build / "plain", file, SAMPLES, tmp_path / "traces.f32").splitlines()
+    expected = [(d.action, d.reason) for d in load_exported(file).decide_many(X)]
+    assert [(ACTIONS[int(a)], REASONS[int(r)]) for a, r in map(str.split, lines)] == expected
+    assert len({action for action, _ in expected}) > 1
 
 
 def test_the_sources_come_into_an_empty_folder_alone(tmp_path: Path) -> None:

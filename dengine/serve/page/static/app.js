@@ -2,7 +2,7 @@
 
 import { begin, ownedBy } from "./actions.js";
 import { drawAll, goOverMap } from "./charts.js";
-import { el } from "./dom.js";
+import { clock, el } from "./dom.js";
 import { Problem, get, listen } from "./server.js";
 import { VIEWS, modeOf, modeWord, warnings } from "./views.js";
 
@@ -28,7 +28,7 @@ function lineIs(state, heard) {
   const old = state === "cut";
   document.body.classList.toggle("old", old);
   at("cut").hidden = !old;
-  at("cut").textContent = old ? `Cut off since ${new Date(heard).toLocaleTimeString()}. What you see is old. The page keeps trying.` : "";
+  at("cut").textContent = old ? `Cut off since ${clock(heard / 1000)}. What you see is old. The page keeps trying.` : "";
 }
 
 function look(wait = 0) {

@@ -3,6 +3,7 @@
 import { capital, el, labelOf, labelWord, nameOf, number, partAddress, percent, svg } from "./dom.js";
 
 const CHANNELS = 3; // drawn, those that leave the band farthest
+const HEIGHTS = [220, 118, 84]; // of each chart, where so many are drawn: what stands below keeps its place
 const drawn = new Map(); // a chart's element: its uPlot, and what watches its width
 const probe = document.createElement("span");
 
@@ -82,14 +83,19 @@ function windowWords({ from, to, low, high, reject }) {
   return `From ${number(from, 2)} to ${number(to, 2)} s an operator's window wants ${limits}, else ${reject ? "reject" : "verify"}. `;
 }
 
+const unitOf = ({ unit }, channel) => (typeof unit === "string" ? unit : unit[channel]);
+
+export const isForce = ({ channels, unit }) => channels === 1 && /^[µmckM]?N$/.test(unit);
+
 export function traceCharts(found) {
   const widest = found.trace.map(() => 0);
   for (const each of found.envelope?.excesses ?? []) widest[each.channel] = Math.max(widest[each.channel], each.widths);
   const order = widest.map((_, channel) => channel).sort((a, b) => widest[b] - widest[a] || a - b);
-  return order.slice(0, CHANNELS).sort((a, b) => a - b).map((channel) => traceChart(found, channel));
+  const shown = order.slice(0, CHANNELS).sort((a, b) => a - b);
+  return shown.map((channel) => traceChart(found, channel, HEIGHTS[shown.length - 1]));
 }
 
-function traceChart(found, channel) {
+function traceChart(found, channel, height) {
   const trace = found.trace[channel];
   const band = found.low && [found.high[channel], found.low[channel], found.median[channel]];
   const bads = found.bads.map((bad) => bad[channel]);
@@ -103,7 +109,7 @@ function traceChart(found, channel) {
     options: {
       scales: { x: { time: false }, y: { range: (_, low, high) => uPlot.rangeNum(Math.min(low, ...limits), Math.max(high, ...limits), 0.1, true) } },
       hooks: { draw: [(plot) => windowMarks(plot, windows)] },
-      axes: [axis(2, { label: "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: found.spec.unit, labelSize: 22, size: 56 })],
+      axes: [axis(2, { label: "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: unitOf(found.spec, channel), labelSize: 22, size: 56 })],
       bands: band ? [{ series: [1, 2], fill: colour("good-soft") }] : [],
       series: [
         {},
@@ -113,7 +119,7 @@ function traceChart(found, channel) {
       ],
     },
   });
-  return el("figure", {}, chart(key, said, 220, made), el("figcaption", {}, said));
+  return el("figure", {}, chart(key, said, height, made), el("figcaption", {}, said));
 }
 
 function traceWords(found, channel) {
@@ -121,8 +127,8 @@ function traceWords(found, channel) {
   const values = found.trace[channel].filter((value) => value !== null);
   const [low, high] = values.length ? [Math.min(...values), Math.max(...values)] : [0, 0];
   const several = found.trace.length > 1;
-  const what = several ? spec.columns[channel] ?? `Channel ${channel + 1}` : "Force";
-  const said = `${what} over ${number(found.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${spec.unit}. ${windowsOf(found, channel).map(windowWords).join("")}`;
+  const what = isForce(spec) ? "Force" : spec.columns[channel] ?? (several ? `Channel ${channel + 1}` : "Trace");
+  const said = `${what} over ${number(found.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${unitOf(spec, channel)}. ${windowsOf(found, channel).map(windowWords).join("")}`;
   if (!envelope) return `${said}No band of good parts is drawn before 20 of them are known.`;
   const outside = `${said}${percent(envelope.outside, 1)} of ${several ? "all channels" : "it"} lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
   const most = envelope.excesses.filter((each) => each.channel === channel).sort((a, b) => b.widths - a.widths)[0];

@@ -6,11 +6,11 @@ const SHAPES = {
   reject: "M5 5l14 14M19 5L5 19",
   verify: "M17 10.5a6.5 6.5 0 1 1-13 0a6.500 6.500 0 1 1 13 0M15.500 15.500L21 21",
   shield: "M12 3l8 3v6c0 5-3.500 8-8 9-4.500-1-8-4-8-9V6Z",
+  open: "M12 3a9 9 0 1 0 .01 0M12 7v5.500l4 2", // a clock
   none: "M12 10a2 2 0 1 0 .01 0",
 };
 SHAPES.good = SHAPES.kept = SHAPES.accept;
 SHAPES.bad = SHAPES.broken = SHAPES.reject;
-SHAPES.open = SHAPES.verify;
 
 function filled(node, given, children) {
   for (const [name, value] of Object.entries(given)) {

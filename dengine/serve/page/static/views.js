@@ -1,7 +1,7 @@
 // What each view shows. A view asks the server, and gives its elements; those with `data-part` are exchanged one by one.
 
 import * as act from "./actions.js";
-import { boundChart, courseChart, judgedChart, mapChart, traceCharts, traceLegend } from "./charts.js";
+import { boundChart, courseChart, isForce, judgedChart, mapChart, traceCharts, traceLegend } from "./charts.js";
 import {
   ACTIONS, LABEL_NAMES, REASON_NAMES, capital, chip, clock, duration, el, icon, label, labelOf, labelWord, moment, nameOf, number,
   partAddress, percent, reasonOf, sourceOf, table,
@@ -12,13 +12,13 @@ const PACE = 30; // newest parts, by which parts an hour are counted
 const DOES = {
   accept: "The part goes on without the check.", reject: "The part goes back to the bin.", verify: "The part goes to the check.",
 };
-const CAME = { good: "It was good.", bad: "It was bad.", none: "Nothing is known of it yet." };
+const CAME = { good: "It was good.", bad: "It was bad.", none: "No result reported yet." };
 const VERDICT = { kept: "Tolerance kept", open: "Not decided yet", broken: "Tolerance broken" };
 const MODES = { decides: "Decides", learns: "Learning", shadow: "Verifying all", safe: "Safe mode" };
 const BY = {
   "every outcome": (bad) => `Every outcome is known: ${number(bad.wrong)} of ${number(bad.known)} were bad.`,
   audits: (bad) => `By audits, ${number(bad.wrong)} of ${number(bad.known)} bad, and by the known system stops.`,
-  "": (bad, stops) => `${stops ? "Only the system stops are known" : "Nothing is known"} so far; audits would bound it.`,
+  "": (bad, stops) => bad.n === 0 ? "No part was accepted without a check." : `${stops ? "Only the system stops are known" : "Nothing is known"} so far; audits would bound it.`,
 };
 
 export function modeOf(doing) {
@@ -26,7 +26,7 @@ export function modeOf(doing) {
   return doing.shadow ? "shadow" : doing.version === 0 ? "learns" : "decides";
 }
 
-export const modeWord = (mode) => [icon(mode === "safe" || mode === "shadow" ? "shield" : mode === "decides" ? "accept" : "verify"), MODES[mode]];
+export const modeWord = (mode) => [icon(mode === "safe" || mode === "shadow" ? "shield" : mode === "decides" ? "accept" : "open"), MODES[mode]];
 
 export function warnings(doing) {
   // What stands above every view, the worst first.
@@ -181,9 +181,9 @@ async function now(get, _, doing) {
     pace(decisions), saved(doing),
   ];
   const shown = el("div", { class: "now" }, card_,
-    card("trace", "The force, and what good and bad parts look like", traceCharts(found), traceLegend(found)),
+    card("trace", `The ${isForce(found.spec) ? "force" : "trace"}, and what good and bad parts look like`, traceCharts(found), traceLegend(found)),
     card("bound", "Bound", bound(found)), card("near", "Neighbours", counts(decision), neighbours(found)),
-    card("why", "Why", why(found)), strip, el("div", { class: "figures" }, figures));
+    el("div", { class: "figures" }, figures), strip, card("why", "Why", why(found)));
   return { title: "Now", shown: [el("h1", { class: "visually-hidden" }, "Now"), shown] };
 }
 
@@ -198,7 +198,7 @@ async function trend(get, asked, parts) {
   const start = new Date().setHours(by === "shift" ? SHIFT_BEGINS : 0, 0, 0, 0) / 1000;
   const { stretches } = await get(`course?${by === "batch" ? `batch=${encodeURIComponent("-_/. ")}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
   const begun = (last) => start + Math.floor((last - start) / (3600 * HOURS[by])) * 3600 * HOURS[by];
-  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch || "no batch" : el("time", {}, moment(begun(each.last)).slice(5, 16)), number(each.n),
+  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch || "no batch" : el("time", {}, moment(begun(each.last)).slice(0, 16)), number(each.n),
     percent((each.accepted + each.rejected) / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad), number(each.outside)]);
   const ways = [...Object.keys(HOURS), ...(batch ? ["batch"] : [])].map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
   return card("trend", "The trend", el("ul", { class: "chips" }, ways), rows.length === 0 ? small("It begins with the first part.")
@@ -220,7 +220,7 @@ async function overview(get, query, doing) {
     : [big("–"), small("Not watched under this policy.")];
   const tiles = [
     doing.shadow && wouldHave(doing), badAccepts(doing), verified(doing), accepted(doing), pace(decisions), saved(doing),
-    figure("novel", "Novel", big(percent(newest.novel_share, 1)), small(`Newest ${number(newest.decisions)} parts`), el("p", {}, `Audits: ${number(newest.audits)} · Outside a window: ${number(newest.outside)}`)),
+    figure("novel", "Novel", big(percent(newest.novel_share, 1)), small(`Newest ${number(newest.decisions)} parts`), el("p", {}, `${doing.recipe.policy.audit_rate > 0 ? "Audits" : "Certain but checked"}: ${number(newest.audits)} · Outside a window: ${number(newest.outside)}`)),
     figure("drift", "Drift, on its way to an alarm", drift),
     figure("model", "Model", big(`version ${doing.version}`), small(`Retrains: ${number(ever.retrains)}, ${number(Object.values(ever.dropped).reduce((a, b) => a + b, 0))} dropped`),
       report && el("p", {}, `newest at ${clock(report.time)}, ${number(report.report.seconds, 2)} s`),
@@ -251,7 +251,7 @@ async function map(get, query, doing) {
   const rows = found.marks.slice(-40).reverse().map((mark) => [el("a", { href: partAddress(mark.id, "map") }, nameOf(mark.part, mark.id)), label(mark.success)]);
   const picture = el("section", { class: "card", id: "map", "data-part": true, "aria-label": "Map of the parts" }, found.marks.length === 0
     ? el("p", { class: "waiting" }, "The map is drawn once the first model is trained.")
-    : [small("Parts whose force looks alike to the model lie together. Choose one to see its force and its history."),
+    : [small("Parts whose traces look alike to the model lie together. Choose one to see its trace and its history."),
       mapChart(found, chosen), el("ul", { class: "legend" }, legend),
       el("details", { id: "map-list" }, el("summary", {}, "The newest parts of the map as a list"), table([["Part"], ["Label"]], rows))]);
   const beside = el("section", { class: "card part", id: "part", "data-part": true, "aria-labelledby": "part-title" }, part
@@ -291,7 +291,7 @@ async function history(get, query) {
   if (older) next.set("before", older);
   const shown = el("section", { class: "card", id: "history", "data-part": true, "aria-label": "History" }, decisions.length === 0
     ? small("No decision fits.")
-    : [table(titles, rows, { class: "decisions" }), el("p", { class: "buttons" }, `${number(decisions.length)} decisions shown.`,
+    : [table(titles, rows, { class: "decisions" }), el("p", { class: "buttons" }, `${number(decisions.length)} decision${decisions.length === 1 ? "" : "s"} shown.`,
       asked.has("before") && el("a", { href: "history" }, "Newest"), older && el("a", { rel: "next", href: `history?${next}` }, "Older"),
       el("button", { type: "button", id: "as-csv", onclick: () => act.download(asCsv(decisions), "decisions.csv") }, "Download these as CSV"))]);
   return { title: "History", shown: [el("h1", {}, "History"), form, shown] };
