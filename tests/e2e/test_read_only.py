@@ -74,9 +74,9 @@ def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(made:
     journal.write_bytes(b"another user's")
     journal.chmod(0o000)
     verified, refused = dengine(["verify", store, "--json"], ["backup", store, "--out", tmp_path / "copy.db"])
-    assert '"waiting": null' in verified["out"]
-    assert refused["code"] == 1
-    assert "read it as the user that its cell runs as" in " ".join(refused["err"].split())
+    assert '"waiting": null' in verified["output"]
+    assert refused["exit_code"] == 1
+    assert "read it as the user that its cell runs as" in " ".join(refused["output"].split())
     assert not (tmp_path / "copy.db").exists()
 
 
