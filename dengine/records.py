@@ -248,7 +248,7 @@ class RetrainReport:
 
     version : of the model that answers afterwards.  n_traces : labelled traces the candidate was given.
     seconds : wall time from taking the data until the version answers; committing it to the store comes on top.
-    n_steps : optimiser steps taken (0 for closed-form reducers and rivals).
+    n_steps : optimiser steps taken (0 for closed-form reducers and baselines).
     accepted : whether the candidate replaced the old version.  reason : why, in words.
     """
 

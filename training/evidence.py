@@ -1,4 +1,4 @@
-"""The paper's 18 cells, every reducer and rival on eight sets, what each promise costs: `make evidence`.
+"""The paper's 18 cells, every reducer and baseline on eight sets, what each promise costs: `make evidence`.
 
     make evidence SCREW=screw_driving.npz            # as training/make_screw_driving.py writes it; left out without
     python training/evidence.py --only conv --n-jobs 2      # what is not asked for stays as it was
@@ -335,7 +335,7 @@ def main() -> None:
     parser = options(__doc__, seeds="100:130", n_jobs=2, keep=Path("out/evidence"), out=Path("docs"))
     parser.add_argument("--screw", help="the screw-driving set, an .npz file")
     parser.add_argument("--sets", default=",".join(SETS), help="with commas between; all by default")
-    parser.add_argument("--only", help="reducers and rivals, with commas between; 'promises' for the variants of conv")
+    parser.add_argument("--only", help="reducers and baselines, with commas between; 'promises' for the variants of conv")
     parser.add_argument("--cycles", type=int, default=1503, help="of a replay, at most")
     parser.add_argument("--cells", type=int, default=len(CELLS), help="1: at (0.1, 90 %%) alone, and no grid")
     args = parser.parse_args()

@@ -44,13 +44,13 @@ def names_of(kind: str) -> tuple[str, ...]:
     """What can be said where this is asked for: the keys of the package's own tables, read when they are needed."""
     from ..decision.intervals import INTERVALS
     from ..decision.policy import RULES, Stops
-    from ..experiments.rivals import RIVALS
+    from ..experiments.baselines import BASELINES
     from ..recipe import RECIPES
     from ..records import FITS, Action, Reason
     from ..store.views import LABELS
 
     known: dict[str, Iterable[str]] = {"guarantee": RULES, "interval": INTERVALS, "stops": get_args(Stops)}
-    known |= {"recipe": RECIPES, "rival": RIVALS, "method": [*RECIPES, *RIVALS], "fit": FITS, "label": LABELS}
+    known |= {"recipe": RECIPES, "baseline": BASELINES, "method": [*RECIPES, *BASELINES], "fit": FITS, "label": LABELS}
     known |= {"action": [each.value for each in Action], "reason": [each.value for each in Reason]}
     return tuple(known[kind])
 
@@ -178,12 +178,12 @@ class RecipeChoice:
         return self.load() if self.asked or self.settings else None
 
     def contender(self) -> Contender:
-        """Who plays by it: dengine, or the rival of that name in the same loop."""
+        """Who plays by it: dengine, or the baseline of that name in the same loop."""
         from ..experiments.replay import Contender
 
-        if self.asked in names_of("rival"):
-            rival = Contender.load(self.asked)
-            return replace(rival, recipe=RecipeChoice(None, self.settings).load(rival.recipe))
+        if self.asked in names_of("baseline"):
+            baseline = Contender.load(self.asked)
+            return replace(baseline, recipe=RecipeChoice(None, self.settings).load(baseline.recipe))
         return Contender(short_name(self.asked or "conv"), self.load())
 
 

@@ -138,7 +138,7 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     default="conv,umap,pca",
     show_default=True,
     type=Listed(Known("method", OWN)),
-    help="With commas between; those that are not dengine's are rivals in the same loop.",
+    help="With commas between; those that are not dengine's are baselines in the same loop.",
 )
 @options.policy_options
 @click.option("--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals.")
@@ -164,7 +164,7 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Reducers and rivals, under one policy or a grid of them. umap-learn takes much longer than the others. Ctrl-C
+    Reducers and baselines, under one policy or a grid of them. umap-learn takes much longer than the others. Ctrl-C
     shows the replays that were finished.
     """
     if len({short_name(one) for one in asked}) < len(asked):
@@ -248,7 +248,7 @@ def _made(frame: pd.DataFrame, replays: Sequence[Replay], title: str) -> Iterato
     else:
         yield "curves.png", curves(_grouped(replays, lambda each: _row_name(each, frame)), title)
     for name, (one, *_) in _grouped(replays, lambda each: each.name).items():
-        if not np.isnan(one.position).all():  # rivals embed nothing
+        if not np.isnan(one.position).all():  # baselines embed nothing
             said = f"{name}, newest parts of one replay (seed {one.seed})"
             yield _file_name(f"map_{name}"), embedding_map(one, title=said)
 
@@ -321,7 +321,7 @@ def costs(
     if finished.interrupted and sum(seeds.count(seed) == len(tasks) / len(stream.seeds) for seed in set(seeds)) < 2:
         end_interrupted("Interrupted: fewer than two shuffles were finished under every policy; there is nothing to show.")
     curve = curve_of(finished.replays, priced)
-    frame, every = curve.to_frame(), f"{curve.baseline:.3g}"
+    frame, every = curve.to_frame(), f"{curve.costs.check:.3g}"
     first = ("" if curve.policy else ">", "-", "all", every, every, "100 %", "-", "-")
     cells = [first, *(_cells(row, row.policy == curve.policy) for row in curve.rows)]
     tell(

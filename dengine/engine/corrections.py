@@ -64,7 +64,7 @@ class Corrections:
         """Say that a label was wrong, or that a forgotten one counts again, from the next decision on.
 
         References, the next retrain, the rule's evidence and the certificate take the label as corrected; its trace's fold
-        stays. A rival, which cannot take a label back, is trained anew at once. What was reported stays in the store.
+        stays. A baseline, which cannot take a label back, is trained anew at once. What was reported stays in the store.
         author : who says so, for the record.
         Raises ReportError for an unknown decision, and for one without a label. A label that is so already changes nothing.
         """
@@ -99,7 +99,7 @@ class Corrections:
         """Let an earlier version answer again, as a new version, so that the history goes on in one line.
 
         Labels that came since are among its references, corrections count, and the rule keeps what it was told. The next
-        retrain goes on from this version. A reducer that is stored by its traces (umap-learn), and a rival, are fitted
+        retrain goes on from this version. A reducer that is stored by its traces (umap-learn), and a baseline, are fitted
         again: the first on what it was fitted on, the second on the same traces with the labels as they count now.
         Raises StoreError for a version that is not kept, which names those that are.
         """

@@ -159,7 +159,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     store : None (memory), a file or URL (SQLite, PostgreSQL), an `SqlStore`. One that is not empty wants `DataEngine.open`.
     seed : of the reducer and of the audits' coin.
     recipe : a `Recipe`, a name or a TOML file, for all settings that are not given beside it; it names its own reducer.
-    model : any `Model`, a rival, that decides by its own rule: of a policy only audit_rate and stops count then.
+    model : any `Model`, a baseline, that decides by its own rule: of a policy only audit_rate and stops count then.
     on_safe_mode : called with the reason when safe mode begins, "" when it ends.
     executor : None retrains in line, between cycles; a `concurrent.futures.Executor` retrains while the cell goes on.
     replaying : stop a retrain on steps alone and never on the clock, so that a seed repeats exactly.
@@ -593,7 +593,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def model(self) -> Any:
-        """The model that answers, a rival as its author knows it; None before the first retrain."""
+        """The model that answers, a baseline as its author knows it; None before the first retrain."""
         return None if self._versions.answering is None else self._versions.answering.user_model
 
     @property
@@ -633,7 +633,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._versions.new_labels
 
     def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """The decision as an exporter takes it. ExportError before the first retrain, for a rival, of a changed store."""
+        """The decision as an exporter takes it.
+
+        ExportError before the first retrain, for a baseline, of a changed store.
+        """
         if self._outbox.doubt:
             raise ExportError(f"Expected a store as it was written, to export from: {self._outbox.doubt}")
         own, policy = self._versions.newest.exported(trace or self.trace), self.policy

@@ -44,7 +44,7 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
 
 def known_to(version: ModelVersion) -> int:
     """The newest label that a version's references held when it was stored."""
-    # A stored state holds what came in during its retrain; a rival, which has none, was refitted without that.
+    # A stored state holds what came in during its retrain; a baseline, which has none, was refitted without that.
     return version.last_seq if "points" in version.state else int(version.state["trained_on"][-1])
 
 
@@ -56,7 +56,7 @@ def corrected_at(version: ModelVersion) -> int:
 def join_since(model: EngineModel, store: SqlStore, version: ModelVersion, window: Window) -> int:
     """Let a version's model learn what came since it was stored, in order; returns the newest correction's number."""
     corrected_to = corrected_at(version)
-    as_of = corrected_to if model.keeps_references else None  # a rival cannot be corrected afterwards
+    as_of = corrected_to if model.keeps_references else None  # a baseline cannot be corrected afterwards
     # Up to the newest in the window: what peers stored since comes as their news.
     since = store.labelled(window.capacity, first=known_to(version) + 1, last=window.newest_seq, corrected_to=as_of)
     corrections = deque(store.corrections(corrected_to))

@@ -125,7 +125,7 @@ class EngineSettings:
             described_ = None if isinstance(own, str) else described(own)
             return replace(self, described=described_), ModelPrediction.from_recipe(self.recipe, self.seed)
         template = as_engine_model(model)
-        in_force = template.in_force(self.recipe)  # of our own kind its numbers count, a rival's are its own affair
+        in_force = template.in_force(self.recipe)  # of our own kind its numbers count, a baseline's are its own affair
         return replace(self, recipe=in_force, model=template.name, described=template.description), template
 
     def must_agree_with(self, asked: Mapping[str, Any]) -> None:

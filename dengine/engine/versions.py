@@ -250,7 +250,7 @@ class ModelVersions:
         tell_all(self.newest, lambda: known, self.evidence)
 
     def correct(self, own: bool = True) -> None:
-        """Learn the store's newest corrections; a rival is trained anew, by the cell that corrected."""
+        """Learn the store's newest corrections; a baseline is trained anew, by the cell that corrected."""
         self.outbox.hold_to_ledger(0)  # the rule is told all of it
         window = self.retrainer.window
         last = None if self.fleet is None else window.newest_seq  # what peers stored since comes as their news
@@ -280,7 +280,7 @@ class ModelVersions:
         state = without_rule(version.state)  # which goes on
         model, trained_on = self.template.successor(), TrainedOn.from_state(version.state)
         if not model.keeps_references:
-            # A rival cannot take a label back: it learns from the same traces as they are labelled now.
+            # A baseline cannot take a label back: it learns from the same traces as they are labelled now.
             trained_on = replace(trained_on, corrected_to=self.corrected_to)
         if model.needs_refit(state) and not refit(model, self.outbox, trained_on):
             raise StoreError(

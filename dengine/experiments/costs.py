@@ -78,11 +78,6 @@ class CostCurve:
     reporting: int
 
     @property
-    def baseline(self) -> float:
-        """A part's cost where everything is verified."""
-        return self.costs.check
-
-    @property
     def cheapest(self) -> PolicyCost:
         """Cheapest in the shuffles that choose, of those that decided anything; of equal ones the strictest."""
         decided = [row for row in self.rows if row.certain] or self.rows
@@ -94,9 +89,9 @@ class CostCurve:
         "does not pay".
         """
         row = self.cheapest
-        if max(row.chosen_by, row.cost) >= self.baseline:
+        if max(row.chosen_by, row.cost) >= self.costs.check:
             return "does not pay"
-        return "pays" if row.upper < self.baseline else "may pay"
+        return "pays" if row.upper < self.costs.check else "may pay"
 
     @property
     def policy(self) -> Policy | None:
@@ -106,7 +101,7 @@ class CostCurve:
     @property
     def sentence(self) -> str:
         """The result, for people."""
-        row, every = self.cheapest, f"verifying everything costs {self.baseline:g} a part"
+        row, every = self.cheapest, f"verifying everything costs {self.costs.check:g} a part"
         who = f"alpha {row.policy.alpha:g}, LB {100 * row.policy.lower_bound:g} %"
         who = "the cost guarantee" if row.policy.guarantee == "cost" else who
         between = f"with the errors at the ends of their 95 % intervals {row.lower:.3g} to {row.upper:.3g}"
@@ -172,7 +167,7 @@ def priced_tasks(
 ) -> list[Task]:
     """Every alpha and lower bound; then dengine's guarantee of costs, where it takes them and outcomes are heard of."""
     one, tasks = Contender.load(who), grid_tasks([who], alphas, lower_bounds, seeds=seeds, cycles=cycles)
-    if one.rival is None:
+    if one.baseline is None:
         with suppress(SettingError):  # of costs that are no prices, or of outcomes that nobody hears of
             tasks += grid_tasks([one.with_policy(guarantee="cost", prices=astuple(costs))], seeds=seeds, cycles=cycles)
     return tasks

@@ -298,7 +298,7 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     groups = {f"alpha {alpha:g}": [row for row in asked if row.policy.alpha == alpha] for alpha in alphas}
     if priced:
         groups["by cost"] = priced
-    top.axhline(curve.baseline, label="verify everything", **LIMIT)
+    top.axhline(curve.costs.check, label="verify everything", **LIMIT)
     for i, (label, rows) in enumerate(groups.items()):
         # The alphas' whiskers side by side.
         places = [len(bounds) if rows is priced else bounds.index(row.policy.lower_bound) for row in rows]
@@ -314,7 +314,7 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
                 ring: Look = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
                 top.scatter(at, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
     means, wide = [row.cost for row in curve.rows], len(groups) + 2
-    lowest, highest = min(0.0, *means), 1.25 * max(curve.baseline, *means)
+    lowest, highest = min(0.0, *means), 1.25 * max(curve.costs.check, *means)
     finish(top, wide, ylim=(lowest, highest), ylabel=f"cost a part [{unit}]")
     highest = max(10.0, 110 * max(row.certain for row in curve.rows))
     finish(bottom, wide, ylim=(0, highest), ylabel="decided without a check\n[% of parts]")

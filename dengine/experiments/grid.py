@@ -29,8 +29,8 @@ from ..errors import DataError, SettingError, expect
 from ..files import read_archive, reading, write_output
 from ..records import RetrainReport
 from ..reducers import reducer_class
+from .baselines import require
 from .replay import Contender, Replay, replay
-from .rivals import require
 from .tables import frame_of
 
 if TYPE_CHECKING:
@@ -68,7 +68,8 @@ class KeptReplays:
         """
         who, own = task.contender, task.contender.recipe.reducer
         parts = [reducer_class(own)] if isinstance(own, str) else _parts_of(own)
-        how = (task.seed, task.cycles, task.shuffle, task.confirm, who.rival, dict(who.params), who.recipe.to_toml(), own)
+        how: tuple[Any, ...] = (task.seed, task.cycles, task.shuffle, task.confirm)
+        how += (who.baseline, dict(who.params), who.recipe.to_toml(), own)
         try:  # a transformer with all that it holds: arrays and functions too, which its description only names
             said = self._digest((self._of_data, _digest_of_source(), [_source_of(part) for part in parts], how))
         except (PicklingError, TypeError, AttributeError) as error:
@@ -150,7 +151,7 @@ def iterate_replays(
     n_jobs : replays at a time, as joblib counts; times are honest with 1 alone.
     keep : folder of finished replays: those that are there are not played again, the others are kept as they end.
     on_cycle : as in `replay`, where n_jobs is 1: a callback does not travel.
-    SettingError, before anything is played, where a rival's library is missing.
+    SettingError, before anything is played, where a baseline's library is missing.
     """
     from joblib import Parallel, delayed
 
@@ -159,7 +160,7 @@ def iterate_replays(
     found = {i: one for i, task in enumerate(tasks) if kept and (one := kept.get(task)) is not None}
     yield from (Played(i, one, True) for i, one in found.items())
     left = sorted((i for i in range(len(tasks)) if i not in found), key=lambda i: tasks[i].seed)
-    for name in sorted({tasks[i].contender.rival or "" for i in left} - {""}):
+    for name in sorted({tasks[i].contender.baseline or "" for i in left} - {""}):
         require(name)  # now, and not when the others have been played
     parallel, told = Parallel(n_jobs=n_jobs, return_as="generator_unordered"), on_cycle if n_jobs == 1 else None
     for i, one in parallel(delayed(_play)(data, i, tasks[i], told) for i in left):
@@ -187,7 +188,7 @@ def run_grid(
 ) -> "pd.DataFrame":
     """A row a replay (see `Replay.summary`), over recipes x intervals x alphas x lower_bounds x seeds from 0 on.
 
-    recipes : a name, or a list of what `replay` takes, rivals too.  keep : folder by which an interrupted grid goes on.
+    recipes : a name, or a list of what `replay` takes, baselines too.  keep : folder by which an interrupted grid goes on.
     Only stops are known of accepted parts, as in the paper.
     Source: the paper's experiments, 30 shuffled repeats of a 3 x 3 grid. Timings are honest only with n_jobs=1.
     """

@@ -11,7 +11,7 @@ score": mean false positives / mean certain predictions of 30 shuffles of 1503 i
 import math
 from typing import TYPE_CHECKING
 
-from .rivals import RIVALS
+from .baselines import BASELINES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,7 +58,7 @@ def paper_table(frame: "pd.DataFrame", recipe: str, interval: str) -> str:
 def findings(frame: "pd.DataFrame") -> list[str]:
     """Which of the paper's findings the replays of a grid bear out: a line a finding, recipe and interval.
 
-    Those that they say nothing of are left out: of rivals, which decide by rules of their own, what the intervals do.
+    Those that they say nothing of are left out: of baselines, which decide by rules of their own, what the intervals do.
     frame : as `run_grid` gives it, of one feedback and one guarantee.
     """
     lines: list[str] = []
@@ -67,7 +67,7 @@ def findings(frame: "pd.DataFrame") -> list[str]:
         lines.append(f"{'holds' if holds else 'does NOT hold'}: {claim}: {measured}")
 
     for (recipe, interval), rows in frame.groupby(["recipe", "interval"], sort=False):
-        who, ours = f"{recipe}, {interval}", str(recipe).split(" ")[0] not in RIVALS
+        who, ours = f"{recipe}, {interval}", str(recipe).split(" ")[0] not in BASELINES
         means = rows.groupby(["alpha", "lower_bound"], sort=False)[["certain", "false_positive"]].mean()
         certain, n = means["certain"], len(means)
         if ours and n > 1 and interval in INTERVALS and certain.any():

@@ -23,8 +23,8 @@ from ..errors import DataError, SettingError, expect
 from ..recipe import RECIPES, Recipe
 from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, in_html
 from ..reducers.base import Reducer
+from .baselines import BASELINES, make_baseline
 from .metrics import VERIFY_SECONDS, Costs
-from .rivals import RIVALS, make_rival
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,30 +38,30 @@ COUNTED = ("verified", "accepted", "rejected", "false_positive", "false_negative
 
 @dataclass(frozen=True)
 class Contender:
-    """Who plays a stream: dengine by a recipe, or a rival method in the same loop.
+    """Who plays a stream: dengine by a recipe, or a baseline method in the same loop.
 
     >>> Contender.load("conv")        # a recipe's name, a TOML file, module:Class, a transformer, a Recipe
-    >>> Contender.load("knn")         # a name in `rivals.RIVALS`
+    >>> Contender.load("knn")         # a name in `baselines.BASELINES`
 
     name : in tables, pictures and file names.
-    recipe : every setting of the engine; of a rival's, those of the loop and the policy that the rival is made with.
-    rival : a name in `RIVALS` that decides in place of reducer and neighbours.  params : the rival's own settings.
+    recipe : every setting of the engine; of a baseline's, those of the loop and the policy that the baseline is made with.
+    baseline : a name in `BASELINES` that decides in place of reducer and neighbours.  params : the baseline's own settings.
     """
 
     name: str
     recipe: Recipe
-    rival: str | None = None
+    baseline: str | None = None
     params: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def load(cls, asked: Any) -> "Contender":
-        """A contender itself, a rival's name (its chosen settings), or what `Recipe.load` takes; SettingError for else."""
+        """A contender itself, a baseline's name, or what `Recipe.load` takes; SettingError for else."""
         if isinstance(asked, Contender):
             return asked
-        if isinstance(asked, str) and asked in RIVALS:
+        if isinstance(asked, str) and asked in BASELINES:
             # The schedule of conv is its own.
             recipe = Recipe(retrain_every=Reducer.default_retrain_every)
-            return cls(asked, recipe, asked, RIVALS[asked].tries[RIVALS[asked].chosen])
+            return cls(asked, recipe, asked, BASELINES[asked].tries[BASELINES[asked].chosen])
         recipe = Recipe.load(asked)
         by_name = isinstance(asked, str | os.PathLike) and (str(asked) in RECIPES or Path(asked).is_file())
         return cls(Path(asked).stem if by_name else recipe.name, recipe)
@@ -72,8 +72,8 @@ class Contender:
 
     def engine(self, seed: int) -> DataEngine:
         """A fresh engine in memory that repeats exactly under a seed."""
-        rival = None if self.rival is None else make_rival(self.rival, self.recipe.policy, seed, **self.params)
-        return DataEngine(recipe=self.recipe, model=rival, seed=seed, replaying=True)
+        baseline = None if self.baseline is None else make_baseline(self.baseline, self.recipe.policy, seed, **self.params)
+        return DataEngine(recipe=self.recipe, model=baseline, seed=seed, replaying=True)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -311,8 +311,8 @@ def replay(
     """Play a data set through a fresh engine in memory: one shuffled pass, or its first `cycles`.
 
     dataset : anything `load_dataset` takes.
-    recipe : anything `Recipe.load` takes, the name of a rival method (`experiments.rivals.RIVALS`), a `Contender`, or a
-        fresh engine, by which a model of your own comes in.
+    recipe : anything `Recipe.load` takes, the name of a baseline (`experiments.baselines.BASELINES`), a `Contender`,
+        or a fresh engine, by which a model of your own comes in.
     seed : of the shuffle and of the engine; the same seed gives the same decisions.
     alpha, lower_bound : of the policy; None: the recipe's, by default 0.05 and 0.95.
     shuffle : False plays the stream as it was recorded, drift and all.

@@ -78,8 +78,8 @@ def prepared(
 ) -> tuple[Exportable, DecisionModule]:
     """What an exporter starts from, and its decision as one eager module.
 
-    ExportError for a rival, before the first training, and where a part of the decision does not compile; OutputError where
-    `path` must not be written: before the work of an export.
+    ExportError for a baseline, before the first training, and where a part of the decision does not compile; OutputError
+    where `path` must not be written: before the work of an export.
     """
     _check_outputs(path, force)
     try:
@@ -87,7 +87,7 @@ def prepared(
     except AttributeError as error:
         got = type(engine_or_model).__name__
         wanted = "Expected a DataEngine or a ModelPrediction to export"
-        raise ExportError(f"{wanted}, got {got}; a rival method stays in Python.") from error
+        raise ExportError(f"{wanted}, got {got}; a baseline stays in Python.") from error
     model = source.model
     if not model.rule.scriptable:
         rule = f"{type(model.rule).__name__} with the interval {model.rule.interval!r}"

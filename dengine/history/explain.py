@@ -62,7 +62,7 @@ def as_it_stood(store: SqlStore, version: int, recipe: Recipe, then: StoredDecis
         stored = store.load_version(version)
     except VersionError:
         return None
-    if "points" not in stored.state:  # a rival keeps nothing
+    if "points" not in stored.state:  # a baseline keeps nothing
         return None
     reports = ((each.report, each.last_seq) for each in store.versions(own=True))
     retrains = [last_seq for report, last_seq in reports if report.accepted and report.version > version]
@@ -290,7 +290,7 @@ class Circumstances:
     safe_mode: str = ""
 
     @property
-    def rival(self) -> str:
+    def baseline(self) -> str:
         """The name of a model that counts and decides by its own, "" where the recipe says how."""
         return self.model if self.model is not None and self.levels is None else ""
 
@@ -311,8 +311,8 @@ def _was_lost(made: Decision) -> bool:
 
 def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
     policy = found.recipe.policy
-    if found.rival or policy.guarantee not in RULES:
-        return None, None, f"{found.rival or policy.guarantee} decides by its own rule"
+    if found.baseline or policy.guarantee not in RULES:
+        return None, None, f"{found.baseline or policy.guarantee} decides by its own rule"
     if policy.guarantee == "local" and not found.safe_mode:
         return policy.lower_bound, 1.0 - policy.lower_bound, "LB, of the ball around the part"
     if found.levels is None:
@@ -410,8 +410,8 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
 
 def _bound_sentences(made: Decision, bound: Bound, found: Circumstances) -> Iterator[str]:
     n, reach = made.n_success + made.n_failure, f"{made.lower:.3f} to {made.upper:.3f}"
-    if found.rival:
-        yield f"{found.rival} gives {made.n_success} successes, {made.n_failure} failures, bound {reach}."
+    if found.baseline:
+        yield f"{found.baseline} gives {made.n_success} successes, {made.n_failure} failures, bound {reach}."
         return
     ball, policy = f"within the radius {found.recipe.radius:g}", found.recipe.policy
     counted = f"{made.n_success} of {n} labels {ball} are successes" if n else f"No label {ball}"

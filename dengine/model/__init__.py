@@ -1,4 +1,4 @@
-"""What the engine drives: the contracts, our own prediction by reducer and radius neighbours, and a rival's adapter."""
+"""What the engine drives: the contracts, our own prediction by reducer and radius neighbours, and a baseline's adapter."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""Two contracts: what a rival method must give (`Model`), and what the engine drives (`EngineModel`).
+"""Two contracts: what a baseline method must give (`Model`), and what the engine drives (`EngineModel`).
 
-`RivalAdapter` makes an `EngineModel` of a rival; our own, `neighbours.ModelPrediction`, is both.
+`BaselineAdapter` makes an `EngineModel` of a baseline; our own, `neighbours.ModelPrediction`, is both.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Looked = tuple[int, int, Prediction | None]  # fault, content hash, what a model
 
 @runtime_checkable
 class Model(Protocol):
-    """What a rival method must give, and no more. X is (n, C, T) float32, y (n,) of 1 = success and 0 = failure."""
+    """What a baseline method must give, and no more. X is (n, C, T) float32, y (n,) of 1 = success and 0 = failure."""
 
     def fit(self, X: Any, y: Any) -> Any:
         """Train anew on labelled traces."""
@@ -70,7 +70,7 @@ class EngineModel(ABC):
     user_model : what `DataEngine.model` shows, the model as its author knows it.  name : in a status or a table.
     description : what it is, its numbers included, the same at every start: a store compares it.
     untold : whether its rule missed what became of a part; it then raises instead of predicting.
-    keeps_references : whether its state and the points stored with labels restore its references; a rival is refitted.
+    keeps_references : whether its state and the points stored with labels restore its references; a baseline is refitted.
     min_traces : how many labelled traces the first training waits for.
     is_compiled : whether no Python runs where it is asked, once it is trained.
     """
@@ -120,7 +120,7 @@ class EngineModel(ABC):
     def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
         """Make a labelled trace a reference, by its point; number : of its label."""
 
-    def renumber_reference(self, was: int, number: int) -> None:  # noqa: B027  # a default: a rival numbers nothing
+    def renumber_reference(self, was: int, number: int) -> None:  # noqa: B027  # a default: a baseline numbers nothing
         """Give a reference the number that its label has by now."""
 
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
@@ -188,7 +188,7 @@ class EngineModel(ABC):
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
         """What an exporter starts from; ExportError where there is nothing that can be exported."""
-        raise ExportError(f"{self.name} is a rival method and stays in Python; only dengine's own model can be exported.")
+        raise ExportError(f"{self.name} is a baseline and stays in Python; only dengine's own model can be exported.")
 
     # No exception inside a model reaches the cell or costs a label. The engine's calls go through these five.
 
@@ -230,16 +230,16 @@ def _guarded(call: Callable[[], T], failed: str) -> T | None:
 
 
 def as_engine_model(model: Model) -> EngineModel:
-    """A model as the engine drives it: our own as it is, a rival adapted. SettingError for what is no model."""
+    """A model as the engine drives it: our own as it is, a baseline adapted. SettingError for what is no model."""
     if isinstance(model, EngineModel):
         return model
     if isinstance(model, type) or not isinstance(model, Model):
         raise SettingError(f"Expected a model with fit, add, count, predict_interval and decide, got {model!r}.")
-    return RivalAdapter(model)
+    return BaselineAdapter(model)
 
 
-class RivalAdapter(EngineModel):
-    """Makes an `EngineModel` of a rival. It decides by its own rule, and it is trained on a deep copy."""
+class BaselineAdapter(EngineModel):
+    """Makes an `EngineModel` of a baseline. It decides by its own rule, and it is trained on a deep copy."""
 
     keeps_references = False
 
@@ -248,11 +248,11 @@ class RivalAdapter(EngineModel):
         self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
 
     def train(self, X: Floats, y: NDArray[Any], *_: object, **__: object) -> Self:
-        self.model.fit(without_extremes(X).copy(), y)  # the window's own, which a rival may write to
+        self.model.fit(without_extremes(X).copy(), y)  # the window's own, which a baseline may write to
         return self
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """The rival's own decision on one trace (C, T), with its evidence; it knows nothing of parts."""
+        """The baseline's own decision on one trace (C, T), with its evidence; it knows nothing of parts."""
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)
         (n_success,), (n_failure,) = self.model.count(X)
@@ -269,8 +269,8 @@ class RivalAdapter(EngineModel):
     def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
         self.model.add(point, y)
 
-    def successor(self) -> RivalAdapter:
-        return RivalAdapter(copy.deepcopy(self.model))
+    def successor(self) -> BaselineAdapter:
+        return BaselineAdapter(copy.deepcopy(self.model))
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from dengine.cli import main
 from dengine.cli.output import INTERRUPTED
 from dengine.datasets import importing
 from dengine.datasets.importing import import_labelled
-from dengine.experiments.rivals import RIVALS
+from dengine.experiments.baselines import BASELINES
 from dengine.store import SqlStore
 from tests.support.command_line import dengine, document, said, succeed, well
 from tests.support.driving import easy_parts
@@ -181,11 +181,11 @@ def test_the_papers_grid_writes_its_tables_its_figures_and_its_findings(data: Pa
     assert "18 replays" in shown
 
 
-def test_rivals_are_compared_under_their_names_which_the_help_says_and_leave_no_map(data: Path, tmp_path: Path) -> None:
+def test_baselines_are_compared_under_their_names_which_the_help_says_and_leave_no_map(data: Path, tmp_path: Path) -> None:
     found = document(*compare(data, "--reducers pca,always,never --repeats 2"), "--out", tmp_path)
     rows = {row["recipe"]: row for row in found["rows"]}
     assert rows["always"]["certain"] == 0
-    assert set(RIVALS) <= set(re.findall(r"\w+", succeed("compare", "--help")))
+    assert set(BASELINES) <= set(re.findall(r"\w+", succeed("compare", "--help")))
     assert rows["never"]["accepted"] == 60 - 50  # all but those before the first retrain
     assert [path.name for path in tmp_path.glob("map_*")] == ["map_pca.png"]
     assert found["costs"]["core_seconds"] > 0

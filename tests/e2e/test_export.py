@@ -326,7 +326,7 @@ def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Datase
         (missed, "missed what became of a part"),
         (DataEngine("pca"), "Nothing was trained yet"),
         (ModelPrediction("pca"), "Nothing was trained yet"),
-        (type("Thing", (), {"model": object()})(), "a rival method stays in Python"),
+        (type("Thing", (), {"model": object()})(), "a baseline stays in Python"),
     ):
         with pytest.raises(ExportError, match=words):
             export_torchscript(what, tmp_path / "model.ts")

@@ -19,7 +19,7 @@ from tests.support.driving import drive as play
 
 
 class Remembering(Counting):
-    """A rival that holds the labels which it was given."""
+    """A baseline that holds the labels which it was given."""
 
     def fit(self, X, y) -> None:
         self.y = np.array(y)
@@ -310,7 +310,7 @@ def test_an_earlier_version_answers_again_as_a_new_one_with_what_came_since(data
     assert engine.version == version + 2
 
 
-def test_a_rival_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_labelled_now(data: Dataset) -> None:
+def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_labelled_now(data: Dataset) -> None:
     engine = DataEngine(model=Remembering(), retrain_every=40, replaying=True)
     cycles = play(engine, data, 0, 90, confirm=True)
     version = engine.version

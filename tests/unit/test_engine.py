@@ -217,7 +217,7 @@ def test_a_finite_trace_beyond_all_measure_is_verified(data: Dataset) -> None:
 
 
 class Failing(Counting):
-    """A rival that learns and then fails, at whatever it is told to."""
+    """A baseline that learns and then fails, at whatever it is told to."""
 
     def __init__(self, at: str = "", error: Exception | None = None) -> None:
         super().__init__()

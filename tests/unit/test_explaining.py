@@ -163,7 +163,7 @@ def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
         assert "safe mode" not in said_of(engine.explain(before.decision.id))
 
 
-def test_a_rival_has_its_own_numbers_and_no_neighbours(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_a_baseline_has_its_own_numbers_and_no_neighbours(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     class Accepting(Counting):
         def predict_interval(self, X: Any) -> tuple[Any, Any]:
             return np.full(len(X), 0.8), np.full(len(X), 1.0)

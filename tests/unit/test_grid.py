@@ -12,9 +12,9 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from dengine import Dataset, Recipe, replay, run_grid
 from dengine.errors import SettingError
+from dengine.experiments.baselines import BASELINES
 from dengine.experiments.grid import KeptReplays, Task, contenders, grid_tasks, iterate_replays
 from dengine.experiments.replay import Contender
-from dengine.experiments.rivals import RIVALS
 from dengine.recipe import RECIPES
 from tests.support.driving import RECIPE
 from tests.support.replays import same
@@ -89,9 +89,9 @@ def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: P
     assert len(files) == len(first) == 8
 
 
-def test_a_rival_without_its_library_is_refused_before_anything_is_played(data, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(RIVALS["always"], "needs", "no_such_library")
-    with pytest.raises(SettingError, match=r'always needs no_such_library.*pip install "dengine\[rivals\]"'):
+def test_a_baseline_without_its_library_is_refused_before_anything_is_played(data, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(BASELINES["always"], "needs", "no_such_library")
+    with pytest.raises(SettingError, match=r'always needs no_such_library.*pip install "dengine\[baselines\]"'):
         run_grid(data, [RECIPE, "always"], **GRID, n_jobs=1, keep=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
@@ -119,4 +119,4 @@ def test_two_of_one_name_and_policy_are_refused_and_a_policy_has_columns_of_its_
     for twice in ([plain, replace(plain, radius=0.3)], [PCA(1), PCA(2)]):
         with pytest.raises(SettingError, match=r"a name of its own for each.*by Contender\(name, recipe\)"):
             contenders(twice)
-    assert set(RIVALS) & set(RECIPES) == set()
+    assert set(BASELINES) & set(RECIPES) == set()

@@ -7,7 +7,7 @@ import pytest
 
 from dengine import DataEngine, Dataset, Policy
 from dengine.errors import StoreError
-from dengine.experiments.rivals import AgreeingNeighbours
+from dengine.experiments.baselines import AgreeingNeighbours
 from dengine.store import SqlStore, verify_history
 from dengine.store.records import KEEP, keeps_state
 from tests.support.driving import learn
@@ -121,8 +121,8 @@ def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_no
 def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damaged(data: Dataset, tmp_path: Path) -> None:
     """Fitted on the others, its references would lie elsewhere: the engine verifies, and learns anew."""
     file = tmp_path / "engine.db"
-    rival = AgreeingNeighbours(Policy(0.1, 0.9))
-    with DataEngine(model=rival, store=file, retrain_every=40) as engine:
+    baseline = AgreeingNeighbours(Policy(0.1, 0.9))
+    with DataEngine(model=baseline, store=file, retrain_every=40) as engine:
         learn(engine, data, range(50))
         assert engine.version == 1
     execute(file, "UPDATE trace SET data = zeroblob(400) WHERE rowid = 7")

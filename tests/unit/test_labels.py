@@ -64,7 +64,7 @@ def test_a_report_without_id_part_or_label_queues_nothing_and_the_store_goes_on(
     assert engine.store.status()["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0, "inspection": 0}
 
 
-class Rival:
+class Baseline:
     """Answers with what it is told to."""
 
     def __init__(self, n_success=3, n_failure=0, lower=0.4, upper=1.0, action="verify") -> None:
@@ -90,7 +90,7 @@ def test_a_check_that_answers_no_label_ends_the_run_and_its_decision_is_kept(ans
 
 @pytest.mark.parametrize("answer", ["STOP", None, True, 0])
 def test_a_cell_that_goes_on_with_no_outcome_is_told_so_and_the_stop_is_not_taken_for_silence(answer, make_data) -> None:
-    engine, cell = DataEngine(model=Rival(9, 0, 1.0, 1.0, Action.ACCEPT), retrain_every=3), ReplayCell(make_data(9))
+    engine, cell = DataEngine(model=Baseline(9, 0, 1.0, 1.0, Action.ACCEPT), retrain_every=3), ReplayCell(make_data(9))
     cell.proceed = lambda: answer
     with pytest.raises(ReportError, match=r"Expected an Outcome"):
         list(engine.run(cell, 9))
@@ -106,9 +106,9 @@ WRONG = [
 
 
 @pytest.mark.parametrize("wrong", WRONG, ids=repr)
-def test_a_rival_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(wrong, make_data, tmp_path: Path) -> None:
+def test_a_baseline_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(wrong, make_data, tmp_path: Path) -> None:
     data = make_data(6)
-    with DataEngine(model=Rival(**wrong), retrain_every=3, store=tmp_path / "engine.db") as engine:
+    with DataEngine(model=Baseline(**wrong), retrain_every=3, store=tmp_path / "engine.db") as engine:
         for x, y in zip(data.X, data.y, strict=True):
             decision = engine.decide(x)
             engine.report(decision.id, y)

@@ -75,7 +75,7 @@ def test_what_contradicts_itself_or_has_no_effect_is_refused_and_spoils_no_store
     assert DataEngine("pca", store=tmp_path / "engine.db").store.settings()
 
 
-def test_the_audit_rate_and_the_loops_settings_count_for_a_rival_too() -> None:
+def test_the_audit_rate_and_the_loops_settings_count_for_a_baseline_too() -> None:
     engine = DataEngine(model=Counting(), policy=Policy(audit_rate=0.3), retrain_every=7, budget=0.2)
     assert (engine.policy.audit_rate, engine.recipe.retrain_every, engine.recipe.budget) == (0.3, 7, 0.2)
     assert engine.store.settings()["model"] == "Counting"

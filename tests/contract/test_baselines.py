@@ -1,4 +1,4 @@
-"""Rivals in the same loop: what each promises to the engine, and what its method says by hand."""
+"""Baselines in the same loop: what each promises to the engine, and what its method says by hand."""
 
 import copy
 import subprocess
@@ -11,7 +11,7 @@ from scipy.stats import binom
 
 from dengine import Action, DataEngine, Policy, Recipe, replay, wilson_interval
 from dengine.errors import SettingError
-from dengine.experiments.rivals import RIVALS, Rival, guaranteed_threshold, make_rival, risk_bound
+from dengine.experiments.baselines import BASELINES, Baseline, guaranteed_threshold, make_baseline, risk_bound
 from dengine.model import Model
 from dengine.records import Reason
 
@@ -22,14 +22,14 @@ QUICK: dict[str, dict[str, Any]] = {
 }
 LEARN_AT_ONCE = ("knn", "wskde")  # those that take labels in between two trainings
 
-every_rival = pytest.mark.parametrize("name", RIVALS)
-learning_rival = pytest.mark.parametrize("name", [name for name in RIVALS if name not in ("always", "never")])
+every_baseline = pytest.mark.parametrize("name", BASELINES)
+learning_baseline = pytest.mark.parametrize("name", [name for name in BASELINES if name not in ("always", "never")])
 
 
-def new(name: str, policy: Policy = LOOSE, seed: int = 0, **params: Any) -> Rival:
-    if RIVALS[name].needs:
-        pytest.importorskip(RIVALS[name].needs)
-    return make_rival(name, policy, seed, **QUICK.get(name, {}) | params)
+def new(name: str, policy: Policy = LOOSE, seed: int = 0, **params: Any) -> Baseline:
+    if BASELINES[name].needs:
+        pytest.importorskip(BASELINES[name].needs)
+    return make_baseline(name, policy, seed, **QUICK.get(name, {}) | params)
 
 
 @pytest.fixture
@@ -39,19 +39,21 @@ def traces(make_data: Any) -> tuple[np.ndarray, np.ndarray]:
     return data.X[:, None, :], data.y
 
 
-@every_rival
-def test_a_rival_gives_the_engine_what_it_asks_for_by_its_seed_and_is_right_on_easy_traces(name: str, traces: Any) -> None:
+@every_baseline
+def test_a_baseline_meets_the_model_contract_repeats_by_its_seed_and_is_right_on_easy_traces(
+    name: str, traces: Any
+) -> None:
     X, y = traces
-    rival = new(name).fit(X[:120], y[:120])
-    assert isinstance(rival, Model)
-    (lower, upper), counts, actions = rival.predict_interval(X[120:]), rival.count(X[120:]), rival.decide(X[120:])
+    baseline = new(name).fit(X[:120], y[:120])
+    assert isinstance(baseline, Model)
+    (lower, upper), counts, actions = baseline.predict_interval(X[120:]), baseline.count(X[120:]), baseline.decide(X[120:])
     assert {each.shape for each in (lower, upper, *counts, actions)} == {(40,)}
     assert ((lower >= 0) & (lower <= upper) & (upper <= 1)).all()
     assert all(n.dtype.kind == "i" and n.min() >= 0 for n in counts)
     assert all(isinstance(action, Action) for action in actions)
     np.testing.assert_array_equal((lower, upper), new(name).fit(X[:120], y[:120]).predict_interval(X[120:]))
-    assert [rival.decide(x[None])[0] for x in X[120:130]] == list(actions[:10])
-    assert [rival.predict_interval(x[None])[0][0] for x in X[120:130]] == pytest.approx(lower[:10], abs=1e-6)
+    assert [baseline.decide(x[None])[0] for x in X[120:130]] == list(actions[:10])
+    assert [baseline.predict_interval(x[None])[0][0] for x in X[120:130]] == pytest.approx(lower[:10], abs=1e-6)
     if name not in ("always", "never"):
         for action, label, fewest in ((Action.ACCEPT, 1, 5), (Action.REJECT, 0, 3)):
             decided = y[120:][actions == action]
@@ -59,70 +61,70 @@ def test_a_rival_gives_the_engine_what_it_asks_for_by_its_seed_and_is_right_on_e
             assert (decided == label).all()
 
 
-@learning_rival
+@learning_baseline
 @pytest.mark.parametrize("labels", [np.ones(60), np.zeros(60)], ids=["successes", "failures"])
 def test_labels_of_one_class_verify_everything(name: str, labels: np.ndarray, traces: Any) -> None:
     X = traces[0]
     assert set(new(name).add(X[0], 1).decide(X[:5])) == {Action.VERIFY}  # before its first training
-    rival = new(name).fit(X[:60], labels)
-    rival.add(X[60], 1)
-    assert set(rival.decide(X[120:])) == {Action.VERIFY}
-    assert list(rival.predict_interval(X[120:])[0]) == [0.0] * 40
+    baseline = new(name).fit(X[:60], labels)
+    baseline.add(X[60], 1)
+    assert set(baseline.decide(X[120:])) == {Action.VERIFY}
+    assert list(baseline.predict_interval(X[120:])[0]) == [0.0] * 40
 
 
-@every_rival
+@every_baseline
 def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_method_learns_at_once(name, traces) -> None:
     X, y = traces
-    rival = new(name, **({"k": 1} if name == "knn" else {})).fit(X[:120], y[:120])
-    before, successor = rival.predict_interval(X[120:]), copy.deepcopy(rival)
+    baseline = new(name, **({"k": 1} if name == "knn" else {})).fit(X[:120], y[:120])
+    before, successor = baseline.predict_interval(X[120:]), copy.deepcopy(baseline)
     for x, label in zip(X[120:], y[120:], strict=True):
         successor.add(x, 1 - label)
     assert np.array_equal(successor.predict_interval(X[120:]), before) == (name not in LEARN_AT_ONCE)
     successor.fit(X[40:], 1 - y[40:])
-    rival.predict_interval(X[:5])  # what it said last is remembered
-    np.testing.assert_array_equal(rival.predict_interval(X[120:]), before)
+    baseline.predict_interval(X[:5])  # what it said last is remembered
+    np.testing.assert_array_equal(baseline.predict_interval(X[120:]), before)
 
 
 def test_the_table_is_complete_and_imports_nothing() -> None:
-    code = "import sys; from dengine.experiments.rivals import RIVALS; print(*{'aeon'} & {*sys.modules})"
+    code = "import sys; from dengine.experiments.baselines import BASELINES; print(*{'aeon'} & {*sys.modules})"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == []
-    assert all(len(kind.tries) == 4 and 0 <= kind.chosen < 4 for kind in RIVALS.values())
-    assert [name for name, kind in RIVALS.items() if not kind.bound] == ["knn", "never"]
+    assert all(len(kind.tries) == 4 and 0 <= kind.chosen < 4 for kind in BASELINES.values())
+    assert [name for name, kind in BASELINES.items() if not kind.bound] == ["knn", "never"]
 
 
 @pytest.mark.parametrize(
     ("name", "params", "words"),
     [
-        ("nope", {}, "rival among knn, wskde"),
-        ("knn", {"n": 3}, "rival knn has no parameter n; it has k"),
+        ("nope", {}, "baseline among knn, wskde"),
+        ("knn", {"n": 3}, "baseline knn has no parameter n; it has k"),
         ("knn", {"k": 0}, "k to be an integer of at least 1, got 0"),
         ("wskde", {"bandwidth": -1.0}, "bandwidth to be a number above 0, got -1.0"),
         ("gp", {"amplitude": 1.0}, "amplitude above 1, got 1.0"),
     ],
 )
 def test_a_wrong_setting_is_named(name: str, params: dict[str, Any], words: str) -> None:
-    if name in RIVALS and RIVALS[name].needs:
-        pytest.importorskip(RIVALS[name].needs)
+    if name in BASELINES and BASELINES[name].needs:
+        pytest.importorskip(BASELINES[name].needs)
     with pytest.raises(SettingError, match=words):
-        make_rival(name, LOOSE, 0, **params)
+        make_baseline(name, LOOSE, 0, **params)
 
 
 def test_neighbours_decide_only_where_all_k_agree() -> None:
     X = np.array([0.0, 1.0, 2.0, 10.0, 11.0, 12.0, 13.0])[:, None, None]
-    rival = new("knn", k=3).fit(X, [1, 1, 1, 0, 0, 0, 1])
+    baseline = new("knn", k=3).fit(X, [1, 1, 1, 0, 0, 0, 1])
     asked = np.array([1.0, 11.0, 12.5])[:, None, None]
-    assert list(rival.decide(asked)) == [Action.ACCEPT, Action.REJECT, Action.VERIFY]
-    assert [list(counts) for counts in rival.count(asked)] == [[3, 0, 1], [0, 3, 2]]
-    np.testing.assert_allclose(rival.predict_interval(asked), [[1.0, 0.0, 1 / 3]] * 2)
+    assert list(baseline.decide(asked)) == [Action.ACCEPT, Action.REJECT, Action.VERIFY]
+    assert [list(counts) for counts in baseline.count(asked)] == [[3, 0, 1], [0, 3, 2]]
+    np.testing.assert_allclose(baseline.predict_interval(asked), [[1.0, 0.0, 1 / 3]] * 2)
 
 
 def test_a_narrow_kernel_counts_a_label_at_the_very_place_twice(traces: Any) -> None:
     # The published effective sample size in two dimensions is 2 sum w: Wilson's interval of twice the counts.
     X, y = traces
-    rival = new("wskde", bandwidth=1e-5).fit(X[:120], y[:120])
+    baseline = new("wskde", bandwidth=1e-5).fit(X[:120], y[:120])
     good = X[:120][y[:120] == 1][:1]
-    assert [int(n[0]) for n in rival.count(good)] == [2, 0]
-    np.testing.assert_allclose(np.ravel(rival.predict_interval(good)), wilson_interval(2, 0, LOOSE.alpha), atol=1e-6)
+    assert [int(n[0]) for n in baseline.count(good)] == [2, 0]
+    np.testing.assert_allclose(np.ravel(baseline.predict_interval(good)), wilson_interval(2, 0, LOOSE.alpha), atol=1e-6)
 
 
 @pytest.mark.parametrize(("wrong", "n", "delta"), [(0, 20, 0.1), (3, 50, 0.05), (49, 50, 0.2)])
@@ -147,8 +149,8 @@ def test_a_risk_above_the_tolerance_is_vouched_for_in_no_more_than_delta_of_all_
     assert np.mean(found) <= 0.2
 
 
-@every_rival
-def test_a_rival_plays_in_the_engines_loop(name: str) -> None:
+@every_baseline
+def test_a_baseline_plays_in_the_engines_loop(name: str) -> None:
     engine = DataEngine.from_recipe(Recipe(retrain_every=50), model=new(name), seed=0, replaying=True)
     played = replay("insertion", engine, cycles=150)
     assert (played.version[50:] >= 1).all()  # it answers after the first retrain

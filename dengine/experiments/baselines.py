@@ -1,9 +1,9 @@
-"""Rival methods for the same loop, by name; each decides by its own rule, on the same traces and the same feedback.
+"""Baseline methods for the same loop, by name; each decides by its own rule, on the same traces and the same feedback.
 
->>> DataEngine.from_recipe("conv", model=make_rival("knn", Policy(alpha=0.1, lower_bound=0.9), seed=0))
+>>> DataEngine.from_recipe("conv", model=make_baseline("knn", Policy(alpha=0.1, lower_bound=0.9), seed=0))
 
 Without a bound: always, never, k neighbours that agree. With one of their own: kernel densities, a Gaussian process, and
-thresholds with a guaranteed risk. A rival's settings are the keyword-only fields of its class.
+thresholds with a guaranteed risk. A baseline's settings are the keyword-only fields of its class.
 """
 
 import math
@@ -35,7 +35,7 @@ MOST_TRAINED = 500  # traces to train a Gaussian process on: the work grows with
 
 
 class Judgement(NamedTuple):
-    """What a rival says of n traces; (n,) each, as in `Decision`; 0 where a method counts nothing."""
+    """What a baseline says of n traces; (n,) each, as in `Decision`; 0 where a method counts nothing."""
 
     lower: Floats
     upper: Floats
@@ -44,10 +44,10 @@ class Judgement(NamedTuple):
 
 
 @dataclass(eq=False)
-class Rival(ABC):
+class Baseline(ABC):
     """A method of somebody else's behind the five methods of `Model`.
 
-    policy : its alpha and lower_bound are numbers of the rival here, and it says what it makes of them.
+    policy : its alpha and lower_bound are numbers of the baseline here, and it says what it makes of them.
     seed : of all that it draws; the same seed and the same labels give the same decisions.
 
     A subclass gives `_learn` and `_judge`, and `_take` where it learns between two trainings. Where a training cannot be
@@ -127,7 +127,7 @@ class Rival(ABC):
         """Learn one trace (1, C, T)."""
 
 
-class Constant(Rival):
+class Constant(Baseline):
     """The same for every part; before the first retrain every part is verified all the same."""
 
     lower: ClassVar[float]
@@ -178,7 +178,7 @@ class References:
 
 
 @dataclass(eq=False, kw_only=True)
-class AgreeingNeighbours(Rival):
+class AgreeingNeighbours(Baseline):
     """Accept where all k nearest labelled traces are successes, reject where all are failures, verify otherwise.
 
     Distances are Euclidean between the traces as they are, all channels in a row. alpha and LB have no effect: k takes the
@@ -242,7 +242,7 @@ class Components:
 
 
 @dataclass(eq=False, kw_only=True)
-class WilsonKernelDensity(Rival):
+class WilsonKernelDensity(Baseline):
     """Kernel-weighted counts of successes and failures, Wilson's interval, and the paper's rule.
 
     bandwidth : h, in deviations of each principal component; None: chosen at each training, among `BANDWIDTHS`, by the
@@ -307,7 +307,7 @@ def chosen_bandwidth(known: References, alpha: float) -> float:
 
 
 @dataclass(eq=False, kw_only=True)
-class GaussianProcess(Rival):
+class GaussianProcess(Baseline):
     """scikit-learn's Gaussian-process classifier on principal components; the paper's rule on its credible interval.
 
     n_components : principal components, which keep their proportions.
@@ -394,7 +394,7 @@ def guaranteed_threshold(confidence: Floats, wrong: Labels, risk: float, delta: 
 
 
 @dataclass(eq=False, kw_only=True)
-class RocketSelective(Rival):
+class RocketSelective(Baseline):
     """MiniRocket (aeon), logistic regression, and SGR's threshold on each side, with delta = alpha.
 
     n_kernels : of MiniRocket, 84 at least; aeon's default.
@@ -452,7 +452,7 @@ class RocketSelective(Rival):
         return guaranteed_threshold(p[called], ~right[called], 1.0 - self.policy.lower_bound, self.policy.alpha)
 
 
-RIVALS: dict[str, type[Rival]] = {  # their libraries are imported where they are made
+BASELINES: dict[str, type[Baseline]] = {  # their libraries are imported where they are made
     "knn": AgreeingNeighbours,
     "wskde": WilsonKernelDensity,
     "gp": GaussianProcess,
@@ -462,24 +462,24 @@ RIVALS: dict[str, type[Rival]] = {  # their libraries are imported where they ar
 }
 
 
-def make_rival(name: str, policy: Policy, seed: int = 0, **params: Any) -> Rival:
-    """A rival by its name in `RIVALS`, untrained, for `DataEngine(model=...)`.
+def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Baseline:
+    """A baseline by its name in `BASELINES`, untrained, for `DataEngine(model=...)`.
 
-    policy : its alpha and lower_bound are the rival's; what it has beside them belongs to the engine.
+    policy : its alpha and lower_bound are the baseline's; what it has beside them belongs to the engine.
     seed : of all that it draws.  params : its own settings; those left out have the class's defaults.
     Its library is imported and compiled here, so that no training is timed with that: aeon takes a minute at first.
     SettingError for an unknown name, an unknown parameter, a value out of range, or a library that is missing.
     """
     require(name)
-    known = [each.name for each in fields(RIVALS[name]) if each.kw_only]
-    if unknown := sorted(set(params) - set(known)):
-        raise SettingError(f"The rival {name} has no parameter {', '.join(unknown)}; it has {', '.join(known) or 'none'}.")
-    return RIVALS[name](policy, seed, **params)
+    known = [each.name for each in fields(BASELINES[name]) if each.kw_only]
+    if unknown := ", ".join(sorted(set(params) - set(known))):
+        raise SettingError(f"The baseline {name} has no parameter {unknown}; it has {', '.join(known) or 'none'}.")
+    return BASELINES[name](policy, seed, **params)
 
 
 def require(name: str) -> None:
-    """SettingError where there is no rival of this name, or the library that it is made with is missing."""
-    expect(name in RIVALS, f"a rival among {', '.join(RIVALS)}", name)
-    needs = RIVALS[name].needs
+    """SettingError where there is no baseline of this name, or the library that it is made with is missing."""
+    expect(name in BASELINES, f"a baseline among {', '.join(BASELINES)}", name)
+    needs = BASELINES[name].needs
     if needs and find_spec(needs) is None:
-        raise SettingError(f'The rival {name} needs {needs}, which is missing; pip install "dengine[rivals]".')
+        raise SettingError(f'The baseline {name} needs {needs}, which is missing; pip install "dengine[baselines]".')
