@@ -274,7 +274,7 @@ CAPTION = (
     "are the clean test."
 )
 COLUMNS = ("", "alpha", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
-SAID = ("recipe", "verdict", "policy", "sentence", "baseline", "costs", "cycles", "choosing", "reporting")
+SAID = ("recipe", "verdict", "policy", "sentence", "costs", "cycles", "choosing", "reporting")
 _COST = click.FloatRange(0.0)
 _ESCAPE = "What a bad part costs that is accepted: a stop, or worse."
 PRICES = {
