@@ -34,7 +34,7 @@ def fill(engine: DataEngine, data: Dataset, n: int) -> None:
             trace = np.array(x, np.float32, ndmin=2)
             records.append(StoredDecision(_verified(f"import-{i}"), trace, hash_, False, 0.0))
             records.append(NewLabel(f"import-{i}", bool(good), Source.VERIFICATION, 0, None, content_hash=hash_))
-        engine.store.take(records)
+        engine.store.apply_records(records)
 
 
 def _verified(name: str) -> Decision:

@@ -158,7 +158,7 @@ def import_parts(
                 labels.append(NewLabel(*of, store.clock(), known.content_hash, known.time))
                 silent = silent if fault else 0
                 counts["quarantined" if fault else "imported"] += 1
-        store.take([*made.values(), *labels])
+        store.apply_records([*made.values(), *labels])
         if on_traces is not None:
             on_traces(min(CHUNK, len(parts) - start))
     taken = counts["imported"], counts["quarantined"], counts["known"]

@@ -161,7 +161,7 @@ class Corrections:
 
     def _make_ready(self) -> None:
         """Swap in what an executor trains, and store what waits: a correction comes after all that was known before."""
-        self._outbox.check()
+        self._outbox.check_usable()
         self._versions.collect(HUNG)
         self._feedback.store_all()
         if self._versions.fleet is not None:
@@ -182,7 +182,7 @@ class Corrections:
     def _correct(self, change: Change) -> Changed:
         self._store.record(change)
         for name in change.decisions:
-            self._outbox.forget(name)
+            self._outbox.evict_decision(name)
         self._versions.correct()
         return self._done(change)
 

@@ -50,7 +50,7 @@ from ..records import (
 )
 from ..reducers.base import Reducer
 from ..store.opening import UNHURRIED, opening
-from ..store.outbox import CLOSE, Outbox
+from ..store.outbox import CLOSE_SECONDS, Outbox
 from ..store.records import StoredDecision
 from ..traces import as_agreed
 from .corrections import Changed, Corrections
@@ -322,12 +322,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises TraceError for a wrong shape, a first trace of less than 10 samples, and the id of another trace; ReportError
         for what is no id. Whatever else fails becomes VERIFY; an id that cannot be looked up too, and that is not recorded.
         """
-        self._outbox.check()
+        self._outbox.check_usable()
         with self._alone:
             id_, number = None if decision_id is None else as_id(decision_id), as_part(part)
             if id_ is not None:
                 try:
-                    if (known := self._outbox.decided_before(id_)) is not None:
+                    if (known := self._outbox.find_earlier(id_)) is not None:
                         return decided_before(known, trace, self.trace)
                 except StoreError as error:
                     return self._unrecorded(id_, number, error)
@@ -335,12 +335,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             known = self._decided(trace, number, late, id_)
             try:
                 if id_ is not None:
-                    self._outbox.secure()
+                    self._outbox.sync()
             except NotTakenError:
                 # A decision that lets a part go on unchecked has to outlive this process, or an id would have two answers.
                 if known.decision.action is not Action.VERIFY:
                     item = self._maker.decide(known.trace, number, None, self.version, Reason.NO_STORE, id_)
-                    known = self._outbox.amend(item)
+                    known = self._outbox.replace_decision(item)
             self._feedback.decided(known)
             self._feedback.announce()
         return known.decision
@@ -351,8 +351,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         It waits for neither store nor disk, and runs no code of the user's, nor umap-learn's. It leaves to `settle` to
         bring in a version, and to tell of safe mode.
         """
-        self._outbox.check()
-        with self._outbox.unless_held() as free, self._alone:
+        self._outbox.check_usable()
+        with self._outbox.try_lock() as free, self._alone:
             ours = self._versions.newest.keeps_references and not self.recipe.own_classes
             quick = ours and (self._versions.answering is None or self._versions.answering.is_compiled)
             if not (free and quick) or self._unseen or self._settings.waiting or self._feedback.remedy:
@@ -366,9 +366,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """A new decision, recorded without waiting."""
         x = self._as_trace(trace)
         self._feedback.settle()
-        unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
+        unasked = Reason.NO_STORE if self._outbox.verify_all_reason else Reason.LATE if late else None
         made = self._maker.decide(x, part, self._versions.answering, self.version, unasked, id_)
-        return self._outbox.decided(made)
+        return self._outbox.record_decision(made)
 
     def _unrecorded(self, decision_id: str, part: str | None, error: StoreError) -> Decision:
         """VERIFY for an id that may have a decision, which cannot be looked up: nothing of it is recorded."""
@@ -381,20 +381,20 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         It is on the disk when this returns; an id that has a decision keeps it. With a store in memory, and before a first
         trace has set the contract, `decide` has to record it, with `late`. Errors as of `decide`.
         """
-        self._outbox.check()
+        self._outbox.check_usable()
         id_, number = as_id(decision_id), as_part(part)
         try:
-            known = self._outbox.decided_before(id_)
+            known = self._outbox.find_earlier(id_)
         except StoreError as error:
             return self._unrecorded(id_, number, error)
         if known is None:
             if self.trace is None or self.store.wait is None:
                 return unasked(id_, number, self.version, Reason.LATE)
-            reason = Reason.NO_STORE if self._outbox.away else Reason.LATE
+            reason = Reason.NO_STORE if self._outbox.verify_all_reason else Reason.LATE
             x = as_agreed(trace, self.trace, False)
-            known = self._outbox.decided(self._maker.decide(x, number, None, self.version, reason, id_))
+            known = self._outbox.record_decision(self._maker.decide(x, number, None, self.version, reason, id_))
         with suppress(NotTakenError):
-            self._outbox.secure()
+            self._outbox.sync()
         return decided_before(known, trace, self.trace)
 
     def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
@@ -402,7 +402,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         if self.trace is None:
             try:
                 if self.store.product is not None:
-                    trace = self._outbox.ask(lambda: peers_trace(self.store)) or trace
+                    trace = self._outbox.call_store(lambda: peers_trace(self.store)) or trace
             except StoreError:  # the cell's own first trace stands
                 log.exception("the product's contract of traces cannot be had")
             settings = replace(self._settings.now, trace=trace, inferred=inferred)
@@ -437,10 +437,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         what is no label; StoreError where the label is not known to be taken: say the same again.
         """
         said, id_ = as_success(success), as_id(decision_id)  # refused before anything is written
-        self._outbox.check()
+        self._outbox.check_usable()
         with self._alone:
             self._versions.collect()
-            known = self._outbox.find(id_, told=True) or self._lost_stop(id_, said, trace, part)
+            known = self._outbox.find_decision(id_, unsynced=True) or self._lost_stop(id_, said, trace, part)
             self._feedback.report(known, said)
             return None if known.quarantined else self._versions.work(self.recipe)
 
@@ -451,13 +451,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 "a system stop whose decision was lost can be reported with its trace."
             )
         item = self._maker.lost_accept(self._as_trace(trace), as_part(part), self.version, decision_id)
-        known = self._outbox.decided(item)
+        known = self._outbox.record_decision(item)
         self._feedback.decided(known)
         return known
 
     def retrain(self) -> RetrainReport:
         """Retrain now, in line; a candidate that fails its gate, or cannot be stored, is dropped and recorded."""
-        self._outbox.check()
+        self._outbox.check_usable()
         with self._alone:
             return self._versions.retrain()
 
@@ -521,9 +521,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError where something is left that the journal does not take; close again when the disk is well.
         """
         with self._alone:
-            if self._outbox.usable:
+            if self._outbox.is_usable:
                 self._feedback.store_waiting()
-                self._versions.collect(CLOSE)
+                self._versions.collect(CLOSE_SECONDS)
             self._outbox.close()
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
@@ -548,12 +548,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """A decision with its trace, and with its label where it has one; None for an unknown id."""
-        return self._outbox.find(as_id(decision_id))
+        return self._outbox.find_decision(as_id(decision_id))
 
     def know_ids(self) -> None:
         """Learn which ids are taken (a second for a million), so that `decide` looks no new one up in the store."""
         self.flush()
-        self._outbox.know()
+        self._outbox.load_ids()
 
     def flush(self, wait: float | None = None) -> None:
         """Return when all that is known so far is on the disk; NotTakenError after `wait` seconds, None: the store's."""
@@ -637,12 +637,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         ExportError before the first retrain, for a baseline, of a changed store.
         """
-        if self._outbox.doubt:
-            raise ExportError(f"Expected a store as it was written, to export from: {self._outbox.doubt}")
+        if self._outbox.integrity_error:
+            raise ExportError(f"Expected a store as it was written, to export from: {self._outbox.integrity_error}")
         own, policy = self._versions.newest.exported(trace or self.trace), self.policy
         coin: dict[str, Any] = {"audit_rate": policy.audited_share, "seed": self.seed, "stops_all": policy.stops == "all"}
         about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml(), "windows": policy.limits}
-        return replace(own, note=self._outbox.event, **about, **coin)
+        return replace(own, note=self._outbox.record_event, **about, **coin)
 
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
         """How it is doing, as a record; arguments and errors as in `history.status.status`."""

@@ -102,7 +102,7 @@ class Feedback:
             self._went_on[known.decision.id] = known
         self._novel += ((known.decision.reason is Reason.NOVEL) - self._novel) / RECENT
         if self._novel > NEARLY_ALL and not self._told_novel:
-            self.outbox.event("novelty", ALL_NOVEL)
+            self.outbox.record_event("novelty", ALL_NOVEL)
         self._told_novel = self._novel > (0.5 if self._told_novel else NEARLY_ALL)
 
     def report(self, known: StoredDecision, success: bool) -> None:
@@ -112,7 +112,7 @@ class Feedback:
         if self._unsynced.get(id_) is not success:  # else it is said again, and learned already
             untrue = self._take_in(known, success)
         self._unsynced[id_] = success
-        self.outbox.secure()
+        self.outbox.sync()
         del self._unsynced[id_]
         if untrue:
             with suppress(StoreError):  # then it is put right when the store is back
@@ -130,14 +130,14 @@ class Feedback:
                 raise already_reported(made.id, stands, now)
             self.store_waiting()
             self.remedy = self.versions.take_back
-            self.outbox.labels([(known, NewLabel(made.id, False, source, self.versions.version, None))])
+            self.outbox.record_labels([(known, NewLabel(made.id, False, source, self.versions.version, None))])
             return True
         untrue = self._waiting.pop(made.id, None) is not None
         self.store_waiting()
         if untrue:
             self.versions.unlearn(known)
         label = self._learn(known, success, source)
-        self.outbox.labels([(known, label)])
+        self.outbox.record_labels([(known, label)])
         self._went_on.pop(made.id, None)
         self._owed.pop(made.id, None)
         if untrue or made.id in self.versions.overdue:
@@ -148,9 +148,9 @@ class Feedback:
     def arrive(self) -> None:
         """Do what had to wait for the store: labels that it has numbered train, and the rule is told the truth."""
         self._count_overdue()
-        for id_, seq in self.outbox.arrived():
+        for id_, seq in self.outbox.pop_label_numbers():
             self.versions.keep(id_, seq)
-        if self.remedy and self.outbox.drained and not self.outbox.fault:
+        if self.remedy and self.outbox.is_drained and not self.outbox.fault:
             if self._waiting:  # else the rule would forget them
                 self.store_waiting()
             else:
@@ -168,7 +168,7 @@ class Feedback:
     def store_waiting(self) -> None:
         """Put the labels of confirmed parts into the journal, without waiting."""
         if self._waiting:
-            self.outbox.labels(self._waiting.values())
+            self.outbox.record_labels(self._waiting.values())
             self._waiting.clear()
             self.arrive()
 
@@ -179,7 +179,7 @@ class Feedback:
 
     def journal_cleared(self) -> None:
         """The same for what is in the journal: of a product's news one may be that very label."""
-        if self.outbox.lacks_labels():
+        if self.outbox.request_label_drain():
             self.outbox.drain()
         self.arrive()
 
@@ -212,7 +212,7 @@ class Feedback:
             return
         self._mode = now
         try:
-            self.outbox.event(SAFE_MODE_BEGAN if now else SAFE_MODE_ENDED, now or safe_again)
+            self.outbox.record_event(SAFE_MODE_BEGAN if now else SAFE_MODE_ENDED, now or safe_again)
             if self.on_safe_mode is not None:
                 self.on_safe_mode(now)
         except Exception:

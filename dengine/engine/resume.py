@@ -31,7 +31,7 @@ def restored(outbox: Outbox, template: EngineModel, state: Mapping[str, NDArray[
 def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on what another was trained on, with the labels of then; False where a trace of these is damaged."""
     store, first, last = outbox.store, int(trained_on.seq[0]), int(trained_on.seq[-1])
-    outbox.hold_to_ledger(first - 1)  # older than what is read of the newest
+    outbox.check_integrity(first - 1)  # older than what is read of the newest
     data = store.labelled(first=first, last=last, corrected_to=trained_on.corrected_to)
     kept = np.isin(data.seq, trained_on.seq)
     said = {each.seq: each.success for each in store.corrections() if each.number <= trained_on.corrected_to}

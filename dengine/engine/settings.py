@@ -238,7 +238,7 @@ class SettingsInForce:
     def save(self) -> None:
         """Store them; where the store is away, they wait."""
         try:
-            self._outbox.ask(lambda: self._outbox.store.save_settings(self.now.to_store()))
+            self._outbox.call_store(lambda: self._outbox.store.save_settings(self.now.to_store()))
             self.waiting = False
         except StoreError:
             self.waiting = True

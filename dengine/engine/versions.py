@@ -177,7 +177,7 @@ class ModelVersions:
 
     def _evidence(self, after: int = 0) -> list[Evidence]:
         """What the rule is told of labels after that number, which are held to the ledger."""
-        self.outbox.hold_to_ledger(after)
+        self.outbox.check_integrity(after)
         return self.store.evidence_since(after, self.evidence.since, self.overdue_to)
 
     def _look_ahead(self, model: EngineModel, labelled: Labelled) -> None:
@@ -246,12 +246,12 @@ class ModelVersions:
 
     def tell_anew(self) -> None:
         """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
-        known = self.outbox.ask(lambda: self.store.evidence_since(0, self.evidence.since, self.overdue_to))
+        known = self.outbox.call_store(lambda: self.store.evidence_since(0, self.evidence.since, self.overdue_to))
         tell_all(self.newest, lambda: known, self.evidence)
 
     def correct(self, own: bool = True) -> None:
         """Learn the store's newest corrections; a baseline is trained anew, by the cell that corrected."""
-        self.outbox.hold_to_ledger(0)  # the rule is told all of it
+        self.outbox.check_integrity(0)  # the rule is told all of it
         window = self.retrainer.window
         last = None if self.fleet is None else window.newest_seq  # what peers stored since comes as their news
         window.refill(self.store.labelled(window.capacity, last=last))
@@ -275,7 +275,7 @@ class ModelVersions:
 
     def roll_back(self, number: int, event: Change) -> RetrainReport:
         """Let an earlier version answer again, as a new one, with what came since among its references."""
-        self.outbox.hold_to_ledger()
+        self.outbox.check_integrity()
         begin, version = self.clock(), self.store.load_version(number)
         state = without_rule(version.state)  # which goes on
         model, trained_on = self.template.successor(), TrainedOn.from_state(version.state)
@@ -435,14 +435,14 @@ class ModelVersions:
         storing = candidate.storing
         if not to_the_end and not storing.done() and (storing.running() or time.monotonic() < candidate.until):
             return False
-        number = self.outbox.result(storing)  # a peer's version may have come before it
+        number = self.outbox.wait_for_result(storing)  # a peer's version may have come before it
         candidate.report = replace(candidate.report, version=number or candidate.report.version)
         return True
 
     def _can_wait(self, candidate: Candidate, to_the_end: bool) -> bool:
         """Whether labels are on their way into the store, and the cell need not wait for that."""
         candidate.patience -= 1
-        return not to_the_end and candidate.patience > 0 and self.outbox.lacks_labels()
+        return not to_the_end and candidate.patience > 0 and self.outbox.request_label_drain()
 
     def _store(self, candidate: Candidate) -> Future[int]:
         model, state = candidate.model, None
@@ -452,7 +452,7 @@ class ModelVersions:
             candidate.trained_on = TrainedOn(candidate.seq, self.corrected_to, int(candidate.seq[-1]))
             state = self._state(model, candidate.trained_on)
         report, last = candidate.report, self.retrainer.window.newest_seq
-        return self.outbox.begin(lambda: self.store.put_version(report, last, state))
+        return self.outbox.submit(lambda: self.store.put_version(report, last, state))
 
     def _swap(self, candidate: Candidate) -> None:
         model, self._news = candidate.model, candidate.report
@@ -547,13 +547,13 @@ class Fleet:
         try:
             self.versions.journal_cleared()
             seq = self._window.newest_seq
-            news = self.versions.outbox.ask(lambda: self.store.news_since(seq, MOST))
+            news = self.versions.outbox.call_store(lambda: self.store.news_since(seq, MOST))
             newer = news.version > max(self.versions.version, self._refused)
             if newer or len(news.labelled.seq):
-                self.versions.outbox.ask(lambda: self.versions.outbox.hold_to_ledger(since=seq))
+                self.versions.outbox.call_store(lambda: self.versions.outbox.check_integrity(since=seq))
             if newer:
                 self.versions.store_waiting()  # the next model is to know of them too
-            version = self.versions.outbox.ask(self.store.last_version) if newer else None
+            version = self.versions.outbox.call_store(self.store.last_version) if newer else None
         except StoreError as error:
             if not self._lost:
                 log.warning("news of product %s cannot be had; the cell goes on without: %s", self.store.product, error)

@@ -177,7 +177,7 @@ def import_journal(store: "StoreLike", path: str | os.PathLike[str], any_model: 
     StoreError while an engine runs on the cell.
     """
     with opening(store, must_exist=True) as opened:
-        opened.own()  # an engine that runs would never learn of these labels
+        opened.claim_cell()  # an engine that runs would never learn of these labels
         known = opened.settings()
         spec = trace_in(known)
         if spec is None or "recipe" not in known:

@@ -19,7 +19,7 @@ import sqlalchemy as sa
 from ..errors import OutputError, StoreError, instead
 from ..files import output_file
 from .connections import reading
-from .journal import Record, journal_path, waiting_records
+from .journal import Record, journal_path, read_undrained
 from .records import CHUNK
 from .schema import DECISION, LABEL, SETTING
 from .sql import SqlStore
@@ -67,7 +67,7 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
         cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Before the store: what leaves a journal meanwhile is in it by then.
-    waiting = {cell: waiting_records(path) for cell, path in paths.items() if path.exists()}
+    waiting = {cell: read_undrained(path) for cell, path in paths.items() if path.exists()}
     with output_file(out) as partial:
         try:
             with instead(OutputError, f"Cannot write {out}", sqlite3.Error, do="choose a folder that has room"):
@@ -94,7 +94,7 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
         return
     with SqlStore(str(file), cell) as store:
         for begin in range(0, len(records), CHUNK):
-            store.take(records[begin : begin + CHUNK])
+            store.apply_records(records[begin : begin + CHUNK])
 
 
 def _fold_wal_and_count(file: Path) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import sqlalchemy as sa
 
 from ..errors import DengineError, StoreError, expect
-from .journal import Record, forked, owned_by, owner, sqlite_file
+from .journal import Record, describe_process, forked_error, owned_error, sqlite_file
 from .ledger import LedgerEntry, chain_writes, doubt_of, ledger_key, must_have_key, newest_entry
 from .queries import WITH_LABELS, WITH_TRACES, Scope, counted, join_product
 from .records import FORGOTTEN, LATE_STOP, Event, NewLabel, StoredDecision, as_text, chunks, decision_row, to_row, trace_row
@@ -209,7 +209,7 @@ class Database:
         self._writing = threading.RLock()  # one write transaction at a time in this process
         self._asked = threading.local()  # of each thread, what says whether its commit is wanted still
         self._key = b"" if url is None else ledger_key()
-        self.newest: tuple[int, str] | None = None
+        self.newest_entry: tuple[int, str] | None = None
         self.on_entry: Callable[[], object] = lambda: None
         self._engine = self._writer = make_engine(url)
         chain_writes(self._engine)
@@ -228,7 +228,7 @@ class Database:
                     prepare_tables(connection, self.cell_id, self.name)
                     must_have_key(connection, self.cell_id, self._key, begin=True)
                     if (last := newest_entry(connection, self.cell_id)) is not None:
-                        self.newest = last.number, last.digest.hex()
+                        self.newest_entry = last.number, last.digest.hex()
                     return Scope(self.cell_id, join_product(connection, self.cell_id, product))
         except StoreError:
             self._engine.dispose()
@@ -257,7 +257,7 @@ class Database:
                     raise StoreError(f"Could not write to {self.name} in time, and was given up; nothing was written.")
             self._check_file()  # nobody is told that a file holds what went into another one
             if newest is not None:
-                self.newest = newest
+                self.newest_entry = newest
                 self.on_entry()
 
     def _check_file(self) -> None:
@@ -270,18 +270,18 @@ class Database:
         raise FileNotFoundError("the file was deleted, moved or replaced while it was open")
 
     @contextmanager
-    def committing(self, wanted: Callable[[], bool]) -> Iterator[None]:
+    def commit_if(self, wanted: Callable[[], bool]) -> Iterator[None]:
         self._asked.wanted = wanted
         try:
             yield
         finally:
             del self._asked.wanted
 
-    def holds_entry(self, number: int, digest: str) -> bool:
+    def has_entry(self, number: int, digest: str) -> bool:
         mine = (LEDGER.c.cell_id == self.cell_id) & (LEDGER.c.number == number)
         return [row.digest.hex() for row in self.read(sa.select(LEDGER.c.digest).where(mine))] == [digest]
 
-    def doubt(self, window: int, since: int | None = None) -> str:
+    def check_integrity(self, window: int, since: int | None = None) -> str:
         """What is read of this cell and its product that is not as the ledgers have it, in words; "" where all is.
 
         window : so many of the newest labels are read.  since : those after that number alone; None: the window.
@@ -293,7 +293,7 @@ class Database:
                     return said if cell == self.cell_id else f"of cell {cell!r} {said}"
         return ""
 
-    def damage(self) -> str:
+    def check_pages(self) -> str:
         """What SQLite finds wrong in a table that is read, or in its indexes, in words; "" where nothing is."""
         for name in READ if self._file is not None else ():
             try:
@@ -308,9 +308,9 @@ class Database:
         """Raise a StoreError where SQLite can read its file, and no more."""
         self.write(lambda connection: connection.exec_driver_sql("UPDATE setting SET value = value WHERE 0"))
 
-    def lease(self) -> None:
+    def acquire_lease(self) -> None:
         """Write from now on through one connection that holds the cell; StoreError where another engine has it."""
-        said = PATIENCE | {"application_name": f"dengine {owner()}"[:63]}  # so that others are told who it is
+        said = PATIENCE | {"application_name": f"dengine {describe_process()}"[:63]}  # so that others are told who it is
         self._writer = sa.create_engine(self.url, pool_pre_ping=True, pool_size=1, max_overflow=0, connect_args=said)
         chain_writes(self._writer)
         sa.event.listen(self._writer, "connect", self._take_lease)
@@ -334,14 +334,14 @@ class Database:
         connection.commit()
         if not taken:
             connection.close()
-            raise owned_by(holder[0] if holder else "another engine", f"cell {self.cell_id!r} of {self.name}")
+            raise owned_error(holder[0] if holder else "another engine", f"cell {self.cell_id!r} of {self.name}")
 
     def check_open(self) -> None:
         """StoreError after closing, and in a fork."""
         if self._closed:
             raise StoreError(f"Expected an open store, got {self.name} after close(); open it again.")
         if os.getpid() != self._pid:
-            raise forked(self._pid, self.name)
+            raise forked_error(self._pid, self.name)
 
     def write(self, work: Callable[[sa.Connection], T], settled: bool = True) -> T:
         """Commit what `work` adds, in one transaction; settled : after what is on its way into the database."""
@@ -397,8 +397,8 @@ class Database:
         query = query.where(DECISION.c.cell_id == self.cell_id)
         return {row.id: row for part in chunks(ids) for row in connection.execute(query.where(DECISION.c.id.in_(part)))}
 
-    def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
-        """Commit what a journal held, as `SqlStore.take`."""
+    def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+        """Commit what a journal held, as `SqlStore.apply_records`."""
         try:
             return self.write(lambda connection: self._take(connection, records))
         except StoreError as error:
@@ -406,7 +406,7 @@ class Database:
                 raise
             if len(records) > 1:  # one of them is what the database refuses
                 half = len(records) // 2
-                return self.take(records[:half]) + self.take(records[half:])
+                return self.apply_records(records[:half]) + self.apply_records(records[half:])
             text = f"{_named(records[0])}, which the database refused: {error.__cause__}"
         self.write(lambda connection: self.insert(connection, EVENT.c.number, [to_row(self._set_aside(text))]))
         return []

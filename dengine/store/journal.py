@@ -1,9 +1,13 @@
-"""A cell's journal: where each decision, label and event is written first, on the local disk, before it is in the store.
+"""A cell's journal: the write-ahead log on the local disk, from which the store is filled.
 
-A locked file of records behind a header. Each record has its length, its CRC-32, and a digest over the record before it, so
-that a changed and a missing one are both noticed. The header says who owns the cell, up to where the store holds the
-records, and the newest entry of its ledger: a store that was cut off, or put back from a copy, does not hold that one. A
-small file beside it, its head, knows that entry too, for where the journal went with the store.
+The journal is one locked file: a header, then the records (decisions, labels, events) in the order
+in which they were written. Each record has its length, its CRC-32, and a digest over itself and the
+record before, so that a changed record and a missing one are both noticed. The header names the
+process that owns the cell, the offset up to which the store holds the records, and the newest entry
+of the cell's ledger that the store held: a store that was cut off or restored from an older copy
+lacks that entry. A small file beside the journal, its head, repeats the entry, for the case that
+the journal was lost together with the store. `Outbox` writes the journal while a cell runs; backup
+and verification read it.
 """
 
 import hashlib
@@ -27,9 +31,11 @@ from ..records import Decision
 from .owned_file import OwnedFile, open_plain
 from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
-LENGTH = struct.Struct("<I")  # of a record's JSON text, before it; the samples of a trace or a point follow it
-RESERVE = 8 << 20  # bytes: 1,800 traces of 1000 samples, two and a half hours of cells that verify every part
-HEADER = 256  # bytes: what this file is, who owns it, and what the store holds of it
+# of a record's JSON text, before it; the samples of a trace or point follow it
+LENGTH = struct.Struct("<I")
+# bytes: 1,800 traces of 1000 samples, or 2.5 hours of a cell that verifies every part
+RESERVE = 8 << 20
+HEADER = 256  # bytes of the header; the first record begins there
 MAGIC = b"dengine journal 2\n"
 MARK = b"\x89rec"  # where a record begins, to find the next one behind a damaged length
 IGNORES_CASE = sys.platform in ("win32", "darwin")  # of names in its usual file systems
@@ -38,8 +44,11 @@ FRAME = struct.Struct("<4sII16s")  # before a record: mark, length, CRC-32, dige
 Record = StoredDecision | NewLabel | Event
 
 
-def to_bytes(record: Record) -> bytes:
-    """Return a record as a journal keeps it: its row in JSON, and the samples of its trace or point."""
+def encode_record(record: Record) -> bytes:
+    """Return a record as a journal keeps it.
+
+    Its row in JSON, then the samples of its trace or point.
+    """
     if isinstance(record, StoredDecision):
         row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
         samples = pack(record.trace)
@@ -50,128 +59,187 @@ def to_bytes(record: Record) -> bytes:
     return LENGTH.pack(len(text)) + text + samples
 
 
-def from_bytes(blob: bytes) -> Record:
-    """Read what `to_bytes` wrote; StoreError for anything else."""
+def decode_record(blob: bytes) -> Record:
+    """Return the record that `encode_record` wrote; StoreError for anything else."""
     do = "open the store with the dengine that wrote it"
-    kinds = (struct.error, ValueError, KeyError, TypeError, AttributeError)
-    with instead(StoreError, "Expected a record of a journal, got what cannot be read", *kinds, do=do):
+    errors = (struct.error, ValueError, KeyError, TypeError, AttributeError)
+    with instead(
+        StoreError, "Expected a record of a journal, got what cannot be read", *errors, do=do
+    ):
         (length,) = LENGTH.unpack_from(blob)
-        rest = blob[LENGTH.size + length :]
+        samples = blob[LENGTH.size + length :]
         kind, row = json.loads(blob[LENGTH.size : LENGTH.size + length])
         if kind == StoredDecision.__name__:
-            trace = unpack(rest).reshape(row["shape"])
+            trace = unpack(samples).reshape(row["shape"])
             return from_row(StoredDecision, row, decision=from_row(Decision, row), trace=trace)
         if kind == NewLabel.__name__:
-            return from_row(NewLabel, row, point=unpack(rest) if rest else None)
+            return from_row(NewLabel, row, point=unpack(samples) if samples else None)
         return from_row(Event, row)
 
 
 class Journal:
-    """An owned, locked journal; one thread appends, and any may read.
+    """An open journal file. One thread appends; any thread may read.
 
-    path : of the file, which is made; a link is refused.
-    owning : whether to lock it; else what is in it now is read, whoever owns it, and nothing is written.
-    end : offset behind the last record.
-    drained : offset up to which the store holds the records.
-    newest : number and digest of the newest entry of the ledger that was known; None: none yet.  head : as the head has it.
-    dropped : bytes of an unfinished record at the end, which a killed process left; they were never acknowledged.
-    damaged : records that are not as they were written, or are missing; the others are read all the same.
+    Parameters
+    ----------
+    path : Path
+        The file; it is created if need be. A symbolic link is refused.
+    owning : bool, default True
+        Lock the file and write to it. False: read what is in it now, whoever owns it.
 
-    Raises StoreError where another process, or another engine of this one, owns it.
+    Attributes
+    ----------
+    end : int
+        Offset behind the last record.
+    drained_to : int
+        Offset up to which the store holds the records; set by the outbox.
+    newest_entry : (int, str) or None
+        Number and digest of the newest ledger entry that the header names; None: no entry yet.
+    head_entry : (int, str) or None
+        The same as the head beside the journal has it.
+    dropped : int
+        Bytes of an unfinished record at the end, left by a killed process and cut off. That record
+        was never acknowledged.
+    damaged : int
+        Records that are missing or not as they were written. The others are read all the same.
+
+    Raises
+    ------
+    StoreError
+        Where another process, or another engine of this one, owns the file.
     """
 
     def __init__(self, path: Path, owning: bool = True) -> None:
         self.path = path
-        self.drained, self.end, self.dropped, self.damaged = HEADER, HEADER, 0, 0
-        self.newest: tuple[int, str] | None = None
-        self.head = _head(path)
+        self.drained_to = HEADER
+        self.end = HEADER
+        self.dropped = 0
+        self.damaged = 0
+        self.newest_entry: tuple[int, str] | None = None
+        self.head_entry = _read_head(path)
         self._digest = bytes(16)
-        self._owning, self._file = owning, _opened(path, owning)
+        self._owning = owning
+        self._file = _open_file(path, owning)
         try:
-            with _using(self.path):
+            with _os_errors(self.path):
                 self._scan()
                 if owning:
                     self._file.truncate(self.end)
-                    self._begin()
+                    self._write_header_and_reserve()
         except StoreError:
             self._file.close()
             raise
 
     @property
-    def empty(self) -> bool:
-        """Whether the store holds all of it."""
-        return self.drained >= self.end
+    def is_drained(self) -> bool:
+        """Whether the store holds all records."""
+        return self.drained_to >= self.end
 
     def append(self, records: Sequence[bytes]) -> list[int]:
-        """Add records; they survive a killed process and lost power once this returns. Returns their offsets.
+        """Append encoded records and sync them to the disk.
 
-        LostJournalError where the file is no longer the one at its path: what was written there, nobody will read.
+        Returns
+        -------
+        list of int
+            The offset of each record, for `read`.
+
+        Raises
+        ------
+        LostJournalError
+            Where the open file is no longer the one at its path, so that nobody would read it.
+        StoreError
+            Where the disk fails.
         """
-        offsets, framed, digest = [], bytearray(), self._digest
+        offsets = []
+        framed = bytearray()
+        digest = self._digest
         for record in records:
             offsets.append(self.end + len(framed))
-            digest = _digest(digest, record)
+            digest = _chain_digest(digest, record)
             framed += FRAME.pack(MARK, len(record), zlib.crc32(record), digest) + record
-        with _using(self.path):
+        with _os_errors(self.path):
             self._file.write(framed, self.end)
             self._file.sync()
         if not self._file.in_place():
-            raise LostJournalError(f"The journal {self.path} was deleted, moved or replaced while it was open; leave it.")
-        self.end, self._digest = self.end + len(framed), digest
+            raise LostJournalError(
+                f"The journal {self.path} was deleted, moved or replaced while it was open; "
+                "leave it."
+            )
+        self.end += len(framed)
+        self._digest = digest
         return offsets
 
     def read(self, offset: int) -> bytes:
-        """Return the record at an offset that `append` gave."""
-        if (record := self._record(offset)) is None:
-            raise StoreError(f"Expected the record that was written to {self.path} at byte {offset}, found another.")
+        """Return the encoded record at an offset that `append` gave.
+
+        StoreError if it was changed.
+        """
+        if (record := self._read_record(offset)) is None:
+            raise StoreError(
+                f"Expected the record that was written to {self.path} at byte {offset}, found "
+                "another."
+            )
         return record
 
-    def records(self) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the whole records that are not drained: where each begins and ends, and the record."""
-        begin = self.drained
-        while begin < self.end:
-            if (record := self._record(begin)) is not None:
-                at, begin = begin, begin + FRAME.size + len(record)
-                yield at, begin, record
-                continue
-            block = self._file.read(1 << 20, begin + 1)  # the next one stands behind the damaged one
-            at = block.find(MARK)
-            if at < 0 and len(block) < 1 << 20:
-                return
-            begin += 1 + (at if at >= 0 else len(block) - len(MARK))
+    def undrained_records(self) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (offset, end, encoded record) of each intact record behind `drained_to`.
 
-    def mark(self, newest: tuple[int, str] | None) -> None:
-        """Note what the store holds by now; without a sync, for to give it a record twice is harmless."""
-        self.newest = newest
-        with _using(self.path):
+        Damaged ones are skipped.
+        """
+        begin = self.drained_to
+        while begin < self.end:
+            if (record := self._read_record(begin)) is not None:
+                offset = begin
+                begin += FRAME.size + len(record)
+                yield offset, begin, record
+                continue
+            # the next record stands behind the damaged one
+            block = self._file.read(1 << 20, begin + 1)
+            mark = block.find(MARK)
+            if mark < 0 and len(block) < 1 << 20:
+                return
+            begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
+
+    def save_newest_entry(self, newest: tuple[int, str] | None) -> None:
+        """Write the newest ledger entry and `drained_to` to header and head, without a sync.
+
+        An older header is harmless: the store ignores a record that it is given twice.
+        """
+        self.newest_entry = newest
+        with _os_errors(self.path):
             self._file.write(self._header(), 0)
         if newest is None:
             return
         path = head_path(self.path)
-        # An older head is no harm.
+        # An older head is harmless.
         with suppress(OSError), os.fdopen(open_plain(path, os.O_WRONLY | os.O_CREAT), "wb") as head:
             head.write(json.dumps(newest).ljust(HEADER).encode())
 
     def clear(self) -> None:
-        """Forget all records; the store holds them now. `reserve` then makes room, on the disk, for others."""
-        with _using(self.path):
+        """Remove all records, which the store holds now. Call `reserve` afterwards."""
+        with _os_errors(self.path):
             self._file.truncate(HEADER)
-            self.drained = self.end = HEADER
-            self._digest, self.damaged = bytes(16), 0
+            self.drained_to = HEADER
+            self.end = HEADER
+            self._digest = bytes(16)
+            self.damaged = 0
             self._file.write(self._header(), 0)
 
     def reserve(self) -> None:
-        """Reserve room, and return once that is on the disk."""
-        with _using(self.path):
+        """Reserve disk space for about RESERVE bytes of records, and sync that."""
+        with _os_errors(self.path):
             self._file.reserve(HEADER + RESERVE)
 
-    def remake(self) -> None:
-        """Make the lost file anew, with what is not drained where it was."""
-        lost, self._file = self._file, _opened(self.path)
+    def recreate(self) -> None:
+        """Create the lost file again, with the undrained records at their old offsets."""
+        lost = self._file
+        self._file = _open_file(self.path)
         try:
-            with _using(self.path):
-                self._file.write(lost.read(self.end - self.drained, self.drained), self.drained)
-                self._begin()
+            with _os_errors(self.path):
+                self._file.write(
+                    lost.read(self.end - self.drained_to, self.drained_to), self.drained_to
+                )
+                self._write_header_and_reserve()
         except StoreError:
             lost, self._file = self._file, lost
             raise
@@ -179,46 +247,66 @@ class Journal:
             lost.close()
 
     def close(self) -> None:
-        """Give the cell free. The file stays: what it knows of the ledger is compared by the next engine."""
+        """Cut off the reserved space and unlock the file.
+
+        It stays, for the next engine to compare with the ledger.
+        """
         if self._owning and not self._file.closed:
-            with _using(self.path):
-                self._file.truncate(HEADER if self.empty else self.end)
+            with _os_errors(self.path):
+                self._file.truncate(HEADER if self.is_drained else self.end)
         self._file.close()
 
     def _header(self) -> bytes:
-        known = json.dumps({"owner": owner()[:80], "drained": self.drained, "newest": self.newest})
-        return (MAGIC + known.encode()).ljust(HEADER, b"\0")
+        """Return the header, HEADER bytes.
 
-    def _begin(self) -> None:
-        """Write the header, and reserve room."""
+        Magic, then owner, drained offset and newest ledger entry in JSON.
+        """
+        fields = {
+            "owner": describe_process()[:80],
+            "drained": self.drained_to,
+            "newest": self.newest_entry,
+        }
+        return (MAGIC + json.dumps(fields).encode()).ljust(HEADER, b"\0")
+
+    def _write_header_and_reserve(self) -> None:
         self._file.write(self._header(), 0)
         self.reserve()
 
     def _scan(self) -> None:
-        """Find the end, and what is damaged on the way; all from where the store has the records."""
+        """Read the header and all undrained records.
+
+        Set `drained_to`, `end`, `dropped`, `damaged` and the digest.
+        """
         size = self._file.size
         if size == 0:
             return
-        head = self._file.read(HEADER, 0)
-        if not head.startswith(MAGIC):
-            raise StoreError(f"Expected a journal of dengine, found another file: {self.path}; move it away.")
+        header = self._file.read(HEADER, 0)
+        if not header.startswith(MAGIC):
+            raise StoreError(
+                f"Expected a journal of dengine, found another file: {self.path}; move it away."
+            )
         try:
-            self.drained, self.newest, _ = _known(head)
+            self.drained_to, self.newest_entry, _ = _parse_header(header)
         except (ValueError, KeyError, TypeError):  # all of it is drained again, which is harmless
             self.damaged += 1
-        before: bytes | None = None  # of the first nothing is known: those before it may be gone
-        begin = self.drained = min(max(self.drained, HEADER), size)
+        # the first record is not checked: those before it may be gone
+        previous: bytes | None = None
+        self.drained_to = min(max(self.drained_to, HEADER), size)
+        begin = self.drained_to
         self.end = size
-        for at, end, record in self.records():
-            digest: bytes = FRAME.unpack(self._file.read(FRAME.size, at))[3]
-            follows = before is None or digest == _digest(before, record)
-            self.damaged += at > begin or not follows
-            before, begin = digest, end
-        left = self._file.read(size - begin, begin)
-        self.end, self.dropped, self._digest = begin, len(left.rstrip(b"\0")), before or bytes(16)
+        for offset, end, record in self.undrained_records():
+            digest: bytes = FRAME.unpack(self._file.read(FRAME.size, offset))[3]
+            follows = previous is None or digest == _chain_digest(previous, record)
+            self.damaged += offset > begin or not follows
+            previous = digest
+            begin = end
+        rest = self._file.read(size - begin, begin)
+        self.end = begin
+        self.dropped = len(rest.rstrip(b"\0"))
+        self._digest = previous or bytes(16)
 
-    def _record(self, offset: int) -> bytes | None:
-        """The record at an offset; None where it is not as it was written."""
+    def _read_record(self, offset: int) -> bytes | None:
+        """Return the encoded record at an offset; None if it is not as it was written."""
         frame = self._file.read(FRAME.size, offset)
         if len(frame) < FRAME.size or not frame.startswith(MARK):
             return None
@@ -233,101 +321,144 @@ class LostJournalError(StoreError):
     """The journal's file is not at its path any more."""
 
 
-def _digest(before: bytes, record: bytes) -> bytes:
-    return blake2b(before + record, digest_size=16).digest()
+def _chain_digest(previous: bytes, record: bytes) -> bytes:
+    """Return the digest of a record, 16 bytes, over the digest of the one before and the record."""
+    return blake2b(previous + record, digest_size=16).digest()
 
 
-def _using(path: Path, owning: bool = True) -> AbstractContextManager[None]:
+def _os_errors(path: Path, owning: bool = True) -> AbstractContextManager[None]:
+    """Turn an OSError of the block into a StoreError that names the journal and says what to do."""
     do = "free some space there, or make its folder writable"
     do = do if owning else "read it as the user that its cell runs as"
     return instead(StoreError, f"Could not use the journal {path}", OSError, do=do)
 
 
-def _opened(path: Path, owning: bool = True) -> OwnedFile:
-    """Open a journal's file; StoreError that names its owner, where another engine has it."""
-    with _using(path, owning):
+def _open_file(path: Path, owning: bool = True) -> OwnedFile:
+    """Open a journal's file, locked if `owning`.
+
+    StoreError that names the owner if another engine has it.
+    """
+    with _os_errors(path, owning):
         try:
             return OwnedFile(path, owning)
         except BlockingIOError as error:
             try:
                 with path.open("rb") as file:
-                    holder = _known(file.read(HEADER))[2]
+                    owner = _parse_header(file.read(HEADER))[2]
             except (OSError, ValueError, KeyError, TypeError):
-                holder = "another engine"
-            raise owned_by(holder, str(path)) from error
+                owner = "another engine"
+            raise owned_error(owner, str(path)) from error
 
 
 def journal_path(url: Any, cell_id: str) -> Path:
-    """Where a cell's journal lies: beside an SQLite file, else in the user's folder of state, `XDG_STATE_HOME`."""
+    """Return the path of a cell's journal.
+
+    Parameters
+    ----------
+    url : sqlalchemy.URL
+        The store.
+    cell_id : str
+
+    Returns
+    -------
+    Path
+        Beside an SQLite file; for a server in the user's state folder (`XDG_STATE_HOME`).
+    """
     name = urllib.parse.quote(cell_id, safe="")
     if IGNORES_CASE:  # or cell A and cell a would have one journal
         name = re.sub("(?<!%)(?<!%[0-9A-F])[A-Z]", lambda letter: f"%{ord(letter[0]):X}", name)
     if url.get_backend_name() == "sqlite":
         return Path(f"{sqlite_file(url)}.{name}.journal")
     state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "dengine"
-    where = hashlib.sha256(f"{url.host}:{url.port}/{url.database}/{cell_id}".encode()).hexdigest()[:12]
-    return state / f"{name[:60]}.{where}.journal"
+    digest = hashlib.sha256(f"{url.host}:{url.port}/{url.database}/{cell_id}".encode()).hexdigest()[
+        :12
+    ]
+    return state / f"{name[:60]}.{digest}.journal"
 
 
 def sqlite_file(url: Any) -> Path:
-    """The file of an SQLite database, by whatever link or URI of SQLite's own it is named: one file has one owner."""
-    named = str(url.database)
-    of_uri = named.startswith("file:")
-    return Path(urllib.request.url2pathname(urllib.parse.urlsplit(named).path) if of_uri else named).resolve()
+    """Return the real file of an SQLite URL, links resolved, also of a `file:` URI.
+
+    One file has one owner.
+    """
+    database = str(url.database)
+    is_uri = database.startswith("file:")
+    return Path(
+        urllib.request.url2pathname(urllib.parse.urlsplit(database).path) if is_uri else database
+    ).resolve()
 
 
 def head_path(journal: Path) -> Path:
+    """Return the path of the head, the small file beside a journal."""
     return journal.with_name(f"{journal.name}.head")
 
 
-def newest_known(path: Path) -> set[tuple[int, str]]:
-    """Numbers and digests of the ledger's newest entry that a journal and its head know, whoever owns them."""
-    found = {_head(path)}
+def read_newest_entries(path: Path) -> set[tuple[int, str]]:
+    """Return the newest ledger entries (number, digest) that a journal and its head name.
+
+    At most two.
+    """
+    entries = {_read_head(path)}
     with suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as file:
-        found.add(_known(file.read(HEADER))[1])
-    return {each for each in found if each is not None}
+        entries.add(_parse_header(file.read(HEADER))[1])
+    return {entry for entry in entries if entry is not None}
 
 
-def waiting_records(path: Path) -> list[Record]:
-    """Return what a journal holds that its store has not taken, whoever owns it.
+def read_undrained(path: Path) -> list[Record]:
+    """Return the records of a journal that its store has not taken, whoever owns it.
 
     If several decisions share an id, only the last is returned.
     """
     journal = Journal(path, owning=False)
     try:
-        records = [from_bytes(blob) for _, _, blob in journal.records()]
+        records = [decode_record(blob) for _, _, blob in journal.undrained_records()]
     finally:
         journal.close()
-    newest = {each.decision.id: each for each in records if isinstance(each, StoredDecision)}
-    return [each for each in records if not isinstance(each, StoredDecision) or newest[each.decision.id] is each]
+    last = {record.decision.id: record for record in records if isinstance(record, StoredDecision)}
+    return [
+        record
+        for record in records
+        if not isinstance(record, StoredDecision) or last[record.decision.id] is record
+    ]
 
 
-def _head(journal: Path) -> tuple[int, str] | None:
+def _read_head(journal: Path) -> tuple[int, str] | None:
+    """Return number and digest of the ledger entry in the head beside a journal.
+
+    None if there is none.
+    """
     with suppress(OSError, ValueError, TypeError):
         number, digest = json.loads(head_path(journal).read_bytes())
         return int(number), str(digest)
     return None
 
 
-def _known(head: bytes) -> tuple[int, tuple[int, str] | None, str]:
-    """What a header says: the offset up to which the store has the records, its newest entry, the owner."""
-    known = json.loads(head[len(MAGIC) :].rstrip(b"\0"))
-    newest = known["newest"]
-    return int(known["drained"]), None if newest is None else (int(newest[0]), str(newest[1])), str(known["owner"])
+def _parse_header(header: bytes) -> tuple[int, tuple[int, str] | None, str]:
+    """Return the fields of a header: drained offset, newest ledger entry, owner."""
+    fields = json.loads(header[len(MAGIC) :].rstrip(b"\0"))
+    newest = fields["newest"]
+    entry = None if newest is None else (int(newest[0]), str(newest[1]))
+    return int(fields["drained"]), entry, str(fields["owner"])
 
 
-def forked(pid: int, name: str) -> StoreError:
-    """Return the error for a fork of the process that opened what this names."""
-    got, do = f"its fork {os.getpid()}", "open it after the fork, in the process that uses it"
+def forked_error(pid: int, name: str) -> StoreError:
+    """Return the error for a forked process that uses what its parent opened."""
+    got = f"its fork {os.getpid()}"
+    do = "open it after the fork, in the process that uses it"
     return StoreError(f"Expected the process that opened {name}, {pid}, got {got}; {do}.")
 
 
-def owner() -> str:
-    """Return who this process is, for the one that finds the cell taken."""
+def describe_process() -> str:
+    """Return this process and host in words, for another process that finds the cell owned."""
     return f"process {os.getpid()} on {socket.gethostname()}"
 
 
-def owned_by(holder: str, name: str) -> StoreError:
+def owned_error(owner: str, name: str) -> StoreError:
     """Return the error for a second engine on a cell."""
-    do = "close that engine first, ask its page or its HTTP where it is served, or give this one a cell_id of its own"
-    return StoreError(f"Expected a cell that no other engine runs on, but {holder} owns {name}; {do}.")
+    do = (
+        "close that engine first, ask its page or its HTTP where it is served, or give this "
+        "one a cell_id of its own"
+    )
+    return StoreError(
+        f"Expected a cell that no other engine runs on, but {owner} owns {name}; {do}."
+    )

@@ -1,8 +1,11 @@
-"""The one way into a store while a cell runs: decisions, labels and events go to a journal first, and from there into it.
+"""The engine's only way to its store while a cell runs: writes go to the local journal first.
 
-One thread writes and syncs the journal, another has the store take what is synced, and asks it what the engine wants to
-know. No call waits longer than the store's `wait`. How far the store lags behind is a number, `lag`: a store that is away
-and one that is slow are the same to the cell. Without a journal (in memory, for reading) the store is called directly.
+Decisions, labels and events are appended to the journal, and from there copied ("drained") into
+the store's database. Two threads do that: one writes and syncs the journal, the other drains it and
+runs the calls that the engine makes to the store. So no call of the engine waits longer than the
+store's time limit (`SqlStore.wait`), even where the disk or the database does not answer.
+`Outbox.lag` is how far the store is behind. A store without a journal (in memory, or opened for
+reading) is called directly.
 """
 
 from __future__ import annotations
@@ -25,7 +28,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import NotTakenError, StoreError
-from .journal import HEADER, Journal, LostJournalError, Record, forked, from_bytes, to_bytes
+from .journal import (
+    HEADER,
+    Journal,
+    LostJournalError,
+    Record,
+    decode_record,
+    encode_record,
+    forked_error,
+)
 from .records import Event, NewLabel, StoredDecision, as_text
 
 if TYPE_CHECKING:
@@ -33,373 +44,570 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("dengine")
 T = TypeVar("T")
-PATIENT = 1e9  # seconds: nobody waits so long
-LINGER, DRAIN = 0.05, 0.25  # seconds that a decision waits for company before it is written, and before the store takes it
-BRIEF = 0.001  # seconds that are no waiting
-BEAT = 1.0  # seconds between two tries of what failed
-CHECK = 0.1  # seconds that opening waits for SQLite's own check; of a larger store, that is done while the cell runs
-LATE = 1.0  # seconds of lag that are a fault of the store
-COMMIT = 2.0  # seconds beyond `wait` for a commit that is under way by then, for it may succeed
-CLOSE = 5.0  # seconds that closing may take
-CHUNK = 500  # records that the store takes at once
-MOST = 1_000  # of the newest decisions, which are known without asking
-UNWRITTEN = 10_000  # records in memory while the disk does not answer; later decisions are verified, and not recorded
+NO_LIMIT = 1e9  # seconds: never reached
+BATCH_SECONDS = 0.05  # a record waits so long for others before they are written together
+DRAIN_SECONDS = 0.25  # synced records wait so long for others before they are drained together
+LOCK_SECONDS = 0.001  # a wait for the lock that counts as none
+RETRY_SECONDS = 1.0  # between two attempts after a failure
+CHECK_SECONDS = (
+    0.1  # opening waits so long for SQLite's check; that of a large store goes on beside
+)
+LAG_SECONDS = 1.0  # a larger lag is a fault of the store
+COMMIT_SECONDS = 2.0  # beyond the time limit, for a commit under way: it may still succeed
+CLOSE_SECONDS = 5.0  # the longest that closing waits
+DRAIN_CHUNK = 500  # records that the store takes in one transaction
+N_RECENT = 1_000  # newest decisions kept in memory
+MAX_UNWRITTEN = 10_000  # records in memory while the disk hangs; later decisions are not recorded
 
 
-class TakenIds:
-    """Ids that decisions have, in 2 MB however many: a Bloom filter.
+class BloomFilter:
+    """A set of decision ids in 2 MB, however many: it may report an id that was never added.
 
-    It may take a new id for a taken one, never the reverse: one in 500 of new ids at a million taken ones.
-    complete : whether all were added.
-    Source: Bloom (1970), CACM 13(7).
+    It never misses an id that was added. At a million ids, one new id in 500 is reported.
+
+    Parameters
+    ----------
+    ids : iterable of str
+        The first ids.
+
+    Attributes
+    ----------
+    complete : bool
+        Whether every id of the store was added; set by the owner of the filter.
+
+    References
+    ----------
+    Bloom (1970), CACM 13(7).
     """
 
     def __init__(self, ids: Iterable[str] = ()) -> None:
-        self._bytes, self.complete = np.zeros(2**21, dtype=np.uint8), False
+        self._bytes = np.zeros(2**21, dtype=np.uint8)
+        self.complete = False
         self.add(*ids)
 
     def add(self, *ids: str) -> None:
-        """These are taken."""
-        byte, bit = self._places(ids)
+        """Add ids."""
+        byte, bit = self._positions(ids)
         np.bitwise_or.at(self._bytes, byte, bit)
 
-    def may_hold(self, decision_id: str) -> bool:
-        """False: it is not taken."""
-        byte, bit = self._places([decision_id])
+    def may_contain(self, decision_id: str) -> bool:
+        """Return False if the id was never added, True if it was or (rarely) if it was not."""
+        byte, bit = self._positions([decision_id])
         return bool((self._bytes[byte] & bit).all())
 
-    def _places(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
-        digests = (blake2b(each.encode("utf-8", "surrogatepass"), digest_size=16).digest() for each in ids)
-        places = np.frombuffer(b"".join(digests), dtype="<u4") % (8 * len(self._bytes))  # four of each
-        return places >> 3, np.left_shift(1, places & 7, dtype=np.uint8, casting="unsafe")
+    def _positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the four bits of each id, each as a byte's index and a byte with one bit set."""
+        digests = (
+            blake2b(id_.encode("utf-8", "surrogatepass"), digest_size=16).digest() for id_ in ids
+        )
+        positions = np.frombuffer(b"".join(digests), dtype="<u4") % (8 * len(self._bytes))
+        return positions >> 3, np.left_shift(1, positions & 7, dtype=np.uint8, casting="unsafe")
 
 
 class Outbox:
-    """What an engine tells and asks its store while the cell runs.
+    """Records what the engine decides, and asks the store for it, within a time limit.
 
-    window : newest labels that are read, and so held to the ledger.
-    owning : claim the cell; else the store is read and nothing more.
-    patient : wait as long as it takes: a replay that repeats exactly never looks at the clock.
+    Every `record_*` method returns at once; `sync` waits for the disk, `drain` for the store.
+
+    Parameters
+    ----------
+    store : SqlStore
+        Where the records end.
+    window : int
+        Number of newest labels that the engine reads, and whose integrity is therefore checked.
+    owning : bool, default True
+        Claim the cell, so that no other engine can write to it. False: only read.
+    patient : bool, default False
+        Wait without a time limit, as a replay does that must repeat exactly.
+
+    Attributes
+    ----------
+    limit : float
+        Seconds that a call waits at most.
+    n_decisions : int
+        Number of the newest recorded decision.
+    integrity_error : str
+        What in the store is not as it was written, so that every part must be verified; "" if
+        nothing is.
+
+    Raises
+    ------
+    StoreError
+        Where another engine owns the cell, or the store cannot take what the journal holds.
     """
 
-    def __init__(self, store: SqlStore, window: int, owning: bool = True, patient: bool = False) -> None:
-        self.store, self._window = store, window
-        self.limit = PATIENT if patient or store.wait is None else store.wait
-        self._reading, self._pid, self._closed = not owning, os.getpid(), False
-        self._changed = threading.Condition(threading.RLock())  # guards all that follows
-        self._recent: OrderedDict[str, StoredDecision] = OrderedDict()
-        self._taken: TakenIds | None = None
-        self._unrecorded: set[str] = set()  # ids that were answered, and are recorded under no decision of theirs
-        self._arrived: list[tuple[str, int]] = []
-        # Of what is not drained: the decisions, each by its offset once it is in the journal; labels with their places.
+    def __init__(
+        self, store: SqlStore, window: int, owning: bool = True, patient: bool = False
+    ) -> None:
+        self.store = store
+        self._window = window
+        self.limit = NO_LIMIT if patient or store.wait is None else store.wait
+        self._reading = not owning
+        self._pid = os.getpid()
+        self._closed = False
+        self._changed = threading.Condition(threading.RLock())  # guards everything below
+        self._recent: OrderedDict[str, StoredDecision] = OrderedDict()  # newest decisions, by id
+        self._known_ids: BloomFilter | None = None
+        self._unrecorded: set[str] = set()  # ids that were answered without recording a decision
+        self._label_numbers: list[tuple[str, int]] = []  # given by the store, not yet collected
+        # Not drained: decisions, or their offsets once they are in the journal; and labels, each
+        # with its position among all records.
         self._decisions: dict[str, StoredDecision | int] = {}
         self._labels: dict[str, tuple[NewLabel, int]] = {}
-        self._times: deque[float] = deque()  # when each record was appended
+        self._times: deque[float] = deque()  # when each undrained record was appended
         self._unwritten: deque[Record] = deque()
-        self._appended = self._synced = self._drained = 0  # how many records so far
-        self._to_sync = self._to_drain = 0  # places that somebody waits for
-        self._tries = 0  # to sync, that failed
-        self.n_decisions = 0  # number of the newest decision that was recorded
-        self._jobs: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        # Numbers of records so far, and up to which of them somebody waits for a sync or a drain.
+        self._appended = self._synced = self._drained = 0
+        self._to_sync = self._to_drain = 0
+        self._n_failed_syncs = 0
+        self.n_decisions = 0
+        self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._sync_began = math.inf
-        self._stuck = self._away = self.doubt = ""  # why the journal, why the store, took nothing; what is not as written
-        self._threads: list[threading.Thread] = []  # one writes, one drains, one learns
-        self._journal = store.own() if owning else None
+        self._journal_error = ""
+        self._store_error = ""
+        self.integrity_error = ""
+        self._threads: list[threading.Thread] = []  # writes the journal, drains it, loads the ids
+        self._journal = store.claim_cell() if owning else None
         if self._journal is not None:
-            self._begin(self._journal)
+            self._start(self._journal)
         elif store.wait is not None:
-            self._doubt_it(store.database.damage())
-            self.hold_to_ledger()
+            self._set_integrity_error(store.database.check_pages())
+            self.check_integrity()
         else:
             self.n_decisions = store.n_decisions()
 
-    def _begin(self, journal: Journal) -> None:
-        """Have the store take what an earlier process left, and begin."""
+    def _start(self, journal: Journal) -> None:
+        """Drain what an earlier process left in the journal, check the store, start the threads."""
         try:
-            # Before the store takes anything.
-            known, database = [each for each in (journal.newest, journal.head) if each is not None], self.store.database
-            if lacking := [each for each in known if not database.holds_entry(*each)]:
-                text = f"the ledger lacks entry {lacking[0][0]}, which this cell's journal knows: the store was cut off"
-                self._note("lost", f"{text}, or put back from a copy; labels may be missing")
-                journal.drained = HEADER  # it may hold some of them still
-            elif len(known) < 2 and database.newest is not None:
-                text = f"the journal {journal.path}, or its head beside it, is new here, and the store is not"
-                self._note("journal", f"{text}: whether the store was cut off, or labels wait elsewhere, is not known")
-            for at, _, blob in journal.records():
-                self._appended, self._synced = self._appended + 1, self._synced + 1
+            self._compare_with_ledger(journal)  # before anything is drained
+            for offset, _, blob in journal.undrained_records():
+                self._appended += 1
+                self._synced += 1
                 self._times.append(time.monotonic())
-                if isinstance(record := from_bytes(blob), StoredDecision):
-                    self._decisions[record.decision.id] = at  # a later one of an id is in the place of an earlier one
-            while not self.drained:
-                self._take(journal)
+                if isinstance(record := decode_record(blob), StoredDecision):
+                    # A later decision of the same id replaces an earlier one.
+                    self._decisions[record.decision.id] = offset
+            while not self.is_drained:
+                self._drain_chunk(journal)
             if journal.dropped:
-                text = f"{journal.dropped} bytes at its end were dropped: a process was killed as it wrote them"
-                self._note("journal", text)
+                text = (
+                    f"{journal.dropped} bytes at its end were dropped: a process was killed "
+                    "as it wrote them"
+                )
+                self._log_event("journal", text)
             if journal.damaged:
-                self._note("journal", f"{journal.damaged} records that are not as they were written were left out")
+                text = f"{journal.damaged} records that are not as they were written were left out"
+                self._log_event("journal", text)
             journal.clear()
             journal.reserve()
             self.n_decisions = self.store.n_decisions()
-            self.store.database.on_entry = self._mark
-            self._mark()
-            check = threading.Thread(target=lambda: self._doubt_it(self.store.database.damage()), daemon=True)
+            self.store.database.on_entry = self._save_newest_entry
+            self._save_newest_entry()
+            check = threading.Thread(
+                target=lambda: self._set_integrity_error(self.store.database.check_pages()),
+                daemon=True,
+            )
             check.start()
-            self.hold_to_ledger()
-            check.join(CHECK)
+            self.check_integrity()
+            check.join(CHECK_SECONDS)
         except BaseException:
             journal.close()
             raise
-        self._arrived.clear()  # what is resumed from the store knows them
-        self.store.before_use = self._settle
-        works = {"journal": self._keep_writing, "store": self._keep_draining, "ids": self._keep_learning}
-        for name, work in works.items():
-            self._threads.append(threading.Thread(target=work, args=(journal,), name=f"dengine-{name}", daemon=True))
-            self._threads[-1].start()
+        self._label_numbers.clear()  # an engine that resumes reads these labels from the store
+        self.store.before_use = self._drain_before_use
+        loops = {
+            "journal": self._write_loop,
+            "store": self._drain_loop,
+            "ids": self._load_ids_loop,
+        }
+        for name, loop in loops.items():
+            thread = threading.Thread(
+                target=loop, args=(journal,), name=f"dengine-{name}", daemon=True
+            )
+            self._threads.append(thread)
+            thread.start()
 
-    def hold_to_ledger(self, since: int | None = None) -> None:
-        """Look whether what is read from the store is as its ledger has it; where it is not, everything is verified.
+    def _compare_with_ledger(self, journal: Journal) -> None:
+        """Record an event where the store's ledger lacks an entry that the journal or its head has.
 
-        since : labels after that number are read; None: the newest `window`.
+        Then the store was cut off or restored from an older copy, and the whole journal is drained
+        again.
+        """
+        entries = [
+            entry for entry in (journal.newest_entry, journal.head_entry) if entry is not None
+        ]
+        database = self.store.database
+        if missing := [entry for entry in entries if not database.has_entry(*entry)]:
+            text = (
+                f"the ledger lacks entry {missing[0][0]}, which this cell's journal knows: "
+                "the store was cut off"
+            )
+            self._log_event("lost", f"{text}, or restored from a copy; labels may be missing")
+            journal.drained_to = HEADER  # the journal may still hold some of them
+        elif len(entries) < 2 and database.newest_entry is not None:
+            text = (
+                f"the journal {journal.path}, or its head beside it, is new here, and the "
+                "store is not"
+            )
+            self._log_event(
+                "journal",
+                f"{text}: whether the store was cut off, or labels are elsewhere, is unknown",
+            )
+
+    def check_integrity(self, since: int | None = None) -> None:
+        """Compare what the engine reads from the store with the ledger; set `integrity_error`.
+
+        Parameters
+        ----------
+        since : int or None
+            Labels after this number are checked; None: the newest `window`.
         """
         if self.store.wait is not None:
-            self._doubt_it(self.store.database.doubt(self._window, since))
+            self._set_integrity_error(self.store.database.check_integrity(self._window, since))
 
-    def _doubt_it(self, said: str) -> None:
-        if said and not self.doubt:
-            self.doubt = f"{said}; see `dengine verify`, and restore the store from a copy."
-            log.error("every part is verified: %s", self.doubt)
+    def _set_integrity_error(self, error: str) -> None:
+        """Keep and log the first integrity error; "" changes nothing."""
+        if error and not self.integrity_error:
+            self.integrity_error = (
+                f"{error}; see `dengine verify`, and restore the store from a copy."
+            )
+            log.error("every part is verified: %s", self.integrity_error)
 
-    def _note(self, kind: str, text: str) -> None:
+    def _log_event(self, kind: str, text: str) -> None:
+        """Log an error and commit it to the store as an event."""
         log.error("%s: %s", kind, text)
         self.store.put_event(kind, text)
 
-    def _mark(self) -> None:
-        """Note the ledger's newest entry in the journal, a drained one or not: a store that was cut off is told by that."""
-        with self._changed, suppress(StoreError):  # what is wrong with the journal, its next record tells
+    def _save_newest_entry(self) -> None:
+        """Write the ledger's newest entry to the journal's header.
+
+        By it a store that was cut off is recognized.
+        """
+        with self._changed, suppress(StoreError):  # a broken journal is reported by its next record
             if self._journal is not None:
-                self._journal.mark(self.store.database.newest)
+                self._journal.save_newest_entry(self.store.database.newest_entry)
 
-    # How it is doing
-
-    @property
-    def away(self) -> str:
-        """Why the cell verifies everything: what is in force was changed, or the journal takes nothing; "" else."""
-        return self.doubt or self._hung
+    # State
 
     @property
-    def _hung(self) -> str:
+    def verify_all_reason(self) -> str:
+        """Why every part must be verified.
+
+        An integrity error, or a journal that cannot be written; "" if neither.
+        """
+        return self.integrity_error or self._journal_fault
+
+    @property
+    def _journal_fault(self) -> str:
+        """Why the journal cannot be written: its last error, or a sync that takes too long.
+
+        "" if it can.
+        """
         seconds = time.monotonic() - self._sync_began
-        return self._stuck or (f"the disk has not answered for {seconds:.1f} s." if seconds > self.limit else "")
+        hangs = f"the disk has not answered for {seconds:.1f} s." if seconds > self.limit else ""
+        return self._journal_error or hangs
 
     @property
     def lag(self) -> float:
-        """Age in seconds of the oldest record that the store has not taken; 0.0 where it has all."""
+        """Age in seconds of the oldest record that is not drained; 0.0 if all are."""
         with self._changed:
             return time.monotonic() - self._times[0] if self._times else 0.0
 
     @property
     def fault(self) -> str:
-        """What is wrong with the store, or with the journal, at present; "" where nothing is."""
-        return self.doubt or self._blocked
+        """What is wrong with the store or the journal at present; "" if nothing is."""
+        return self.integrity_error or self._unavailable_reason
 
     @property
-    def _blocked(self) -> str:
-        """Why the store cannot be written, or asked, at present."""
-        late = f"no answer from the store for {self.lag:.1f} s." if self.lag > max(LATE, self.limit) else ""
-        return self._hung or self._away or late
+    def _unavailable_reason(self) -> str:
+        """Why the store cannot be written or read at present; "" if it can."""
+        lag = self.lag
+        late = (
+            f"no answer from the store for {lag:.1f} s."
+            if lag > max(LAG_SECONDS, self.limit)
+            else ""
+        )
+        return self._journal_fault or self._store_error or late
 
     @property
-    def usable(self) -> bool:
-        """Whether this is the process that opened it, and it was not closed."""
+    def is_usable(self) -> bool:
+        """Whether this is the process that opened it, and it is not closed."""
         return os.getpid() == self._pid and not self._closed
 
-    def check(self) -> None:
-        """Raise a StoreError after closing, for reading, and in a fork, whose ids would mix with its parent's."""
+    def check_usable(self) -> None:
+        """Raise a StoreError if it is closed, was opened for reading, or is in a forked process."""
         if os.getpid() != self._pid:
-            raise forked(self._pid, "the engine")
+            raise forked_error(self._pid, "the engine")
         if self._closed:
             raise StoreError("Expected an open engine, got one after close(); open it again.")
         if self._reading:
-            raise StoreError("Expected an engine that owns its cell, got one that was opened for reading; open it without.")
+            raise StoreError(
+                "Expected an engine that owns its cell, got one that was opened for reading; "
+                "open it without."
+            )
 
     @contextmanager
-    def unless_held(self) -> Iterator[bool]:
-        """Whether it can be told something without waiting for its threads, which wait until the block ends."""
-        held = self._changed.acquire(timeout=BRIEF)  # whoever looks what is new there, has it for an instant
+    def try_lock(self) -> Iterator[bool]:
+        """Try to take the lock for the block, without waiting; yield whether that succeeded.
+
+        While the block holds the lock, the threads of the outbox wait.
+        """
+        locked = self._changed.acquire(
+            timeout=LOCK_SECONDS
+        )  # a thread that only looks has it for an instant
         try:
-            yield held
+            yield locked
         finally:
-            if held:
+            if locked:
                 self._changed.release()
 
-    # What the engine tells
+    # What the engine records
 
-    def decided(self, made: StoredDecision) -> StoredDecision:
-        """Record a decision, as the engine makes it, without waiting, in any thread; returns the first one of its id.
+    def record_decision(self, item: StoredDecision) -> StoredDecision:
+        """Record a new decision without waiting; callable from any thread.
 
-        It has its number, or 0 where it is not recorded.
+        Parameters
+        ----------
+        item : StoredDecision
+            The decision with its trace.
+
+        Returns
+        -------
+        StoredDecision
+            The same with its number; number 0 if it could not be recorded, since the disk hangs. If
+            the id already has a decision in memory, that one, and nothing is recorded.
         """
-        id_ = made.decision.id
+        id_ = item.decision.id
         with self._changed:
             if (first := self._recent.get(id_)) is not None:
                 return first
             self._unrecorded.discard(id_)
-            if len(self._unwritten) >= UNWRITTEN:
+            if len(self._unwritten) >= MAX_UNWRITTEN:
                 self._unrecorded.add(id_)
             else:
                 self.n_decisions += 1
-                made = replace(made, number=self.n_decisions)
-                self._append([made])
-        return made
+                item = replace(item, number=self.n_decisions)
+                self._append([item])
+        return item
 
-    def amend(self, item: StoredDecision) -> StoredDecision:
-        """Put a decision in the place of its id's, which nobody was told; returns that one if it is on the disk by now."""
+    def replace_decision(self, item: StoredDecision) -> StoredDecision:
+        """Replace a recorded decision that was not returned to the caller yet, under the same id.
+
+        Returns
+        -------
+        StoredDecision
+            The new decision; or the first one, unchanged, if that is on disk by now.
+        """
         with self._changed:
             first = self._recent[item.decision.id]
             if not isinstance(self._decisions.get(item.decision.id), StoredDecision):
                 return first
-            made = replace(item, time=first.time, trace=first.trace, number=first.number)
-            self._append([made])
-        return made
+            item = replace(item, time=first.time, trace=first.trace, number=first.number)
+            self._append([item])
+        return item
 
-    def labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
-        """Record labels of decisions, without waiting. Their numbers come with `arrived`."""
+    def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
+        """Record labels of decisions without waiting.
+
+        `pop_label_numbers` later returns the numbers that they get.
+        """
         now = self.store.clock
         with self._changed:
             self._append(
-                [replace(label, time=now(), content_hash=of.content_hash, decided=of.time) for of, label in labels]
+                [
+                    replace(label, time=now(), content_hash=item.content_hash, decided=item.time)
+                    for item, label in labels
+                ]
             )
 
-    def event(self, kind: str, text: str) -> None:
-        """Record what happened, without waiting."""
+    def record_event(self, kind: str, text: str) -> None:
+        """Record an event, a kind in one word and a text for people, without waiting."""
         with self._changed:
             self._append([Event(0, self.store.clock(), as_text(kind), as_text(text))])
 
     def _append(self, records: Sequence[Record]) -> None:
-        """Take records, and know of them."""
-        arrived = self.store.take(records) if self._journal is None else []
+        """Add records in memory and wake the journal's thread.
+
+        Without a journal the store takes them at once.
+        """
+        numbers = self.store.apply_records(records) if self._journal is None else []
         for record in records:
             self._appended += 1
             if isinstance(record, StoredDecision):
-                self._recent[record.decision.id] = self._decisions[record.decision.id] = record
-                if self._taken is not None:
-                    self._taken.add(record.decision.id)
-                if len(self._recent) > MOST:
+                self._recent[record.decision.id] = record
+                self._decisions[record.decision.id] = record
+                if self._known_ids is not None:
+                    self._known_ids.add(record.decision.id)
+                if len(self._recent) > N_RECENT:
                     self._recent.popitem(last=False)
             elif isinstance(record, NewLabel):
                 self._labels[record.decision_id] = record, self._appended
         if self._journal is None:
             self._synced = self._drained = self._appended
-            self._was_taken(records, arrived)
+            self._remove_drained(records, numbers)
         else:
             self._times += [time.monotonic()] * len(records)
-            if not self._unwritten:  # else whoever writes knows of some
+            if not self._unwritten:  # else the thread is awake already
                 self._changed.notify_all()
             self._unwritten += records
 
-    def _was_taken(self, records: Sequence[Record], arrived: Sequence[tuple[str, int]]) -> None:
-        """The store has these, and gave their labels numbers."""
-        self._arrived += arrived
+    def _remove_drained(
+        self, records: Sequence[Record], numbers: Sequence[tuple[str, int]]
+    ) -> None:
+        """Drop stored records from memory; keep the numbers that their labels were given."""
+        self._label_numbers += numbers
         for record in records:
             if isinstance(record, StoredDecision):
                 self._decisions.pop(record.decision.id, None)
             elif isinstance(record, NewLabel):
                 self._labels.pop(record.decision_id, None)
-                if (known := self._recent.get(record.decision_id)) is not None:
-                    self._recent[record.decision_id] = replace(known, success=record.success, source=record.source)
+                if (item := self._recent.get(record.decision_id)) is not None:
+                    item = replace(item, success=record.success, source=record.source)
+                    self._recent[record.decision_id] = item
 
-    def secure(self, seconds: float | None = None) -> None:
-        """Return when all that was told is on the disk. NotTakenError where that takes too long, or fails.
+    def sync(self, seconds: float | None = None) -> None:
+        """Wait until everything that was recorded is on disk.
 
-        seconds : to wait at most; None: the limit.
+        Parameters
+        ----------
+        seconds : float or None
+            The longest to wait; None: `limit`.
+
+        Raises
+        ------
+        NotTakenError
+            Where that takes too long, or fails. Recording the same again is harmless.
         """
         limit = self.limit if seconds is None else seconds
         with self._changed:
-            self._to_sync, tries = (place := self._appended), self._tries
+            place = self._appended
+            self._to_sync = place
+            n_failed = self._n_failed_syncs
             self._changed.notify_all()
-            self._changed.wait_for(lambda: self._synced >= place or self._tries > tries, limit)
+            self._changed.wait_for(
+                lambda: self._synced >= place or self._n_failed_syncs > n_failed, limit
+            )
             if self._synced < place:
-                why = self._stuck or f"the disk gave no answer within {limit:g} s."
+                reason = self._journal_error or f"the disk gave no answer within {limit:g} s."
                 raise NotTakenError(
-                    f"What was told is not known to be taken: {why} "
-                    "Say the same again; once the disk is well it is taken, and counts once."
+                    f"The record may not be on disk: {reason} "
+                    "Report the same again; once the disk answers it is taken, and counts once."
                 )
 
     # What the engine asks
 
-    def find(self, decision_id: str, told: bool = False) -> StoredDecision | None:
-        """Return a decision; None where it is unknown. StoreError where it can't be looked up, for the store is away.
+    def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
+        """Return a decision with its label, from memory, the journal or the store.
 
-        told : with its label as soon as that was told; else once it is on the disk.
+        Parameters
+        ----------
+        decision_id : str
+        unsynced : bool, default False
+            Include a label that is recorded and not yet on disk.
+
+        Returns
+        -------
+        StoredDecision or None
+            None if no decision has this id.
+
+        Raises
+        ------
+        StoreError
+            Where the id cannot be looked up, since the store is unavailable.
         """
         with self._changed:
             if decision_id in self._unrecorded:
                 raise StoreError(
-                    f"Expected a decision that is recorded, got {decision_id!r}, which could not be looked up, and was "
+                    f"Expected a decision that is recorded, got {decision_id!r}, which could "
+                    "not be looked up, and was "
                     "verified unrecorded; decide on the part again."
                 )
-            held: Any = self._recent.get(decision_id) or self._decisions.get(decision_id)
-            if isinstance(held, int) and self._journal is not None:
-                held = from_bytes(self._journal.read(held))
-            known: StoredDecision | None = held
+            entry: Any = self._recent.get(decision_id) or self._decisions.get(decision_id)
+            if isinstance(entry, int) and self._journal is not None:
+                entry = decode_record(self._journal.read(entry))
+            item: StoredDecision | None = entry
             label, place = self._labels.get(decision_id, (None, 0))
-            label = label if told or place <= self._synced else None
-        if known is None and not self._is_new(decision_id):
-            known = self.ask(lambda: self.store.get_decision(decision_id))
-        if known is not None and label is not None:
-            known = replace(known, success=label.success, source=label.source)
-        return known
+            label = label if unsynced or place <= self._synced else None
+        if item is None and not self._is_new(decision_id):
+            item = self.call_store(lambda: self.store.get_decision(decision_id))
+        if item is not None and label is not None:
+            item = replace(item, success=label.success, source=label.source)
+        return item
 
-    def decided_before(self, decision_id: str) -> StoredDecision | None:
-        """The decision that an id has; None: it is new. StoreError where that is not known: it stays unrecorded."""
+    def find_earlier(self, decision_id: str) -> StoredDecision | None:
+        """Return the decision that an id already has; None if the id is new.
+
+        Raises
+        ------
+        StoreError
+            Where that cannot be looked up; the id is then remembered as answered but unrecorded.
+        """
         with self._changed:
             self._unrecorded.discard(decision_id)
         try:
-            return None if self._is_new(decision_id) else self.find(decision_id)
+            return None if self._is_new(decision_id) else self.find_decision(decision_id)
         except StoreError:
             self._unrecorded.add(decision_id)
             raise
 
-    def _keep_learning(self, journal: Journal) -> None:
-        """Learn which ids are taken, when the store is there: meanwhile ids are looked up one by one."""
+    def _load_ids_loop(self, journal: Journal) -> None:
+        """Run `load_ids` until it succeeds; until then every new id is looked up in the store."""
         while not self._closed:
             try:
-                self.know()
+                self.load_ids()
                 break
             except StoreError:
                 with self._changed:
-                    self._changed.wait_for(lambda: self._closed, BEAT)
+                    self._changed.wait_for(lambda: self._closed, RETRY_SECONDS)
 
-    def know(self) -> None:
-        """Learn which ids are taken by now, a second for a million, so that in an outage new ones are known to be new."""
+    def load_ids(self) -> None:
+        """Read the ids of all decisions into memory, to recognize a new id without the store.
+
+        Takes about a second for a million.
+        """
         with self._changed:
-            taken = self._taken = self._taken or TakenIds([*self._recent, *self._decisions])
-        for ids in () if taken.complete else self.store.decision_ids():
+            if self._known_ids is None:
+                self._known_ids = BloomFilter([*self._recent, *self._decisions])
+            known_ids = self._known_ids
+        for ids in () if known_ids.complete else self.store.decision_ids():
             with self._changed:
-                taken.add(*ids)
-        taken.complete = True
+                known_ids.add(*ids)
+        known_ids.complete = True
 
     def _is_new(self, decision_id: str) -> bool:
-        """Whether an id is taken for certain by no decision; False where that is not known."""
-        return self._taken is not None and self._taken.complete and not self._taken.may_hold(decision_id)
+        """Return whether an id certainly has no decision; False also if that is not known."""
+        known_ids = self._known_ids
+        return (
+            known_ids is not None and known_ids.complete and not known_ids.may_contain(decision_id)
+        )
 
-    def forget(self, decision_id: str) -> None:
-        """Look a decision up in the store the next time: what was known of it here is no longer so."""
+    def evict_decision(self, decision_id: str) -> None:
+        """Drop a decision from memory, since it was corrected in the store.
+
+        The next search reads it there.
+        """
         self._recent.pop(decision_id, None)
 
-    def arrived(self) -> list[tuple[str, int]]:
-        """The numbers that the store has given labels, by their decisions; each once."""
+    def pop_label_numbers(self) -> list[tuple[str, int]]:
+        """Return (decision id, label number) of the labels stored since the last call.
+
+        Each is returned once.
+        """
         with self._changed:
-            arrived, self._arrived = self._arrived, []
-        return arrived
+            numbers = self._label_numbers
+            self._label_numbers = []
+        return numbers
 
     @property
-    def drained(self) -> bool:
-        """Whether the store has all that was told."""
+    def is_drained(self) -> bool:
+        """Whether the store has taken every record."""
         return self._drained == self._appended
 
-    def lacks_labels(self) -> bool:
-        """Whether the store lacks labels that were told; then it takes what there is at once, and nobody waits for it."""
+    def request_label_drain(self) -> bool:
+        """Ask the threads to drain labels at once, without waiting for it.
+
+        Return whether any label is not drained.
+        """
         with self._changed:
             if self._labels:
                 self._to_sync = self._to_drain = self._appended
@@ -407,183 +615,267 @@ class Outbox:
             return bool(self._labels)
 
     def drain(self) -> None:
-        """Return when the store has all that was told so far. StoreError where it is away, or takes too long."""
-        with self._changed:
-            if self.drained:
-                return
-            self._to_sync = self._to_drain = place = self._appended
-            self._changed.notify_all()
-            if not self._changed.wait_for(lambda: self._drained >= place or bool(self._blocked), self.limit):
-                self._away = f"no answer from the store within {self.limit:g} s."
-            if self._drained < place:
-                raise self._is_away()
+        """Wait until the store has taken everything recorded so far.
 
-    def _is_away(self) -> StoreError:
-        return StoreError(f"The store is away: {self._blocked} Labels wait in its journal; try this again when it is back.")
+        Raises
+        ------
+        StoreError
+            Where the store is unavailable, or takes too long.
+        """
+        with self._changed:
+            if self.is_drained:
+                return
+            place = self._appended
+            self._to_sync = self._to_drain = place
+            self._changed.notify_all()
+            if not self._changed.wait_for(
+                lambda: self._drained >= place or bool(self._unavailable_reason), self.limit
+            ):
+                self._store_error = f"no answer from the store within {self.limit:g} s."
+            if self._drained < place:
+                raise self._unavailable()
+
+    def _unavailable(self) -> StoreError:
+        """Return the error for a store that cannot be reached now."""
+        return StoreError(
+            f"The store is unavailable: {self._unavailable_reason} Labels wait in its journal; "
+            "try this again when it is back."
+        )
 
     def flush(self, seconds: float | None = None) -> None:
-        """Return when all that is known so far is in the store, or, where that is away, on the disk: see `secure`."""
-        self.secure(seconds)
+        """Wait until every record is in the store, or on disk if the store is unavailable.
+
+        Parameters and errors are those of `sync`.
+        """
+        self.sync(seconds)
         with suppress(StoreError):
             self.drain()
 
-    def ask(self, work: Callable[[], T]) -> T:
-        """Call the store with the time limit; StoreError where it is away."""
-        return self.result(self.begin(work))
+    def call_store(self, call: Callable[[], T]) -> T:
+        """Call the store and return the result, within the time limit.
 
-    def result(self, future: Future[T]) -> T:
-        """What a call to the store returned. StoreError where it takes too long: it is given up, unless it commits."""
+        StoreError where the store is unavailable.
+        """
+        return self.wait_for_result(self.submit(call))
+
+    def wait_for_result(self, future: Future[T]) -> T:
+        """Return the result of a call that was submitted.
+
+        Raises
+        ------
+        StoreError
+            Where it takes longer than `limit`. The call is then cancelled, unless it is committing.
+        """
         if not wait([future], self.limit).done and not future.cancel():
-            wait([future], COMMIT)
+            wait([future], COMMIT_SECONDS)
         if future.cancelled() or not future.done():
             raise StoreError(f"no answer from the store within {self.limit:g} s.")
         return future.result()
 
-    def begin(self, work: Callable[[], T]) -> Future[T]:
-        """Begin to call the store; `result` ends it."""
+    def submit(self, call: Callable[[], T]) -> Future[T]:
+        """Have the store's thread run a call; `wait_for_result` waits for it.
+
+        Without a journal there is no such thread: the call runs here, before this returns, and what
+        it raises is raised here.
+
+        Raises
+        ------
+        StoreError
+            Where the store is unavailable.
+        """
         future: Future[T] = Future()
         if self._journal is None:
-            future.set_result(work())
+            future.set_result(call())
             return future
         with self._changed:
-            if self._blocked:
-                raise self._is_away()
-            self._jobs.append((future, work))
+            if self._unavailable_reason:
+                raise self._unavailable()
+            self._calls.append((future, call))
             self._changed.notify_all()
         return future
 
-    def _settle(self) -> None:
-        """Who uses the store itself sees all that was told."""
+    def _drain_before_use(self) -> None:
+        """Drain before the store is used directly, so that its user sees every record."""
         if not self._closed and threading.current_thread() is not self._threads[1]:
             with suppress(StoreError):
                 self.drain()
 
     def close(self) -> None:
-        """Write everything, to the journal what the store does not take, and let it go within seconds; once."""
-        if not self.usable:
+        """Drain, stop the threads and close store and journal, within seconds.
+
+        A second call does nothing.
+
+        What the store does not take stays in the journal, and the next engine drains it.
+        """
+        if not self.is_usable:
             return
         self.flush()
         with self._changed:
-            self._changed.wait_for(lambda: self.drained or bool(self._away), CLOSE)
+            self._changed.wait_for(
+                lambda: self.is_drained or bool(self._store_error), CLOSE_SECONDS
+            )
             self._closed = True
             self._changed.notify_all()
         for thread in self._threads[:2]:
-            thread.join(CLOSE)
-        if self.drained and not any(thread.is_alive() for thread in self._threads[:2]):
+            thread.join(CLOSE_SECONDS)
+        if self.is_drained and not any(thread.is_alive() for thread in self._threads[:2]):
             self.store.close()
         elif self._journal is not None:
-            log.warning("the store was left, its journal %s holds what it lacks: %s", self._journal.path, self.fault)
-            self.store.database.close(waiting=False)  # else its lease on the cell would outlive the engine
+            log.warning(
+                "the store was left, its journal %s holds what it lacks: %s",
+                self._journal.path,
+                self.fault,
+            )
+            self.store.database.close(
+                waiting=False
+            )  # else its lease on the cell would outlive the engine
             self._journal.close()
 
     # The thread that writes the journal
 
-    def _keep_writing(self, journal: Journal) -> None:
+    def _write_loop(self, journal: Journal) -> None:
+        """Write and sync new records in batches until closed.
+
+        After an error, try the same batch again.
+        """
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._unwritten or self._closed)
-                self._changed.wait_for(lambda: self._to_sync > self._synced or self._closed, LINGER)
+                self._changed.wait_for(
+                    lambda: self._to_sync > self._synced or self._closed, BATCH_SECONDS
+                )
                 if not (batch := list(self._unwritten)):
                     return
                 self._sync_began = time.monotonic()
             try:
-                self._write(journal, batch)
+                self._write_batch(journal, batch)
             except Exception as error:  # whatever it is, the cell goes on, and this thread too
                 with self._changed:
-                    self._stuck, self._tries, self._sync_began = str(error), self._tries + 1, math.inf
+                    self._journal_error = str(error)
+                    self._n_failed_syncs += 1
+                    self._sync_began = math.inf
                     self._changed.notify_all()
                     if self._closed:
                         return
-                    self._changed.wait(BEAT)
+                    self._changed.wait(RETRY_SECONDS)
 
-    def _write(self, journal: Journal, batch: Sequence[Record]) -> None:
+    def _write_batch(self, journal: Journal, batch: Sequence[Record]) -> None:
+        """Append records to the journal and sync it.
+
+        A large journal is cleared first, a lost one created again.
+        """
         if journal.end > 8 << 20:
             with self._changed:  # a cell that never pauses would fill the disk
                 self._to_drain = max(self._to_drain, self._synced)
                 self._changed.notify_all()
-                if empty := self._changed.wait_for(lambda: journal.empty, LINGER):
+                if is_drained := self._changed.wait_for(lambda: journal.is_drained, BATCH_SECONDS):
                     journal.clear()
-            if empty:
+            if is_drained:
                 journal.reserve()  # without the lock: a disk that hangs would hang the cell
-        blobs = [to_bytes(record) for record in batch]
+        blobs = [encode_record(record) for record in batch]
         try:
             offsets = journal.append(blobs)
         except LostJournalError as error:
-            log.error("%s It is made anew with what the store lacks.", error)
-            with self._changed:  # nobody reads or marks it meanwhile
-                journal.remake()
+            log.error("%s It is created again with what the store lacks.", error)
+            with self._changed:  # nobody reads it or writes its header meanwhile
+                journal.recreate()
             offsets = journal.append(blobs)
-            self.event("journal", f"{error} It was made anew with what the store lacked.")
+            self.record_event(
+                "journal", f"{error} It was created again with what the store lacked."
+            )
         with self._changed:
-            for record, at in zip(batch, offsets, strict=True):
+            for record, offset in zip(batch, offsets, strict=True):
                 self._unwritten.popleft()
-                if isinstance(record, StoredDecision) and self._decisions.get(record.decision.id) is record:
-                    self._decisions[record.decision.id] = at
+                if (
+                    isinstance(record, StoredDecision)
+                    and self._decisions.get(record.decision.id) is record
+                ):
+                    self._decisions[record.decision.id] = offset
             self._synced += len(batch)
-            self._stuck, self._sync_began = "", math.inf
+            self._journal_error = ""
+            self._sync_began = math.inf
             self._changed.notify_all()
 
-    # The thread that drains it into the store
+    # The thread that drains the journal into the store
 
-    def _keep_draining(self, journal: Journal) -> None:
+    def _drain_loop(self, journal: Journal) -> None:
+        """Drain synced records and run submitted calls until closed.
+
+        After an error, try again later.
+        """
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._jobs or self._drained < self._synced or self._closed)
-                self._changed.wait_for(lambda: self._jobs or self._to_drain > self._drained or self._closed, DRAIN)
-                job = self._jobs.popleft() if self._jobs else None
+                self._changed.wait_for(
+                    lambda: self._calls or self._drained < self._synced or self._closed
+                )
+                self._changed.wait_for(
+                    lambda: self._calls or self._to_drain > self._drained or self._closed,
+                    DRAIN_SECONDS,
+                )
+                call = self._calls.popleft() if self._calls else None
             try:
                 while self._drained < self._synced:
-                    self._take(journal)
-                self._away = ""
+                    self._drain_chunk(journal)
+                self._store_error = ""
             except Exception as error:  # whatever it is, the cell goes on, and this thread too
-                if not self._away:
+                if not self._store_error:
                     log.warning("labels wait in the journal beside the store: %s", error)
                 with self._changed:
-                    self._away = str(error)
+                    self._store_error = str(error)
                     self._changed.notify_all()
-            if job is not None:
-                self._run(*job)
+            if call is not None:
+                self._run_call(*call)
             with self._changed:
-                if self._closed and (self._away or self._drained == self._synced) and not self._jobs:
+                if (
+                    self._closed
+                    and (self._store_error or self._drained == self._synced)
+                    and not self._calls
+                ):
                     return
-                if self._away:
-                    self._changed.wait_for(lambda: self._jobs or self._closed, BEAT)
+                if self._store_error:
+                    self._changed.wait_for(lambda: self._calls or self._closed, RETRY_SECONDS)
 
-    def _take(self, journal: Journal) -> None:
-        """Have the store take a piece of what is synced."""
+    def _drain_chunk(self, journal: Journal) -> None:
+        """Have the store take the oldest synced records, at most DRAIN_CHUNK, at once."""
         with self._changed:
-            n = min(CHUNK, self._synced - self._drained)
-        found = [(at, end, from_bytes(blob)) for at, end, blob in islice(journal.records(), n)]
-        with self._changed:  # without the decisions that another one is in the place of
+            n = min(DRAIN_CHUNK, self._synced - self._drained)
+        entries = [
+            (offset, end, decode_record(blob))
+            for offset, end, blob in islice(journal.undrained_records(), n)
+        ]
+        with self._changed:  # without the decisions that were replaced
             records = [
                 record
-                for at, _, record in found
-                if not isinstance(record, StoredDecision) or self._decisions.get(record.decision.id) == at
+                for offset, _, record in entries
+                if not isinstance(record, StoredDecision)
+                or self._decisions.get(record.decision.id) == offset
             ]
-        arrived = self.store.take(records)
+        numbers = self.store.apply_records(records)
         with self._changed:
-            journal.drained = found[-1][1]
-            self._mark()
-            self._was_taken(records, arrived)
+            journal.drained_to = entries[-1][1]
+            self._save_newest_entry()
+            self._remove_drained(records, numbers)
             for _ in range(n):
                 self._times.popleft()
             self._drained += n
             self._changed.notify_all()
 
-    def _run(self, future: Future[Any], work: Callable[[], Any]) -> None:
-        """Make a call, unless it was given up; what it raises is raised where its result is asked for."""
+    def _run_call(self, future: Future[Any], call: Callable[[], Any]) -> None:
+        """Run a submitted call, unless it was cancelled; set the future's result or exception."""
 
-        def wanted() -> bool:
-            return future.running() or (not future.cancelled() and future.set_running_or_notify_cancel())
+        def is_wanted() -> bool:
+            return future.running() or (
+                not future.cancelled() and future.set_running_or_notify_cancel()
+            )
 
         if future.cancelled():
             return
         try:
-            with self.store.database.committing(wanted):
-                result = work()
+            with self.store.database.commit_if(is_wanted):
+                result = call()
         except BaseException as error:
-            if wanted():
+            if is_wanted():
                 future.set_exception(error)
         else:
-            if wanted():
+            if is_wanted():
                 future.set_result(result)

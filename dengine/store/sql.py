@@ -4,7 +4,7 @@
     store = SqlStore("postgresql+psycopg://user:password@host/database", cell_id="cell-7")
 
 What a returned call promises, given a disk that keeps what it synced: all that is put is committed. An engine does not put
-what it decides: that goes into a journal first, and from there, by `take`, into the database.
+what it decides: that goes into a journal first, and from there, by `apply_records`, into the database.
 """
 
 import math
@@ -95,8 +95,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         None: all keep them. A retrain itself stays listed for ever.
 
     SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may open one
-    cell: label numbers stay unique and increasing. Engines own their cell (`own`): a second one is refused.
-    before_use : called before each use of it but `take`, so that it sees what is on its way into it.
+    cell: label numbers stay unique and increasing. Engines own their cell (`claim_cell`): a second one is refused.
+    before_use : called before each use of it but `apply_records`, so that it sees what is on its way into it.
     In memory it has no journal, nobody owns it, `close` leaves it as it is, and one thread at a time may use it.
     """
 
@@ -601,7 +601,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
     # The one engine that owns the cell
 
-    def own(self) -> Journal | None:
+    def claim_cell(self) -> Journal | None:
         """Claim the cell for one engine; its journal, None where there is none. StoreError where another engine has it."""
         if self.wait is None:
             return None
@@ -611,21 +611,21 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         journal = Journal(journal_path(self.database.url, self.cell_id))
         try:
             if not in_file:
-                self.database.lease()
+                self.database.acquire_lease()
         except StoreError:
             journal.close()
             raise
         self._journal = journal
         return journal
 
-    def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+    def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
         """Commit what a journal holds, all or none; returns the numbers of its labels by their decisions.
 
         What is there already, and is the same, counts as taken. Another decision of the same id, a label on that, or a
         second label becomes an event, "dead letter": it is never guessed which one is right.
         """
         if self.wait is not None:
-            return self.database.take(records)
+            return self.database.apply_records(records)
         numbers: list[tuple[str, int]] = []
         for each in records:
             if isinstance(each, StoredDecision) and each.decision.id not in self._held:
@@ -634,7 +634,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
                 numbers.append((each.decision_id, self._labels + len(numbers) + 1))  # nobody else gives any
                 self._held[each.decision_id] = True
             elif not isinstance(each, Event):  # what is there already, or contradicts it
-                numbers = self.database.take(records)
+                numbers = self.database.apply_records(records)
                 self._held |= dict.fromkeys((name for name, _ in numbers), True)
                 break
         else:
@@ -648,7 +648,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self._write_trained()
         waiting, self._waiting = self._waiting, []
         for part in chunks(waiting):
-            self.database.take(part)
+            self.database.apply_records(part)
 
     def close(self) -> None:
         """Disconnect."""

@@ -22,7 +22,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from .connections import integrity, reading
-from .journal import journal_path, newest_known, waiting_records
+from .journal import journal_path, read_newest_entries, read_undrained
 from .ledger import START, entry_digest, ledger_key, must_have_key, row_sum, rows_digest, settings_faults, state_sum
 from .records import CHUNK
 from .schema import CHAINED, DECISION, LABEL, LEDGER, METADATA, SCHEMA_KEY, SETTING, TRACE, VERSION
@@ -88,7 +88,7 @@ def verify_history(
     with reading(str(url)) as connection:
         names = _chosen_cells(connection, cell_id)
         journals = {name: journal_path(connection.engine.url, name) for name in names}
-        known = {name: newest_known(path) for name, path in journals.items()}
+        known = {name: read_newest_entries(path) for name, path in journals.items()}
         waiting = {name: _count_waiting(path) for name, path in journals.items()}
     with reading(str(url)) as connection:  # anew: what the journals knew is in the store as it is now
         pages = integrity(connection) if connection.dialect.name == "sqlite" else []
@@ -112,7 +112,7 @@ def verify_history(
 
 def _count_waiting(journal: Path) -> int | None:
     with suppress(StoreError):  # it is damaged, or another user's
-        return len(waiting_records(journal)) if journal.exists() else None
+        return len(read_undrained(journal)) if journal.exists() else None
     return None
 
 

@@ -213,7 +213,7 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
         for i, damaged in enumerate(EXTREME.values()):
             trace = np.asarray(damaged(X[150 + i]), dtype=np.float32)[None]
             item = StoredDecision(decision(f"extreme {i}"), trace, 1 + i, False, store.clock())
-            store.take(labelled(item, bool(y[150 + i])))
+            store.apply_records(labelled(item, bool(y[150 + i])))
     engine = DataEngine.open(tmp_path / "e.db", reducer=TEACHABLE[name](), replaying=True)
     if first:
         learn(range(150))

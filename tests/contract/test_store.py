@@ -72,7 +72,9 @@ def test_labels_in_one_batch_are_numbered_in_the_order_given(store: SqlStore) ->
 
 def test_a_batch_longer_than_a_chunk_is_taken_whole(store: SqlStore) -> None:
     names = [str(i) for i in range(1203)]
-    store.take([StoredDecision(decision(name), np.zeros((1, 2), np.float32), int(name), False, 1.0) for name in names])
+    store.apply_records(
+        [StoredDecision(decision(name), np.zeros((1, 2), np.float32), int(name), False, 1.0) for name in names]
+    )
     assert put_labels(store, *(label(name, silent=1) for name in names)) == list(range(1, 1204))
     assert store.labelled().hashes.tolist() == list(range(1203))
     assert store.silent_total() == 1203
@@ -117,7 +119,7 @@ def test_what_is_imported_is_labelled_and_numbered_after_what_was_there(store: S
     traces, hashes, labels = trace(1, (3, 2, 30)), [5, -5, 6], [1, 0, 1]
     decisions = [replace(decision(name), part=part) for name, part in zip("bcd", ["x", None, "z"], strict=True)]
     for made, x, hash_, good in zip(decisions, traces, hashes, labels, strict=True):
-        assert len(store.take(labelled(StoredDecision(made, x, hash_, False, 1.0), good))) == 1
+        assert len(store.apply_records(labelled(StoredDecision(made, x, hash_, False, 1.0), good))) == 1
     assert [store.get_decision(name).decision for name in "bcd"] == decisions
     found = store.labelled(3)
     np.testing.assert_array_equal(found.traces, traces)
@@ -241,12 +243,12 @@ def test_status_counts_what_was_put(store: SqlStore) -> None:
 def test_in_memory_a_label_has_its_number_before_anything_is_written() -> None:
     store = SqlStore()
     made = [StoredDecision(decision(name), trace(), 1, False, 1.0) for name in "abcd"]
-    store.take(labelled(made[0], True)[:1])
-    assert store.take(labelled(made[0], True)[1:]) == [("a", 1)]
-    assert store.take(labelled(made[1], False) + labelled(made[2], True)) == [("b", 2), ("c", 3)]
+    store.apply_records(labelled(made[0], True)[:1])
+    assert store.apply_records(labelled(made[0], True)[1:]) == [("a", 1)]
+    assert store.apply_records(labelled(made[1], False) + labelled(made[2], True)) == [("b", 2), ("c", 3)]
     assert store.labelled().labels.tolist() == [1, 0, 1]
-    assert store.take([*labelled(made[3], True), *labelled(made[1], False)]) == [("d", 4), ("b", 2)]
-    assert store.take(labelled(made[3], False)) == []  # a second label, which is set aside
+    assert store.apply_records([*labelled(made[3], True), *labelled(made[1], False)]) == [("d", 4), ("b", 2)]
+    assert store.apply_records(labelled(made[3], False)) == []  # a second label, which is set aside
     assert store.labelled().seq.tolist() == [1, 2, 3, 4]
     assert [event.kind for event in store.events()] == ["dead letter"]
 

@@ -11,14 +11,14 @@ import pytest
 
 from dengine import Action, DataEngine, Dataset, Source
 from dengine.errors import ReportError
-from dengine.store.outbox import TakenIds
+from dengine.store.outbox import BloomFilter
 from tests.support.driving import RECIPE, drive
 
 
 def test_taken_ids_are_never_taken_for_new_ones() -> None:
-    taken = TakenIds(f"order-{i}" for i in range(20_000))
-    assert all(taken.may_hold(f"order-{i}") for i in range(20_000))
-    assert not any(taken.may_hold(f"part-{i}") for i in range(1_000))
+    taken = BloomFilter(f"order-{i}" for i in range(20_000))
+    assert all(taken.may_contain(f"order-{i}") for i in range(20_000))
+    assert not any(taken.may_contain(f"part-{i}") for i in range(1_000))
 
 
 @pytest.mark.parametrize("stored", [False, True])

@@ -38,7 +38,7 @@ def put_decision(
 ) -> None:
     """A decision and its trace, (C, T) or (T,)."""
     values = np.array(trace, dtype=np.float32, ndmin=2)
-    store.take([StoredDecision(decision, values, content_hash, quarantined, store.clock())])
+    store.apply_records([StoredDecision(decision, values, content_hash, quarantined, store.clock())])
 
 
 def labelled(item: StoredDecision, success: bool) -> list[StoredDecision | NewLabel]:
@@ -53,7 +53,7 @@ def put_labels(store: SqlStore, *labels: NewLabel) -> list[int]:
     for label in labels:
         held = store.get_decision(label.decision_id, trace=False)
         taken.append(replace(label, time=now, content_hash=held.content_hash, decided=held.time))
-    numbers = dict(store.take(taken))
+    numbers = dict(store.apply_records(taken))
     return [numbers[label.decision_id] for label in labels]
 
 

@@ -40,7 +40,7 @@ def write(store: SqlStore, n: int = 12) -> SqlStore:
     put_label(store, "d0", True, Source.VERIFICATION, 1, points[0], silent=2)
     put_labels(store, *[NewLabel(f"d{i}", i % 2 == 0, Source.AUDIT, 1, points[i], overdue_to=i) for i in range(1, n - 2)])
     imported = (labelled(StoredDecision(decision(f"i{i}"), traces[i], i, False, 1.0), True) for i in range(4))
-    store.take([record for pair in imported for record in pair])
+    store.apply_records([record for pair in imported for record in pair])
     for version in (1, 2):
         store.put_version(report(version), 5, {"w": rng.normal(size=40)})
     store.put_version(report(2, accepted=False), 6, None)

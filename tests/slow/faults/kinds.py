@@ -538,7 +538,7 @@ def asked_again(outcome: Outcome, place: Place, stored: int = 0) -> None:
     nothing = cell.engine.decide(np.zeros(X.shape[1]))
     for start in range(0, stored, 5000):
         ids = (f"stored-{i}" for i in range(start, min(start + 5000, stored)))
-        cell.engine.store.take([StoredDecision(replace(nothing, id=id_), X[:1], 1, True, 0.0) for id_ in ids])
+        cell.engine.store.apply_records([StoredDecision(replace(nothing, id=id_), X[:1], 1, True, 0.0) for id_ in ids])
     known = [cell.timed(lambda i=i: cell.engine.decide(X[i], decision_id=f"part-{i}")) for i in range(IDS)]
     cell.engine.close()
     cell.engine = engine = DataEngine.open(place.store())  # which has none of them by heart

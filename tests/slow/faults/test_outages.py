@@ -18,7 +18,7 @@ import sqlalchemy as sa
 from dengine import Action, DataEngine, Decision, Reason, Source
 from dengine.errors import StoreError
 from dengine.store import Event, NewLabel, StoredDecision
-from dengine.store.journal import FRAME, Journal, from_bytes, to_bytes
+from dengine.store.journal import FRAME, Journal, decode_record, encode_record
 from tests.slow.faults.__main__ import faults
 from tests.slow.faults.harness import RECIPE, Cell, Outcome, Place
 from tests.slow.faults.kinds import ON_DISKS, Hung, killed_server, lock
@@ -118,7 +118,7 @@ def test_an_executor_that_was_shut_down_is_replaced_by_retrains_in_line(place: P
 def left(path: Path) -> tuple[list[bytes], int, bool]:
     """What a journal holds when it is opened again, how much of it is damaged, and whether its end was dropped."""
     with contextlib.closing(Journal(path)) as again:
-        return [record for _, _, record in again.records()], again.damaged, again.dropped > 0
+        return [record for _, _, record in again.undrained_records()], again.damaged, again.dropped > 0
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_what_is_damaged_in_a_journal_is_noticed_and_costs_none_behind_it(
     path = tmp_path / "a.journal"
     journal = Journal(path)
     offsets = journal.append([bytes([65 + i]) * 50 for i in range(5)])
-    journal.let_go()
+    journal.close()
     path.write_bytes(damage(path.read_bytes(), offsets))
     for again in (False, True):  # and goes on behind what is there
         records, found, dropped = left(path)
@@ -172,7 +172,7 @@ def test_a_label_and_an_event_in_a_journal_return_bit_for_bit(tmp_path: Path) ->
     point = np.array([0.1, -7e-30], dtype=np.float32)
     label = NewLabel("part 7", True, Source.CONFIRMED, 3, point, 5, 12.25, -(2**63), 0.1)
     event = Event(0, 3.5, "safe mode", "began: ä", {"a": [1, None]})
-    back, event_back = (from_bytes(to_bytes(record)) for record in (label, event))
+    back, event_back = (decode_record(encode_record(record)) for record in (label, event))
     np.testing.assert_array_equal(back.point, point)
     assert replace(back, point=None) == replace(label, point=None)
     assert event_back == event
@@ -187,14 +187,14 @@ def test_what_a_journal_holds_of_another_decision_of_an_id_is_set_aside_with_its
     label = NewLabel("part 7", False, Source.VERIFICATION, 0, None, content_hash=1)
     with place.store() as store:
         for _ in range(2):  # the same again is taken, and counts once
-            assert store.take([first]) == []
-        assert store.take([other, replace(label, time=5.0, decided=other.time)]) == []
+            assert store.apply_records([first]) == []
+        assert store.apply_records([other, replace(label, time=5.0, decided=other.time)]) == []
         assert (store.get_decision("part 7").success, store.status()["labels"]) == (None, 0)
         texts = [event.text for event in store.events()]
         assert [event.kind for event in store.events()] == ["dead letter", "dead letter"]
         assert "data" in texts[0]
         assert "another decision" in texts[1]
         for _ in range(2):
-            assert store.take([replace(label, time=6.0, decided=first.time)]) == [("part 7", 1)]
-        assert store.take([replace(label, time=7.0, decided=first.time, success=True)]) == []
+            assert store.apply_records([replace(label, time=6.0, decided=first.time)]) == [("part 7", 1)]
+        assert store.apply_records([replace(label, time=7.0, decided=first.time, success=True)]) == []
         assert "a second label" in store.events()[-1].text
