@@ -18,7 +18,13 @@ def run(command: list[str], folder: Path) -> str:
     """Run a command outside the repository; return what it printed."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     completed = subprocess.run(
-        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+        command,
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
     )
     assert completed.returncode == 0, completed.stdout
     return completed.stdout
@@ -29,10 +35,15 @@ def distributions(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the sdist, and the wheel that is built from it."""
     source = tmp_path_factory.mktemp("source")
     subprocess.run(
-        f"git -C '{repo}' ls-files -z | tar -C '{repo}' --null -T - -c | tar -C '{source}' -x", shell=True, check=True
+        f"git -C '{repo}' ls-files -z | tar -C '{repo}' --null -T - -c | tar -C '{source}' -x",
+        shell=True,
+        check=True,
     )
     folder = tmp_path_factory.mktemp("dist")
-    run([sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(source)], folder)
+    run(
+        [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(source)],
+        folder,
+    )
     return folder
 
 
@@ -40,20 +51,34 @@ def test_both_files_pass_the_checks_of_the_package_index(distributions: Path) ->
     files = sorted(distributions.iterdir())
     assert [file.name.split("-")[0] for file in files] == ["dengine", "dengine"]
     assert {"".join(file.suffixes)[-4:] for file in files} == {".whl", "r.gz"}
-    printed = run([sys.executable, "-m", "twine", "check", "--strict", *map(str, files)], distributions)
+    printed = run(
+        [sys.executable, "-m", "twine", "check", "--strict", *map(str, files)], distributions
+    )
     assert printed.count("PASSED") == 2
 
 
 @pytest.mark.parametrize("python", PYTHONS)
-def test_the_wheel_alone_runs_the_readmes_example(python: str, distributions: Path, repo: Path, tmp_path: Path) -> None:
+def test_the_wheel_alone_runs_the_readmes_example(
+    python: str, distributions: Path, repo: Path, tmp_path: Path
+) -> None:
     interpreter = shutil.which(python)
     if interpreter is None:
         pytest.skip(f"{python} is not on this machine")
     (wheel,) = distributions.glob("*.whl")
     run([interpreter, "-m", "venv", "clean"], tmp_path)
-    install = ["clean/bin/python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]
+    install = [
+        "clean/bin/python",
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--disable-pip-version-check",
+        "--no-compile",
+    ]
     run([*install, "--constraint", str(repo / "constraints.txt"), str(wheel)], tmp_path)
-    example, *_ = re.findall(r"```python\n(.*?)```", (repo / "README.md").read_text("utf-8"), re.DOTALL)
+    example, *_ = re.findall(
+        r"```python\n(.*?)```", (repo / "README.md").read_text("utf-8"), re.DOTALL
+    )
     (tmp_path / "example.py").write_text(example, "utf-8")
     assert "accepted" in run(["clean/bin/python", "-I", "example.py"], tmp_path)
     assert "dengine" in run(["clean/bin/dengine", "--version"], tmp_path)
