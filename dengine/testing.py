@@ -21,7 +21,7 @@ from sklearn.base import BaseEstimator, clone
 from .cells.replay import ReplayCell
 from .datasets import Dataset
 from .decision.policy import Policy
-from .decision.rule import script
+from .decision.scripting import script
 from .engine.engine import DataEngine
 from .folds import content_fold
 from .recipe import Recipe

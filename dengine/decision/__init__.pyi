@@ -3,6 +3,7 @@ from .intervals import INTERVALS as INTERVALS
 from .intervals import binomial_interval as binomial_interval
 from .intervals import clopper_pearson_interval as clopper_pearson_interval
 from .intervals import jeffreys_interval as jeffreys_interval
+from .intervals import wald_interval as wald_interval
 from .intervals import wilson_interval as wilson_interval
 from .policy import RULES as RULES
 from .policy import Policy as Policy

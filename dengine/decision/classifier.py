@@ -10,9 +10,10 @@ from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ..records import ACTIONS
+from .neighbours import RadiusNeighbours
 from .policy import Policy, check_radius
 from .references import Counts, RadiusIndex
-from .rule import DecisionRule, RadiusNeighbours
+from .rule import DecisionRule
 
 
 class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
@@ -92,7 +93,9 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         check_radius(self.radius)
         return Policy(self.alpha, self.lower_bound, self.interval)
 
-    def around(self, index: RadiusIndex, rule: DecisionRule | None = None, scored: bool = False) -> RadiusNeighbours:
+    def neighbours_over(
+        self, index: RadiusIndex, rule: DecisionRule | None = None, scored: bool = False
+    ) -> RadiusNeighbours:
         """What decides over the points of `index`, by these settings; `rule` in place of the policy's own.
 
         scored : whether the first axis is a probability of success, which a rule that only sorts takes for its score.
@@ -102,7 +105,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
     def _start(self, dim: int) -> None:
         self.index_ = RadiusIndex(dim, self.capacity)
-        self.neighbours_ = self.around(self.index_)
+        self.neighbours_ = self.neighbours_over(self.index_)
 
     def _add(self, Z: Any, y: Any) -> Self:
         success = np.asarray(y) == self.classes_[-1]

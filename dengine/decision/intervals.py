@@ -4,11 +4,19 @@
     >>> wilson_interval(96, 4, alpha=0.05)  # the paper's "Wilson Formula results" (b), first row
     (0.901..., 0.984...)
 
-All are two-sided at error level alpha: z is the 1 - alpha/2 normal quantile, each tail holds alpha/2.
-All take integer arrays of one shape and return `(lower, upper)`, float64 of that shape (floats for scalars),
-with `0 <= lower <= n_success / n <= upper <= 1`. Without neighbours nothing is known: (0, 1).
+The public functions take integer arrays and return `(lower, upper)` with
+`0 <= lower <= n_success / n <= upper <= 1`. Each interval is two-sided at error level alpha: z is the
+1 - alpha / 2 quantile of the normal distribution, and each tail holds alpha / 2. Where nothing was
+counted, the interval is (0, 1). `INTERVALS` lists them by name.
+
+The Wilson and the Wald formula stand here twice, and nowhere else. `wilson_limits` and `wald_limits`
+are written for NumPy arrays and for PyTorch tensors alike (they are given the library as `xp`): the
+public functions and the ONNX export share them. `wilson_bound` and `wald_bound` take two integers:
+TorchScript compiles only functions with fixed scalar types, and a tensor operation for each of the
+dozen steps would slow down every decision.
 """
 
+import math
 from collections.abc import Callable
 from statistics import NormalDist
 from typing import Any
@@ -18,100 +26,281 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import expect
 
-SORTED = ("pooled", "cost")  # guarantees under which the interval around a trace only sorts
-SORTING = 0.5  # two-sided error level of an interval that only sorts: z = 0.67
+SORTING_GUARANTEES = ("pooled", "cost")  # under these the interval around a trace only sorts parts
+SORTING_ERROR_LEVEL = 0.5  # of an interval that only sorts: z = 0.67
 Bounds = tuple[Any, Any]  # two floats for scalar counts, two float64 arrays otherwise
 Interval = Callable[[ArrayLike, ArrayLike, float], Bounds]
+ScalarBound = Callable[[int, int, float], tuple[float, float]]
 FloatArray = NDArray[np.float64]
 
 
-def level_of(alpha: float, guarantee: str) -> float:
-    """Error level of the interval around a trace, for each guarantee."""
-    return SORTING if guarantee in SORTED else alpha
+def interval_error_level(alpha: float, guarantee: str) -> float:
+    """Return the error level of the interval around one trace under a guarantee.
+
+    Parameters
+    ----------
+    alpha : float
+        The policy's error level.
+    guarantee : str
+        A name in `policy.RULES`, or `module:Class`.
+
+    Returns
+    -------
+    float
+        `SORTING_ERROR_LEVEL` where the interval only sorts parts, else `alpha`.
+    """
+    return SORTING_ERROR_LEVEL if guarantee in SORTING_GUARANTEES else alpha
 
 
 def normal_quantile(alpha: float) -> float:
-    """Z of a two-sided interval: the 1 - alpha/2 quantile of the standard normal distribution."""
-    told = 0.0 < alpha / 2.0 < 1.0 - alpha / 2.0 < 1.0  # one that is too small to be told from 0 is none either
-    expect(told, "0 < alpha < 1", alpha, "0.05 asks for a 95 % interval")
+    """Return z of a two-sided interval: the 1 - alpha / 2 quantile of the normal distribution.
+
+    Raises
+    ------
+    SettingError
+        If alpha is not between 0 and 1, or too small to be told from 0.
+    """
+    valid = 0.0 < alpha / 2.0 < 1.0 - alpha / 2.0 < 1.0
+    expect(valid, "0 < alpha < 1", alpha, "0.05 asks for a 95 % interval")
     return NormalDist().inv_cdf(1.0 - alpha / 2.0)
 
 
 def wilson_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05) -> Bounds:
-    """Wilson score interval of a success probability.
+    """Compute the Wilson score interval of a success probability.
 
-    n_success, n_failure : int arrays of one shape, counts within the radius.
-    alpha : two-sided error level; z is the 1 - alpha/2 normal quantile.
-    Returns (lower, upper), float64, same shape. No neighbours: (0, 1), nothing is known yet.
-    Source: Wilson (1927), JASA 22(158); the paper's equation for the Wilson score interval.
+    Parameters
+    ----------
+    n_success, n_failure : array of int, of one shape
+        Labels of each kind within the radius.
+    alpha : float, default 0.05
+        Error level; the interval is two-sided, with z at 1 - alpha / 2.
+
+    Returns
+    -------
+    lower, upper : float64 array of that shape, or float for scalar counts
+        (0, 1) where nothing was counted.
+
+    Raises
+    ------
+    SettingError
+        If alpha is not between 0 and 1.
+    ValueError
+        If the shapes differ or a count is negative.
+
+    References
+    ----------
+    Wilson (1927), JASA 22(158); the paper's equation for the Wilson score interval.
     """
     z = normal_quantile(alpha)
-    n_s, n_f, k = _counts(n_success, n_failure)
-    k_safe = np.maximum(k, 1.0)
-    centre = (n_s + z * z / 2.0) / (k + z * z)
-    half = z / (k + z * z) * np.sqrt(n_s * n_f / k_safe + z * z / 4.0)
-    return _tidy(centre - half, centre + half, n_s, k)
+    successes, failures = _as_counts(n_success, n_failure)
+    return _as_floats(*wilson_limits(np, successes, failures, z))
 
 
-def binomial_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05) -> Bounds:
-    """Binomial (Wald) interval: the paper's baseline, Eq. 1. One neighbour already gives [1, 1]: not a bound to rely on.
+def wald_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05) -> Bounds:
+    """Compute the Wald interval, the normal approximation; the paper's baseline, Eq. 1.
 
-    Arguments and result as `wilson_interval`. Source: Brown, Cai and DasGupta (2001), Statistical Science 16(2).
+    A single neighbour already gives [1, 1], so it is not a bound to rely on. The paper calls it the
+    binomial interval; `binomial_interval` and the setting "binomial" are the same function.
+
+    Parameters
+    ----------
+    n_success, n_failure : array of int, of one shape
+        Labels of each kind within the radius.
+    alpha : float, default 0.05
+        Error level; the interval is two-sided, with z at 1 - alpha / 2.
+
+    Returns
+    -------
+    lower, upper : float64 array of that shape, or float for scalar counts
+        (0, 1) where nothing was counted.
+
+    References
+    ----------
+    Brown, Cai and DasGupta (2001), Statistical Science 16(2).
     """
     z = normal_quantile(alpha)
-    n_s, n_f, k = _counts(n_success, n_failure)
-    k_safe = np.maximum(k, 1.0)
-    half = z / np.sqrt(k_safe) * np.sqrt(n_s * n_f / k_safe**2)
-    return _tidy(n_s / k_safe - half, n_s / k_safe + half, n_s, k)
+    successes, failures = _as_counts(n_success, n_failure)
+    return _as_floats(*wald_limits(np, successes, failures, z))
 
 
-def clopper_pearson_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05) -> Bounds:
-    """Clopper-Pearson interval: never covers less than 1 - alpha, for any probability and any count.
+binomial_interval = wald_interval  # the paper's name
 
-    Arguments and result as `wilson_interval`. Source: Clopper and Pearson (1934), Biometrika 26(4).
+
+def clopper_pearson_interval(
+    n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05
+) -> Bounds:
+    """Compute the Clopper-Pearson interval, which never covers with less than 1 - alpha.
+
+    Parameters
+    ----------
+    n_success, n_failure : array of int, of one shape
+        Labels of each kind within the radius.
+    alpha : float, default 0.05
+        Error level; the interval is two-sided.
+
+    Returns
+    -------
+    lower, upper : float64 array of that shape, or float for scalar counts
+        (0, 1) where nothing was counted.
+
+    References
+    ----------
+    Clopper and Pearson (1934), Biometrika 26(4).
     """
     return _beta_interval(n_success, n_failure, alpha, 0.0, 1.0)
 
 
 def jeffreys_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05) -> Bounds:
-    """Jeffreys interval: equal-tailed credible interval under the Beta(1/2, 1/2) prior, ends closed at 0 and n successes.
+    """Compute the Jeffreys interval: equal-tailed credible interval under a Beta(1/2, 1/2) prior.
 
-    Arguments and result as `wilson_interval`. Source: Brown, Cai and DasGupta (2001), Statistical Science 16(2), 4.1.1.
+    The lower end is 0 without a success, the upper end 1 without a failure.
+
+    Parameters
+    ----------
+    n_success, n_failure : array of int, of one shape
+        Labels of each kind within the radius.
+    alpha : float, default 0.05
+        Error level; the interval is two-sided.
+
+    Returns
+    -------
+    lower, upper : float64 array of that shape, or float for scalar counts
+        (0, 1) where nothing was counted.
+
+    References
+    ----------
+    Brown, Cai and DasGupta (2001), Statistical Science 16(2), section 4.1.1.
     """
     return _beta_interval(n_success, n_failure, alpha, 0.5, 0.5)
 
 
 INTERVALS: dict[str, Interval] = {
     "wilson": wilson_interval,
-    "binomial": binomial_interval,
+    "binomial": wald_interval,
     "clopper_pearson": clopper_pearson_interval,
     "jeffreys": jeffreys_interval,
 }
 
 
-def _beta_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float, own: float, other: float) -> Bounds:
-    """Quantiles of a Beta distribution; own, other : what is added to the counts of its side and of the other one."""
+def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any, Any]:
+    """Compute Wilson limits of float64 arrays (`xp` is numpy) or tensors (`xp` is torch).
+
+    Parameters
+    ----------
+    xp : module
+        `numpy` or `torch`, whose functions are used.
+    n_success, n_failure : float64 array or tensor, of one shape
+        Counts of each kind.
+    z : float
+        Normal quantile, see `normal_quantile`.
+
+    Returns
+    -------
+    lower, upper : float64 array or tensor of that shape
+        (0, 1) where nothing was counted.
+    """
+    n = xp.where(n_success + n_failure > 0.0, n_success + n_failure, 1.0)
+    centre = (n_success + z * z / 2.0) / (n + z * z)
+    half_width = z / (n + z * z) * xp.sqrt(n_success * n_failure / n + z * z / 4.0)
+    return _clip_limits(xp, centre - half_width, centre + half_width, n_success, n_failure)
+
+
+def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any, Any]:
+    """Compute Wald limits of arrays or tensors; parameters and result as of `wilson_limits`."""
+    n = xp.where(n_success + n_failure > 0.0, n_success + n_failure, 1.0)
+    half_width = z / xp.sqrt(n) * xp.sqrt(n_success * n_failure / (n * n))
+    rate = n_success / n
+    return _clip_limits(xp, rate - half_width, rate + half_width, n_success, n_failure)
+
+
+def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
+    """Compute `wilson_interval` of two integers at the normal quantile z; TorchScript compiles it.
+
+    Returns lower and upper, (0, 1) where both counts are 0.
+    """
+    total = float(n_success + n_failure)
+    if total == 0.0:
+        return 0.0, 1.0
+    rate = n_success / total
+    centre = (n_success + z * z / 2.0) / (total + z * z)
+    half_width = z / (total + z * z) * math.sqrt(n_success * n_failure / total + z * z / 4.0)
+    return max(0.0, min(centre - half_width, rate)), min(1.0, max(centre + half_width, rate))
+
+
+def wald_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
+    """Compute `wald_interval` of two integers at the normal quantile z; TorchScript compiles it.
+
+    Returns lower and upper, (0, 1) where both counts are 0.
+    """
+    total = float(n_success + n_failure)
+    if total == 0.0:
+        return 0.0, 1.0
+    rate = n_success / total
+    half_width = z / math.sqrt(total) * math.sqrt(n_success * n_failure / (total * total))
+    return max(0.0, min(rate - half_width, rate)), min(1.0, max(rate + half_width, rate))
+
+
+SCALAR_BOUNDS: dict[str, ScalarBound] = {"wilson": wilson_bound, "binomial": wald_bound}
+ARRAY_LIMITS = {"wilson": wilson_limits, "binomial": wald_limits}  # of the same intervals
+
+
+def scalar_interval(
+    interval: str, alpha: float, n_success: int, n_failure: int, z: float
+) -> tuple[float, float]:
+    """Evaluate any interval of `INTERVALS` on two integers, in Python; TorchScript cannot compile it.
+
+    It has the parameters of a `ScalarBound` behind `interval` and `alpha`; z is not used.
+    Returns lower and upper as floats.
+    """
+    lower, upper = INTERVALS[interval](n_success, n_failure, alpha)
+    return float(lower), float(upper)
+
+
+def _beta_interval(
+    n_success: ArrayLike, n_failure: ArrayLike, alpha: float, prior: float, other_prior: float
+) -> Bounds:
+    """Return quantiles of Beta distributions as (lower, upper).
+
+    `prior` is added to the count of the side that an end belongs to (successes for the lower end,
+    failures for the upper one), `other_prior` to the other count.
+    """
     from scipy.special import betaincinv
 
-    normal_quantile(alpha)  # one place checks alpha
-    n_s, n_f, k = _counts(n_success, n_failure)
-    lower = np.where(n_s > 0, betaincinv(np.maximum(n_s + own, 0.5), n_f + other, alpha / 2.0), 0.0)
-    upper = np.where(n_f > 0, betaincinv(n_s + other, np.maximum(n_f + own, 0.5), 1.0 - alpha / 2.0), 1.0)
-    return _tidy(lower, upper, n_s, k)
+    normal_quantile(alpha)  # checks alpha
+    successes, failures = _as_counts(n_success, n_failure)
+    a, b = np.maximum(successes + prior, 0.5), failures + other_prior
+    lower = np.where(successes > 0, betaincinv(a, b, alpha / 2.0), 0.0)
+    a, b = successes + other_prior, np.maximum(failures + prior, 0.5)
+    upper = np.where(failures > 0, betaincinv(a, b, 1.0 - alpha / 2.0), 1.0)
+    return _as_floats(*_clip_limits(np, lower, upper, successes, failures))
 
 
-def _counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    n_s, n_f = np.asarray(n_success, dtype=np.float64), np.asarray(n_failure, dtype=np.float64)
-    if n_s.shape != n_f.shape:
-        raise ValueError(f"Expected counts of one shape, got {n_s.shape} successes and {n_f.shape} failures.")
-    if np.any(n_s < 0) or np.any(n_f < 0):
+def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return both counts as float64 arrays; ValueError for other shapes and negative counts."""
+    successes = np.asarray(n_success, dtype=np.float64)
+    failures = np.asarray(n_failure, dtype=np.float64)
+    if successes.shape != failures.shape:
+        got = f"{successes.shape} successes and {failures.shape} failures"
+        raise ValueError(f"Expected counts of one shape, got {got}.")
+    if np.any(successes < 0) or np.any(failures < 0):
         raise ValueError("Expected counts of zero or more, got a negative one.")
-    return n_s, n_f, n_s + n_f
+    return successes, failures
 
 
-def _tidy(lower: FloatArray, upper: FloatArray, n_s: FloatArray, k: FloatArray) -> Bounds:
-    # Rounding must not push a bound past the observed rate or out of [0, 1].
-    rate = n_s / np.maximum(k, 1.0)
-    lower = np.where(k > 0, np.clip(np.minimum(lower, rate), 0.0, 1.0), 0.0)
-    upper = np.where(k > 0, np.clip(np.maximum(upper, rate), 0.0, 1.0), 1.0)
+def _clip_limits(
+    xp: Any, lower: Any, upper: Any, n_success: Any, n_failure: Any
+) -> tuple[Any, Any]:
+    """Return limits within [0, 1] that enclose the observed rate, (0, 1) where nothing was counted.
+
+    Rounding alone could push a limit past the rate or out of [0, 1].
+    """
+    total = n_success + n_failure
+    rate = n_success / xp.where(total > 0.0, total, 1.0)
+    lower = xp.clip(xp.minimum(lower, rate), 0.0, 1.0)
+    upper = xp.clip(xp.maximum(upper, rate), 0.0, 1.0)
+    return xp.where(total > 0.0, lower, 0.0), xp.where(total > 0.0, upper, 1.0)
+
+
+def _as_floats(lower: FloatArray, upper: FloatArray) -> Bounds:
+    """Return arrays as they are, and arrays without a dimension as two floats."""
     return (float(lower), float(upper)) if lower.ndim == 0 else (lower, upper)

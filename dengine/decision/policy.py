@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..errors import SettingError, expect
 from ..records import ACTIONS, Action, Window, find_class, is_number, is_whole
 from .certificate import Certificate, Outcomes, certify
-from .intervals import INTERVALS, SORTED, Bounds, level_of, normal_quantile
+from .intervals import INTERVALS, SORTING_GUARANTEES, Bounds, interval_error_level, normal_quantile
 
 if TYPE_CHECKING:
     from .rule import DecisionRule
@@ -90,7 +90,7 @@ class Policy:
         wanted = "prices of a check, an escape and a false reject, errors above two checks"
         expect(known, wanted, self.prices, "as in 5,120,47.5")
         object.__setattr__(self, "prices", prices)
-        if self.guarantee in SORTED and self.stops == "some" and self.audited_share == 0.0:
+        if self.guarantee in SORTING_GUARANTEES and self.stops == "some" and self.audited_share == 0.0:
             raise SettingError(
                 f"Expected audits, or stops='all', beside the {self.guarantee} guarantee, which can claim nothing of parts "
                 "that nobody hears of; set audit_rate=0.1, or stops='all' where every bad accepted part stops the system."
@@ -140,15 +140,15 @@ class Policy:
 
     def rule(self) -> DecisionRule:
         """A new rule by these settings, which has been told nothing yet. SettingError where its class cannot be found."""
-        from . import rule  # torch is imported where it is used
+        from . import member_rules  # torch is imported where it is used
 
         own = RULES.get(self.guarantee)
-        found = find_class(self.guarantee) if own is None else getattr(rule, own[self.stops])
-        if not issubclass(found, rule.DecisionRule):
+        found = find_class(self.guarantee) if own is None else getattr(member_rules, own[self.stops])
+        if not issubclass(found, member_rules.DecisionRule):
             raise SettingError(f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none.")
-        more: dict[str, Any] = {"tolerances": self.tolerances} if issubclass(found, rule.PricedRule) else {}
-        if issubclass(found, rule.PooledRule | rule.PricedRule):
-            more["rate"] = self.known_share
+        more: dict[str, Any] = {"tolerances": self.tolerances} if issubclass(found, member_rules.PricedRule) else {}
+        if issubclass(found, member_rules.PooledRule | member_rules.PricedRule):
+            more["inclusion_probability"] = self.known_share
         try:
             made: DecisionRule = found(self.alpha, self.lower_bound, self.interval, **more)
         except TypeError as error:
@@ -164,7 +164,7 @@ class Policy:
 
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
         """(lower, upper) of the success probability, by the policy's interval."""
-        return INTERVALS[self.interval](n_success, n_failure, level_of(self.alpha, self.guarantee))
+        return INTERVALS[self.interval](n_success, n_failure, interval_error_level(self.alpha, self.guarantee))
 
     def action(self, lower: float, upper: float) -> Action:
         """What one bound allows, by the paper's rule."""

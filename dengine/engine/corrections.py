@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ..decision.intervals import SORTED
+from ..decision.intervals import SORTING_GUARANTEES
+from ..decision.members import SAFE_MODES
 from ..decision.policy import Policy
-from ..decision.rule import SAFE_MODE
 from ..errors import ReportError, SettingError, expect, listed
 from ..records import as_success
 from ..store.outbox import Outbox
@@ -142,10 +142,10 @@ class Corrections:
             raise SettingError(f"A model that was handed in decides by its own numbers, {said}; {do}.")
         self._make_ready()
         # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.
-        asked = policy.guarantee in SORTED and policy.known_share != now.recipe.policy.known_share
+        asked = policy.guarantee in SORTING_GUARANTEES and policy.known_share != now.recipe.policy.known_share
         anew = not own and (asked or any(name in new for name in SCORING))
         since = 0 if versions.answering is None else versions.next_number
-        evidence = EvidenceWindow(since, SAFE_MODE.index(versions.newest.safe_mode)) if anew else now.evidence
+        evidence = EvidenceWindow(since, SAFE_MODES.index(versions.newest.safe_mode)) if anew else now.evidence
         settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, evidence=evidence)
         kind, text = (
             POLICY_CHANGED,

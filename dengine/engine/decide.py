@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..decision.rule import script
+from ..decision.scripting import script
 from ..errors import TraceConflictError, TraceError, expect
 from ..folds import audited, part_hash
 from ..model.base import EngineModel, Prediction

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from .. import __version__
 from ..decision.policy import NO_WINDOWS, Policy
-from ..decision.rule import script
+from ..decision.scripting import script
 from ..errors import ImportRefusedError, SettingError, StoreError, expect, shortened
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
@@ -30,7 +30,7 @@ MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy
 
 @dataclass(frozen=True, slots=True)
 class EvidenceWindow:
-    """What the rule in force is told: what was decided from version `since` on; it began at `began_in` of `SAFE_MODE`."""
+    """What the rule in force is told: what was decided from version `since` on; it began at `began_in` of `SAFE_MODES`."""
 
     since: int = 0
     began_in: int = 0

@@ -102,8 +102,10 @@ class Baseline(ABC):
         from ..decision.rule import action_of
 
         lower, upper, *_ = self.judge(X)
-        accept_at, reject_at = self.limits or (self.policy.lower_bound, 1.0 - self.policy.lower_bound)
-        found = (action_of(float(a), float(b), accept_at, reject_at) for a, b in zip(lower, upper, strict=True))
+        accept_threshold, reject_threshold = self.limits or (self.policy.lower_bound, 1.0 - self.policy.lower_bound)
+        found = (
+            action_of(float(a), float(b), accept_threshold, reject_threshold) for a, b in zip(lower, upper, strict=True)
+        )
         return np.array([ACTIONS[i] for i in found], dtype=object)
 
     def judge(self, X: ArrayLike) -> Judgement:

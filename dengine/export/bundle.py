@@ -26,9 +26,11 @@ from typing import Any
 import torch
 
 from .. import __version__
+from ..decision import member_rules
 from ..decision.code import is_code_changed
+from ..decision.intervals import SCALAR_BOUNDS
+from ..decision.members import SAFE_MODES
 from ..decision.policy import RULES
-from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS, DecisionRule
 from ..errors import ExportError, instead
 from ..files import UNREADABLE, check_output, read_key, write_output
 from ..model.base import Exportable
@@ -113,7 +115,7 @@ def prepared(
 def describe(source: Exportable) -> dict[str, Any]:
     """What the file says of itself, readable without loading it."""
     model, index, rule = source.model, source.model.index, type(source.model.rule)
-    ours = rule.__module__ == DecisionRule.__module__
+    ours = getattr(member_rules, rule.__name__, None) is rule
     named = next((name for name, rules in RULES.items() if ours and rule.__name__ in rules.values()), "")
     return {
         "schema": SCHEMA,
@@ -135,7 +137,7 @@ def describe(source: Exportable) -> dict[str, Any]:
         "fields": list(FIELDS),
         "actions": [str(a) for a in Action],
         "reasons": [str(r) for r in Reason],
-        "safe_modes": list(SAFE_MODE),
+        "safe_modes": list(SAFE_MODES),
         "model_version": source.model_version,
         "recipe": source.recipe,
         "audit_rate": source.audit_rate,

@@ -146,13 +146,13 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Why everything is verified at present: the position in `SAFE_MODE`, 0 where it is not."""
+        """Why everything is verified at present: the position in `SAFE_MODES`, 0 where it is not."""
         return self.predictor.neighbours.rule.safe_mode()
 
     @torch.jit.export
     def n_references(self) -> int:
         """References held."""
-        return self.predictor.neighbours.ring.size()
+        return self.predictor.neighbours.references.size()
 
     def take(self, success: bool) -> None:
         """What became of the part that was decided last."""
@@ -172,8 +172,8 @@ class DecisionModule(nn.Module):
         """Tell the rule of a part, and make it a reference."""
         around, space = self.predictor.neighbours, self.toss(own) % self.n_spaces
         around.rule.observe(self.silent, novel)
-        around.rule.tell(lower, upper, success, alone, looked)
-        around.ring.put(z[space], 1.0 if success else 0.0, space, own)
+        around.rule.update(lower, upper, success, alone, looked)
+        around.references.put(z[space], 1.0 if success else 0.0, space, own)
         self.silent = 0
 
     def as_trace(self, trace: Tensor) -> Tensor:

@@ -23,7 +23,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from ..decision.rule import CERTAIN, UNCERTAIN, DecisionRule
+from ..decision.intervals import ARRAY_LIMITS
+from ..decision.neighbours import CERTAIN, UNCERTAIN
+from ..decision.rule import DecisionRule
 from ..errors import ExportError, instead
 from ..model.base import Exportable
 from ..model.neighbours import NOVEL
@@ -173,23 +175,9 @@ class Twin(nn.Module):
         inside = distances <= self.radius * self.radius
         n_success = (inside & (self.success == 1)).to(torch.int64).sum()
         n_failure = (inside & (self.success == 0)).to(torch.int64).sum()
-        lower, upper = self.bound(n_success.to(torch.float64), n_failure.to(torch.float64))
-        accepts, rejects = lower >= self.rule.accept_at, upper <= self.rule.reject_at
+        lower, upper = ARRAY_LIMITS[self.rule.interval](torch, n_success.double(), n_failure.double(), self.rule.z)
+        accepts, rejects = lower >= self.rule.accept_threshold, upper <= self.rule.reject_threshold
         return torch.where(accepts, 1, torch.where(rejects, 2, 0)), lower, upper, n_success, n_failure
-
-    def bound(self, n_success: Tensor, n_failure: Tensor) -> tuple[Tensor, Tensor]:
-        """`DecisionRule.bound` of two () float64; no neighbours: (0, 1)."""
-        empty = n_success + n_failure == 0.0
-        k = torch.where(empty, 1.0, n_success + n_failure)
-        rate, z = n_success / k, self.rule.z
-        if self.rule.interval == "wilson":
-            centre = (n_success + z * z / 2.0) / (k + z * z)
-            half = z / (k + z * z) * (n_success * n_failure / k + z * z / 4.0).sqrt()
-        else:
-            centre, half = rate, z / k.sqrt() * (n_success * n_failure / (k * k)).sqrt()
-        lower = torch.minimum(centre - half, rate).clamp(min=0.0)
-        upper = torch.maximum(centre + half, rate).clamp(max=1.0)
-        return torch.where(empty, 0.0, lower), torch.where(empty, 1.0, upper)
 
 
 def _to_onnx(twin: Twin, spec: TraceSpec) -> Any:

@@ -24,7 +24,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from .. import __version__
-from ..decision.rule import SAFE_MODE, script
+from ..decision.members import SAFE_MODES
+from ..decision.scripting import script
 from ..engine.decide import as_part
 from ..errors import ExportError, instead
 from ..folds import part_hash
@@ -142,7 +143,7 @@ class ExportedModel:
     @property
     def safe_mode(self) -> str:
         """Why everything is verified at present, in words; "" where it is not."""
-        return SAFE_MODE[self.module.safe_mode()]
+        return SAFE_MODES[self.module.safe_mode()]
 
     def save(self, path: str | os.PathLike[str], *, key: KeyFile | None = None, force: bool = False) -> Path:
         """Write all that was learned, and what waits for its label, to a file of the same kind, with its checksum.

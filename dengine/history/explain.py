@@ -19,11 +19,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..decision.intervals import SORTED, level_of
+from ..decision.intervals import SORTING_GUARANTEES, interval_error_level
+from ..decision.member_rules import MemberRule
+from ..decision.members import CLOSED
 from ..decision.novelty import NoveltyGate
 from ..decision.policy import RULES, Policy
 from ..decision.references import RadiusIndex
-from ..decision.rule import NOBODY, DecisionRule, part, restore
+from ..decision.rule import DecisionRule
+from ..decision.scripting import arrays_with_prefix, restore
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..recipe import Recipe
@@ -100,7 +103,7 @@ def _novelty(stored: ModelVersion, then: StoredDecision | None) -> Novelty | Non
     gate = NoveltyGate(*(int(n) for n in stored.state["trace_shape"]))
     gate.asleep = False
     try:
-        restore(gate, part(stored.state, "novelty."))
+        restore(gate, arrays_with_prefix(stored.state, "novelty."))
     except StoreError:  # the gate of another version of dengine
         return None
     with torch.inference_mode():
@@ -113,21 +116,21 @@ def _restored(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
         return None  # nothing is imported because a store says so; an engine that runs here has imported it
     rule = policy.rule()
     try:
-        restore(rule, part(stored.state, "rule."))
+        restore(rule, arrays_with_prefix(stored.state, "rule."))
     except StoreError:  # the rule was another one, handed in with its model, or had missed something
         return None
     return rule
 
 
 def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Levels | None:
-    if (policy.guarantee, policy.stops) == ("local", "some") and not part(stored.state, "rule."):
+    if (policy.guarantee, policy.stops) == ("local", "some") and not arrays_with_prefix(stored.state, "rule."):
         return policy.lower_bound, policy.lower_bound  # the paper's rule learns nothing
-    if (rule := _restored(stored, policy)) is None or rule.evidence is None:
+    if (rule := _restored(stored, policy)) is None or not isinstance(rule, MemberRule):
         return None
     for label in told:
         if not label.quarantined and label.source is not Source.INSPECTION:
             _update(rule, label)
-    return float(rule.evidence.open[0]), float(rule.evidence.open[1])
+    return float(rule.evidence.thresholds[0]), float(rule.evidence.thresholds[1])
 
 
 def rule_now(store: SqlStore, policy: Policy) -> DecisionRule | None:
@@ -138,8 +141,8 @@ def rule_now(store: SqlStore, policy: Policy) -> DecisionRule | None:
     since, began_in, policy_since = (int(settings.get(name, 0)) for name in ("told_since", "began_in", "policy_since"))
     past = rule_past(store, stored, since, policy.label_within, policy_since)
     if not past.told_to:  # as an engine that is opened
-        rule = rule.anew()
-        rule.begin_in(began_in)
+        rule = rule.clone()
+        rule.start_in_safe_mode(began_in)
     for evidence in store.evidence_since(past.told_to, since, past.overdue_to):
         _update(rule, evidence)
     return rule
@@ -148,7 +151,7 @@ def rule_now(store: SqlStore, policy: Policy) -> DecisionRule | None:
 def _update(rule: DecisionRule, outcome: PastLabel | Evidence) -> None:
     """Update a rule with what became of a part."""
     rule.observe(outcome.silent, outcome.novel)
-    rule.tell(outcome.lower, outcome.upper, outcome.success, outcome.predicted, outcome.looked)
+    rule.update(outcome.lower, outcome.upper, outcome.success, outcome.predicted, outcome.looked)
 
 
 # The envelope: a picture for people, not a test. One sample in twenty of an ordinary success lies outside, by its making.
@@ -318,13 +321,13 @@ def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
     if found.levels is None:
         return None, None, "the levels that held then are not kept"
     accept_at, reject_at = found.levels
-    held = "the lowest level that held then" if policy.guarantee in SORTED else "what held in safe mode"
-    return accept_at if accept_at < NOBODY else None, 1.0 - reject_at if reject_at < NOBODY else None, held
+    held = "the lowest level that held then" if policy.guarantee in SORTING_GUARANTEES else "what held in safe mode"
+    return accept_at if accept_at < CLOSED else None, 1.0 - reject_at if reject_at < CLOSED else None, held
 
 
 def is_score(policy: Policy, made: Decision) -> bool:
     """Whether a decision was sorted by its heads' score, and not by an interval."""
-    return policy.guarantee in SORTED and made.lower == made.upper
+    return policy.guarantee in SORTING_GUARANTEES and made.lower == made.upper
 
 
 def _needed(policy: Policy, made: Decision, threshold: float | None, success: int) -> int | None:
@@ -419,7 +422,8 @@ def _bound_sentences(made: Decision, bound: Bound, found: Circumstances) -> Iter
     if is_score(policy, made):
         yield f"{counted}; the heads give it {made.lower:.3f}, the mean of what each says of its success."
     else:
-        yield f"{counted}; {name} at alpha {level_of(policy.alpha, policy.guarantee):g} bounds the success rate by {reach}."
+        error_level = interval_error_level(policy.alpha, policy.guarantee)
+        yield f"{counted}; {name} at alpha {error_level:g} bounds the success rate by {reach}."
     if bound.accept_at is None and bound.reject_at is None:
         why = found.safe_mode or ("" if found.levels is None else "no level of evidence held yet")
         yield f"Nothing could pass, whatever the bound: {why}." if why else f"What it had to reach: {bound.level}."

@@ -308,15 +308,16 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
 
 def watch(store: SqlStore, recipe: Recipe) -> Watch | None:
     """What the rule that answers knows of drift; None where it watches nothing, or that is not kept."""
-    from .explain import rule_now  # torch
+    from ..decision.member_rules import MemberRule  # torch
+    from .explain import rule_now
 
     if recipe.policy.guarantee == "local" and recipe.policy.stops != "all":
         return None
     rule = rule_now(store, recipe.policy)
-    if rule is None or rule.evidence is None:
+    if not isinstance(rule, MemberRule):
         return None
-    limits, mode = rule.evidence.alarm_at, rule.safe_mode()
-    sums = [0.0 if mode == 3 else each for each in rule.evidence.watch.tolist()]
+    limits, mode = rule.evidence.alarm_limits, rule.safe_mode()
+    sums = [0.0 if mode == 3 else each for each in rule.evidence.detector_sums.tolist()]
     return Watch(*(max(0.0, each / limit) for each, limit in zip(sums, limits, strict=True)))
 
 

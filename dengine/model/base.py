@@ -137,7 +137,7 @@ class EngineModel(ABC):
         return self
 
     def begin_safely_in(self, mode: int) -> None:  # noqa: B027  # a default: it has no safe mode
-        """Verify everything for this reason, a position in `SAFE_MODE`, until fresh evidence keeps the tolerance."""
+        """Verify everything for this reason, a position in `SAFE_MODES`, until fresh evidence keeps the tolerance."""
 
     @abstractmethod
     def successor(self) -> EngineModel:

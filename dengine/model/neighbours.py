@@ -25,10 +25,13 @@ from torch import Tensor, nn
 
 from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.code import is_code_changed
+from ..decision.members import SAFE_MODES
+from ..decision.neighbours import RadiusNeighbours
 from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
 from ..decision.references import Counts, RadiusIndex
-from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, model_of_another_version, part, restore, script
+from ..decision.rule import DecisionRule
+from ..decision.scripting import arrays_with_prefix, incompatible_model_error, restore, script
 from ..errors import ExportError, listed
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
@@ -286,7 +289,7 @@ class ModelPrediction(EngineModel):
                 shape, own = X.shape[1:], self.classifier
                 gate = NoveltyGate(*shape)
                 gate.asleep = not self.novelty
-                around = own.around(RadiusIndex(blank.dim, own.capacity), self.rule, self.spaces.scores)
+                around = own.neighbours_over(RadiusIndex(blank.dim, own.capacity), self.rule, self.spaces.scores)
                 mould_of(Predictor(trace_gate(shape), blank, torch.ones(self.n_spaces), gate, around).eval(), shape)
             ahead.result()
 
@@ -298,7 +301,7 @@ class ModelPrediction(EngineModel):
 
     def _compile(self) -> Any:
         own, encoder, gate = self.classifier, self.spaces.module(), trace_gate(self.trace_shape)
-        around = own.around(self.index, self.rule, self.spaces.scores)
+        around = own.neighbours_over(self.index, self.rule, self.spaces.scores)
         scale, compiles = torch.from_numpy(self.scale), self.rule.scriptable and _compiles(self.rule)
         encoder = encoder if encoder is not None and _compiles(encoder) else None
         if encoder is not None and compiles:
@@ -350,7 +353,7 @@ class ModelPrediction(EngineModel):
     ) -> None:  # fmt: skip
         before = dict(self.rule.state_dict())
         self.rule.observe(unobserved, novel)
-        self.rule.tell(lower, upper, success, predicted, looked)
+        self.rule.update(lower, upper, success, predicted, looked)
         for name, now in self.rule.state_dict().items():
             if now.data_ptr() != before[name].data_ptr():  # bound anew: the compiled module reads the tensor it shares
                 before[name].copy_(now)
@@ -359,7 +362,7 @@ class ModelPrediction(EngineModel):
 
     def forget(self) -> None:
         """The rule as it was before it was told anything; in place, for the compiled module reads it."""
-        self.rule.load_state_dict(self.rule.anew().state_dict())
+        self.rule.load_state_dict(self.rule.clone().state_dict())
 
     @property
     def remembers(self) -> bool:
@@ -373,11 +376,11 @@ class ModelPrediction(EngineModel):
         return new
 
     def begin_safely_in(self, mode: int) -> None:
-        self.rule.begin_in(mode)
+        self.rule.start_in_safe_mode(mode)
 
     @property
     def safe_mode(self) -> str:
-        return SAFE_MODE[self.rule.safe_mode()]
+        return SAFE_MODES[self.rule.safe_mode()]
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """The whole prediction on one trace (C, T); the part with this hash, if it is known, has no vote."""
@@ -441,23 +444,23 @@ class ModelPrediction(EngineModel):
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         if not self.needs_refit(state):
-            self.spaces.set_state(part(state, "reducer."))
+            self.spaces.set_state(arrays_with_prefix(state, "reducer."))
         elif self.spaces.get_state() is not None:  # another reducer of that name, whose points lie elsewhere
-            raise model_of_another_version(f"{type(self.spaces).__name__} has no state")
+            raise incompatible_model_error(f"{type(self.spaces).__name__} has no state")
         self.trace_shape = tuple(int(n) for n in state["trace_shape"])
         self.scale = np.asarray(state["scale"])
         self.index = RadiusIndex.from_state(state, self.classifier.capacity)
         self.gate = NoveltyGate(*self.trace_shape)
-        self.gate.asleep = not part(state, "novelty.")
+        self.gate.asleep = not arrays_with_prefix(state, "novelty.")
         for module, prefix in ((self.rule, "rule."), (self.gate, "novelty.")):
-            if arrays := part(state, prefix):
+            if arrays := arrays_with_prefix(state, prefix):
                 restore(module, arrays)
         self._predictor = None
         return self
 
     def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
         """Whether the reducer gave no arrays of its own."""
-        return not part(state, "reducer.")
+        return not arrays_with_prefix(state, "reducer.")
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
         if "trace_shape" not in vars(self):

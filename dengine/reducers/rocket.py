@@ -38,7 +38,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
-from ..decision.rule import part, restore, script
+from ..decision.scripting import arrays_with_prefix, restore, script
 from ..errors import SettingError, expect
 from ..records import is_whole
 from .base import (
@@ -791,8 +791,8 @@ class RocketReducer(Reducer):
         self.trace_shape_ = (channels, samples)
         self.n_features_in_ = channels * samples
         self._build(channels, samples)
-        restore(self.net_, part(state, "net."))
-        by_field = [part(state, f"{name}.").values() for name in Tower._fields]
+        restore(self.net_, arrays_with_prefix(state, "net."))
+        by_field = [arrays_with_prefix(state, f"{name}.").values() for name in Tower._fields]
         self.towers_ = [
             Tower(*(torch.from_numpy(np.array(value)) for value in values)) for values in zip(*by_field, strict=True)
         ]

@@ -34,7 +34,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 
-from ..decision.rule import part, restore, script
+from ..decision.scripting import arrays_with_prefix, restore, script
 from ..errors import SettingError, expect, instead
 from ..files import write_output
 from ..records import is_whole
@@ -365,10 +365,10 @@ class TorchReducer(Reducer):
         self.n_steps_left_ = n_steps_left
         self.n_new_steps_ = n_new_steps
         self.loss_ = float(state["loss"])
-        restore(self.preprocessor_, part(state, "preprocessor."))
-        restore(self.members_, part(state, "members."))
-        restore(self.averaged_members_, part(state, "averaged."))
-        for name, value in part(state, "optimizer.").items():
+        restore(self.preprocessor_, arrays_with_prefix(state, "preprocessor."))
+        restore(self.members_, arrays_with_prefix(state, "members."))
+        restore(self.averaged_members_, arrays_with_prefix(state, "averaged."))
+        for name, value in arrays_with_prefix(state, "optimizer.").items():
             i, key = name.split(".")
             self.optimizer_state_.setdefault(int(i), {})[key] = torch.from_numpy(np.array(value))
         self.encoder_ = self._new_encoder()

@@ -39,7 +39,7 @@ from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
-from ..decision.rule import part, restore
+from ..decision.scripting import arrays_with_prefix, restore
 from ..errors import SettingError, expect
 from ..records import is_number, is_whole
 from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, seed_of
@@ -929,7 +929,7 @@ class UmapReducer(Reducer):
         n_frames, self.seed_, *progress = (int(value) for value in state["counts"])
         self.n_epochs_, self.n_steps_, self.n_new_steps_ = progress
         self.make_frames_ = Frames(channels, samples, n_frames)
-        restore(self.make_frames_, part(state, "frames."))
+        restore(self.make_frames_, arrays_with_prefix(state, "frames."))
         neighbors = Neighbors(
             numbers=np.array(state["numbers"]),
             frames=torch.from_numpy(np.array(state["references"])),

@@ -15,7 +15,8 @@ import torch
 from sklearn.decomposition import PCA
 
 from dengine import DataEngine, Dataset, ModelPrediction, Recipe, TraceSpec, export_torchscript, load_exported, make_reducer
-from dengine.decision.rule import SAFE_MODE, DecisionRule
+from dengine.decision.members import SAFE_MODES
+from dengine.decision.rule import DecisionRule
 from dengine.errors import ExportError, OutputError, TraceError
 from dengine.export import read_metadata
 from dengine.export.decision import FIELDS, METHODS
@@ -130,13 +131,16 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
             if i > 600 and not saved and known.action is Action.ACCEPT and not heard:  # one that waits
                 exported, saved = load_exported(exported.save(tmp_path / "later.ts")), True
         model = engine.model
-        mine = {f"ring.{name}": t for name, t in model.index.state_dict().items()}
+        mine = {f"references.{name}": t for name, t in model.index.state_dict().items()}
         mine |= model.rule.state_dict()
         kept = {".".join(name.split(".")[-2:]): t for name, t in exported.module.named_buffers()}
         for name in mine.keys() & kept.keys():  # what can change; freezing made constants of the rest
             torch.testing.assert_close(kept[name], mine[name], rtol=0, atol=0)
-        assert {"ring.points", "ring.parts", "ring.repeats", "ring.total"} <= kept.keys()
-        assert type(model.rule) is DecisionRule or {"evidence.told", "evidence.watch", "evidence.open"} <= kept.keys()
+        assert {"references.points", "references.parts", "references.repeats", "references.total"} <= kept.keys()
+        assert (
+            type(model.rule) is DecisionRule
+            or {"evidence.member_counts", "evidence.detector_sums", "evidence.thresholds"} <= kept.keys()
+        )
     assert min(happened[kind] for kind in ("verify, heard", "verify, silent", "accept, heard", "accept, silent")) > 10
     assert happened.keys() >= {Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.SATURATED, Reason.OUTSIDE}
     assert len(modes) > 1 or stops == "some"
@@ -194,7 +198,7 @@ def test_the_file_says_what_it_is_without_being_loaded(audited: DataEngine, file
     metadata = read_metadata(file)
     assert metadata["schema"] == 2
     assert (metadata["guarantee"], metadata["stops"], metadata["novelty"]) == ("local", "some", audited.recipe.novelty)
-    assert metadata["safe_modes"] == list(SAFE_MODE)
+    assert metadata["safe_modes"] == list(SAFE_MODES)
     assert metadata["trace"] == asdict(TraceSpec(SAMPLES, limit=LIMIT)) | {"columns": []}
     assert (metadata["alpha"], metadata["lower_bound"], metadata["audit_rate"]) == (0.1, 0.9, 0.3)
     assert metadata["model_version"] == audited.version
@@ -342,10 +346,11 @@ def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(make_dat
     for i, (x, y) in enumerate(zip(new.X, new.y, strict=True)):
         assert exported.learn(x, bool(y)) == min(121 + i, 150)
         model.add(x, y)
-    ring = {name.rsplit(".", 1)[-1]: t.numpy() for name, t in exported.module.named_buffers() if ".ring." in name}
-    np.testing.assert_array_equal(ring["spaces"][120:], content_fold(new.X[:30], model.n_spaces))
+    buffers = exported.module.named_buffers()
+    references = {name.rsplit(".", 1)[-1]: t.numpy() for name, t in buffers if ".references." in name}
+    np.testing.assert_array_equal(references["spaces"][120:], content_fold(new.X[:30], model.n_spaces))
     for name in ("total", "labels", "spaces", "points"):
-        np.testing.assert_array_equal(ring[name], getattr(model.index, name).numpy())
+        np.testing.assert_array_equal(references[name], getattr(model.index, name).numpy())
 
 
 def test_what_was_learned_survives_saving(file: Path, many: np.ndarray, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import torch
 from sklearn.neighbors import RadiusNeighborsClassifier
 
 from dengine import INTERVALS, Action, Policy, WilsonRadiusClassifier
-from dengine.decision.rule import script
+from dengine.decision.scripting import script
 from dengine.errors import SettingError
 
 

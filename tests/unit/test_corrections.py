@@ -350,17 +350,17 @@ def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data: Dataset) -> N
     engine = make(POOLED.with_policy(guarantee="local"))
     play(engine, data, 0, 170)
     rule = engine.model.rule
-    members = rule.evidence.told.clone()
+    totals = rule.evidence.level_totals.clone()
     engine.set_policy(replace(engine.policy, audit_rate=0.9))
     assert engine.model.rule is rule
-    assert (rule.evidence.told == members).all()
+    assert (rule.evidence.level_totals == totals).all()
     looked = [engine.decide(x) for x in data.X[170:] if not engine.safe_mode]
     certain = [d for d in looked if d.predicted is not Action.VERIFY]
     assert sum(d.audit for d in certain) > 0.6 * len(certain) > 0
     assert {d.propensity for d in certain} == {0.9}
     engine.set_policy(replace(engine.policy, lower_bound=0.85))  # of which the certificate speaks from now on
     assert (engine.certificate().accepted.n, engine.certificate().tolerance) == (0, pytest.approx(0.15))
-    assert int(engine.model.rule.evidence.told.sum()) == 0
+    assert int(engine.model.rule.evidence.level_totals.sum()) == 0
 
 
 def test_safe_mode_outlasts_a_change_of_policy_until_fresh_evidence(tmp_path: Path, data: Dataset) -> None:

@@ -53,7 +53,8 @@ def spoiled(stream: Dataset) -> Dataset:
 
 def beyond(engine: DataEngine) -> list[int]:
     """Members of LB's own level that the rule counts beyond those of which the store has labels, and the bad ones."""
-    known, (n, bad) = engine.store.evidence_since(0), engine.model.rule.evidence.told[0, 0, 1].sum(0).tolist()
+    known = engine.store.evidence_since(0)
+    n, bad = engine.model.rule.evidence.level_counts_since_alarm[0, 0].sum(0).tolist()
     reached = [each.success for each in known if each.lower >= 0.9]
     return [n - len(reached), bad - reached.count(False)]
 
@@ -152,7 +153,7 @@ def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_i
     engine.report(*next(iter(owed.items())))  # the rule is told anew, of nothing that was owed under another policy
     engine.flush()
     engine.decide(stream.X[0])
-    assert engine.model.rule.evidence.told.sum() == 0
+    assert engine.model.rule.evidence.level_totals.sum() == 0
 
 
 HISTORIES = {

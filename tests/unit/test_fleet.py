@@ -233,7 +233,7 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
     assert evidence == [engine.store.status()["labels"] for engine in (first, second)]
     assert rule(first) != rule(second)
     assert first.store.tally().outcomes != second.store.tally().outcomes
-    assert rule(second)["evidence.told"] != rule(fleet.engine("c", recipe=POOLED))["evidence.told"]
+    assert rule(second)["evidence.level_totals"] != rule(fleet.engine("c", recipe=POOLED))["evidence.level_totals"]
     assert second.store.get_decision("nobody") is None
 
 

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from dengine import TraceSpec
-from dengine.decision.rule import script
+from dengine.decision.scripting import script
 from dengine.folds import audited, content_fold, content_hash, fold_of, toss
 from dengine.traces import TraceGate
 

@@ -8,20 +8,17 @@ import torch
 from scipy import stats
 
 from dengine import Policy
-from dengine.decision.rule import (
+from dengine.decision.member_rules import LOWEST_LEVEL, PooledRule, PricedRule, WatchedRule
+from dengine.decision.members import (
     BET,
     FALSE_ALARMS,
-    LOWEST,
-    NEWEST,
-    SAFE_MODE,
-    DecisionRule,
-    Evidence,
-    PooledRule,
-    PricedRule,
-    WatchedRule,
-    most_wrong,
-    script,
+    N_RECENT,
+    SAFE_MODES,
+    MemberEvidence,
+    max_recent_errors,
 )
+from dengine.decision.rule import DecisionRule
+from dengine.decision.scripting import script
 from dengine.errors import SettingError
 
 ACCEPT, REJECT, VERIFY = 1, 2, 0
@@ -33,7 +30,7 @@ def pooled(alpha: float = 0.1, lower_bound: float = 0.9) -> PooledRule:
 
 def tell(rule: DecisionRule, lower: float, *outcomes: bool, upper: float = 1.0) -> None:
     for success in outcomes:
-        rule.tell(lower, upper, success)
+        rule.update(lower, upper, success)
 
 
 def enough(alpha: float, tolerance: float) -> int:
@@ -50,7 +47,7 @@ def test_a_level_opens_with_the_part_that_makes_the_evidence_enough(alpha: float
     tell(rule, lower_bound, True)
     assert rule.action(lower_bound, 1.0) == ACCEPT
     # Each is a member of all looser levels too, so the loosest holds as well: what looks worse was never seen to fail.
-    assert rule.action(LOWEST + 0.05, 1.0) == ACCEPT
+    assert rule.action(LOWEST_LEVEL + 0.05, 1.0) == ACCEPT
 
 
 def test_what_came_before_a_level_was_aimed_at_is_no_evidence_for_it() -> None:
@@ -66,44 +63,44 @@ def test_what_came_before_a_level_was_aimed_at_is_no_evidence_for_it() -> None:
 
 
 def test_the_newest_of_a_level_may_hold_so_many_wrong_ones_and_no_more() -> None:
-    rule, most = pooled(), most_wrong(0.1)
+    rule, most = pooled(), max_recent_errors(0.1)
     tell(rule, 0.9, *[True] * 1000)
     for n_wrong in range(1, most + 2):
         tell(rule, 0.6, False, *[True] * 4)  # not so many that the detector would notice
         assert rule.action(0.6, 1.0) == (ACCEPT if n_wrong <= most else VERIFY)
     assert (rule.safe_mode(), rule.action(0.9, 1.0)) == (0, ACCEPT)  # the stricter level goes on
-    tell(rule, 0.6, *[True] * NEWEST)
+    tell(rule, 0.6, *[True] * N_RECENT)
     assert rule.action(0.6, 1.0) == ACCEPT
 
 
 def test_stops_that_come_unasked_are_no_evidence_where_not_all_are_known_and_audits_weigh_by_their_propensity() -> None:
-    rule = PooledRule(0.1, 0.9, rate=0.1)
+    rule = PooledRule(0.1, 0.9, inclusion_probability=0.1)
     for _ in range(5000):
-        rule.tell(0.95, 1.0, True, predicted=1, looked=0.0)
+        rule.update(0.95, 1.0, True, predicted=1, inclusion_probability=0.0)
     assert rule.action(0.95, 1.0) == VERIFY
     n = 0
     while rule.action(0.95, 1.0) == VERIFY:
-        rule.tell(0.95, 1.0, True, predicted=0, looked=1.0)
+        rule.update(0.95, 1.0, True, predicted=0, inclusion_probability=1.0)
         n += 1
     assert 9 * enough(0.1, 0.1) < n < 11 * enough(0.1, 0.1)  # what is to come is looked at in one of ten
     for _ in range(100):
-        rule.tell(0.95, 1.0, True, predicted=1, looked=0.0)
-    rule.tell(0.95, 1.0, False, predicted=1, looked=0.1)  # it stands for ten
+        rule.update(0.95, 1.0, True, predicted=1, inclusion_probability=0.0)
+    rule.update(0.95, 1.0, False, predicted=1, inclusion_probability=0.1)  # it stands for ten
     assert rule.action(0.95, 1.0) == VERIFY
 
 
 def test_a_pooled_guarantee_of_which_nobody_hears_is_refused() -> None:
     with pytest.raises(SettingError, match="Expected audits, or stops='all', beside the pooled guarantee"):
         Policy(guarantee="pooled")
-    assert Policy(guarantee="pooled", audit_rate=0.02).rule().rate == 0.02
-    assert Policy(guarantee="pooled", stops="all", audit_rate=0.02).rule().rate == 1.0
+    assert Policy(guarantee="pooled", audit_rate=0.02).rule().evidence.inclusion_probability == 0.02
+    assert Policy(guarantee="pooled", stops="all", audit_rate=0.02).rule().evidence.inclusion_probability == 1.0
 
 
 def adversary(rule: PooledRule, rng: np.random.Generator, tolerance: float) -> bool:
     """Whether anything ever passes, where every part is beyond the tolerance: who sees the levels tries one by one."""
     for level in reversed(rule.evidence.levels[0]):
         for _ in range(60):
-            rule.tell(level, 1.0, bool(rng.random() >= 1.02 * tolerance))
+            rule.update(level, 1.0, bool(rng.random() >= 1.02 * tolerance))
             if rule.action(level, 1.0) == ACCEPT:
                 return True
     return False
@@ -113,16 +110,18 @@ def test_an_adversary_who_sees_the_levels_makes_a_false_claim_no_more_often_than
     def false_claims() -> int:
         return sum(adversary(pooled(0.2, 0.8), np.random.default_rng(i), 0.2) for i in range(40))
 
-    def each_level_by_itself(self: Evidence, side: int) -> None:
-        ask(self, side)
-        aim = int(self.aim[side])
-        if self.shown(side, self.told[side, 1, 1 + aim].flatten().tolist()):
-            self.open[side].fill_(self.levels[side][aim])
+    def each_level_by_itself(self: MemberEvidence, side: int) -> None:
+        choose_threshold(self, side)
+        target = int(self.target_level[side])
+        counts = self.level_counts_since_alarm[side, target].flatten().tolist()
+        if self.keeps_tolerance(side, counts):
+            self.thresholds[side].fill_(self.levels[side][target])
 
-    ask, honest = Evidence.ask, false_claims()
+    choose_threshold = MemberEvidence.choose_threshold
+    honest = false_claims()
     assert stats.binomtest(honest, 40, 0.2, alternative="greater").pvalue > 1e-3
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Evidence, "ask", each_level_by_itself)
+        patch.setattr(MemberEvidence, "choose_threshold", each_level_by_itself)
         assert stats.binomtest(false_claims(), 40, 0.2, alternative="greater").pvalue < 1e-3  # it is an adversary
 
 
@@ -147,7 +146,7 @@ def test_by_costs_a_part_passes_only_while_the_members_had_cost_at_most_one_esca
                 passed += 1
                 assert cost <= 120 + 1e-6
             good = bool(rng.random() >= share_bad)
-            rule.tell(1.0, 1.0, good)
+            rule.update(1.0, 1.0, good)
             cost += 0 if good else 120
             cost -= 5
         assert passed > 0
@@ -162,11 +161,11 @@ def test_by_costs_nothing_passes_that_is_expected_to_cost_more_than_its_check() 
 
 
 def test_by_costs_an_audit_stands_for_as_many_as_it_was_drawn_from_and_a_stop_that_came_unasked_for_none() -> None:
-    rule = priced(rate=0.1)
+    rule = priced(inclusion_probability=0.1)
     tell(rule, 1.0, *[True] * 30)
-    rule.tell(1.0, 1.0, False, predicted=1, looked=0.0)
+    rule.update(1.0, 1.0, False, predicted=1, inclusion_probability=0.0)
     assert rule.action(1.0, 1.0) == ACCEPT
-    rule.tell(1.0, 1.0, False, predicted=1, looked=0.1)  # ten escapes
+    rule.update(1.0, 1.0, False, predicted=1, inclusion_probability=0.1)  # ten escapes
     assert rule.action(1.0, 1.0) == VERIFY
 
 
@@ -206,7 +205,7 @@ def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts_and_verified
         tell(rule, 0.95, False)
         bad += 1
     assert bad <= 6
-    assert SAFE_MODE[rule.safe_mode()] == "accepted parts failed more often than the tolerance"
+    assert SAFE_MODES[rule.safe_mode()] == "accepted parts failed more often than the tolerance"
     while rule.safe_mode() != 0:
         assert rule.action(1.0, 1.0) == VERIFY
         assert rule.action(0.0, 0.0) == VERIFY
@@ -234,17 +233,19 @@ def test_silence_is_no_success_for_a_level_and_no_failure_for_the_watch() -> Non
     silent, told = pooled(), pooled()
     for rule in (silent, told):
         tell(rule, 0.95, *[True] * 100)
-    before = silent.evidence.told.clone()
+    before = {name: value.clone() for name, value in silent.state_dict().items() if "counts" in name}
     silent.observe(50, False)
-    assert torch.equal(silent.evidence.told, before)
+    assert all(torch.equal(silent.state_dict()[name], value) for name, value in before.items())
     for _ in range(50):
         told.observe(1, False)
-    torch.testing.assert_close(silent.evidence.watch[0], told.evidence.watch[0])  # fifty at once, or one by one
+    torch.testing.assert_close(
+        silent.evidence.detector_sums[0], told.evidence.detector_sums[0]
+    )  # fifty at once, or one by one
     # Every twentieth accepted part stops the system: within the tolerance, though no success is ever heard of.
     watched = WatchedRule(0.1, 0.9)
     for _ in range(30):
         watched.observe(19, False)
-        watched.tell(0.95, 1.0, False)
+        watched.update(0.95, 1.0, False)
     assert watched.safe_mode() == 0
 
 
@@ -254,7 +255,7 @@ def test_too_many_novel_traces_start_safe_mode_and_a_few_do_not() -> None:
         few.observe(0, i % 10 == 0)
         many.observe(0, i % 2 == 0)
     assert few.safe_mode() == 0
-    assert SAFE_MODE[many.safe_mode()] == "too many traces were novel"
+    assert SAFE_MODES[many.safe_mode()] == "too many traces were novel"
     for every in (2, 1000):  # as many as ever, and few
         assert many.safe_mode() == 3
         for i in range(1, 300):
@@ -274,7 +275,7 @@ def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(guarantee: str, st
         success, silent, novel = bool(rng.random() < 0.97), int(rng.integers(0, 3)), bool(rng.random() < 0.05)
         for rule in (eager, scripted):
             rule.observe(silent, novel)
-            rule.tell(lower, upper, success)
+            rule.update(lower, upper, success)
         assert eager.safe_mode() == scripted.safe_mode()
     for name, value in eager.state_dict().items():
         assert torch.equal(value, scripted.state_dict()[name]), name

@@ -92,7 +92,7 @@ def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp
         with DataEngine.open(path) as engine:
             known, last = engine.store.evidence_since(200), engine.store.labelled(n)
             outcomes, sources = engine.store.tally().outcomes, engine.store.status()["sources"]
-            members = engine.model.rule.state_dict()["evidence.told"].clone()
+            members = engine.model.rule.state_dict()["evidence.level_totals"].clone()
         lower, success = [0.25, 0.925, 0.9375, 0.9375, 0.9375, 0.0], [True, True, False, True, False, False]
         hashes = [part_hash(p) for p in ("P1", "P2", "P3", "P6", "P4", "P1")]
         silent = [0, 0, 0, 0, 0, 0]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dengine import load_dataset
 from dengine.decision.novelty import NoveltyGate, fit_novelty
-from dengine.decision.rule import script
+from dengine.decision.scripting import script
 from tests.slow.proof.garbage import KINDS
 
 Traces = NDArray[np.float32]

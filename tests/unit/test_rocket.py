@@ -12,7 +12,7 @@ from sklearn.metrics import roc_auc_score
 
 from dengine import DataEngine, Dataset, Recipe, RocketReducer
 from dengine.datasets.importing import import_labelled
-from dengine.decision.rule import script
+from dengine.decision.scripting import script
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule

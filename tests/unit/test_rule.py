@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dengine import INTERVALS, Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, export_torchscript
-from dengine.decision.rule import SCALAR_BOUNDS, DecisionRule, action_of
+from dengine.decision.intervals import SCALAR_BOUNDS
+from dengine.decision.rule import DecisionRule, action_of
 from dengine.errors import ExportError, SettingError
 from dengine.model.neighbours import ModelPrediction
 
@@ -52,13 +53,15 @@ class FuseRule(DecisionRule):
 
     def action(self, lower: float, upper: float) -> int:
         """The paper's action, but for a pause."""
-        found = action_of(lower, upper, self.accept_at, self.reject_at)
+        found = action_of(lower, upper, self.accept_threshold, self.reject_threshold)
         return 0 if found == 1 and int(self.pause.item()) > 0 else found
 
     @torch.jit.export
-    def tell(self, lower: float, upper: float, success: bool, predicted: int = 0, looked: float = 1.0) -> None:
+    def update(
+        self, lower: float, upper: float, success: bool, predicted: int = 0, inclusion_probability: float = 1.0
+    ) -> None:
         """A stop sets the fuse; each label after it burns a little of it."""
-        if not success and lower >= self.accept_at:
+        if not success and lower >= self.accept_threshold:
             self.pause.fill_(5)
         else:
             self.pause.fill_(max(0, int(self.pause.item()) - 1))
@@ -70,14 +73,16 @@ class SpokenRule(DecisionRule):
     compiles = False
 
     def action(self, lower: float, upper: float) -> int:
-        return {True: 1, False: 0}[lower >= self.accept_at]
+        return {True: 1, False: 0}[lower >= self.accept_threshold]
 
 
 class FailingRule(FuseRule):
     """Cannot be told anything."""
 
-    def tell(self, lower: float, upper: float, success: bool, predicted: int = 0, looked: float = 1.0) -> None:
-        raise RuntimeError("tell failed")
+    def update(
+        self, lower: float, upper: float, success: bool, predicted: int = 0, inclusion_probability: float = 1.0
+    ) -> None:
+        raise RuntimeError("update failed")
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from torch import nn
 
 from dengine import ConvReducer, DataEngine, Dataset, Recipe, TorchReducer
 from dengine.datasets.importing import import_labelled
-from dengine.decision.rule import script
+from dengine.decision.scripting import script
 from dengine.errors import SettingError
 from dengine.folds import content_fold
 from dengine.reducers import torch_reducer

@@ -23,7 +23,7 @@ from dengine import (
     export_torchscript,
     load_exported,
 )
-from dengine.decision.rule import script
+from dengine.decision.scripting import script
 from dengine.errors import SettingError
 from dengine.records import FITS, trace_in
 from dengine.traces import REASONS, TraceGate, as_trace, fits, fitted, spec_of

@@ -25,7 +25,7 @@ from dengine import (
     load_dataset,
     load_exported,
 )
-from dengine.decision.rule import script
+from dengine.decision.scripting import script
 from dengine.errors import SettingError, StoreError
 from dengine.reducers.base import StopRule
 from dengine.reducers.umap import (

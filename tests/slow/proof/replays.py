@@ -206,5 +206,5 @@ def noise_cases() -> list[Case]:
 
 def _members(engine: DataEngine, side: int) -> int:
     """How many members the rule has counted, of the parts that it accepts (0) or rejects (1)."""
-    evidence = None if engine.model is None else engine.model.rule.evidence
-    return 0 if evidence is None else int(evidence.told[side, 0, 0, :, 0].sum())
+    evidence = None if engine.model is None else getattr(engine.model.rule, "evidence", None)
+    return 0 if evidence is None else int(evidence.member_counts[side, :, 0].sum())

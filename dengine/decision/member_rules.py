@@ -1,0 +1,134 @@
+"""The rules that learn from outcomes: watched, pooled and priced.
+
+All three decide by `members.MemberEvidence`, which opens and closes levels of the score. `policy.RULES`
+says which one belongs to which guarantee.
+"""
+
+import torch
+
+from .members import MemberEvidence
+from .rule import DecisionRule
+
+LOWEST_LEVEL = 0.3  # a lower score says little about a part
+PRICED_LEVELS = (0.5, 1.0)  # shares of the tolerance that a part of a level may fail with
+
+
+class MemberRule(DecisionRule):
+    """Base class of the rules that decide by `MemberEvidence` in place of LB.
+
+    Parameters
+    ----------
+    alpha, lower_bound, interval
+        As of `DecisionRule`.
+    evidence : MemberEvidence
+        What opens and closes the levels.
+    """
+
+    def __init__(
+        self, alpha: float, lower_bound: float, interval: str, evidence: MemberEvidence
+    ) -> None:
+        super().__init__(alpha, lower_bound, interval)
+        self.evidence = evidence
+
+    def action(self, lower: float, upper: float) -> int:
+        """Return what a bound allows at present, as its position in `Action`."""
+        return self.evidence.action(lower, upper)
+
+    @torch.jit.export
+    def update(
+        self,
+        lower: float,
+        upper: float,
+        success: bool,
+        predicted: int = 0,
+        inclusion_probability: float = 1.0,
+    ) -> None:
+        """Count the outcome of a part, which may move the thresholds; as `DecisionRule.update`."""
+        self.evidence.update(lower, upper, success, predicted, inclusion_probability)
+
+    @torch.jit.export
+    def observe(self, n_silent: int, novel: bool) -> None:
+        """Update the drift detectors, which may start the safe mode; as `DecisionRule.observe`."""
+        self.evidence.observe(n_silent, novel)
+
+    @torch.jit.export
+    def safe_mode(self) -> int:
+        """Return why every part is verified at present: a position in `SAFE_MODES`."""
+        return int(self.evidence.safe_mode.item())
+
+    @torch.jit.unused
+    def start_in_safe_mode(self, safe_mode: int) -> None:
+        """Verify everything from the start, as after an alarm; 0 changes nothing."""
+        if safe_mode:
+            self.evidence.start_safe_mode(safe_mode)
+
+
+class WatchedRule(MemberRule):
+    """The paper's rule with a safe mode, for cells where silence after an accept means success."""
+
+    def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
+        tolerance = 1.0 - float(lower_bound)
+        levels = [float(lower_bound)]
+        evidence = MemberEvidence(alpha, (tolerance, tolerance), [levels, levels], kind="watched")
+        super().__init__(alpha, lower_bound, interval, evidence)
+
+
+class PooledRule(MemberRule):
+    """Accept what reaches the target level while the members show that it may be; reject likewise.
+
+    Parameters
+    ----------
+    alpha, lower_bound, interval
+        As of `DecisionRule`. Alpha is the error level of the bet; the interval only sorts parts.
+    inclusion_probability : float, default 1.0
+        As of `MemberEvidence`.
+    """
+
+    sorts = True
+
+    def __init__(
+        self,
+        alpha: float,
+        lower_bound: float,
+        interval: str = "wilson",
+        inclusion_probability: float = 1.0,
+    ) -> None:
+        tolerance = 1.0 - float(lower_bound)
+        step = 0.5 * tolerance
+        n_levels = int((lower_bound - LOWEST_LEVEL) / step + 1e-9) + 1
+        levels = [float(lower_bound) - i * step for i in range(n_levels)]
+        evidence = MemberEvidence(
+            alpha, (tolerance, tolerance), [levels, levels], inclusion_probability
+        )
+        super().__init__(alpha, lower_bound, interval, evidence)
+        self.extra_arguments = (inclusion_probability,)
+
+
+class PricedRule(MemberRule):
+    """Accept what is expected to cost less than its check while the account allows; reject likewise.
+
+    Parameters
+    ----------
+    alpha, lower_bound, interval
+        As of `DecisionRule`. The interval only sorts parts; LB decides nothing.
+    tolerances : pair of float
+        For each side the share of wrong decisions at which they cost as much as checks, see
+        `Policy.tolerances`.
+    inclusion_probability : float, default 1.0
+        As of `MemberEvidence`.
+    """
+
+    sorts = True
+
+    def __init__(
+        self,
+        alpha: float,
+        lower_bound: float,
+        interval: str,
+        tolerances: tuple[float, float],
+        inclusion_probability: float = 1.0,
+    ) -> None:
+        levels = [[1.0 - share * tolerance for share in PRICED_LEVELS] for tolerance in tolerances]
+        evidence = MemberEvidence(alpha, tolerances, levels, inclusion_probability, kind="priced")
+        super().__init__(alpha, lower_bound, interval, evidence)
+        self.extra_arguments = (tolerances, inclusion_probability)

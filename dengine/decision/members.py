@@ -1,0 +1,344 @@
+"""The evidence that a learning decision rule keeps: outcomes of its members, levels, drift detectors.
+
+`MemberEvidence` is a module with one buffer for each quantity. `member_rules` builds the pooled, the
+priced and the watched rule on it; TorchScript compiles it into the exported file, where it goes on
+learning.
+
+*Members* are the parts whose score reached the target level when they were decided, accepted or
+checked. The score for accepting is the lower bound, the score for rejecting 1 - upper bound. Each
+side has candidate *levels* of the score, the strictest first; the rule accepts (rejects) a part
+whose score reaches the threshold of that side, which is one of the levels, or out of reach.
+
+*The bet.* A bettor who stakes the same share on every member, against the claim "the mean failure
+probability is above the tolerance", has a capital of 1 / alpha or more with a probability of at most
+alpha while that claim is true. So the pooled rule opens a level while the capital is at least
+1 / alpha. Statement, assumptions, proof and references: docs/explanation/pooled_proof.md.
+
+*The account.* The priced rule counts what accepting all members would have cost beyond checking
+them, in units of one false accept, and opens a level while the balance is at least -1.
+
+*Safe mode.* A mean over all members reacts late to drift. So CUSUM detectors (`certificate.cusum`)
+watch the accepted parts, the rejected parts, and the share of novel traces. After an alarm every part
+is verified until the members decided since the alarm show again that the tolerance is kept.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from .certificate import cusum
+
+SAFE_MODES = (  # why every part is verified; the position is the integer in exported files
+    "",
+    "accepted parts failed more often than the tolerance",
+    "rejected parts were good more often than the tolerance",
+    "too many traces were novel",
+)
+BET = 0.55  # share of the largest stake; best for failure rates of nearly half of the tolerance
+N_RECENT = 50  # newest outcomes of a level that are tested by themselves
+TAIL_PROBABILITY = 0.2  # at most, of the allowed number of errors among them at the tolerance
+CLOSED = 2.0  # a threshold that no score reaches
+OVERDRAFT = 1.0  # false accepts that the priced rule may be behind: the first parts may be unlucky
+FALSE_ALARMS = 100.0  # at the tolerance itself one alarm in 100 / alpha parts on average, or fewer
+NOVEL_SHARE = 0.2  # of the traces of a stream that may be novel
+FEW_NOVEL = 25.0  # traces in a row that are not novel; a novel one takes back 1 / NOVEL_SHARE - 1
+
+
+def max_recent_errors(tolerance: float) -> int:
+    """Return how many of `N_RECENT` outcomes may be wrong.
+
+    More are wrong with a probability of at most `TAIL_PROBABILITY` where each is wrong with the
+    probability `tolerance`.
+    """
+    tail, k = 1.0, -1
+    while tail > TAIL_PROBABILITY:
+        k += 1
+        tail -= math.comb(N_RECENT, k) * tolerance**k * (1.0 - tolerance) ** (N_RECENT - k)
+    return k
+
+
+def log_capital_steps(tolerance: float, inclusion_probability: float) -> list[float]:
+    """Return what each part adds to the log capital of the bet.
+
+    Returns
+    -------
+    list of 4 floats
+        For each checked part, in addition for each wrong one of these; the same for audited parts,
+        which are included with the probability `inclusion_probability`.
+    """
+    stake = BET / (1.0 - BET * tolerance)
+    steps: list[float] = []
+    for scale in (stake * inclusion_probability, stake):
+        good = math.log1p(scale * tolerance)
+        wrong = math.log1p(scale * (tolerance - 1.0))
+        steps += [good, wrong - good]
+    return steps
+
+
+def weighted_sum(counts: list[int], weights: list[float]) -> float:
+    """Return the sum of counts[i] * weights[i]."""
+    total = 0.0
+    for count, weight in zip(counts, weights):  # noqa: B905  strict is not TorchScript
+        total += count * weight
+    return total
+
+
+class MemberEvidence(nn.Module):
+    """Outcomes of members and levels, drift detectors, and the threshold of each side.
+
+    Side 0 accepts, side 1 rejects. Counts are held apart for *checked* parts (outcome asked for with
+    certainty) and *audited* parts (asked for with the probability `inclusion_probability`).
+
+    Parameters
+    ----------
+    alpha : float
+        Error level of the bet.
+    tolerances : pair of float
+        For each side, the largest share of wrong decisions.
+    levels : two lists of float
+        For each side the candidate levels of the score, strictest first; as many on each side.
+    inclusion_probability : float, default 1.0
+        Probability, fixed beforehand, that the outcome of a certain decision is asked for; 1 where
+        all outcomes are known.
+    kind : {"watched", "pooled", "priced"}, default "pooled"
+        "watched": the first level is open from the start and closes at an alarm. "pooled": a level
+        opens by the bet. "priced": a level opens by the account.
+
+    Attributes
+    ----------
+    member_counts : Tensor of int64, shape (2, 2, 2)
+        [side, checked or audited, parts or wrong parts], of all members so far.
+    member_counts_since_alarm : Tensor of int64, shape (2, 2, 2)
+        The same since the last alarm.
+    level_counts_since_alarm : Tensor of int64, shape (2, L, 2, 2)
+        [side, level, checked or audited, parts or wrong parts]: parts whose score reached the level.
+    level_totals : Tensor of int64, shape (2, L)
+        Parts that ever reached each level.
+    recent_errors : Tensor of int64, shape (2, L, N_RECENT)
+        1 for each of the newest parts of a level that was wrong; the oldest is overwritten.
+    detector_sums : Tensor of float64, shape (3,)
+        CUSUM of accepted parts, of rejected parts, and of novel traces.
+    thresholds : Tensor of float64, shape (2,)
+        Score that a part must reach to be accepted, and to be rejected; `CLOSED` if nothing may pass.
+    target_level : Tensor of int64, shape (2,)
+        For each side the position of the level whose parts are members.
+    safe_mode : Tensor of int64, shape ()
+        Position in `SAFE_MODES`; 0 outside of the safe mode.
+    """
+
+    member_counts: Tensor
+    member_counts_since_alarm: Tensor
+    level_counts_since_alarm: Tensor
+    level_totals: Tensor
+    recent_errors: Tensor
+    detector_sums: Tensor
+    thresholds: Tensor
+    target_level: Tensor
+    safe_mode: Tensor
+
+    def __init__(
+        self,
+        alpha: float,
+        tolerances: tuple[float, float],
+        levels: list[list[float]],
+        inclusion_probability: float = 1.0,
+        *,
+        kind: str = "pooled",
+    ) -> None:
+        super().__init__()
+        self.levels = levels
+        self.is_watched = kind == "watched"
+        self.is_priced = kind == "priced"
+        self.inclusion_probability = inclusion_probability
+        self.n_recent = N_RECENT
+        self.closed = CLOSED
+        self.max_recent_errors = [max_recent_errors(tolerance) for tolerance in tolerances]
+        # Of the bet and of the account, what each kind of part adds; see `log_capital_steps`.
+        self.required_log_capital = math.log(1.0 / alpha)
+        self.capital_steps = [log_capital_steps(t, inclusion_probability) for t in tolerances]
+        self.required_balance = [-OVERDRAFT, 0.0]
+        self.balance_steps = [
+            [t, -1.0, t / inclusion_probability, -1.0 / inclusion_probability] for t in tolerances
+        ]
+        # Of a detector, what a wrong part adds, where a right one takes 1, and the alarm's limit.
+        detectors = [cusum(share, FALSE_ALARMS / alpha) for share in (*tolerances, NOVEL_SHARE)]
+        self.error_steps = [float(step) for step, _ in detectors]
+        self.alarm_limits = [float(limit) for _, limit in detectors]
+        self.correct_step = -1.0
+        self.few_novel = FEW_NOVEL
+        self.novel_setback = 1.0 / NOVEL_SHARE - 1.0
+        n_levels = len(levels[0])
+        counts = {
+            "member_counts": (2, 2, 2),
+            "member_counts_since_alarm": (2, 2, 2),
+            "level_counts_since_alarm": (2, n_levels, 2, 2),
+            "level_totals": (2, n_levels),
+            "recent_errors": (2, n_levels, N_RECENT),
+            "target_level": (2,),
+            "safe_mode": (),
+        }
+        for name, shape in counts.items():
+            self.register_buffer(name, torch.zeros(shape, dtype=torch.int64))
+        first = [side[0] if self.is_watched else CLOSED for side in levels]
+        self.register_buffer("thresholds", torch.tensor(first, dtype=torch.float64))
+        self.register_buffer("detector_sums", torch.zeros(3, dtype=torch.float64))
+
+    def action(self, lower: float, upper: float) -> int:
+        """Return the action that a bound allows at present: 0 verify, 1 accept, 2 reject.
+
+        A part that could as well be accepted as rejected is verified.
+        """
+        thresholds: list[float] = self.thresholds.tolist()
+        accepts = lower >= thresholds[0]
+        rejects = upper <= 1.0 - thresholds[1]
+        if accepts == rejects:
+            return 0
+        return 1 if accepts else 2
+
+    def observe(self, n_silent: int, novel: bool) -> None:
+        """Update the detectors with accepted parts of unknown outcome, and with this trace.
+
+        `n_silent` accepted parts went on since the last label, and count as not wrong. `novel` says
+        whether the trace of the part at hand was novel. An alarm starts the safe mode.
+        """
+        self.step_detector(0, self.correct_step, n_silent)
+        safe_mode = int(self.safe_mode.item())
+        if safe_mode == 0:
+            self.step_detector(2, self.correct_step, n_silent)
+            self.step_detector(2, self.error_steps[2] if novel else self.correct_step, 1)
+        elif safe_mode == 3:  # the sum now counts how long few traces have been novel
+            step = -self.novel_setback if novel else 1.0
+            self.detector_sums[2].fill_(max(float(self.detector_sums[2].item()), 0.0) + step)
+
+    def update(
+        self,
+        lower: float,
+        upper: float,
+        success: bool,
+        predicted: int,
+        inclusion_probability: float,
+    ) -> None:
+        """Count the outcome of a part on both sides, choose the thresholds, and end the safe mode.
+
+        Parameters and their meaning as of `DecisionRule.update`. The safe mode ends when the side
+        that raised the alarm has an open level again; after too many novel traces, when novel ones
+        are few again and either side has one.
+        """
+        self.count_outcome(0, lower, not success, predicted, inclusion_probability)
+        self.count_outcome(1, 1.0 - upper, success, predicted, inclusion_probability)
+        safe_mode = int(self.safe_mode.item())
+        if safe_mode == 3:
+            threshold = self.thresholds.min()
+            calm = float(self.detector_sums[2].item()) >= self.few_novel
+        else:
+            threshold = self.thresholds[max(0, safe_mode - 1)]
+            calm = True
+        if safe_mode != 0 and calm and float(threshold.item()) < self.closed:
+            self.safe_mode.zero_()
+            self.detector_sums[2].zero_()
+
+    def count_outcome(
+        self, side: int, score: float, wrong: bool, predicted: int, inclusion_probability: float
+    ) -> None:
+        """Count one part of known outcome on one side, then choose the threshold of that side.
+
+        The detector takes every part that reaches the threshold; levels and members take a part only
+        if its outcome was asked for (`inclusion_probability` > 0) or all outcomes are known.
+        """
+        if score >= float(self.thresholds[side].item()):
+            self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
+        audited = 0
+        if self.inclusion_probability < 1.0:
+            if inclusion_probability == 0.0:
+                return
+            audited = int(inclusion_probability < 1.0)
+        n_levels = len(self.levels[side])
+        n_reached = 0
+        for level in self.levels[side]:
+            n_reached += int(level <= score)
+        # A part that the model was certain of is a member even where its label came late.
+        target = int(self.target_level[side].item())
+        is_member = n_reached > n_levels - 1 - target or predicted == side + 1
+        if n_reached == 0 and not is_member:
+            return
+        first = n_levels - n_reached
+        slots = self.level_totals[side, first:].unsqueeze(1) % self.n_recent  # of the oldest
+        self.recent_errors[side, first:].scatter_(1, slots, int(wrong))
+        self.level_totals[side, first:].add_(1)
+        n_columns = 1 + int(wrong)  # parts, and wrong parts
+        self.level_counts_since_alarm[side, first:, audited, :n_columns].add_(1)
+        if is_member:
+            self.member_counts[side, audited, :n_columns].add_(1)
+            self.member_counts_since_alarm[side, audited, :n_columns].add_(1)
+        self.choose_threshold(side)
+
+    def step_detector(self, detector: int, step: float, times: int) -> None:
+        """Add `step` to a CUSUM `times` times, restarting at 0 below 0; start the safe mode at its limit.
+
+        With several steps `step` is negative, so that none but the last can start from 0.
+        """
+        if times <= 0:
+            return
+        before = float(self.detector_sums[detector].item())
+        total = max(before + (times - 1) * step, 0.0) + step
+        self.detector_sums[detector].fill_(total)
+        if total >= self.alarm_limits[detector]:
+            safe_mode = int(self.safe_mode.item())
+            if safe_mode == 0 or safe_mode == 3:
+                self.start_safe_mode(detector + 1)
+            else:  # a side that has not shown its tolerance yet stays the reason
+                self.start_safe_mode(min(safe_mode, detector + 1))
+
+    def start_safe_mode(self, safe_mode: int) -> None:
+        """Close both sides until the members from now on show that the tolerance is kept.
+
+        `safe_mode` is the position of the reason in `SAFE_MODES`.
+        """
+        self.detector_sums.zero_()
+        self.member_counts_since_alarm.zero_()
+        self.level_counts_since_alarm.zero_()
+        self.target_level.zero_()
+        self.thresholds.fill_(self.closed)
+        self.safe_mode.fill_(safe_mode)
+
+    def choose_threshold(self, side: int) -> None:
+        """Set the target level and the threshold of one side from the counts.
+
+        The target is the lowest level whose parts since the last alarm, and whose newest parts, are
+        good enough. The threshold is that level if the members show as much, else `CLOSED`.
+        """
+        levels: list[list[int]] = self.level_counts_since_alarm[side].flatten(1).tolist()
+        if self.is_watched:  # only an alarm closes it
+            closed = float(self.thresholds[side].item()) >= self.closed
+            if closed and self.keeps_tolerance(side, levels[0]):
+                # Assigned to an element, a float of TorchScript would go through float32.
+                self.thresholds[side].fill_(self.levels[side][0])
+            return
+        members: list[int] = self.member_counts[side].flatten().tolist()
+        since: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
+        n_wrong: list[int] = self.recent_errors[side].sum(1).tolist()
+        target = len(n_wrong) - 1
+        while target >= 0:
+            few_errors = n_wrong[target] <= self.max_recent_errors[side]
+            if few_errors and self.allows_more(side, levels[target]):
+                break
+            target -= 1
+        self.target_level[side].fill_(max(0, target))
+        after_alarm = since != members or int(self.safe_mode.item()) != 0
+        opens = target >= 0 and self.allows_more(side, members)
+        opens = opens and (not after_alarm or self.keeps_tolerance(side, since))
+        self.thresholds[side].fill_(self.levels[side][target] if opens else self.closed)
+
+    def allows_more(self, side: int, counts: list[int]) -> bool:
+        """Return whether counts allow more parts of their kind, by the bet or by the account.
+
+        `counts` holds checked parts, wrong ones of these, audited parts, wrong ones of these.
+        """
+        if self.is_priced:
+            return weighted_sum(counts, self.balance_steps[side]) >= self.required_balance[side]
+        return self.keeps_tolerance(side, counts)
+
+    def keeps_tolerance(self, side: int, counts: list[int]) -> bool:
+        """Return whether the bet shows that the parts keep the tolerance; `counts` as above."""
+        return weighted_sum(counts, self.capital_steps[side]) >= self.required_log_capital

@@ -1,0 +1,78 @@
+"""The radius-neighbour decision: count references around one embedded trace and ask the rule.
+
+`RadiusNeighbours` joins a `RadiusIndex` and a `DecisionRule` into one module that compiles to
+TorchScript. `WilsonRadiusClassifier` and the model's `Predictor` are built on it.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from ..records import REASONS, Reason
+from .references import RadiusIndex
+from .rule import DecisionRule
+
+CERTAIN = REASONS.index(Reason.CERTAIN)
+UNCERTAIN = REASONS.index(Reason.UNCERTAIN)
+SAFE_MODE = REASONS.index(Reason.SAFE_MODE)
+
+
+class RadiusNeighbours(nn.Module):
+    """Counts the references around one embedded trace and asks the rule.
+
+    Parameters
+    ----------
+    references : RadiusIndex
+        The labelled points.
+    rule : DecisionRule
+        Turns the counts into a bound and an action.
+    radius : float
+        Radius within which labels count, in units of the scaled embedding, surface included.
+    scored : bool, default False
+        Whether the first axis of each space is a probability of success. A rule whose bound only
+        sorts then takes the mean of these for both ends of the bound: it uses all labels except the
+        part's own. The counts are returned all the same.
+    """
+
+    def __init__(
+        self, references: RadiusIndex, rule: DecisionRule, radius: float, scored: bool = False
+    ) -> None:
+        super().__init__()
+        self.scored = scored
+        self.references: RadiusIndex = references
+        self.rule: DecisionRule = rule
+        self.radius = float(radius)
+        self.certain = CERTAIN
+        self.uncertain = UNCERTAIN
+        self.safe_mode = SAFE_MODE
+
+    @torch.jit.export
+    def reason(self, action: int) -> int:
+        """Return the position in `Reason` of why the rule chose this action."""
+        if action != 0:
+            return self.certain
+        return self.uncertain if self.rule.safe_mode() == 0 else self.safe_mode
+
+    def forward(self, z: Tensor, part: int = 0) -> tuple[int, float, float, int, int]:
+        """Decide on one embedded trace.
+
+        Parameters
+        ----------
+        z : Tensor of float32, shape (K, d)
+            The scaled embedding.
+        part : int, default 0
+            Hash of its part, whose own references do not count; 0 for an unknown part.
+
+        Returns
+        -------
+        action : int
+            0 verify, 1 accept, 2 reject.
+        lower, upper : float
+        n_success, n_failure : int
+        """
+        distances = self.references.squared_distances(z, part)
+        n_success, n_failure = self.references.count_near(distances, self.radius)
+        if self.scored:
+            score = float(z.select(1, 0).mean().item())
+            return self.rule.action(score, score), score, score, n_success, n_failure
+        action, lower, upper = self.rule(n_success, n_failure)
+        return action, lower, upper, n_success, n_failure

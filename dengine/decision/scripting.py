@@ -1,0 +1,82 @@
+"""Compile modules to TorchScript, and copy stored arrays back into modules.
+
+The reducers, the decision rules, the novelty gate and the export use these helpers.
+"""
+
+import threading
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from ..errors import StoreError
+from .code import remember_code
+
+_SCRIPTING = threading.Lock()
+
+
+def script(module: nn.Module) -> Any:
+    """Compile a module with `torch.jit.script`, without its deprecation notice.
+
+    TorchScript works in the supported range of PyTorch. One thread compiles at a time: where two
+    parse at once, Python's parser raises "AST constructor recursion depth mismatch".
+
+    Parameters
+    ----------
+    module : nn.Module
+        The module to compile; its code is remembered, see `code.is_code_changed`.
+
+    Returns
+    -------
+    torch.jit.ScriptModule
+        It shares the tensors of `module`.
+    """
+    with _SCRIPTING, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r".*torch\.jit\..* is deprecated.*")
+        scripted = torch.jit.script(module)
+    remember_code(module)
+    return scripted
+
+
+def arrays_with_prefix(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a state whose names begin with `prefix`, by the rest of their names."""
+    return {
+        name.removeprefix(prefix): array for name, array in state.items() if name.startswith(prefix)
+    }
+
+
+def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Copy arrays, in place, into the parameters and buffers of a module.
+
+    Parameters
+    ----------
+    module : nn.Module
+        The module to write to.
+    arrays : mapping of str to array
+        One array for each name in `module.state_dict()`.
+
+    Raises
+    ------
+    StoreError
+        If the names or shapes are not those of the module.
+    """
+    tensors = module.state_dict()  # shares its tensors with the module
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    if {name: array.shape for name, array in arrays.items()} != shapes:
+        raise incompatible_model_error(f"{type(module).__name__} has other sizes")
+    for name, array in arrays.items():
+        tensors[name].copy_(torch.from_numpy(np.array(array)))
+
+
+def incompatible_model_error(defect: str) -> StoreError:
+    """Return the error for a stored model that this version of dengine cannot restore.
+
+    `defect` says what does not fit, as in "ConvReducer has other sizes".
+    """
+    got = f"one whose {defect}; its labels are whole"
+    do = "learn from them anew, by `dengine train --data OLD.db --store NEW.db`"
+    return StoreError(f"Expected a model of this version of dengine, got {got}: {do}.")
