@@ -141,10 +141,11 @@ class Policy:
     def rule(self) -> DecisionRule:
         """A new rule by these settings, which has been told nothing yet. SettingError where its class cannot be found."""
         from . import member_rules  # torch is imported where it is used
+        from .rule import DecisionRule
 
         own = RULES.get(self.guarantee)
         found = find_class(self.guarantee) if own is None else getattr(member_rules, own[self.stops])
-        if not issubclass(found, member_rules.DecisionRule):
+        if not issubclass(found, DecisionRule):
             raise SettingError(f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none.")
         more: dict[str, Any] = {"tolerances": self.tolerances} if issubclass(found, member_rules.PricedRule) else {}
         if issubclass(found, member_rules.PooledRule | member_rules.PricedRule):

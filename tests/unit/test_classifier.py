@@ -51,7 +51,7 @@ def test_predictions_are_those_of_scikit_learns_radius_neighbours() -> None:
 def test_scripted_the_rule_over_the_ring_answers_as_the_classifier_does() -> None:
     Z, y = blobs()
     model = WilsonRadiusClassifier(radius=0.4, alpha=0.1, lower_bound=0.9).fit(Z, y)
-    scripted = script(model.around(model.index_))
+    scripted = script(model.neighbours_over(model.index_))
     queries = torch.rand(60, 1, 2, generator=torch.Generator().manual_seed(0)) * 4 - 2
     assert [scripted(q) for q in queries] == [model.neighbours_(q) for q in queries]
 

@@ -133,8 +133,8 @@ def test_a_level_that_its_members_contradict_stays_shut_below_the_ones_that_hold
     assert rule.action(0.7, 1.0) == VERIFY
 
 
-def priced(rate: float = 1.0) -> PricedRule:
-    return PricedRule(0.1, 0.9, "wilson", (5 / 120, 5 / 47.5), rate)
+def priced(inclusion_probability: float = 1.0) -> PricedRule:
+    return PricedRule(0.1, 0.9, "wilson", (5 / 120, 5 / 47.5), inclusion_probability)
 
 
 @pytest.mark.parametrize("share_bad", [0.02, 0.06, 0.3])
@@ -222,7 +222,7 @@ def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever
         n, rules = 0, [WatchedRule(alpha, lower_bound) for _ in range(40)]
         for rule in rules:
             while rule.safe_mode() == 0:
-                rule.evidence.count(0, 0.95, bool(rng.random() < rate), 0, 1.0)
+                rule.evidence.count_outcome(0, 0.95, bool(rng.random() < rate), 0, 1.0)
                 n += 1
         mean.append(n / len(rules))
     assert mean[0] > 0.7 * FALSE_ALARMS / alpha  # of 40; exactly, it is beyond that
