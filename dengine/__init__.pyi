@@ -19,6 +19,7 @@ from .experiments.replay import Replay as Replay
 from .experiments.replay import replay as replay
 from .export.torchscript import export_torchscript as export_torchscript
 from .export.torchscript import load_exported as load_exported
+from .limits import ForceLimits as ForceLimits
 from .model.neighbours import ModelPrediction as ModelPrediction
 from .recipe import Recipe as Recipe
 from .records import Action as Action
@@ -29,7 +30,6 @@ from .records import Reason as Reason
 from .records import RetrainReport as RetrainReport
 from .records import Source as Source
 from .records import TraceSpec as TraceSpec
-from .records import Window as Window
 from .reducers import REDUCERS as REDUCERS
 from .reducers import make_reducer as make_reducer
 from .reducers.base import CrossFitted as CrossFitted

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from .errors import DataError, TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
-from .records import FITS, REASONS, Reason, TraceSpec, Window
+from .limits import ForceLimits
+from .records import FITS, REASONS, Reason, TraceSpec
 
 # What clocks are called, in the languages of recorders. Any word of a name, as in `header.stamp` or `Relative Time`;
 # and names that say it only by themselves, as `ms`.
@@ -250,7 +251,7 @@ class TraceGate(nn.Module):
         return reason, int(torch.dot(steps, self.weights).item())
 
 
-class WindowGate(nn.Module):
+class ForceLimitsGate(nn.Module):
     """An operator's windows, scripted, for the engine and the exported file; SettingError where traces cannot hold them."""
 
     limits: Tensor
@@ -258,7 +259,7 @@ class WindowGate(nn.Module):
     action: Tensor
     time: Tensor
 
-    def __init__(self, windows: Sequence[Window], spec: TraceSpec) -> None:
+    def __init__(self, windows: Sequence[ForceLimits], spec: TraceSpec) -> None:
         super().__init__()
         time = torch.tensor([[i / spec.rate_hz for i in range(spec.samples)]])
         known: dict[Any, int] = {None: spec.channels}  # time stands behind the channels

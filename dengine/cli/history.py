@@ -69,14 +69,14 @@ def history(store: str, events: bool, **asked: Any) -> None:
     """
     from ..history.status import beside
     from ..history.status import history as read
-    from ..records import plain
+    from ..representation import to_jsonable
     from ..store.opening import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
         found = list(read(opened, **asked))
         since = asked["since"] if asked["since"] is not None or not found else found[0].time
         others = beside(opened, since, asked["until"]) if events else {}
-    record = {"store": store, "decisions": [plain(past) | {"label": past.label} for past in found]} | others
+    record = {"store": store, "decisions": [to_jsonable(past) | {"label": past.label} for past in found]} | others
     tell(record, _table(merge(*others.values(), found, key=lambda each: each.time)))
 
 
@@ -144,7 +144,7 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     from ..experiments.figures import explained_picture
     from ..history.explain import explain as explained
     from ..history.status import history
-    from ..records import plain
+    from ..representation import to_jsonable
     from ..store.opening import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
@@ -154,7 +154,7 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
                 raise ReportError(f"Expected a decision in {store}, there is none yet; let an engine decide first.")
             decision = newest.decision.id
         found = explained(opened, decision, neighbours)
-    record, past = {"store": store} | plain(found), found.decision
+    record, past = {"store": store} | to_jsonable(found), found.decision
     tables = [facts(f"{past.decision.id}: {past.decision.action.value}, {past.decision.reason.value}", _rows(found))]
     if found.envelope is not None and found.envelope.excesses:
         columns = ("", "from", "to", "in widths")

@@ -89,11 +89,11 @@ def tell(
         except DengineError as error:
             refusal = error
     if as_json():
-        from ..records import plain
+        from ..representation import to_jsonable
 
         named = {"verb": click.get_current_context().info_name} | dict(record)
         written = named if made is None else named | {"files": files}
-        click.echo(json.dumps(plain(written), indent=2, allow_nan=False))  # NaN, which JSON has not, is null by now
+        click.echo(json.dumps(to_jsonable(written), indent=2, allow_nan=False))  # NaN, which JSON has not, is null by now
     else:
         show(*parts, *(f"Wrote {path}" for path in files))
     if refusal is not None:

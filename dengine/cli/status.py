@@ -34,7 +34,7 @@ def status(store: str, last: int, check_seconds: float) -> None:
     accepted parts is of one look; what is certified holds however often one looks.
     """
     from ..history.status import status as status_of
-    from ..records import plain
+    from ..representation import to_jsonable
     from ..store.opening import open_store
     from ..store.peers import list_cells
     from ..store.records import CellAddress, address
@@ -51,7 +51,7 @@ def status(store: str, last: int, check_seconds: float) -> None:
     n, checked = found.ever.would_accept.n + found.ever.would_reject.n, found.ever.verified
     saved = f"{duration(n * check_seconds)} of checks at {duration(check_seconds)}"
     would = [f"It would have decided {n:,} of the {checked:,} parts that were verified: {saved}."] if n else []
-    record = {"store": store} | plain(found) | {"certificate": certificate_record(found.certificate)}
+    record = {"store": store} | to_jsonable(found) | {"certificate": certificate_record(found.certificate)}
     tell(record, *_tables(store, found), *would)
 
 

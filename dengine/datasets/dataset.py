@@ -16,7 +16,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError, TraceError, expect, shortened
-from ..records import FITS, TraceSpec, in_html
+from ..records import FITS, TraceSpec
+from ..representation import to_html
 from ..traces import as_traces, fits, fitted
 from . import units
 
@@ -109,7 +110,7 @@ class Dataset:
         known = f"{good} good, {len(self) - good} bad, {self.unlabelled} unlabelled, {len(self.faults)} left out"
         return f"<Dataset {self.name}: {len(self)} traces, {form}, {known}>"
 
-    _repr_html_ = in_html
+    _repr_html_ = to_html
 
     @property
     def spec(self) -> TraceSpec:

@@ -24,7 +24,7 @@ from ..engine.engine import DataEngine
 from ..errors import StoreError, TraceError
 from ..folds import content_hash, own_hash
 from ..recipe import Recipe
-from ..records import REASONS, Action, Decision, Reason, TraceSpec, as_success, source_of, trace_in
+from ..records import REASONS, Action, Decision, Reason, TraceSpec, as_success, source_of, stored_trace_spec
 from ..store.opening import UNHURRIED, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
@@ -48,7 +48,7 @@ def form_in(store: "StoreLike", source: Any) -> dict[str, Any]:
         return {}
     try:
         with opening(store, must_exist=True) as opened:
-            agreed = trace_in(opened.settings())
+            agreed = stored_trace_spec(opened.settings())
             if opened is not store:
                 opened.close()
     except StoreError:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, instead, listed
 from ..files import is_database, read_archive, reading
-from ..records import trace_in
+from ..records import stored_trace_spec
 from ..traces import as_trace, spec_of
 from . import units
 from .bags import is_stream, read_bag
@@ -166,7 +166,7 @@ def _read_store(path: Path, name: str, asked: Asked) -> Dataset:
     with opening(path, must_exist=True) as store:
         if said := store.database.doubt(0, since=0):
             raise DataError(f"Expected {path} as its ledger has it, {said}; see `dengine verify`, and restore a copy.")
-        held, spec = store.labelled(), trace_in(store.settings())
+        held, spec = store.labelled(), stored_trace_spec(store.settings())
     store.close()
     if spec is None or not len(held.labels):
         raise DataError(f"Expected a store with labelled traces, {path} has none; record some first, as in shadow mode.")

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 from numpy.typing import ArrayLike
 
 from ..errors import SettingError, expect
-from ..records import ACTIONS, Action, Window, find_class, is_number, is_whole
+from ..imports import import_class
+from ..limits import ForceLimits
+from ..records import ACTIONS, Action, is_number, is_whole
 from .certificate import Certificate, Outcomes, certify
 from .intervals import INTERVALS, SORTING_GUARANTEES, Bounds, interval_error_level, normal_quantile
 
@@ -36,8 +38,8 @@ class Policy:
     lower_bound : the paper's LB, in (0.5, 1): accept where lower >= LB, reject where upper <= 1 - LB.
     interval : a name in `INTERVALS`.
     guarantee : the rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a `DecisionRule` of your
-        own. "local", the paper's, speaks of the ball around one trace, "pooled" of all parts together, "cost" of what they
-        cost by `prices`, and neither of the two numbers above but for the safe mode: see `rule`.
+        own. "local", the paper's, speaks of the neighbourhood of one trace, "pooled" of all parts together, "cost" of what
+        they cost by `prices`: then `lower_bound` has no effect, and `alpha` only on the safe mode.
     stops : "all" where every bad accepted part stops the system and is reported before the next decision: then silence
         until that decision confirms the part. "some", the default, where silence says nothing.
     audit_rate : share of certain decisions that are verified all the same, in [0, 1]; a guarantee on rejects needs it, and
@@ -49,8 +51,8 @@ class Policy:
     prices : of a check, of a bad part that is accepted, and of a good one that is rejected, in one unit, by which "cost"
         decides: accept what fails with less than check / escape, reject what succeeds with less than check / false reject.
         An error costs more than two checks.
-    windows : an operator's limits beside the model, each a `Window`, or its text. What leaves one is verified, or rejected,
-        whatever the model says (`Reason.OUTSIDE`), and no claim counts it.
+    windows : an operator's limits beside the model, each a `ForceLimits`, or its text. A trace that leaves one is verified,
+        or rejected, whatever the model says (`Reason.OUTSIDE`), and no claim counts it.
     Raises SettingError for a value out of its range.
     """
 
@@ -62,7 +64,7 @@ class Policy:
     stops: Stops = "some"
     shadow: bool = False
     label_within: int = 1000
-    windows: tuple[Window, ...] = ()
+    windows: tuple[ForceLimits, ...] = ()
     prices: tuple[float, float, float] = (5.0, 120.0, 47.5)
 
     def __post_init__(self) -> None:
@@ -80,9 +82,9 @@ class Policy:
         expect(isinstance(self.shadow, bool), "shadow to be True or False", self.shadow)
         expect(is_whole(self.label_within, 1, 10**9), "label_within of at least one decision", self.label_within)
         listed = self.windows if isinstance(self.windows, tuple | list) else (None,)
-        windows = tuple(Window.parse(each) if isinstance(each, str) else each for each in listed)
-        known = all(isinstance(each, Window) for each in windows)
-        expect(known, "a list of windows, each a Window, or its text", self.windows)
+        windows = tuple(ForceLimits.parse(each) if isinstance(each, str) else each for each in listed)
+        known = all(isinstance(each, ForceLimits) for each in windows)
+        expect(known, "a list of windows, each a ForceLimits, or its text", self.windows)
         object.__setattr__(self, "windows", windows)
         known = isinstance(self.prices, tuple | list) and len(self.prices) == 3 and all(map(is_number, self.prices))
         prices = tuple(float(each) for each in self.prices) if known else (0.0, 0.0, 0.0)
@@ -126,7 +128,7 @@ class Policy:
         return 1.0 if self.shadow else self.audit_rate
 
     @property
-    def limits(self) -> tuple[Window, ...]:
+    def limits(self) -> tuple[ForceLimits, ...]:
         """The windows as they act: in the shadow mode none rejects."""
         return tuple(replace(each, reject=each.reject and not self.shadow) for each in self.windows)
 
@@ -144,7 +146,7 @@ class Policy:
         from .rule import DecisionRule
 
         own = RULES.get(self.guarantee)
-        found = find_class(self.guarantee) if own is None else getattr(member_rules, own[self.stops])
+        found = import_class(self.guarantee) if own is None else getattr(member_rules, own[self.stops])
         if not issubclass(found, DecisionRule):
             raise SettingError(f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none.")
         more: dict[str, Any] = {"tolerances": self.tolerances} if issubclass(found, member_rules.PricedRule) else {}

@@ -45,10 +45,10 @@ from ..records import (
     as_id,
     as_outcome,
     as_success,
-    in_html,
     source_of,
 )
 from ..reducers.base import Reducer
+from ..representation import to_html
 from ..store.opening import UNHURRIED, opening
 from ..store.outbox import CLOSE_SECONDS, Outbox
 from ..store.records import StoredDecision
@@ -660,7 +660,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         rest = ", safe mode" if self.safe_mode else ", shadow mode" if self.shadow else ""
         return f"<DataEngine {of}, {form}, {self.new_labels} new labels{rest}>"
 
-    _repr_html_ = in_html
+    _repr_html_ = to_html
 
     def history_frame(self, last: int | None = None, **where: Any) -> pd.DataFrame:
         """`history` as a DataFrame, a row a decision by its id, with its label and its time as a datetime."""

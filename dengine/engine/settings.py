@@ -13,9 +13,9 @@ from ..errors import ImportRefusedError, SettingError, StoreError, expect, short
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT, Recipe, described
-from ..records import TraceSpec, is_whole, trace_in
+from ..records import TraceSpec, is_whole, stored_trace_spec
 from ..store.outbox import Outbox
-from ..traces import WindowGate
+from ..traces import ForceLimitsGate
 
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
@@ -62,7 +62,7 @@ class EngineSettings:
         known = self.trace is None or isinstance(self.trace, TraceSpec)
         expect(known, "a TraceSpec as trace", self.trace, "TraceSpec(samples=1000) for one")
         if self.trace is not None:
-            WindowGate(self.recipe.policy.windows, self.trace)  # refused before it is in force
+            ForceLimitsGate(self.recipe.policy.windows, self.trace)  # refused before it is in force
 
     def to_store(self) -> dict[str, str]:
         """As `SqlStore.save_settings` takes them."""
@@ -115,7 +115,7 @@ class EngineSettings:
         sound = seed.isdecimal() and seed.isascii() and len(seed) < 100
         expect(sound, "a seed in the store's settings", seed, "restore the store from a copy", StoreError)
         policy_since, *evidence = (int(known.get(name, "0")) for name in MARKS)
-        own, trace = known.get("model"), trace_in(known)
+        own, trace = known.get("model"), stored_trace_spec(known)
         return cls(recipe, int(seed), own, made_with, trace, inferred, policy_since, EvidenceWindow(*evidence))
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
@@ -182,7 +182,7 @@ def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str])
 
 def peers_trace(store: "SqlStore") -> TraceSpec | None:
     """The contract of traces that a product's cells have agreed on; None where there is none, or no product."""
-    return next(filter(None, map(trace_in, store.peers_settings().values())), None)
+    return next(filter(None, map(stored_trace_spec, store.peers_settings().values())), None)
 
 
 def as_peers(asked: Mapping[str, Any], store: "SqlStore", allow_import: bool | Collection[str]) -> dict[str, Any]:
@@ -220,7 +220,7 @@ class SettingsInForce:
     """The settings in force, and the store's copy of them.
 
     now : they themselves.  audited_share : of certain decisions that are verified all the same.
-    outside : what the policy's windows say of a trace, as `WindowGate`; None where there are none.
+    outside : what the policy's windows say of a trace, as `ForceLimitsGate`; None where there are none.
     waiting : whether the store lacks them, and `save` is to be called again.
     """
 
@@ -233,7 +233,9 @@ class SettingsInForce:
         """Go on under others."""
         policy, trace = settings.recipe.policy, settings.trace
         self.now, self.audited_share = settings, policy.audited_share
-        self.outside = script(WindowGate(policy.limits, trace)).forward if policy.windows and trace is not None else None
+        self.outside = (
+            script(ForceLimitsGate(policy.limits, trace)).forward if policy.windows and trace is not None else None
+        )
 
     def save(self) -> None:
         """Store them; where the store is away, they wait."""

@@ -208,7 +208,7 @@ class ModelVersions:
         """
         made, model, point = known.decision, self.answering, None
         if unobserved is not None and made.model_version >= self.evidence.since:
-            how = ACTIONS.index(made.predicted), made.looked
+            how = ACTIONS.index(made.predicted), made.inclusion_probability
             self.newest.tell_safely(made.lower, made.upper, success, made.reason is Reason.NOVEL, unobserved, *how)
         number = 0 if model is None else next(self._provisional)
         self._waiting[made.id] = known, success, number

@@ -21,8 +21,9 @@ from ..datasets import load_dataset
 from ..engine.engine import DataEngine
 from ..errors import DataError, SettingError, expect
 from ..recipe import RECIPES, Recipe
-from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, in_html
+from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport
 from ..reducers.base import Reducer
+from ..representation import to_html
 from .baselines import BASELINES, make_baseline
 from .metrics import VERIFY_SECONDS, Costs
 
@@ -127,7 +128,7 @@ class Replay:
         cycles = f"{self.recipe.policy.summary}, {len(self)} cycles"
         return f"<Replay of {self.name or 'a run'}{where}: {cycles}, {told}>"
 
-    _repr_html_ = in_html
+    _repr_html_ = to_html
 
     @property
     def dropped(self) -> list[str]:

@@ -27,7 +27,7 @@ from ..datasets.dataset import must
 from ..datasets.importing import ImportReport, import_parts
 from ..errors import DataError, StoreError, instead
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, TraceSpec, trace_in
+from ..records import Action, Decision, Reason, TraceSpec, stored_trace_spec
 from ..store.opening import opening
 from ..traces import as_trace
 
@@ -179,7 +179,7 @@ def import_journal(store: "StoreLike", path: str | os.PathLike[str], any_model: 
     with opening(store, must_exist=True) as opened:
         opened.claim_cell()  # an engine that runs would never learn of these labels
         known = opened.settings()
-        spec = trace_in(known)
+        spec = stored_trace_spec(known)
         if spec is None or "recipe" not in known:
             raise StoreError(f"Expected the store that the model was exported from, {store} knows no trace contract.")
         policy = Recipe.from_toml(known["recipe"]).policy

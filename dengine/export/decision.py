@@ -7,9 +7,10 @@ import torch
 from torch import Tensor, nn
 
 from ..folds import COIN_BITS, MIX, audit_salt
+from ..limits import ForceLimits
 from ..model.neighbours import NOVEL, Predictor
-from ..records import FITS, REASONS, Reason, TraceSpec, Window
-from ..traces import TraceGate, WindowGate, fitted
+from ..records import FITS, REASONS, Reason, TraceSpec
+from ..traces import ForceLimitsGate, TraceGate, fitted
 
 One = tuple[int, int, float, float, int, int, Tensor]
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
@@ -33,10 +34,10 @@ class DecisionModule(nn.Module):
 
     def __init__(
         self, spec: TraceSpec, predictor: Predictor, n_spaces: int, dim: int,
-        audit_rate: float, seed: int, stops_all: bool = False, windows: tuple[Window, ...] = (),
+        audit_rate: float, seed: int, stops_all: bool = False, windows: tuple[ForceLimits, ...] = (),
     ) -> None:  # fmt: skip
         super().__init__()
-        self.predictor, self.limit, self.windows = predictor, TraceGate(spec).limit, WindowGate(windows, spec)
+        self.predictor, self.limit, self.windows = predictor, TraceGate(spec).limit, ForceLimitsGate(windows, spec)
         self.channels, self.samples, self.fit = spec.channels, spec.samples, FITS.index(spec.fit)
         self.n_spaces, self.dim = n_spaces, dim
         self.audit_below, self.salt, self.audit_rate = int(audit_rate * 2**COIN_BITS), audit_salt(seed), float(audit_rate)
@@ -161,7 +162,7 @@ class DecisionModule(nn.Module):
         self.waits = self.nobody
 
     def looked(self, action: int, alone: int) -> float:
-        """`Decision.looked`."""
+        """`Decision.inclusion_probability`."""
         if action != 0:
             return 0.0
         return 1.0 if alone == 0 else self.audit_rate

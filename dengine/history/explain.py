@@ -30,11 +30,12 @@ from ..decision.scripting import arrays_with_prefix, restore
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, Source, TraceSpec, in_html, trace_in
+from ..records import Action, Decision, Reason, Source, TraceSpec, stored_trace_spec
+from ..representation import to_html
 from ..store.evidence import rule_past
 from ..store.records import SAFE_MODE_BEGAN, Evidence, ModelVersion, StoredDecision, VersionError, unknown_decision
 from ..store.views import HistoryFilter, PastLabel
-from ..traces import LARGEST, WindowGate
+from ..traces import LARGEST, ForceLimitsGate
 
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
@@ -377,7 +378,7 @@ def _not_finite(made: Decision, trace: NDArray[np.float32], found: Circumstances
 
 def _outside(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
     x, windows = torch.from_numpy(trace), found.recipe.policy.windows
-    left = [str(each) for each in windows if WindowGate([each], found.spec)(x)]
+    left = [str(each) for each in windows if ForceLimitsGate([each], found.spec)(x)]
     return f": it leaves an operator's window, {' and '.join(left) or 'which is not known'}, whatever the model says."
 
 
@@ -506,7 +507,7 @@ class Explanation:
         made = self.decision.decision
         return f"<Explanation of {made.id}: {made.action.value}, {made.reason.value}, {len(self.neighbours)} neighbours>"
 
-    _repr_html_ = in_html
+    _repr_html_ = to_html
 
 
 def of_part(store: SqlStore, part: str) -> str:
@@ -547,7 +548,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     answering = as_it_stood(store, made.model_version, recipe, past) if made.model_version else None
     found = Circumstances(
         recipe=recipe,
-        spec=trace_in(known) or TraceSpec(samples=samples, channels=channels),
+        spec=stored_trace_spec(known) or TraceSpec(samples=samples, channels=channels),
         model=known.get("model"),
         seed=int(known.get("seed", "0")),
         levels=None if answering is None else answering.levels,

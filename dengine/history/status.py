@@ -18,7 +18,8 @@ from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
 from ..errors import StoreError, expect
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, TraceSpec, in_html, trace_in
+from ..records import Action, Decision, Reason, TraceSpec, stored_trace_spec
+from ..representation import to_html
 from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Outcomes, StoredDecision, StoredVersion
 from ..store.views import HistoryFilter, Stretch, Tally
 
@@ -147,7 +148,7 @@ class Status:
     retraining: bool = False
     store_lag: float = 0.0
 
-    _repr_html_ = in_html
+    _repr_html_ = to_html
 
     def __repr__(self) -> str:
         n = self.ever
@@ -220,7 +221,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         product=store.product,
         settings=settings,
         recipe=recipe,
-        trace=trace_in(settings),
+        trace=stored_trace_spec(settings),
         model=settings.get("model"),
         version=next((each.version for each in reversed(store.retrains()) if each.accepted), 0),
         shadow=policy.shadow,

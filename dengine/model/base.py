@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from ..decision.policy import Policy
 from ..errors import ExportError, SettingError, shortened
+from ..limits import ForceLimits
 from ..recipe import Recipe
-from ..records import Action, Reason, TraceSpec, Window
+from ..records import Action, Reason, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
 from ..traces import without_extremes
 
@@ -288,7 +289,7 @@ class Exportable:
     audit_rate: float = 0.0
     seed: int = 0
     stops_all: bool = False
-    windows: tuple[Window, ...] = ()
+    windows: tuple[ForceLimits, ...] = ()
     model_version: int = 0
     recipe: str = ""
     note: Callable[[str, str], object] | None = None

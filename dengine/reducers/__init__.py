@@ -9,7 +9,8 @@ import lazy_loader
 import numpy as np
 
 from ..errors import SettingError, expect
-from ..records import find_class, is_number, is_whole
+from ..imports import import_class
+from ..records import is_number, is_whole
 
 if TYPE_CHECKING:
     from .base import CrossFitted as CrossFitted
@@ -37,7 +38,7 @@ MOST = 2**31 - 1  # of a parameter that is an integer
 def reducer_class(name: str) -> type:
     """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for."""
     expect(name in _NAMED or ":" in name, f"a reducer among {', '.join(_NAMED)}, or module:Class of your own", name)
-    found: type = __getattr__(_NAMED[name][1]) if name in _NAMED else find_class(name)
+    found: type = __getattr__(_NAMED[name][1]) if name in _NAMED else import_class(name)
     if missing := [each for each in ("fit", "transform", "get_params") if not callable(getattr(found, each, None))]:
         raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has no {' and no '.join(missing)}.")
     return found

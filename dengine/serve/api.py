@@ -41,7 +41,8 @@ from ..errors import (
 from ..history.explain import Explanation
 from ..history.map import PartMap
 from ..history.status import Course, Status
-from ..records import Action, Decision, plain
+from ..records import Action, Decision
+from ..representation import to_jsonable
 from ..store.records import Correction, Event, StoredDecision, StoredVersion, VersionError
 from .service import Told
 
@@ -276,7 +277,7 @@ ANSWERS = {
 
 def answer(name: str, record: object = None, **more: Any) -> Json:
     """An answer: what it has of a record's fields, and more of them."""
-    said = (plain(record) or {}) | more
+    said = (to_jsonable(record) or {}) | more
     return {key: said[key] for key in ANSWERS[name].__struct_fields__ if key in said}
 
 

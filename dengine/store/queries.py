@@ -114,7 +114,7 @@ def counted(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
 
 
 def how_looked() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
-    """What the model alone would have done, as a position in `ACTIONS`, and `Decision.looked`."""
+    """What the model alone would have done, as a position in `ACTIONS`, and `Decision.inclusion_probability`."""
     positions = {action.value: position for position, action in enumerate(ACTIONS)}
     asked = sa.case((DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0)
     return sa.case(positions, value=DECISION.c.predicted).label("predicted"), asked.label("looked")

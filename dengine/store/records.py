@@ -175,7 +175,7 @@ class Evidence(NamedTuple):
     lower, upper : the bound that it was decided by.
     novel : whether it was decided as unlike all that was learned from, `Reason.NOVEL`.
     silent : accepted parts of which nothing was heard between the previous label and this one.
-    predicted : position in `Action` of what the model alone would have done.  looked : as `Decision.looked`.
+    predicted : position in `Action` of what the model alone would have done.  looked : as `Decision.inclusion_probability`.
     """
 
     seq: int
@@ -193,10 +193,10 @@ def overdue_evidence(decision: Decision) -> list[Evidence]:
     told = []
     if decision.lower > 0.0:
         accepts = int(decision.predicted is Action.ACCEPT)
-        told.append(Evidence(0, decision.lower, 1.0, False, False, 0, accepts, decision.looked))
+        told.append(Evidence(0, decision.lower, 1.0, False, False, 0, accepts, decision.inclusion_probability))
     if decision.upper < 1.0:
         rejects = 2 * int(decision.predicted is Action.REJECT)
-        told.append(Evidence(0, 0.0, decision.upper, True, False, 0, rejects, decision.looked))
+        told.append(Evidence(0, 0.0, decision.upper, True, False, 0, rejects, decision.inclusion_probability))
     return told
 
 

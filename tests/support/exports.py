@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from dengine import DataEngine, Dataset, ModelPrediction, Policy, Recipe, TraceSpec, WilsonRadiusClassifier, Window
+from dengine import DataEngine, Dataset, ForceLimits, ModelPrediction, Policy, Recipe, TraceSpec, WilsonRadiusClassifier
 from tests.support.driving import learn
 
 SAMPLES, LIMIT = 100, 500.0
-WINDOWS = (Window(0.02, 0.06, high=5.0), Window(0.1, 0.15, low=-20.0, high=22.5, reject=True))
+WINDOWS = (ForceLimits(0.02, 0.06, high=5.0), ForceLimits(0.1, 0.15, low=-20.0, high=22.5, reject=True))
 OF_POLICY = {each.name for each in fields(Policy)}
 
 

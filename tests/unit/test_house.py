@@ -67,7 +67,7 @@ def test_no_base_of_ours_has_a_single_subclass() -> None:
 
 
 def test_no_module_is_imported_by_a_string() -> None:
-    # The one table of names by string is `dengine/__init__.pyi`; a user's own `module:Class` is found by `find_class`.
+    # The one table of names by string is `dengine/__init__.pyi`; a user's own `module:Class` is imported by `import_class`.
     strings = {
         f"{node.value} ({module}, line {node.lineno})"
         for module, tree in MODULES.items()

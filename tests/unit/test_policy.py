@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dengine import Action, DataEngine, Policy, Reason, Recipe, TraceSpec
 from dengine.errors import SettingError
-from dengine.traces import WindowGate
+from dengine.traces import ForceLimitsGate
 from tests.support.exports import SAMPLES, recipe, trained
 
 policies = st.builds(Policy, alpha=st.floats(0.001, 0.9), lower_bound=st.floats(0.501, 0.999))
@@ -77,7 +77,7 @@ HELD = {  # by seconds, or by channel 1, of samples 0 to 5 ten a second, and of 
 def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits(window: str, said: int) -> None:
     x, held = torch.arange(6, dtype=torch.float32), recipe(windows=(window,))
     spec = TraceSpec(6, rate_hz=10.0, channels=2, columns=("F", "Z"))
-    assert WindowGate(held.policy.windows, spec)(torch.stack([x, -x])) == said
+    assert ForceLimitsGate(held.policy.windows, spec)(torch.stack([x, -x])) == said
     assert Recipe.from_toml(held.to_toml()) == held
     assert str(*held.policy.windows) == window
 

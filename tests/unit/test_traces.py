@@ -25,7 +25,7 @@ from dengine import (
 )
 from dengine.decision.scripting import script
 from dengine.errors import SettingError
-from dengine.records import FITS, trace_in
+from dengine.records import FITS, stored_trace_spec
 from dengine.traces import REASONS, TraceGate, as_trace, fits, fitted, spec_of
 from tests.support.driving import learn
 
@@ -57,7 +57,7 @@ def reason_of(x: np.ndarray, limit: float | None = None, compiled: bool = False)
 def test_each_channel_has_a_unit(unit: Any, channels: int, stored: Any, units: tuple[str, ...]) -> None:
     spec = TraceSpec(10, channels=channels, unit=unit)
     assert (spec.unit, spec.units) == (stored, units)
-    assert trace_in({"trace": json.dumps(asdict(spec))}) == spec
+    assert stored_trace_spec({"trace": json.dumps(asdict(spec))}) == spec
 
 
 @pytest.mark.parametrize("unit", [("kN",), ("kN", "mm", "V"), (), 5, (1, 2)])

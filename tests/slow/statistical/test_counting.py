@@ -149,7 +149,7 @@ def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
 
 TAKEN_BACK = [(ModelVersions, name, lambda self: None) for name in ("take_back", "tell_anew")]
 SAID: list[tuple[list[Any], Case]] = [
-    ([(Decision, "looked", 1.0)], replace(WORSENS, stops="some", audit_rate=0.3, confirms=True)),
+    ([(Decision, "inclusion_probability", 1.0)], replace(WORSENS, stops="some", audit_rate=0.3, confirms=True)),
     ([(ModelVersions, "owe", lambda self, made: None)], replace(WORSENS, truth="edge", missing=0.9, label_within=20)),
     (TAKEN_BACK, replace(WORSENS, late=5)),
 ]

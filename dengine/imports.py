@@ -1,0 +1,23 @@
+"""Importing a user's class by its name `module:Class`, for a reducer or a guarantee of their own."""
+
+from importlib import import_module
+
+from .errors import SettingError, instead, shortened
+
+
+def import_class(path: str) -> type:
+    """Import the class that `module:Class` names.
+
+    Raises
+    ------
+    SettingError
+        If the module cannot be imported, whatever it raises, or has no such class.
+    """
+    module, _, name = path.partition(":")
+    message = f"Expected module:Class that can be imported here, got {shortened(path)}"
+    with instead(SettingError, message, Exception):
+        value = getattr(import_module(module), name)
+    if not isinstance(value, type):
+        kind = type(value).__name__
+        raise SettingError(f"Expected module:Class, {shortened(path)} is a {kind} and no class.")
+    return value

@@ -1,0 +1,102 @@
+"""An operator's limits of the force: the class `ForceLimits` and its text form, START:END:LOW:HIGH.
+
+`Policy(windows=...)` takes them as objects or as texts, `--window` as text, and a store keeps the
+text. `traces.ForceLimitsGate` checks a trace against them, in the engine and in exported files.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from .errors import SettingError, expect, shortened
+from .records import MOST, is_name, is_number, is_whole
+
+
+@dataclass(frozen=True, slots=True)
+class ForceLimits:
+    """Limits of one channel within a stretch of time, or of another channel's values.
+
+    `str` gives the text START:END:LOW:HIGH, in which a limit may be empty, followed by the other
+    fields that are set, as in `0.2:0.4::60:channel=1:along=2:reject`; `parse` reads it.
+
+    Parameters
+    ----------
+    start, end : float
+        The stretch, both ends included: seconds from the first sample, or values of the channel
+        `along`, in its unit.
+    low, high : float
+        Least and greatest value that the samples in the stretch may have, in their unit, both
+        included. One of the two may be infinite.
+    channel : int or str, default 0
+        Channel that is limited: its index, or its name among the columns of the traces.
+    along : int or str, optional
+        Channel, say the position of the tool, whose values between `start` and `end` mark the
+        stretch. None: time.
+    reject : bool, default False
+        Whether a trace that leaves the limits, or has no sample in the stretch, is rejected; if
+        not, it is verified.
+
+    Raises
+    ------
+    SettingError
+        For values that describe no limits.
+    """
+
+    start: float
+    end: float
+    low: float = -math.inf
+    high: float = math.inf
+    channel: int | str = 0
+    along: int | str | None = None
+    reject: bool = False
+
+    def __post_init__(self) -> None:
+        numbers = (self.start, self.end, self.low, self.high)
+        valid = all(map(is_number, numbers)) and isinstance(self.reject, bool)
+        valid = valid and -math.inf < self.start <= self.end < math.inf
+        valid = valid and self.low <= self.high and (self.low, self.high) != (-math.inf, math.inf)
+        valid = valid and _is_channel(self.channel)
+        valid = valid and (self.along is None or _is_channel(self.along))
+        wanted = "start <= end, low <= high, one of these finite, and channels from 0 on, or names"
+        expect(valid, f"a window with {wanted}", self)
+
+    def __str__(self) -> str:
+        fields = [_number_text(value) for value in (self.start, self.end, self.low, self.high)]
+        if self.channel != 0:
+            fields.append(f"channel={self.channel}")
+        if self.along is not None:
+            fields.append(f"along={self.along}")
+        if self.reject:
+            fields.append("reject")
+        return ":".join(fields)
+
+    @classmethod
+    def parse(cls, text: str) -> ForceLimits:
+        """Return the limits that a text describes; raise SettingError for any other text."""
+        pairs = [field.partition("=") for field in text.split(":")]
+        options: dict[str, Any] = {}
+        try:
+            start, end, low, high = (field for field, _, _ in pairs[:4])
+            for name, _, value in pairs[4:]:
+                options[name] = int(value) if value.isdecimal() else value or True
+            limits = float(low or "-inf"), float(high or "inf")
+            return cls(float(start), float(end), *limits, **options)
+        except SettingError:
+            raise
+        except (TypeError, ValueError) as error:
+            form = "START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
+            raise SettingError(f"Expected windows as {form}, got {shortened(text)}.") from error
+
+
+def _is_channel(value: Any) -> bool:
+    """Return whether a value is a channel's index, or a name that the text form can hold."""
+    if not isinstance(value, str):
+        return is_whole(value, 0, MOST)
+    return is_name(value) and not value.isdecimal() and {*" :="}.isdisjoint(value)
+
+
+def _number_text(value: float) -> str:
+    """Return a number as the text form writes it, "" for an infinity."""
+    return "" if math.isinf(value) else repr(float(value)).removesuffix(".0")
