@@ -1,4 +1,4 @@
-"""Importing a user's class by its name `module:Class`, for a reducer or a guarantee of their own."""
+"""Importing a class of the user, a reducer or a decision rule, by its name `module:Class`."""
 
 from importlib import import_module
 

@@ -1,9 +1,9 @@
-"""A recipe: every setting of an engine, from and to TOML.
+"""A recipe: every setting of an engine, read from and written to TOML.
 
-    >>> Recipe.load("conv")               # by name, from a file, or as it is
+    >>> Recipe.load("conv")  # a name in `RECIPES`, a TOML file, or a Recipe
     >>> Recipe.load("my_cell.toml").to_toml()
 
-A run is its recipe, its data and its seed; nothing else changes what it decides.
+The decisions of a run follow from its recipe, its data and its seed; nothing else changes them.
 """
 
 from __future__ import annotations
@@ -23,31 +23,34 @@ import numpy as np
 from .decision.policy import Policy, check_radius
 from .errors import SettingError, StoreError, expect, instead, listed
 from .records import is_number, is_whole
-from .reducers import make_reducer, own_default, reducer_class
+from .reducers import REDUCERS, make_reducer, own_default, reducer_class
 
 Params = Mapping[str, bool | int | float | str]
-OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
-BARE = re.compile(r"[A-Za-z0-9_-]+")  # a name that TOML takes without quotes
+CLASS_PATH = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
+BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")  # a key that TOML takes without quotes
 PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating)
 NOVELTY = 1.5
 LARGEST = 2**20  # bytes of a recipe's file
-WHOLE = {  # the least and the most; beyond the latter no machine goes, and an error now is better than one at each retrain
+# Least and greatest value of the integer settings. No machine can use more, and an error now is
+# better than one at each retrain.
+INTEGER_RANGES = {
     "folds": (2, 1000),
     "max_steps": (0, 10**9),
     "window": (10, 10**8),
 }
-OBJECT = "object "  # before the class of a reducer that TOML cannot say
+OBJECT_PREFIX = "object "  # before the class name of a reducer that TOML cannot describe
 
 
-class OwnDefault:
-    """A field of `Recipe` whose default belongs to the reducer: None reads as what the reducer's class says.
+class ReducerDefault:
+    """Descriptor of a field of `Recipe` whose default is an attribute of the reducer's class.
 
-    It is looked up when it is read, so that naming a reducer imports nothing.
+    Where the field is None, reading it gives the class's value. The class is imported only then,
+    so that naming a reducer imports nothing.
 
     Parameters
     ----------
     name : str
-        Attribute of the reducer's class, `default_radius` say; see `Reducer`.
+        Attribute of the reducer's class, such as `default_radius`; see `Reducer`.
     check : callable
         Raises SettingError for a value out of range.
     """
@@ -75,71 +78,106 @@ class OwnDefault:
 
 
 def _check_retrain_every(value: Any) -> None:
+    """Raise SettingError for a `retrain_every` that is no integer in range."""
     at_least = "retrain_every to be an integer of at least 1"
     expect(is_whole(value, 1, 10**9), at_least, value, "at most 1,000,000,000")
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Every setting of an engine; the reducer checks its own part.
+    """Every setting of an engine.
 
-    reducer : a name in `REDUCERS`, `module:Class` of your own, or a scikit-learn transformer as it is.
-    params : the reducer's own settings, where it is a name.
-    policy : the user's two numbers, the interval, the rule, the audit rate.
-    radius : of the ball whose labels count, in units of the scaled embedding; None: the reducer's
-        own, `default_radius`.
-    folds : K of honest counting, for a reducer that uses labels.
-    retrain_every : new labels between two retrains; None: the reducer's own, `default_retrain_every`.
-    budget : seconds of wall time that a retrain may take in a live engine.
-    max_steps : optimiser steps of a retrain at most; None: the reducer's own. A replay stops on steps alone.
-    window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
-    novelty : a trace is novel where its squared distance to the nearest learned one, by any of four measures, is
-        more than so many times that which 99.5 % of these have from one another; 0: nothing is novel.
+    Parameters
+    ----------
+    reducer : str or estimator, default "conv"
+        A name in `REDUCERS`, `module:Class` of your own, or a scikit-learn transformer.
+    params : mapping, default {}
+        Parameters of the reducer, where it is a name. The reducer checks them when it is made.
+    policy : Policy
+        Error level, lower bound, interval, decision rule, audit rate.
+    radius : float, optional
+        Radius of the neighbourhood whose labels count, in units of the scaled embedding. None:
+        the reducer's `default_radius`.
+    folds : int, default 5
+        Number of folds, and of spaces, of a reducer that trains with labels.
+    retrain_every : int, optional
+        New labels between two retrains. None: the reducer's `default_retrain_every`.
+    budget : float, default 0.45
+        Seconds of wall time that a retrain may take in a live engine.
+    max_steps : int, optional
+        Optimiser steps of a retrain at most. None: the reducer's own limit. A replay stops on
+        steps alone, so that it repeats exactly.
+    window : int, default 10_000
+        Labelled traces that train and are counted: the newest ones, of either label.
+    novelty : float, default 1.5
+        A trace is novel if its squared distance to the nearest learned trace, by any of four
+        measures, is more than this many times the distance that 99.5 % of the learned traces keep
+        to their nearest. 0: no trace is novel.
+
+    Raises
+    ------
+    SettingError
+        For a value out of its range.
     """
 
     reducer: Any = "conv"
     params: Params = field(default_factory=dict)
     policy: Policy = field(default_factory=Policy)
-    radius: float = OwnDefault("default_radius", check_radius)  # type: ignore[assignment]
+    radius: float = ReducerDefault("default_radius", check_radius)  # type: ignore[assignment]
     folds: int = 5
-    retrain_every: int = OwnDefault("default_retrain_every", _check_retrain_every)  # type: ignore[assignment]
+    retrain_every: int = ReducerDefault("default_retrain_every", _check_retrain_every)  # type: ignore[assignment]
     budget: float = 0.45
     max_steps: int | None = None
     window: int = 10_000
     novelty: float = NOVELTY
 
     def __post_init__(self) -> None:
-        for name, (least, most) in WHOLE.items():
+        for name, (least, most) in INTEGER_RANGES.items():
             value = getattr(self, name)
-            held = is_whole(value, least, most) or (name == "max_steps" and value is None)
-            expect(held, f"{name} to be an integer of at least {least}", value, f"at most {most:,}")
+            valid = is_whole(value, least, most) or (name == "max_steps" and value is None)
+            expect(
+                valid, f"{name} to be an integer of at least {least}", value, f"at most {most:,}"
+            )
         expect(is_number(self.budget) and self.budget > 0.0, "budget > 0 seconds", self.budget)
-        novelty = is_number(self.novelty) and 0.0 <= self.novelty < float("inf")
-        expect(novelty, "a finite novelty of 0 or more", self.novelty, "0 turns it off")
-        expect(isinstance(self.params, Mapping), "params to be a table of the reducer's settings", self.params)
+        valid = is_number(self.novelty) and 0.0 <= self.novelty < float("inf")
+        expect(valid, "a finite novelty of 0 or more", self.novelty, "0 turns it off")
+        is_table = isinstance(self.params, Mapping)
+        expect(is_table, "params to be a table of the reducer's settings", self.params)
         for name, value in self.params.items():
-            held = (value is None or isinstance(value, PLAIN)) and BARE.fullmatch(str(name)) is not None
-            expect(held, "params of plain names and values", {name: value}, "hand an object in")
-        named = isinstance(self.reducer, str) or all(hasattr(self.reducer, each) for each in ("fit", "get_params"))
-        expect(named, "a reducer's name, or a scikit-learn transformer with fit and get_params", self.reducer)
+            valid = value is None or isinstance(value, PLAIN)
+            valid = valid and BARE_KEY.fullmatch(str(name)) is not None
+            expect(valid, "params of plain names and values", {name: value}, "hand an object in")
+        methods = ("fit", "get_params")
+        valid = isinstance(self.reducer, str) or all(hasattr(self.reducer, m) for m in methods)
+        wanted = "a reducer's name, or a scikit-learn transformer with fit and get_params"
+        expect(valid, wanted, self.reducer)
         expect(isinstance(self.policy, Policy), "policy to be a Policy", self.policy)
 
     @property
     def name(self) -> str:
-        """What to call it in a table: its reducer."""
+        """Name of the recipe in tables: its reducer's name, or class name."""
         return self.reducer if isinstance(self.reducer, str) else type(self.reducer).__name__
 
     @property
-    def own_classes(self) -> list[str]:
-        """Each `module:Class` that it names, of its reducer and its rule, and that is not of the package."""
-        names = (_named(self.reducer, self.params)[0], self.policy.guarantee)
+    def user_classes(self) -> list[str]:
+        """The `module:Class` of its reducer and of its rule, where they are not of this package."""
+        names = (_name_and_params(self.reducer, self.params)[0], self.policy.guarantee)
         return [name for name in names if ":" in name and not name.startswith("dengine.reducers.")]
 
     @classmethod
     def load(cls, recipe: Any) -> Recipe:
-        """A recipe by its name in `RECIPES`, from a TOML file's path, for a reducer of your own, or as it is.
+        """Return a recipe.
 
-        A reducer of your own is `module:Class`, or a scikit-learn transformer.
+        Parameters
+        ----------
+        recipe : str, path, Recipe or estimator
+            A name in `RECIPES`, the path of a TOML file, a Recipe, which is returned unchanged, or
+            a reducer of your own: `module:Class`, or a scikit-learn transformer.
+
+        Raises
+        ------
+        SettingError
+            For anything else, and for a file that is no recipe.
         """
         if isinstance(recipe, Recipe):
             return recipe
@@ -149,142 +187,186 @@ class Recipe:
             return cls(recipe)
         if str(recipe) in RECIPES:
             return RECIPES[str(recipe)]
-        text = _text_of(Path(recipe))
+        text = _read_text(Path(recipe))
         if text is not None:
             return cls.from_toml(text, where=str(recipe))
-        if OWN.fullmatch(str(recipe)):
+        if CLASS_PATH.fullmatch(str(recipe)):
             return cls(str(recipe))
         wanted = f"a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer"
         raise SettingError(f"Expected {wanted}; {str(recipe)[:200]} is none.")
 
     @classmethod
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
-        """Parse `to_toml`'s form; SettingError names an unknown key or a value out of range."""
-        with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):  # the former of huge integers, too
+        """Parse the text that `to_toml` writes.
+
+        Raises SettingError, which begins with `where`, for an unknown key or a value out of range.
+        """
+        # tomllib raises ValueError for huge integers, too.
+        with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
             table = tomllib.loads(text)
-        _must_be_known(table, cls, where)
-        reducer, policy = table.get("reducer", "conv"), table.pop("policy", {})
-        expect(isinstance(reducer, str), f"in {where} reducer to be a name, or module:Class", reducer)
+        _check_keys(table, cls, where)
+        reducer = table.get("reducer", "conv")
+        policy = table.pop("policy", {})
+        expect(
+            isinstance(reducer, str), f"in {where} reducer to be a name, or module:Class", reducer
+        )
         expect(isinstance(policy, Mapping), f"in {where} policy to be a table, [policy]", policy)
-        _must_be_known(policy, Policy, f"{where}, policy,")
+        _check_keys(policy, Policy, f"{where}, policy,")
         if isinstance(table.get("params"), Mapping):
-            table["params"] = _without_none(table["params"])
+            table["params"] = _with_none(table["params"])
         try:
-            return cls(**_without_none(table), policy=Policy(**policy))
+            return cls(**_with_none(table), policy=Policy(**policy))
         except (TypeError, SettingError) as error:
             raise SettingError(f"{where}: {str(error).rstrip('.')}.") from error
 
     @classmethod
-    def from_store(cls, settings: Mapping[str, str], where: str = "the recipe in the store") -> Recipe:
-        """Parse the recipe that a store keeps, without importing a class that it names.
+    def from_store(
+        cls, settings: Mapping[str, str], where: str = "the recipe in the store"
+    ) -> Recipe:
+        """Parse the recipe among the settings of a store, without importing a class that it names.
 
-        Raises StoreError where such a class would have to be asked for its radius: the store is damaged.
+        Raises StoreError if the radius is missing and such a class would have to be imported for
+        its default: the store is damaged.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
         if missing and str(recipe.reducer) not in RECIPES:
             got = f"a recipe of {recipe.name} without {listed(missing)}"
-            raise StoreError(f"Expected {where} to hold every setting, got {got}; restore the store from a copy.")
+            do = "restore the store from a copy"
+            raise StoreError(f"Expected {where} to hold every setting, got {got}; {do}.")
         return recipe
 
     def to_toml(self) -> str:
-        """The recipe as TOML; None is written as "none".
+        """Return the recipe as TOML, in which None is written as "none".
 
-        A reducer object is written as `module:Class` and its parameters; where those are no plain values, as in a pipeline,
-        as "object Class": it must be handed in again.
+        A reducer object is written as `module:Class` and its parameters. Where these are no plain
+        values, as in a pipeline, it is written as "object Class", and the object must be handed in
+        again.
         """
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("params", "policy")}
-        plain["reducer"], params = _named(self.reducer, self.params)
+        plain = {f.name: getattr(self, f.name) for f in fields(self)}
+        plain["reducer"], params = _name_and_params(self.reducer, self.params)
+        del plain["params"], plain["policy"]
         policy = {f.name: getattr(self.policy, f.name) for f in fields(self.policy)}
         tables = {"": plain, "policy": policy, "params": dict(params)}
-        # An empty [params] is written too: left out, it would mean those of the reducer's own recipe.
-        return "\n".join(_table(name, values) for name, values in tables.items())
+        # An empty [params] is written too: left out, it would mean those of the reducer's recipe.
+        return "\n".join(_table_text(name, values) for name, values in tables.items())
 
-    def with_settings(self, **asked: Any) -> Recipe:
-        """The same with what was asked for; None asks for nothing."""
-        return replace(self, **{name: value for name, value in asked.items() if value is not None})
+    def with_settings(self, **settings: Any) -> Recipe:
+        """Return a copy with these settings; those that are None stay as they are."""
+        changes = {name: value for name, value in settings.items() if value is not None}
+        return replace(self, **changes)
 
     def with_policy(self, **changes: Any) -> Recipe:
-        """The same with another alpha, lower_bound, interval or audit_rate."""
+        """Return a copy whose policy has these settings changed."""
         return replace(self, policy=replace(self.policy, **changes))
 
     def make_reducer(self, seed: int) -> Any:
-        """Return the reducer: an object as it is, or one made by its name.
+        """Return the reducer: the object that was given, or a new one of the name.
 
-        One that is made gets the seed and the folds, where it takes them.
+        A new one gets the seed as `random_state`, and `folds`, where it takes them.
         """
         if not isinstance(self.reducer, str):
             return self.reducer
-        known = signature(reducer_class(self.reducer)).parameters
-        # A reducer that cross-fits by itself takes the folds; any other is cross-fitted from outside.
-        own = {name: value for name, value in (("random_state", seed), ("folds", self.folds)) if name in known}
-        return make_reducer(self.reducer, **own | dict(self.params))
+        # A reducer that cross-fits itself takes the folds; any other is cross-fitted from outside.
+        defaults = {"random_state": seed, "folds": self.folds}
+        accepted = signature(reducer_class(self.reducer)).parameters
+        params = {name: value for name, value in defaults.items() if name in accepted}
+        return make_reducer(self.reducer, **params | dict(self.params))
 
 
-def _must_be_known(table: Mapping[str, Any], of: Any, where: str) -> None:
-    """SettingError for a key that is no field of this record."""
-    known = {f.name for f in fields(of)}
-    unknown = sorted(set(table) - known)
+def _check_keys(table: Mapping[str, Any], record_type: Any, where: str) -> None:
+    """Raise SettingError for a key that is no field of a dataclass."""
+    names = sorted(f.name for f in fields(record_type))
+    unknown = sorted(set(table) - set(names))
     if unknown:
-        raise SettingError(f"{where} has an unknown key {listed(unknown)}; known are {', '.join(sorted(known))}.")
+        message = f"{where} has an unknown key {listed(unknown)}; known are {', '.join(names)}."
+        raise SettingError(message)
 
 
-def _text_of(path: Path) -> str | None:
-    """The text of a recipe's file; None where there is none. SettingError for what is no text, or cannot be read."""
+def _read_text(path: Path) -> str | None:
+    """Return the text of a recipe's file, None if there is no such file.
+
+    Raises SettingError if it is too large, is not UTF-8 or cannot be read.
+    """
     try:
         if not path.is_file():
             return None
         if path.stat().st_size > LARGEST:
-            raise SettingError(f"Expected a recipe of at most {LARGEST // 2**20} MB, {path} is larger.")
+            limit = f"a recipe of at most {LARGEST // 2**20} MB"
+            raise SettingError(f"Expected {limit}, {path} is larger.")
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise SettingError(f"{path} is not UTF-8 text: {error.reason} at byte {error.start}; save it as UTF-8.") from error
+        got = f"{error.reason} at byte {error.start}"
+        raise SettingError(f"{path} is not UTF-8 text: {got}; save it as UTF-8.") from error
     except OSError as error:  # a name that is too long among them
-        raise SettingError(f"Cannot read the recipe {str(path)[:200]}: {error.strerror}.") from error
+        raise SettingError(
+            f"Cannot read the recipe {str(path)[:200]}: {error.strerror}."
+        ) from error
 
 
-def _named(reducer: Any, params: Params) -> tuple[str, Params]:
-    """A reducer as TOML can say it: a name and plain parameters."""
+def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
+    """Return a reducer as TOML can describe it: a name, and parameters with plain values.
+
+    A name is returned with the `params` given. An object gives its `module:Class` and its own
+    parameters, or "object Class" and none, where these are not plain or the class is local.
+    """
     if isinstance(reducer, str):
         return reducer, params
-    kind = type(reducer)
-    own: dict[str, Any] = reducer.get_params(deep=False)
-    defaults = {name: each.default for name, each in signature(kind).parameters.items()}
-    plain = all(isinstance(v, PLAIN) or (v is None and defaults.get(k) is None) for k, v in own.items())
-    if not plain or "<locals>" in kind.__qualname__ or kind.__module__ == "__main__":
-        return f"{OBJECT}{kind.__name__}", {}
-    return f"{kind.__module__}:{kind.__qualname__}", {name: value for name, value in own.items() if value is not None}
-
-
-def described(thing: Any) -> str:
-    """An estimator's class and settings, nested ones included, as text that is the same at every start."""
-    settings = thing.get_params(deep=True)
-    values = (
-        f"{name}={value!r}" if isinstance(value, PLAIN) or value is None else f"{name}: {type(value).__qualname__}"
-        for name, value in sorted(settings.items())
+    cls = type(reducer)
+    values: dict[str, Any] = reducer.get_params(deep=False)
+    defaults = {name: parameter.default for name, parameter in signature(cls).parameters.items()}
+    is_plain = all(
+        isinstance(value, PLAIN) or (value is None and defaults.get(name) is None)
+        for name, value in values.items()
     )
-    return f"{type(thing).__qualname__}({', '.join(values)})"
+    if not is_plain or "<locals>" in cls.__qualname__ or cls.__module__ == "__main__":
+        return f"{OBJECT_PREFIX}{cls.__name__}", {}
+    name = f"{cls.__module__}:{cls.__qualname__}"
+    return name, {key: value for key, value in values.items() if value is not None}
 
 
-def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
+def describe_estimator(estimator: Any) -> str:
+    """Return an estimator's class and parameters, nested ones included, as text.
+
+    The text is the same in every process: objects are named by their class alone.
+    """
+    params = estimator.get_params(deep=True)
+    values = (
+        f"{name}={value!r}"
+        if isinstance(value, PLAIN) or value is None
+        else f"{name}: {type(value).__qualname__}"
+        for name, value in sorted(params.items())
+    )
+    return f"{type(estimator).__qualname__}({', '.join(values)})"
+
+
+def _with_none(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table with None in the place of each "none"."""
     return {key: None if value == "none" else value for key, value in table.items()}
 
 
-def _table(name: str, values: Mapping[str, Any]) -> str:
-    return "".join([f"[{name}]\n" * bool(name), *(f"{key} = {_value(value)}\n" for key, value in values.items())])
+def _table_text(name: str, values: Mapping[str, Any]) -> str:
+    """Return a table of TOML: its header, unless the name is "", and a line for each value."""
+    header = f"[{name}]\n" if name else ""
+    return header + "".join(f"{key} = {_value_text(value)}\n" for key, value in values.items())
 
 
-def _value(value: Any) -> str:
-    if value is None or isinstance(value, str):  # a string is written as in JSON, but for one character
-        return json.dumps("none" if value is None else value, ensure_ascii=False).replace("\x7f", "\\u007F")
-    if isinstance(value, tuple):  # of windows, or prices
-        return f"[{', '.join(_value(each if isinstance(each, PLAIN) else str(each)) for each in value)}]"
-    plain = value.item() if isinstance(value, np.generic) else value  # NumPy's repr names its type, which is not TOML
+def _value_text(value: Any) -> str:
+    """Return a plain value, None, or a tuple of values as TOML writes it."""
+    if value is None:
+        return '"none"'
+    if isinstance(value, str):  # written as in JSON, except for one character
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
+    if isinstance(value, tuple):  # windows or prices
+        items = (item if isinstance(item, PLAIN) else str(item) for item in value)
+        return f"[{', '.join(map(_value_text, items))}]"
+    # The repr of a NumPy scalar names its type, which is not TOML.
+    plain = value.item() if isinstance(value, np.generic) else value
     return str(plain).lower() if isinstance(plain, bool) else repr(plain)
 
 
 RECIPES: dict[str, Recipe] = {
-    **{name: Recipe(name) for name in ("conv", "umap", "umap-learn", "pca", "rocket")},
-    # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored; it asks nothing else of a trace.
+    **{name: Recipe(name) for name in REDUCERS},
+    # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored, no novelty.
     "paper": Recipe("umap", policy=Policy(alpha=0.1, lower_bound=0.9), novelty=0.0),
 }

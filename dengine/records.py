@@ -110,7 +110,8 @@ class TraceSpec:
         Unit of the samples, shown to people and used by `limit`: one for all channels, or one for
         each, as ("kN", "mm") or "kN, mm".
     limit : float, optional
-        Range of the sensor, in `unit`. A sample at or beyond ±limit is saturated. None: not checked.
+        Range of the sensor, in `unit`: a sample at or beyond ±limit is saturated. None: not
+        checked.
     fit : {"strict", "cut", "pad", "resample"}, default "strict"
         What happens to a trace of another length, see `traces.fitted`. strict: TraceError. cut: a
         longer one loses its end. pad: like cut, and a shorter one repeats its last sample.

@@ -73,7 +73,8 @@ def _described(value: Any, names: set[str], seen: set[int]) -> Any:
     for name, cell in zip(value.__code__.co_freevars, value.__closure__ or (), strict=True):
         known[name] = cell.cell_contents
     referred = [(name, _described(known[name], mentioned, seen)) for name in sorted(known)]
-    return _instructions(value.__code__), repr(value.__defaults__), referred
+    defaults = repr((value.__defaults__, value.__kwdefaults__))
+    return _instructions(value.__code__), defaults, referred
 
 
 def _names(code: CodeType) -> Iterator[str]:

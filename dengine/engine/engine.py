@@ -353,7 +353,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         self._outbox.check_usable()
         with self._outbox.try_lock() as free, self._alone:
-            ours = self._versions.newest.keeps_references and not self.recipe.own_classes
+            ours = self._versions.newest.keeps_references and not self.recipe.user_classes
             quick = ours and (self._versions.answering is None or self._versions.answering.is_compiled)
             if not (free and quick) or self._unseen or self._settings.waiting or self._feedback.remedy:
                 return None

@@ -12,7 +12,7 @@ from ..decision.scripting import script
 from ..errors import ImportRefusedError, SettingError, StoreError, expect, shortened
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
-from ..recipe import OBJECT, Recipe, described
+from ..recipe import OBJECT_PREFIX, Recipe, describe_estimator
 from ..records import TraceSpec, is_whole, stored_trace_spec
 from ..store.outbox import Outbox
 from ..traces import ForceLimitsGate
@@ -97,18 +97,19 @@ class EngineSettings:
             raise SettingError(f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...).")
         if "model" not in known and model is not None:
             raise SettingError(f"The engine of {name} has its own model, {recipe.name}; leave model=... out.")
-        if model is not None or recipe.name.startswith(OBJECT):
+        if model is not None or recipe.name.startswith(OBJECT_PREFIX):
             if model is None and (reducer is None or isinstance(reducer, str)):
                 unnamed = f"{recipe.reducer}, has no name in TOML"
                 raise SettingError(f"The reducer of {name}, {unnamed}: hand it in again, reducer=...")
-            given = described(reducer) if model is None else as_engine_model(model).description
+            given = describe_estimator(reducer) if model is None else as_engine_model(model).description
             if made_with is not None and given != made_with:
                 raise SettingError(f"{name} was made with {made_with}, got {given}: its labels were counted by that one.")
             recipe = recipe if model is not None else replace(recipe, reducer=reducer, params={})
         elif reducer is not None and not isinstance(reducer, str):
             again = Recipe.from_toml(Recipe(reducer).to_toml())
             if (again.reducer, again.params) != (recipe.reducer, recipe.params):
-                raise SettingError(f"Expected reducer {recipe.name} of {name}, got {described(reducer)}; leave it out.")
+                got = describe_estimator(reducer)
+                raise SettingError(f"Expected reducer {recipe.name} of {name}, got {got}; leave it out.")
         must_allow(recipe, name, allow_import is True or {*(allow_import or ()), *classes_of(reducer)})
         inferred = "inferred" in known
         seed = known.get("seed", "0")
@@ -122,7 +123,7 @@ class EngineSettings:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
         if model is None:
             own = self.recipe.reducer
-            described_ = None if isinstance(own, str) else described(own)
+            described_ = None if isinstance(own, str) else describe_estimator(own)
             return replace(self, described=described_), ModelPrediction.from_recipe(self.recipe, self.seed)
         template = as_engine_model(model)
         in_force = template.in_force(self.recipe)  # of our own kind its numbers count, a baseline's are its own affair
@@ -164,7 +165,7 @@ def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recip
 def classes_of(reducer: Any = None, recipe: Any = None, policy: Policy | None = None, **others: Any) -> list[str]:
     """Each `module:Class` that a caller names himself, in settings as `DataEngine` takes them."""
     said = [Recipe.load(each) for each in (reducer, recipe) if each is not None]
-    return [name for each in (*said, Recipe(policy=policy or Policy())) for name in each.own_classes]
+    return [name for each in (*said, Recipe(policy=policy or Policy())) for name in each.user_classes]
 
 
 def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
@@ -172,7 +173,7 @@ def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str])
 
     allow_import : True: any may; else the names of those that may.
     """
-    refused = [] if allow_import is True else [name for name in recipe.own_classes if name not in (allow_import or ())]
+    refused = [] if allow_import is True else [name for name in recipe.user_classes if name not in (allow_import or ())]
     if refused:
         again = "name it again (reducer=, recipe=, policy=; --reducer, --guarantee)"
         allow = "allow it, where you trust the store (allow_import=True; --allow-import)"

@@ -34,7 +34,7 @@ from ..decision.rule import DecisionRule
 from ..decision.scripting import arrays_with_prefix, incompatible_model_error, restore, script
 from ..errors import ExportError, listed
 from ..folds import content_hash, fold_of
-from ..recipe import NOVELTY, Recipe, described
+from ..recipe import NOVELTY, Recipe, describe_estimator
 from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
 from ..reducers import make_reducer, own_default
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, space_scale
@@ -226,7 +226,7 @@ class ModelPrediction(EngineModel):
 
     @property
     def description(self) -> str:  # type: ignore[override]  # asked when the rule may be another
-        own = f"{described(self.reducer)} under {described(self.classifier)}"
+        own = f"{describe_estimator(self.reducer)} under {describe_estimator(self.classifier)}"
         return f"{own}, {self.folds} folds, {type(self.rule).__name__}"
 
     def in_force(self, recipe: Recipe) -> Recipe:
