@@ -1,4 +1,9 @@
-"""The exception tree, and what errors and screens may say of a value: a line of it, and never a password."""
+"""The exceptions of dengine, and functions that build their messages.
+
+`expect` and `instead` raise messages of one form: what was expected, what came, what to do.
+`shortened`, `excerpt` and `listed` keep a message to one line, `without_password` masks passwords,
+and `as_options` turns advice for Python into advice for the command line.
+"""
 
 import math
 import re
@@ -9,130 +14,189 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-HIDDEN = "***"
-# Up to the last @: a password may hold one that is not escaped, or a blank. A path writes // as /.
+MASK = "***"
+# Up to the last @, for a password may hold an unescaped one, or a blank. A path writes // as /.
 URL = re.compile(r"(\w[\w+.-]*:/{1,2}[^\s:/@'\"]*):(\S*|[^\n'\"]*)@")
-NAMED = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)  # in a URL's query, or of libpq
+# In the query of a URL, or as libpq writes it.
+PASSWORD = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)
 QUOTES = ("'", '"')
-OPTIONS = "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic|columns|decimal|thousands"
+OPTIONS = (
+    "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic|columns"
+    "|decimal|thousands"
+)
 OPTION = re.compile(rf"(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))")
-LONG = 60  # characters of a value in an error
-SHORT = reprlib.Repr()
-SHORT.maxstring = SHORT.maxother = SHORT.maxlong = LONG
+TRACE_SPEC = re.compile(r"(?:DataEngine\(trace=)?TraceSpec\(([^()]*)\)\)?")
+MAX_LENGTH = 60  # characters of a value in a message
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = MAX_LENGTH
 
 
 def without_password(text: str) -> str:
-    """A text with *** in the place of every password in a database URL: `scheme://user:***@host`, `password=***`."""
-    return NAMED.sub(rf"\1={HIDDEN}", URL.sub(rf"\1:{HIDDEN}@", text))
+    """Return a text in which *** stands for every password of a database URL.
+
+    As in `scheme://user:***@host` and `password=***`.
+    """
+    return PASSWORD.sub(rf"\1={MASK}", URL.sub(rf"\1:{MASK}@", text))
 
 
 def shortened(value: Any) -> str:
-    """A value as `repr` shows it, at most some 60 characters of it: an error must not hold a megabyte."""
+    """Return the `repr` of a value, cut to some 60 characters, for a message."""
     try:
-        return SHORT.repr(value)
+        return _REPR.repr(value)
     except ValueError:  # an integer of more digits than Python prints
-        return f"a number of {value.bit_length()} bits" if isinstance(value, int) else f"a {type(value).__name__}"
+        is_integer = isinstance(value, int)
+        return (
+            f"a number of {value.bit_length()} bits" if is_integer else f"a {type(value).__name__}"
+        )
 
 
 def excerpt(text: str, at: int = 0) -> str:
-    """Some 60 characters of a text, as `repr` shows them, around the one at `at`, which is named if it is not ASCII."""
-    begin = max(min(at - LONG // 2, len(text) - LONG), 0)
-    said = f"{'...' if begin else ''}{text[begin : begin + LONG]!r}{'...' if len(text) > begin + LONG else ''}"
-    odd = text[at : at + 1]
-    if not odd or (odd.isascii() and odd.isprintable()):
-        return said
-    return f"{said}, with {unicodedata.name(odd, 'a control character')} (U+{ord(odd):04X}) at character {at + 1}"
+    """Return the `repr` of some 60 characters of a text around position `at`, for a message.
+
+    The character at that position is named if it is not printable ASCII.
+    """
+    begin = max(min(at - MAX_LENGTH // 2, len(text) - MAX_LENGTH), 0)
+    end = begin + MAX_LENGTH
+    before = "..." if begin else ""
+    after = "..." if len(text) > end else ""
+    result = f"{before}{text[begin:end]!r}{after}"
+    char = text[at : at + 1]
+    if not char or (char.isascii() and char.isprintable()):
+        return result
+    name = unicodedata.name(char, "a control character")
+    return f"{result}, with {name} (U+{ord(char):04X}) at character {at + 1}"
 
 
 def listed(names: Iterable[Any]) -> str:
-    """The first few of some names, and how many more there are."""
+    """Return the first eight of some names, and how many more there are, for a message."""
     names = list(names)
-    few = ", ".join(str(name)[:100] for name in names[:8])
-    return f"{few} and {len(names) - 8} more" if len(names) > 8 else few
+    first = ", ".join(str(name)[:100] for name in names[:8])
+    return f"{first} and {len(names) - 8} more" if len(names) > 8 else first
 
 
 def as_options(text: str) -> str:
-    """Advice for Python, `TraceSpec(rate_hz=500)`, in the words of the command, `--rate-hz 500`."""
+    """Return a message with its advice for Python written as options of the command line.
 
-    def typed(found: re.Match[str]) -> str:
-        name, value = f"--{(found[1] or found[3]).replace('_', '-')}", found[2] or ""
-        return f"{name} {shlex.quote(value[1:-1]) if value[:1] in QUOTES else value}".rstrip()
+    `TraceSpec(rate_hz=500)` becomes `--rate-hz 500`.
+    """
 
-    return OPTION.sub(typed, re.sub(r"(?:DataEngine\(trace=)?TraceSpec\(([^()]*)\)\)?", r"\1", text))
+    def to_option(match: re.Match[str]) -> str:
+        name = (match[1] or match[3]).replace("_", "-")
+        value = match[2] or ""
+        if value[:1] in QUOTES:
+            value = shlex.quote(value[1:-1])
+        return f"--{name} {value}".rstrip()
+
+    return OPTION.sub(to_option, TRACE_SPEC.sub(r"\1", text))
 
 
 def percent(share: float, form: str = ".1f") -> str:
-    """A share as a person reads it, 12.3 %; "-" for NaN."""
+    """Return a share as text, 0.123 as "12.3 %", and NaN as "-"."""
     return "-" if math.isnan(share) else f"{100 * share:{form}} %"
 
 
 class DengineError(Exception):
-    """Base of every error that dengine raises on purpose; the passwords of database URLs in its text are masked."""
+    """Base of all errors that dengine raises on purpose.
 
-    def __init__(self, *said: object) -> None:
-        super().__init__(*(without_password(each) if isinstance(each, str) else each for each in said))
+    Passwords of database URLs in its message are masked.
+    """
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(without_password(arg) if isinstance(arg, str) else arg for arg in args))
 
 
 class TraceError(DengineError, ValueError):
-    """A trace of the wrong shape or type: the caller's bug, not the world's fault."""
+    """A trace of the wrong shape or type, which is a bug of the caller."""
 
 
 class SettingError(DengineError, ValueError):
-    """A setting (policy, recipe, reducer, cell) outside its range or unknown by name."""
+    """A setting of a policy, recipe, reducer or cell with an unknown name or out of its range."""
 
 
 class ImportRefusedError(SettingError):
-    """A class that a store names, and that its caller neither named again nor allowed to be imported."""
+    """A store names a class of the user that the caller did not allow to be imported."""
 
 
 class DataError(DengineError, ValueError):
-    """A data set that cannot be read, or whose parts do not fit together."""
+    """A data set that cannot be read, or whose arrays do not fit together."""
 
 
 class ReportError(DengineError, ValueError):
-    """A report that says nothing (no label, no id), on an unknown decision, a second one, or one against the first."""
+    """A report without a valid label or id, or on a decision that is unknown or was reported."""
 
 
 class UnknownDecisionError(ReportError):
-    """A report on a decision that this cell does not know."""
+    """A report on a decision that is not in the store."""
 
 
 class ReportConflictError(ReportError):
-    """A report against what is recorded: a second label."""
+    """A report that contradicts the label that is recorded."""
 
 
 class TraceConflictError(TraceError):
-    """Another trace under the id of a recorded decision."""
+    """A trace other than the recorded one, under the id of a recorded decision."""
 
 
-def expect(held: bool, wanted: str, got: Any, do: str = "", error: type[DengineError] = SettingError) -> None:
-    """An error that says what was expected, what came and what to do, unless it held."""
-    if not held:
-        raise error(f"Expected {wanted}, got {shortened(got)}{'; ' if do else ''}{do}.")
+def expect(
+    valid: bool, wanted: str, got: Any, do: str = "", error: type[DengineError] = SettingError
+) -> None:
+    """Raise an error unless `valid`.
+
+    Parameters
+    ----------
+    valid : bool
+    wanted : str
+        What was expected.
+    got : object
+        What came; shown by `shortened`.
+    do : str
+        What the user can do about it.
+    error : type
+        Class of the error. Its message is "Expected `wanted`, got `got`; `do`."
+    """
+    if not valid:
+        advice = f"; {do}" if do else ""
+        raise error(f"Expected {wanted}, got {shortened(got)}{advice}.")
 
 
 @contextmanager
-def instead(error: type[DengineError], said: str, *of: type[Exception], do: str = "") -> Iterator[None]:
-    """An error of this kind in the place of others, with what these say; one of its own kind passes as it is."""
+def instead(
+    error: type[DengineError], message: str, *caught: type[Exception], do: str = ""
+) -> Iterator[None]:
+    """Context manager that raises `error` instead of the exceptions `caught`.
+
+    Parameters
+    ----------
+    error : type
+        Class of the new error. An exception of this class passes unchanged.
+    message : str
+        Beginning of the new message; the message of the caught exception follows.
+    *caught : type
+        Exceptions to catch.
+    do : str
+        What the user can do about it, the end of the new message.
+    """
     try:
         yield
     except error:
         raise
-    except of as raised:
-        why = " ".join(str(getattr(raised, "strerror", None) or raised)[:300].split()) or type(raised).__name__
-        raise error(f"{said}: {why.rstrip('.')}{'; ' if do else ''}{do}.") from raised
+    except caught as exception:
+        text = str(getattr(exception, "strerror", None) or exception)
+        why = " ".join(text[:300].split()) or type(exception).__name__
+        advice = f"; {do}" if do else ""
+        raise error(f"{message}: {why.rstrip('.')}{advice}.") from exception
 
 
 class StoreError(DengineError, RuntimeError):
-    """A store that cannot be opened, belongs to something else, or lost its writer."""
+    """A store that cannot be opened or written, is damaged, or is no store of this package."""
 
 
 class NotTakenError(StoreError):
-    """A label that is not known to be on the disk: say the same again; it counts once."""
+    """A label of which it is unknown whether it is on disk. Report it again: it counts once."""
 
 
 class BusyError(DengineError, RuntimeError):
-    """A server that has as much to do as it takes, or is closing: whoever asked goes on without it, and verifies."""
+    """A server that is overloaded or is closing. The cell should verify the part."""
 
 
 class ExportError(DengineError, RuntimeError):
@@ -140,8 +204,8 @@ class ExportError(DengineError, RuntimeError):
 
 
 class OutputError(DengineError, RuntimeError):
-    """A file that cannot be written, or that holds something else than an earlier output of the same kind."""
+    """A file that cannot be written, or that must not be overwritten."""
 
 
 class CellError(DengineError, RuntimeError):
-    """A robot cell that cannot be reached, does not answer in time, or says that it could not do what it was told."""
+    """A robot cell that cannot be reached, does not respond in time, or reports a failure."""

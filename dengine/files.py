@@ -1,4 +1,8 @@
-"""Files: written whole or not at all and never over what is there; NumPy archives from anywhere, read safely."""
+"""Files: outputs, written as a whole or not at all, and NumPy archives, read safely.
+
+`output_file` and `write_output` never replace a file unasked, and never a database. `read_archive`
+unpacks no Python objects, and no more bytes than the machine can hold.
+"""
 
 import hashlib
 import io
@@ -20,118 +24,205 @@ from numpy.typing import NDArray
 
 from .errors import DataError, DengineError, OutputError, expect, instead
 
-MOST = 8 * 2**30  # bytes
+MAX_BYTES = 8 * 2**30  # of arrays
 # All that zipfile, zlib, lzma and NumPy were seen to raise on damaged files.
-UNREADABLE: tuple[type[Exception], ...] = (OSError, EOFError, ValueError, TypeError, LookupError, OverflowError)
-UNREADABLE += (MemoryError, RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)
-DATABASES = (b"SQLite format 3\0", b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")  # a store, and its write-ahead log
-NO_FILES = {stat.S_IFLNK: "link", stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe"}
+UNREADABLE: tuple[type[Exception], ...] = (
+    *(OSError, EOFError, ValueError, TypeError, LookupError, OverflowError, MemoryError),
+    *(RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
+# First bytes of a store, and of its write-ahead log.
+DATABASES = (b"SQLite format 3\0", b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
+SPECIAL_FILES = {stat.S_IFLNK: "link", stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe"}
 MANIFEST = "manifest.json"
-SHORTEST_KEY = 16  # bytes
+MIN_KEY_BYTES = 16
 
 
 def read_key(path: str | os.PathLike[str], error: type[DengineError]) -> bytes:
-    """The secret in a key's file; an error of this kind for what cannot be read, or is too short to be one."""
-    with instead(error, f"The key's file {path} cannot be read", OSError, do="dengine export --make-key writes one"):
+    """Return the secret in a key's file, without the line's end.
+
+    Raises `error` if the file cannot be read, or has fewer than 16 bytes.
+    """
+    message = f"The key's file {path} cannot be read"
+    with instead(error, message, OSError, do="dengine export --make-key writes one"):
         secret = Path(path).read_bytes().rstrip(b"\r\n")
-    wanted = f"a key of {SHORTEST_KEY} bytes or more in {path}"
-    expect(len(secret) >= SHORTEST_KEY, wanted, len(secret), "use dengine export --make-key", error)
+    wanted = f"a key of {MIN_KEY_BYTES} bytes or more in {path}"
+    is_long = len(secret) >= MIN_KEY_BYTES
+    expect(is_long, wanted, len(secret), "use dengine export --make-key", error)
     return secret
 
 
-def must_fit(size: float, what: object) -> None:
-    """DataError for more bytes of arrays than `MOST`, or than half of the machine's memory where that is less."""
-    most = MOST
-    with suppress(AttributeError, ValueError, OSError):  # of a system that does not tell
+def check_size(size: float, what: object) -> None:
+    """Raise DataError if arrays would need too much memory.
+
+    The limit is `MAX_BYTES`, or half of the machine's memory if that is less.
+
+    Parameters
+    ----------
+    size : float
+        Bytes of all arrays.
+    what : object
+        What they are in, for the error.
+    """
+    limit = MAX_BYTES
+    with suppress(AttributeError, ValueError, OSError):  # on systems without these figures
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        most = min(MOST, memory // 2) if memory > 0 else MOST
-    if size > most:
+        limit = min(MAX_BYTES, memory // 2) if memory > 0 else MAX_BYTES
+    if size > limit:
+        wanted = f"at most {_size_text(limit)} of arrays in {what}"
         do = "split it, or read it where there is more memory"
-        raise DataError(f"Expected at most {_size(most)} of arrays in {what}, got {_size(size)}; {do}.")
+        raise DataError(f"Expected {wanted}, got {_size_text(size)}; {do}.")
 
 
-def reading(
-    what: object, kind: str, package: str = "", extra: str = "", also: tuple[type[Exception], ...] = ()
+def read_errors(
+    source: object,
+    kind: str,
+    package: str = "",
+    extra: str = "",
+    also: tuple[type[Exception], ...] = (),
 ) -> AbstractContextManager[None]:
-    """DataError for whatever a library raises on a file that is damaged, or is not of its kind, and where it is missing.
+    """Return a context manager that raises DataError instead of what a library raises on bad files.
 
-    package, extra : what reads such files, and the extra of dengine that installs it.  also : other errors of its own.
+    Parameters
+    ----------
+    source : object
+        What is read, for the error.
+    kind : str
+        What it should be, for the error: "a Parquet file".
+    package : str
+        Package that reads such files. DataError at once if it is not installed.
+    extra : str
+        Extra of dengine that installs the package, for that error.
+    also : tuple of type
+        Exceptions to catch beside `UNREADABLE`.
     """
     if package and find_spec(package) is None:
-        raise DataError(f'Expected {package} for {kind}, it is not installed: pip install "dengine[{extra}]".')
-    return instead(DataError, f"Cannot read {what} as {kind}", *UNREADABLE, *also)
+        do = f'pip install "dengine[{extra}]"'
+        raise DataError(f"Expected {package} for {kind}, it is not installed: {do}.")
+    return instead(DataError, f"Cannot read {source} as {kind}", *UNREADABLE, *also)
 
 
-def _size(n_bytes: float) -> str:
+def _size_text(n_bytes: float) -> str:
+    """Return a number of bytes in GB, or in MB where it is under half a GB."""
     return f"{n_bytes / 2**30:.1f} GB" if n_bytes >= 2**29 else f"{n_bytes / 2**20:.1f} MB"
 
 
 def read_archive(
     source: str | os.PathLike[str] | bytes, names: Collection[str] | None = None, *, name: str = ""
 ) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """The arrays of an .npz by name, and the names of all that it holds.
+    """Read arrays of an .npz archive.
 
-    source : a file, or its content.  names : of the arrays that are wanted; None: all.  name : for errors.
-    DataError for what is no archive, is damaged, holds Python objects, or claims too much: nothing is unpacked then.
+    Parameters
+    ----------
+    source : path or bytes
+        The file, or its content.
+    names : collection of str, optional
+        Arrays that are wanted, those that are there. None: all.
+    name : str
+        What to call the archive in errors; the path by default.
+
+    Returns
+    -------
+    arrays : dict of str to array
+    all_names : list of str
+        Names of all arrays in the archive.
+
+    Raises
+    ------
+    DataError
+        If it is no archive, is damaged, holds Python objects, or needs too much memory. Nothing is
+        unpacked then.
     """
-    called = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
-    content = io.BytesIO(source) if isinstance(source, bytes) else source
-    with reading(called, "an .npz file of plain arrays"), np.load(content, allow_pickle=False) as archive:
+    title = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
+    file = io.BytesIO(source) if isinstance(source, bytes) else source
+    kind = "an .npz file of plain arrays"
+    with read_errors(title, kind), np.load(file, allow_pickle=False) as archive:
         if not isinstance(archive, np.lib.npyio.NpzFile):
             raise ValueError("it is a single array")
-        members = {each.filename.removesuffix(".npy"): each.file_size for each in archive.zip.infolist()}
-        wanted = [key for key in members if names is None or key in names]
-        must_fit(sum(members[key] for key in wanted), called)
-        return {key: np.asarray(archive[key]) for key in wanted}, list(members)
+        members = archive.zip.infolist()
+        sizes = {member.filename.removesuffix(".npy"): member.file_size for member in members}
+        wanted = [key for key in sizes if names is None or key in names]
+        check_size(sum(sizes[key] for key in wanted), title)
+        return {key: np.asarray(archive[key]) for key in wanted}, list(sizes)
 
 
 def is_database(path: Path) -> bool:
-    """Whether a regular file begins as a store does."""
+    """Return whether a regular file is a SQLite database, or its write-ahead log."""
     with path.open("rb") as file:
         return file.read(16).startswith(DATABASES)
 
 
 def check_output(path: str | os.PathLike[str], force: bool = False) -> None:
-    """OutputError where a file must not be written: ask before the work whose result it is to hold.
+    """Raise OutputError if a file must not be written.
 
-    A path that exists is refused without `force`; a database, folder, link, pipe or device always.
+    Call it before the work whose result the file is to hold.
+
+    Parameters
+    ----------
+    path : path
+        File to write. A database, folder, link, pipe or device is always refused.
+    force : bool, default False
+        Whether another file that exists may be replaced.
     """
     target = Path(path)
-    with _told(target):
+    with _write_errors(target):
         try:
             mode = os.lstat(target).st_mode
         except FileNotFoundError:
             return
         if not stat.S_ISREG(mode):
-            what = NO_FILES.get(stat.S_IFMT(mode), "device")
-            raise OutputError(f"Expected a file to write, {target} is a {what}; name another one.")
+            kind = SPECIAL_FILES.get(stat.S_IFMT(mode), "device")
+            raise OutputError(f"Expected a file to write, {target} is a {kind}; name another one.")
+        unchanged = "was left as it was; name another file"
         if is_database(target):
-            raise OutputError(f"{target} is a database, as a store is, and was left as it was; name another file.")
+            raise OutputError(f"{target} is a database, as a store is, and {unchanged}.")
         if not force:
-            raise OutputError(f"{target} exists, and was left as it was; name another file, or replace it with --force.")
+            raise OutputError(f"{target} exists, and {unchanged}, or replace it with --force.")
 
 
-def write_output(path: str | os.PathLike[str], content: bytes, force: bool = False, *, make_folder: bool = False) -> Path:
-    """Write a file whole or not at all, as `output_file`; returns its path."""
+def write_output(
+    path: str | os.PathLike[str], content: bytes, force: bool = False, *, make_folder: bool = False
+) -> Path:
+    """Write a file as a whole or not at all, and return its path; parameters as `output_file`."""
     with output_file(path, force, make_folder=make_folder) as partial:
         partial.write_bytes(content)
     return Path(path)
 
 
 @contextmanager
-def output_file(path: str | os.PathLike[str], force: bool = False, *, make_folder: bool = False) -> Iterator[Path]:
-    """Give an empty file to write to, which is synced and renamed to this path when the block has ended well.
+def output_file(
+    path: str | os.PathLike[str], force: bool = False, *, make_folder: bool = False
+) -> Iterator[Path]:
+    """Context manager that gives the path of an empty file to write.
 
-    It has a random name in the same folder. OutputError as `check_output`, and for what the disk says.
-    make_folder : make its folder if need be.
+    If the block ends well, the file is synced and renamed to `path`; if not, it is deleted.
+
+    Parameters
+    ----------
+    path : path
+        File that is to be there at the end.
+    force : bool, default False
+        Whether a file that exists may be replaced; see `check_output`.
+    make_folder : bool, default False
+        Whether its folder is made if there is none.
+
+    Yields
+    ------
+    Path
+        A file with a random name in the same folder.
+
+    Raises
+    ------
+    OutputError
+        If `check_output` refuses the path, or the system does.
     """
     target = Path(path)
-    with _told(target):
+    with _write_errors(target):
         if make_folder:
             target.parent.mkdir(parents=True, exist_ok=True)
         check_output(target, force)
         partial = target.with_name(f".dengine-{secrets.token_hex(8)}.partial")
-        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # exclusively: no planted link is followed
+        # Exclusively, so that no link that somebody put there is followed.
+        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         try:
             yield partial
             with partial.open("r+b") as file:
@@ -148,15 +239,25 @@ def output_file(path: str | os.PathLike[str], force: bool = False, *, make_folde
 
 
 def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> Path:
-    """Write or go on with `manifest.json`, last: the SHA-256 of each output in a folder. What it lists is whole."""
-    target, sums = folder / MANIFEST, {}
-    with suppress(OSError, ValueError, TypeError, KeyError):  # there is none, or it is somebody else's
-        sums, force = dict(json.loads(target.read_bytes())["sha256"]), True
+    """Add the SHA-256 of files to `manifest.json` of their folder, and return its path.
+
+    It is made if there is none. Write it last: the files that it lists are complete. Raises
+    OutputError if there is a file of that name that is no manifest, unless `force`.
+    """
+    target = folder / MANIFEST
+    sums: dict[str, str] = {}
+    with suppress(OSError, ValueError, TypeError, KeyError):  # no file, or no manifest
+        sums = dict(json.loads(target.read_bytes())["sha256"])
+        force = True
     sums |= {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-    return write_output(target, (json.dumps({"sha256": sums}, indent=2) + "\n").encode(), force)
+    content = json.dumps({"sha256": sums}, indent=2) + "\n"
+    return write_output(target, content.encode(), force)
 
 
-def _told(target: Path) -> AbstractContextManager[None]:
-    """What the system says, as an OutputError that says what to do."""
-    do = "choose a folder that exists, is writable and has room, and a file that no program has open"
-    return instead(OutputError, f"Cannot write {target}", OSError, ValueError, do=do)  # the latter for a name with a NUL
+def _write_errors(target: Path) -> AbstractContextManager[None]:
+    """Return a context manager that raises OutputError, with advice, for an error of the system."""
+    do = (
+        "choose a folder that exists, is writable and has room, and a file that no program has open"
+    )
+    # ValueError is raised for a name with a NUL.
+    return instead(OutputError, f"Cannot write {target}", OSError, ValueError, do=do)

@@ -113,8 +113,8 @@ class TraceSpec:
         Range of the sensor, in `unit`: a sample at or beyond ±limit is saturated. None: not
         checked.
     fit : {"strict", "cut", "pad", "resample"}, default "strict"
-        What happens to a trace of another length, see `traces.fitted`. strict: TraceError. cut: a
-        longer one loses its end. pad: like cut, and a shorter one repeats its last sample.
+        What happens to a trace of another length, see `traces.fit_length`. strict: TraceError. cut:
+        a longer one loses its end. pad: like cut, and a shorter one repeats its last sample.
         resample: linear interpolation. A trace that cannot be fitted becomes NaN and is verified.
     columns : tuple of str, default ()
         Names of the channels, by which the columns of a DataFrame are selected.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
-from ..files import must_fit, reading
+from ..files import check_size, read_errors
 from . import labels
 from .dataset import Asked, Collected, Dataset, UnreadableError, as_dataset, must
 from .tables import natural
@@ -75,7 +75,7 @@ def _reader(path: Path) -> "Iterator[McapReader]":
     from mcap_ros2.decoder import DecoderFactory
     from zstandard import ZstdError
 
-    with reading(path, "an MCAP file", also=(McapError, ZstdError)), path.open("rb") as file:
+    with read_errors(path, "an MCAP file", also=(McapError, ZstdError)), path.open("rb") as file:
         yield make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
 
 
@@ -87,8 +87,8 @@ def _topics(files: Sequence[Path]) -> dict[str, str]:
             summary = reader.get_summary()
             if summary is None or summary.statistics is None:
                 raise DataError(f"Expected a summary in {path}, there is none: was it cut off? mcap recover mends it.")
-            must_fit(float(SIZE) * summary.statistics.message_count, path)
-            must_fit(float(max((chunk.uncompressed_size for chunk in summary.chunk_indexes), default=0)), path)
+            check_size(float(SIZE) * summary.statistics.message_count, path)
+            check_size(float(max((chunk.uncompressed_size for chunk in summary.chunk_indexes), default=0)), path)
             types = {number: schema.name for number, schema in summary.schemas.items()}
             found |= {channel.topic: types.get(channel.schema_id, "") for channel in summary.channels.values()}
     return found
@@ -124,7 +124,7 @@ def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
     files = sorted(path.glob(f"*{SUFFIX}"), key=lambda each: natural(each.name)) if path.is_dir() else [path]
     if not files:
         raise DataError(f"Expected MCAP files in the bag {path}, found none; ros2 bag convert makes them of .db3 files.")
-    with reading(path, "MCAP files", "mcap_ros2", "mcap"):
+    with read_errors(path, "MCAP files", "mcap_ros2", "mcap"):
         have = _topics(files)
     kinds = {kind.rpartition("/")[2]: topic for topic, kind in have.items()}
     told = f"label={kinds['Bool']!r}" if "Bool" in kinds else "a CSV file of them by number, from 1 (labels)"

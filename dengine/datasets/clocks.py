@@ -1,6 +1,6 @@
 """Which column of a recording is its clock, what its times are, and the rate that they tell.
 
-A clock is known by its name (`traces.is_time`), or by its values: times of day, or seconds since 1970. Any
+A clock is known by its name (`traces.is_time_column`), or by its values: times of day, or seconds since 1970. Any
 other column that rises steadily may be one, or a path: it is offered, and a person says so.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import excerpt, listed
-from ..traces import is_time
+from ..traces import is_time_column
 from . import units
 from .dataset import UnreadableError
 
@@ -87,7 +87,7 @@ def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
         if not places:
             raise UnreadableError(f"Expected a column {time} of times, found {listed(names)}")
         return places[0]
-    if places := [i for i, name in enumerate(names) if is_time(name)]:
+    if places := [i for i, name in enumerate(names) if is_time_column(name)]:
         return max(places, key=lambda i: _rising_share(head.iloc[:, i]))  # a date beside the time of day does not
     return next((i for i in range(len(names)) if _is_clock(head.iloc[:, i], names[i])), None)
 
@@ -159,7 +159,7 @@ def clock_of(frame: pd.DataFrame, time: str | None = None, units_row: Sequence[s
         got = excerpt(str(column[odd[0]]))
         what = f"Expected a time in column {name}, {wanted}, got {got}; a stated rate (rate_hz) needs none"
         raise UnreadableError(what, odd[0])
-    if time is None and not is_time(name):
+    if time is None and not is_time_column(name):
         known = f"Column {name or place + 1} is taken as the clock by its values"
         said = f"{known}; {said}" if said else known
     return Clock(name, seconds, said)

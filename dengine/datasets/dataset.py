@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import DataError, TraceError, expect, shortened
 from ..records import FITS, TraceSpec
 from ..representation import to_html
-from ..traces import as_traces, fits, fitted
+from ..traces import as_traces, can_fit_length, fit_length
 from . import units
 
 if TYPE_CHECKING:
@@ -300,7 +300,7 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
     lengths = np.array([each.trace.shape[1] for each in found.read], dtype=np.int64)
     fit, samples = form_of(lengths, asked.fit, asked.samples)
     stretch = samples / float(np.median(lengths)) if fit == "resample" else 1.0
-    unfit = [i for i, have in enumerate(lengths.tolist()) if not fits(have, samples, FITS.index(fit))]
+    unfit = [i for i, have in enumerate(lengths.tolist()) if not can_fit_length(have, samples, FITS.index(fit))]
     found.leave_out({i: f"Expected {_wanted(samples, fit)}, got {lengths[i]}" for i in unfit})
     block = np.stack([_fitted(each.trace, samples, fit) for each in found.read])
     rates = np.array([each.rate_hz or np.nan for each in found.read])
@@ -445,7 +445,7 @@ def refit(data: Dataset, asked: Asked) -> Dataset:
         return data if asked.samples is None else data.cut(asked.samples)
     have = data.X.shape[-1]
     fit, samples = form_of(np.array([have], dtype=np.int64), asked.fit, asked.samples)
-    if not fits(have, samples, FITS.index(fit)):
+    if not can_fit_length(have, samples, FITS.index(fit)):
         raise DataError(f"Expected {_wanted(samples, fit)}, {data.name} has {have}.")
     stretch = samples / have if fit == "resample" else 1.0
     rate = None if data.rate_hz is None else data.rate_hz * stretch
@@ -456,7 +456,7 @@ def _fitted(x: NDArray[np.float32], samples: int, fit: str) -> NDArray[np.float3
     """(..., T) -> (..., samples), by what fits live traces too."""
     if x.shape[-1] == samples:
         return x
-    values: NDArray[np.float32] = fitted(torch.from_numpy(np.array(x, order="C")), samples, FITS.index(fit)).numpy()
+    values: NDArray[np.float32] = fit_length(torch.from_numpy(np.array(x, order="C")), samples, FITS.index(fit)).numpy()
     return values
 
 

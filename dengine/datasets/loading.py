@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, instead, listed
-from ..files import is_database, read_archive, reading
+from ..files import is_database, read_archive, read_errors
 from ..records import stored_trace_spec
 from ..traces import as_trace, spec_of
 from . import units
@@ -192,7 +192,7 @@ def _read_npz(named: Files, name: str, asked: Asked) -> Dataset:
         raise DataError(f"Expected {_wanted_arrays(named, asked)}")
     if asked.part != "part" and asked.part not in found:
         raise DataError(f"Expected an array {asked.part} in {', '.join(named)}, found {listed(have)}.")
-    with reading(name, "an .npz file of plain arrays"):
+    with read_errors(name, "an .npz file of plain arrays"):
         arrays = [_by_part(found[each], found[label]) for each in own or ("X",)]
         X = np.stack(arrays, axis=1) if len(own) > 1 else arrays[0]
         if "scale" in found:

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
-from ..files import reading
-from ..traces import is_time
+from ..files import read_errors
+from ..traces import is_time_column
 from . import labels, units
 from .clocks import floats, place_of_clock, seconds_of
 from .dataset import (
@@ -195,7 +195,7 @@ def _advice(named: Mapping[str, Path], asked: Asked) -> str | None:
     if _look_like_labels(found) and found[0] and found[1]:
         return advice
     some = dict(list(named.items())[:: max(len(named) // FEW, 1)])
-    columns = [name for name in _top(next(iter(named.values())), asked)[0] if name and not is_time(name)]
+    columns = [name for name in _top(next(iter(named.values())), asked)[0] if name and not is_time_column(name)]
     known = {name: _count_labels(some, labels.in_column(some, name, asked)) for name in columns}
     telling = [name for name, found in known.items() if not found[None] and _look_like_labels(found) and len(+found) > 1]
     if telling:
@@ -255,7 +255,7 @@ def _channels_in(top: list[list[str]], asked: Asked) -> list[str]:
     with suppress(UnreadableError):
         frame = pd.DataFrame(whole, columns=header, dtype=object)
         clock = place_of_clock(frame, asked.time)
-    return [name for i, name in enumerate(header) if name and i != clock and not is_time(name)]
+    return [name for i, name in enumerate(header) if name and i != clock and not is_time_column(name)]
 
 
 def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
@@ -286,7 +286,7 @@ def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
 def _parquet(path: Path) -> Sheet:
     import pandas as pd
 
-    with reading(path, "a Parquet file", "pyarrow", "files"):
+    with read_errors(path, "a Parquet file", "pyarrow", "files"):
         return Sheet(_with_row_numbers(pd.read_parquet(path)), [], 0, [], "")
 
 
@@ -388,7 +388,7 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str,
 
     written : the units of columns.
     """
-    time = asked.time or next((name for name in frame.columns if is_time(name)), "")
+    time = asked.time or next((name for name in frame.columns if is_time_column(name)), "")
     for name in (asked.part, time):
         if name not in frame:
             wanted = f"a row a sample in {source}, with columns of parts (part) and times (time)"
@@ -442,7 +442,7 @@ def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
     if max(map(len, _numbered(frame.columns).values()), default=0) > 2:
         return ""
     part = asked.part if asked.part in frame and frame[asked.part].duplicated().any() else ""
-    time = asked.time or next((name for name in frame.columns if is_time(name)), "")
+    time = asked.time or next((name for name in frame.columns if is_time_column(name)), "")
     time = time or next(
         (name for name in frame.columns if part and name != part and _rises_within_parts(frame, part, name)), ""
     )
@@ -508,7 +508,7 @@ def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
         return str(frame.columns[known])
     several = {name for names in _numbered(frame.columns).values() if len(names) > 1 for _, name in names}
     left = [name for name in frame.columns if name not in several]
-    if asked.time is None and len(left) == len(frame.columns) and any(is_time(name) for name in left):
+    if asked.time is None and len(left) == len(frame.columns) and any(is_time_column(name) for name in left):
         do = "as in one recording; give a folder of such CSV files"
         raise DataError(f"Expected a row an insertion, got {listed(left)}, {do}.")
     likely = [name for name in left if 2 <= frame[name].nunique() <= MOST_WORDS]

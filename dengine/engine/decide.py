@@ -17,7 +17,7 @@ from ..folds import audited, part_hash
 from ..model.base import EngineModel, Prediction
 from ..records import LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
 from ..store.records import StoredDecision
-from ..traces import TraceGate, as_agreed, first_contract
+from ..traces import TraceGate, convert_trace, infer_trace_spec
 from .settings import SettingsInForce
 
 log = logging.getLogger("dengine")
@@ -43,7 +43,7 @@ class DecisionMaker:
 
     def first_contract(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
         """The contract that a first trace (C, T) sets; None for a bad one: it is verified, and the contract stays open."""
-        spec, fit = first_contract(x, trace)
+        spec, fit = infer_trace_spec(x, trace)
         self._gate = TraceGate(spec)  # a bad one needs it as well: to say what is bad
         return spec if fit else None
 
@@ -107,7 +107,7 @@ class DecisionMaker:
 
 def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
     """The decision that this id has already; TraceError where it was made on another trace."""
-    x = as_agreed(trace, spec, False)
+    x = convert_trace(trace, spec, False)
     if not np.array_equal(x, known.trace, equal_nan=True):
         own = f"the trace that decision {known.decision.id!r} was made on"
         raise TraceConflictError(f"Expected {own}, got another; give it an id of its own.")

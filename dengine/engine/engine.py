@@ -52,7 +52,7 @@ from ..representation import to_html
 from ..store.opening import UNHURRIED, opening
 from ..store.outbox import CLOSE_SECONDS, Outbox
 from ..store.records import StoredDecision
-from ..traces import as_agreed
+from ..traces import convert_trace
 from .corrections import Changed, Corrections
 from .decide import DecisionMaker, as_part, decided_before, unasked
 from .feedback import Feedback
@@ -391,7 +391,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             if self.trace is None or self.store.wait is None:
                 return unasked(id_, number, self.version, Reason.LATE)
             reason = Reason.NO_STORE if self._outbox.verify_all_reason else Reason.LATE
-            x = as_agreed(trace, self.trace, False)
+            x = convert_trace(trace, self.trace, False)
             known = self._outbox.record_decision(self._maker.decide(x, number, None, self.version, reason, id_))
         with suppress(NotTakenError):
             self._outbox.sync()
@@ -412,10 +412,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self.trace or trace
 
     def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
-        x = as_agreed(trace, self.trace, self._settings.now.inferred and self.version + self.new_labels == 0)
+        x = convert_trace(trace, self.trace, self._settings.now.inferred and self.version + self.new_labels == 0)
         if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
             if self.agree_on(spec, inferred=True) != spec:  # a peer's trace came first
-                return as_agreed(trace, self.trace, False)
+                return convert_trace(trace, self.trace, False)
         elif self._settings.waiting:
             self._settings.save()
         if self._unseen and self.trace is not None and np.isfinite(x).all():

@@ -26,7 +26,7 @@ import numpy as np
 
 from ..datasets import Dataset, load_dataset
 from ..errors import DataError, SettingError, expect
-from ..files import read_archive, reading, write_output
+from ..files import read_archive, read_errors, write_output
 from ..records import RetrainReport
 from ..reducers import reducer_class
 from .baselines import require
@@ -82,7 +82,7 @@ class KeptReplays:
         """The replay, under the contender's present name; None where it is not there, or damaged."""
         path = self.path(task)
         try:
-            with reading(path, "a kept replay"):
+            with read_errors(path, "a kept replay"):
                 arrays: dict[str, Any] = read_archive(path)[0]
                 about = json.loads(str(arrays.pop("about")))
                 retrains = tuple(RetrainReport(**each) for each in about.pop("retrains"))

@@ -10,7 +10,7 @@ from ..folds import COIN_BITS, MIX, audit_salt
 from ..limits import ForceLimits
 from ..model.neighbours import NOVEL, Predictor
 from ..records import FITS, REASONS, Reason, TraceSpec
-from ..traces import ForceLimitsGate, TraceGate, fitted
+from ..traces import ForceLimitsGate, TraceGate, fit_length
 
 One = tuple[int, int, float, float, int, int, Tensor]
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
@@ -184,7 +184,7 @@ class DecisionModule(nn.Module):
         if x.dim() != 2 or x.size(0) != self.channels or not length:
             raise ValueError(f"Expected one trace of {self.channels} x {self.samples} samples, got shape {trace.size()}.")
         x = x.to(torch.float32).contiguous()
-        return x if x.size(1) == self.samples else fitted(x, self.samples, self.fit)
+        return x if x.size(1) == self.samples else fit_length(x, self.samples, self.fit)
 
     def toss(self, content: int) -> int:
         """`folds.toss` of one hash: 64-bit integers that wrap around."""

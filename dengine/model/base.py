@@ -21,7 +21,7 @@ from ..limits import ForceLimits
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
-from ..traces import without_extremes
+from ..traces import clip_extremes
 
 log = logging.getLogger("dengine")
 
@@ -249,7 +249,7 @@ class BaselineAdapter(EngineModel):
         self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
 
     def train(self, X: Floats, y: NDArray[Any], *_: object, **__: object) -> Self:
-        self.model.fit(without_extremes(X).copy(), y)  # the window's own, which a baseline may write to
+        self.model.fit(clip_extremes(X).copy(), y)  # the window's own, which a baseline may write to
         return self
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:

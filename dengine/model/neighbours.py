@@ -38,7 +38,7 @@ from ..recipe import NOVELTY, Recipe, describe_estimator
 from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
 from ..reducers import make_reducer, own_default
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, space_scale
-from ..traces import TraceGate, as_labels, as_traces, without_extremes
+from ..traces import TraceGate, as_labels, as_traces, clip_extremes
 from .base import Embedding, EngineModel, Exportable, Gate, Looked, Prediction
 
 log = logging.getLogger("dengine")
@@ -262,7 +262,7 @@ class ModelPrediction(EngineModel):
         self, X: Floats, y: NDArray[Any], hashes: Ints, stop: StopRule | None = None, numbers: Ints | None = None
     ) -> Self:
         """Train the reducer, warm where it can be, and make every trace a reference."""
-        X, y = without_extremes(X), y.astype(np.int64)
+        X, y = clip_extremes(X), y.astype(np.int64)
         folds = fold_of(hashes, self.n_spaces)
         points = self.spaces.train(X, y, folds, stop, numbers)
         self.trace_shape = X.shape[1:]
@@ -280,7 +280,7 @@ class ModelPrediction(EngineModel):
         self.spaces.warm_up()
 
     def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
-        X = without_extremes(X)
+        X = clip_extremes(X)
         """`Reducer.look_ahead`; and where nothing answers yet, compile what will: a first retrain has no time for that."""
         blank = self.spaces.blank(X)
         with ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,)) as pool:

@@ -13,7 +13,7 @@ import pytest
 
 from dengine import DataEngine, Policy, Reason, Recipe, load_dataset
 from dengine.errors import DataError, DengineError, SettingError
-from dengine.files import must_fit, read_archive
+from dengine.files import check_size, read_archive
 from dengine.reducers import reducer_class
 from tests.support.command_line import dengine
 from tests.support.driving import learn
@@ -129,16 +129,16 @@ def test_a_bomb_is_refused_by_what_it_claims(tmp_path: Path, monkeypatch: pytest
     assert path.stat().st_size < 2**17
     with pytest.raises(DataError, match="Expected arrays X and y"):
         load_dataset(path)
-    monkeypatch.setattr("dengine.files.MOST", 2**20)
+    monkeypatch.setattr("dengine.files.MAX_BYTES", 2**20)
     with pytest.raises(DataError, match=r"at most 1\.0 MB of arrays in .*, got 64\.0 MB"):
         read_archive(path)
 
 
 def test_only_what_is_wanted_counts_and_never_over_eight_gigabytes(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DataError, match="GB of arrays in it, got"):
-        must_fit(8.1 * 2**30, "it")
+        check_size(8.1 * 2**30, "it")
     content = npz(X=np.zeros((3, 9)), big=np.zeros(10**6))
-    monkeypatch.setattr("dengine.files.MOST", 2**16)
+    monkeypatch.setattr("dengine.files.MAX_BYTES", 2**16)
     assert set(read_archive(content, ["X"])[0]) == {"X"}
     with pytest.raises(DataError, match="of arrays in"):
         read_archive(content)

@@ -7,7 +7,7 @@ import pytest
 
 from dengine import Action, DataEngine, Reason, TraceSpec
 from dengine.errors import TraceError
-from dengine.traces import LEAST
+from dengine.traces import MIN_SAMPLES
 from tests.support.driving import learn
 
 BAD = {Reason.NOT_FINITE: np.full(7_000, np.nan), Reason.CONSTANT: np.zeros((3, 500))}
@@ -33,14 +33,14 @@ def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(place, reason
         assert engine.decide(data.X[0]).reason is not Reason.MODEL_ERROR
 
 
-@pytest.mark.parametrize("samples", [1, 2, 3, LEAST - 1])
+@pytest.mark.parametrize("samples", [1, 2, 3, MIN_SAMPLES - 1])
 def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(place, samples: int) -> None:
     with DataEngine("pca", store=place) as engine:
         with pytest.raises(TraceError, match=rf"got 1 x {samples}; record longer, or start with DataEngine\(trace="):
             engine.decide(np.arange(samples))
         assert (engine.trace, engine.store.status()["decisions"]) == (None, 0)
-        engine.decide(np.arange(LEAST))
-        assert engine.trace == TraceSpec(LEAST)
+        engine.decide(np.arange(MIN_SAMPLES))
+        assert engine.trace == TraceSpec(MIN_SAMPLES)
     with DataEngine("pca", trace=TraceSpec(samples)) as engine:  # it is meant
         assert engine.decide(np.arange(samples)).reason in (Reason.NO_MODEL, Reason.CONSTANT)
 

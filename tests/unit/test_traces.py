@@ -26,7 +26,7 @@ from dengine import (
 from dengine.decision.scripting import script
 from dengine.errors import SettingError
 from dengine.records import FITS, stored_trace_spec
-from dengine.traces import REASONS, TraceGate, as_trace, fits, fitted, spec_of
+from dengine.traces import REASONS, TraceGate, as_trace, can_fit_length, fit_length, spec_of
 from tests.support.driving import learn
 
 NO_TRACES = (np.float32(3.0), np.zeros((2, 3, 4)), np.zeros(0), np.zeros((1, 0)), np.zeros((0, 5)))
@@ -166,11 +166,11 @@ def test_resample_is_linear_interpolation_over_the_whole(have: int, channels: in
 @settings(max_examples=150, deadline=None)
 def test_what_cannot_honestly_be_fitted_is_not_finite_and_nothing_else_is(have, samples: int, fit: int, seed: int) -> None:
     x = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, have)).astype(np.float32))
-    got = fitted(x, samples, fit)
+    got = fit_length(x, samples, fit)
     assert got.shape == (2, samples)
-    assert bool(got.isfinite().all()) == fits(have, samples, fit)
+    assert bool(got.isfinite().all()) == can_fit_length(have, samples, fit)
     honest = have >= samples if fit == 1 else samples <= 2 * have <= 4 * samples
-    assert fits(have, samples, fit) == honest
+    assert can_fit_length(have, samples, fit) == honest
     if not honest:  # it keeps what there is
         kept = min(have, samples - 1)
         assert torch.equal(got[:, :kept], x[:, :kept])
@@ -207,7 +207,7 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(fit: s
             np.testing.assert_array_equal(raw[6].numpy(), theirs.embedding)
         decided.append((x, ours))
     for x, one in decided:
-        lost = not fits(len(x), SAMPLES, FITS.index(fit)) or np.isnan(x[:SAMPLES]).any()
+        lost = not can_fit_length(len(x), SAMPLES, FITS.index(fit)) or np.isnan(x[:SAMPLES]).any()
         assert (one.reason is Reason.NOT_FINITE) == lost
     assert {one.action for _, one in decided} >= {Action.VERIFY, Action.ACCEPT}
     lost, labels = engine.decide(np.linspace(0, 9, 30)), engine.new_labels
