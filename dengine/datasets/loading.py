@@ -164,7 +164,7 @@ def _read_store(path: Path, name: str, asked: Asked) -> Dataset:
     from ..store.opening import opening
 
     with opening(path, must_exist=True) as store:
-        if said := store.database.doubt(0, since=0):
+        if said := store.database.check_integrity(0, since=0):
             raise DataError(f"Expected {path} as its ledger has it, {said}; see `dengine verify`, and restore a copy.")
         held, spec = store.labelled(), stored_trace_spec(store.settings())
     store.close()

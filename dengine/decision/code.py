@@ -73,8 +73,7 @@ def _described(value: Any, names: set[str], seen: set[int]) -> Any:
     for name, cell in zip(value.__code__.co_freevars, value.__closure__ or (), strict=True):
         known[name] = cell.cell_contents
     referred = [(name, _described(known[name], mentioned, seen)) for name in sorted(known)]
-    defaults = repr((value.__defaults__, value.__kwdefaults__))
-    return _instructions(value.__code__), defaults, referred
+    return _instructions(value.__code__), repr(value.__defaults__), referred
 
 
 def _names(code: CodeType) -> Iterator[str]:

@@ -166,8 +166,8 @@ from dengine.decision.rule import DecisionRule
 import {limits}
 
 
-def helper(x: float, *, minus: float = 0.0) -> float:
-    return x - minus
+def helper(x: float) -> float:
+    return x
 
 
 class Part(nn.Module):
@@ -196,7 +196,6 @@ def rejects(self: object, lower: float, upper: float) -> int:
 CHANGES = {  # of a rule's module, whose rule accepts: what is replaced, by what, and the action then
     "a constant of a module": (lambda rules: rules.limits, "LIMIT", 2.0, Action.VERIFY),
     "a function": (lambda rules: rules, "helper", lambda x: x - 1.0, Action.VERIFY),
-    "a default of a keyword": (lambda rules: rules.helper, "__kwdefaults__", {"minus": 1.0}, Action.VERIFY),
     "a helper's method": (lambda rules: rules.Part, "forward", lower_by_one, Action.VERIFY),
     "its own method": (lambda rules: rules.MyRule, "action", rejects, Action.REJECT),
 }
