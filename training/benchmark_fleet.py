@@ -194,7 +194,7 @@ def check(plan: Plan, worked: Worked) -> dict[str, Any]:
             lost += known is None or known.success is None
             wrong += known is not None and known.success is (not good)
             mixed += known is not None and read_mark(known.trace) != (cell, cycle)
-        mixed += sum(read_mark(x)[0] != cell for x in store.labelled(own=True).traces)
+        mixed += sum(read_mark(x)[0] != cell for x in store.labelled(cell_only=True).traces)
     about = {name: worked[name] for name in ("cell", "version", "certain")} | {"sent": len(sent)}
     return about | {"stored": stored, "lost": lost, "wrong": wrong, "mixed": mixed}
 

@@ -143,7 +143,7 @@ def _recorded(store: SqlStore, source: DataChoice, cycles: int, **others: Any) -
 
     dataset = source.load()
     # By content: of a part that comes twice the store's own hash would name both.
-    played = store.labelled(own=True)
+    played = store.labelled(cell_only=True)
     hashes = content_hash(played.traces)
     for id_ in store.unreported_accepts()[-1:]:
         newest = store.get_decision(id_)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
 # Parts of the shadow mode are no audits, though they have their reason.
-TITLES = {"stops": "accepted, and bad", "audits": "certain but checked"}
+TITLES = {"false_accepts": "accepted, and bad", "audits": "certain but checked"}
 APART = ("newest", "ever", "recipe", "trace", "certificate", "retrains", "events", "settings", "last")
 ELSEWHERE = ("retraining", "store_lag")  # of an engine that runs
 LAST = "The newest so many decisions, looked at apart."
@@ -58,7 +58,8 @@ def status(store: str, last: int, check_seconds: float) -> None:
 def _tables(store: str, found: "Status") -> list[Any]:
     """A column each for the newest decisions and for all; and what is of now."""
     columns, both = ("", f"last {found.newest.decisions:,}", "since birth"), (found.newest, found.ever)
-    names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "stops")  # what is bad comes first
+    # what is bad comes first
+    names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "false_accepts")
     spans = [[TITLES.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
     now = [("look at", found.alarm)] if found.alarm else []
     shown = found
@@ -88,7 +89,8 @@ def _of_span(name: str, span: "Span") -> str:
         return "none was accepted"
     if name == "would_accept" and value.known and span.bad_accepts.by == value.by:
         return "as bad accepts, below"  # the same parts
-    return _held(value, span.stops if name == "bad_accepts" else 0) if hasattr(value, "verdict") else written(name, value)
+    stops = span.false_accepts if name == "bad_accepts" else 0
+    return _held(value, stops) if hasattr(value, "verdict") else written(name, value)
 
 
 def _held(said: "Judged", stops: int) -> str:

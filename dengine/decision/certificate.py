@@ -101,7 +101,8 @@ def _run_length(share: float, step: int, limit: int) -> float:
 class Outcomes:
     """How many parts the model was certain of since the policy's settings last changed, and what became of them.
 
-    accepted, rejected : let go without a check.  stops, confirmed : of the accepted, known to be bad, and to be good.
+    accepted, rejected : let go without a check.
+    false_accepts, confirmed : of the accepted, known to be bad, and to be good.
     audited_accepts, audited_accepts_bad : checked though the model would have accepted, and the bad ones of them.
     false_rejects : of the rejected, those that somebody looked at and found good.
     audited_rejects, audited_rejects_good : checked though the model would have rejected, and the good ones of them.
@@ -111,7 +112,7 @@ class Outcomes:
     """
 
     accepted: int = 0
-    stops: int = 0
+    false_accepts: int = 0
     confirmed: int = 0
     audited_accepts: int = 0
     audited_accepts_bad: int = 0
@@ -233,21 +234,21 @@ def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audi
     lost_rejects = outcomes.forgotten_audited_rejects + outcomes.overdue_audited_rejects
     o = replace(
         outcomes,
-        stops=outcomes.stops + outcomes.forgotten_accepts,
+        false_accepts=outcomes.false_accepts + outcomes.forgotten_accepts,
         audited_accepts=outcomes.audited_accepts + lost_accepts,
         audited_accepts_bad=outcomes.audited_accepts_bad + lost_accepts,
         audited_rejects=outcomes.audited_rejects + lost_rejects,
         audited_rejects_good=outcomes.audited_rejects_good + lost_rejects,
     )
     share = 1.0 if stops == "all" or audit_rate == 0.0 else 0.1  # of alpha: audits see less and need more
-    if stops == "all" or 0 < o.accepted == o.stops + o.confirmed:
-        accepted = _bounded(o.accepted, o.accepted, o.stops, 1.0, share * alpha)
+    if stops == "all" or 0 < o.accepted == o.false_accepts + o.confirmed:
+        accepted = _bounded(o.accepted, o.accepted, o.false_accepts, 1.0, share * alpha)
     elif audit_rate == 0.0:
         accepted = _bounded(o.accepted, 0, 0, 0.0, alpha)
     else:
         n, n_bad = o.accepted + o.audited_accepts, o.audited_accepts_bad
         accepted = _bounded(n, o.audited_accepts, n_bad, audit_rate, (1.0 - share) * alpha)
-        upper = max(accepted.upper, (n_bad + o.stops) / max(1, n))
+        upper = max(accepted.upper, (n_bad + o.false_accepts) / max(1, n))
         accepted = replace(accepted, upper=upper, shadowed=audit_rate == 1.0 and o.accepted == 0)
     n, n_good = o.rejected + o.audited_rejects, o.audited_rejects_good
     rejected = _bounded(n, o.audited_rejects, n_good, audit_rate, alpha)

@@ -161,7 +161,7 @@ class Policy:
     def certificate(self, outcomes: Outcomes) -> Certificate:
         """What may be said of the parts so far; where all stops are known, a part counts once its silence is over."""
         if self.stops == "all":
-            outcomes = replace(outcomes, accepted=outcomes.stops + outcomes.forgotten_accepts + outcomes.confirmed)
+            outcomes = replace(outcomes, accepted=outcomes.false_accepts + outcomes.forgotten_accepts + outcomes.confirmed)
         said = certify(outcomes, self.alpha, self.tolerances[0], self.stops, self.audited_share)
         return replace(said, prices=self.prices) if self.guarantee == "cost" else said
 

@@ -60,7 +60,7 @@ class Feedback:
         """Go on from the store: what was accepted and not reported."""
         self._mode = self.versions.newest.safe_mode
         store = self.outbox.store
-        for owed in store.owed(self.settings.now.evidence.since):
+        for owed in store.pending_decisions(self.settings.now.evidence.since):
             if owed.number > self.versions.overdue_to:
                 self._owed[owed.decision.id] = owed
         ids = store.unreported_accepts(self.settings.now.policy_since)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.base import EngineModel
-from ..store.records import Correction, Evidence, ModelVersion
+from ..store.records import Correction, ModelVersion, OutcomeRecord
 from .settings import EvidenceWindow
 from .trainer import TrainedOn, Window
 
@@ -92,16 +92,17 @@ def change(model: EngineModel, store: SqlStore, correction: Correction) -> bool:
     return True
 
 
-def tell_all(model: EngineModel, known: Callable[[], list[Evidence]], evidence: EvidenceWindow) -> None:
+def tell_all(model: EngineModel, known: Callable[[], list[OutcomeRecord]], evidence: EvidenceWindow) -> None:
     """Reset a model's rule and replay its evidence."""
     model.forget()
     model.begin_safely_in(evidence.began_in)
     tell(model, known)
 
 
-def tell(model: EngineModel, asked: Callable[[], list[Evidence]]) -> None:
+def tell(model: EngineModel, asked: Callable[[], list[OutcomeRecord]]) -> None:
     """Tell a model's rule what became of parts, in the order of their labels; one that learns nothing asks for nothing."""
     if not model.remembers:
         return
     for each in asked():
-        model.tell_safely(each.lower, each.upper, each.success, each.novel, each.silent, each.predicted, each.looked)
+        bounds = each.lower, each.upper
+        model.tell_safely(*bounds, each.success, each.novel, each.silent, each.predicted, each.inclusion_probability)

@@ -29,17 +29,17 @@ from ..model.base import EngineModel
 from ..recipe import Recipe
 from ..records import ACTIONS, Decision, Reason, RetrainReport
 from ..reducers.base import State
-from ..store.evidence import rule_past
 from ..store.outbox import Outbox
 from ..store.records import (
     Change,
-    Evidence,
     Labelled,
     ModelVersion,
+    OutcomeRecord,
     StoredDecision,
-    overdue_evidence,
+    overdue_outcomes,
     without_rule,
 )
+from ..store.rule_progress import read_rule_progress
 from .resume import change, join_since, known_to, refit, restored, tell, tell_all
 from .settings import EvidenceWindow
 from .trainer import HUNG, Retrainer, Trained, TrainedOn, Window
@@ -152,8 +152,8 @@ class ModelVersions:
         # The later versions may be damaged: what an earlier one's rule learned under an earlier policy is left out.
         state = {} if version is None else version.state if version.version >= since else without_rule(version.state)
         model = None if version is None else restored(self.outbox, template, state)
-        past = rule_past(store, None if model is None else version, since, within, policy_since)
-        self.overdue, self.overdue_to = set(past.overdue), past.overdue_to
+        past = read_rule_progress(store, None if model is None else version, since, within, policy_since)
+        self.overdue, self.overdue_to = set(past.overdue_ids), past.overdue_to
         if version is None or model is None:
             if len(labelled.seq) >= 500:  # and no retrain yet: they were imported
                 self._look_ahead(template, labelled)
@@ -166,8 +166,8 @@ class ModelVersions:
             self._look_ahead(model, labelled)
             model.prepare_safely(template)
             self.corrected_to = join_since(model, store, version, self.retrainer.window)
-            if past.told_to:
-                tell(model, lambda: self._evidence(past.told_to))
+            if past.last_seq:
+                tell(model, lambda: self._evidence(past.last_seq))
             else:
                 tell_all(model, self._evidence, self.evidence)
             self.new_labels = int((labelled.seq > trained_on.counts_from).sum())
@@ -175,10 +175,10 @@ class ModelVersions:
         if self.fleet is not None:
             self.fleet.resume()
 
-    def _evidence(self, after: int = 0) -> list[Evidence]:
+    def _evidence(self, after: int = 0) -> list[OutcomeRecord]:
         """What the rule is told of labels after that number, which are held to the ledger."""
         self.outbox.check_integrity(after)
-        return self.store.evidence_since(after, self.evidence.since, self.overdue_to)
+        return self.store.outcomes_since(after, self.evidence.since, self.overdue_to)
 
     def _look_ahead(self, model: EngineModel, labelled: Labelled) -> None:
         """Compute beside the cell what a retrain on these begins with: an opening need not wait for it."""
@@ -224,7 +224,7 @@ class ModelVersions:
         """Tell the rule that a part was decided wrongly, whichever way: its check was not reported in time."""
         if made.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
-        for told in overdue_evidence(made):
+        for told in overdue_outcomes(made):
             self.overdue.add(made.id)
             self.newest.tell_safely(*told[1:])
 
@@ -246,7 +246,7 @@ class ModelVersions:
 
     def tell_anew(self) -> None:
         """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
-        known = self.outbox.call_store(lambda: self.store.evidence_since(0, self.evidence.since, self.overdue_to))
+        known = self.outbox.call_store(lambda: self.store.outcomes_since(0, self.evidence.since, self.overdue_to))
         tell_all(self.newest, lambda: known, self.evidence)
 
     def correct(self, own: bool = True) -> None:
@@ -325,7 +325,7 @@ class ModelVersions:
     def _state(self, model: EngineModel, trained_on: TrainedOn) -> State:
         own = {"corrected_to": np.array(self.corrected_to)} | ({} if self.fleet is None else self.fleet.state())
         own |= {"overdue_to": np.array(self.overdue_to)}
-        own |= {"owed": np.array(True)} if self.overdue else {}  # an opened engine tells the rule anew
+        own |= {"includes_overdue": np.array(True)} if self.overdue else {}  # an opened engine tells the rule anew
         return model.get_state() | trained_on.to_state() | own
 
     def _begin_counting(self) -> None:
@@ -498,7 +498,7 @@ class Fleet:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """What a version has to say of this cell."""
-        return {"told_to": np.array(self._told_to)}
+        return {"rule_last_seq": np.array(self._told_to)}
 
     def keep(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
         """Take a label of this cell that was stored, and is a reference already."""

@@ -32,8 +32,8 @@ from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, Source, TraceSpec, stored_trace_spec
 from ..representation import to_html
-from ..store.evidence import rule_past
-from ..store.records import SAFE_MODE_BEGAN, Evidence, ModelVersion, StoredDecision, VersionError, unknown_decision
+from ..store.records import SAFE_MODE_BEGAN, ModelVersion, OutcomeRecord, StoredDecision, VersionError, unknown_decision
+from ..store.rule_progress import read_rule_progress
 from ..store.views import HistoryFilter, PastLabel
 from ..traces import LARGEST, ForceLimitsGate
 
@@ -68,7 +68,7 @@ def as_it_stood(store: SqlStore, version: int, recipe: Recipe, then: StoredDecis
         return None
     if "points" not in stored.state:  # a baseline keeps nothing
         return None
-    reports = ((each.report, each.last_seq) for each in store.versions(own=True))
+    reports = ((each.report, each.last_seq) for each in store.versions(cell_only=True))
     retrains = [last_seq for report, last_seq in reports if report.accepted and report.version > version]
     upto = min([*retrains[:1], stored.last_seq + STRIDE])
     later = store.past_labels(stored.last_seq, upto)
@@ -140,19 +140,19 @@ def rule_now(store: SqlStore, policy: Policy) -> DecisionRule | None:
     if stored is None or (rule := _restored(stored, policy)) is None:
         return None
     since, began_in, policy_since = (int(settings.get(name, 0)) for name in ("told_since", "began_in", "policy_since"))
-    past = rule_past(store, stored, since, policy.label_within, policy_since)
-    if not past.told_to:  # as an engine that is opened
+    past = read_rule_progress(store, stored, since, policy.label_within, policy_since)
+    if not past.last_seq:  # as an engine that is opened
         rule = rule.clone()
         rule.start_in_safe_mode(began_in)
-    for evidence in store.evidence_since(past.told_to, since, past.overdue_to):
+    for evidence in store.outcomes_since(past.last_seq, since, past.overdue_to):
         _update(rule, evidence)
     return rule
 
 
-def _update(rule: DecisionRule, outcome: PastLabel | Evidence) -> None:
+def _update(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
     """Update a rule with what became of a part."""
     rule.observe(outcome.silent, outcome.novel)
-    rule.update(outcome.lower, outcome.upper, outcome.success, outcome.predicted, outcome.looked)
+    rule.update(outcome.lower, outcome.upper, outcome.success, outcome.predicted, outcome.inclusion_probability)
 
 
 # The envelope: a picture for people, not a test. One sample in twenty of an ordinary success lies outside, by its making.

@@ -61,7 +61,7 @@ class Span:
     first, last : times of the oldest and the newest; None where there is none.
     outside : left an operator's window, and were verified or rejected without the model.
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
-    accepted, rejected : by the model, without a check.  stops : of the accepted, those known to be bad.
+    accepted, rejected : by the model, without a check.  false_accepts : of the accepted, those known to be bad.
     false_rejects : of the rejected, those that were looked at and found good.
     bad_accepts : parts that it let pass, and would have but for an audit, by the policy's alpha; of
         no part where none passed, as in the shadow mode.
@@ -82,7 +82,7 @@ class Span:
     quarantined: int
     accepted: int
     rejected: int
-    stops: int
+    false_accepts: int
     false_rejects: int
     would_accept: Judged
     would_reject: Judged
@@ -153,7 +153,7 @@ class Status:
     def __repr__(self) -> str:
         n = self.ever
         at = f"{self.cell}: version {self.version}, {n.decisions} decision{'' if n.decisions == 1 else 's'}"
-        return f"<Status of {at}, {n.verified} verified, {n.accepted} accepted, {n.stops} known bad, {n.rejected} rejected>"
+        return f"<Status of {at}, {n.verified} verified, {n.accepted} accepted, {n.false_accepts} known bad, {n.rejected} rejected>"
 
     @property
     def alarm(self) -> str:
@@ -212,7 +212,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     settings = store.settings()
     if "recipe" not in settings:
         raise StoreError(f"Expected a store that an engine has used, cell {store.cell_id!r} of this one is empty.")
-    recipe, counts, retrains = Recipe.from_store(settings), store.status(), store.versions(own=True)
+    recipe, counts, retrains = Recipe.from_store(settings), store.status(), store.versions(cell_only=True)
     every, policy, events = store.tally(), recipe.policy, store.events()
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
     outcomes, since = every.outcomes, int(settings.get("policy_since", 0))
@@ -231,7 +231,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         last=last,
         newest=_span(store.tally(last), retrains, policy),
         ever=_span(every, retrains, policy),
-        unreported=outcomes.accepted - outcomes.stops - outcomes.confirmed,
+        unreported=outcomes.accepted - outcomes.false_accepts - outcomes.confirmed,
         certificate=policy.certificate(store.tally(since_version=since, within=policy.label_within).outcomes),
         retrains=tuple(retrains),
         events=tuple(events[-EVENTS:]),
@@ -264,7 +264,7 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         quarantined=tally.by("quarantined")[True],
         accepted=outcomes.accepted,
         rejected=outcomes.rejected,
-        stops=outcomes.stops,
+        false_accepts=outcomes.false_accepts,
         false_rejects=outcomes.false_rejects,
         would_accept=_judged(*accepts, by=by),
         would_reject=_judged(*rejects, by=by),
@@ -297,13 +297,13 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
     """
     if not outcomes.accepted:
         return _judged(0, 0, policy.tolerances[0], policy.alpha)
-    n, heard = outcomes.accepted + outcomes.audited_accepts, outcomes.stops + outcomes.confirmed
+    n, heard = outcomes.accepted + outcomes.audited_accepts, outcomes.false_accepts + outcomes.confirmed
     if heard and (policy.stops == "all" or outcomes.accepted == heard):
-        return _judged(heard, outcomes.stops, policy.tolerances[0], policy.alpha, n, "every outcome")
+        return _judged(heard, outcomes.false_accepts, policy.tolerances[0], policy.alpha, n, "every outcome")
     said = _judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0], policy.alpha, n)
-    quiet = outcomes.accepted - outcomes.stops
-    lower = max(said.lower, 1.0 - wilson_interval(quiet, outcomes.stops, policy.alpha)[1])
-    upper = max(said.upper, outcomes.stops / max(1, outcomes.accepted))
+    quiet = outcomes.accepted - outcomes.false_accepts
+    lower = max(said.lower, 1.0 - wilson_interval(quiet, outcomes.false_accepts, policy.alpha)[1])
+    upper = max(said.upper, outcomes.false_accepts / max(1, outcomes.accepted))
     return replace(said, lower=lower, upper=upper, verdict=_verdict(lower, upper, said.tolerance))
 
 
@@ -344,7 +344,7 @@ def course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
     """Read what a picture is drawn from; by : as of `SqlStore.stretches`, of which the newest are drawn."""
     modes = [event for event in store.events() if event.kind in MODES]
     stretches = store.stretches(max(1, min(STRETCHES, store.tally().count() // FEWEST)), **by)[-STRETCHES:]
-    return Course(stretches, store.versions(own=True), modes, recipe.policy.tolerances[0], last)
+    return Course(stretches, store.versions(cell_only=True), modes, recipe.policy.tolerances[0], last)
 
 
 def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
@@ -387,5 +387,5 @@ def beside(
 ) -> dict[str, list[StoredVersion | Event]]:
     """What happened beside the decisions, retrains and events, oldest first, between two times in seconds; None: any."""
     first, end = since or float("-inf"), float("inf") if until is None else until
-    past: dict[str, list[Any]] = {"retrains": store.versions(own=True), "events": store.events()}
+    past: dict[str, list[Any]] = {"retrains": store.versions(cell_only=True), "events": store.events()}
     return {name: [each for each in happened if first <= each.time < end] for name, happened in past.items()}

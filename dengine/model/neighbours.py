@@ -435,7 +435,7 @@ class ModelPrediction(EngineModel):
         """Plain arrays: references always; the reducer's and the rule's own where they have any ("reducer.", "rule.")."""
         state = {"trace_shape": np.array(self.trace_shape), "scale": self.scale} | self.index.get_state()
         if self.untold:
-            state["untold"] = np.array(True)  # what the rule learned is not whole: an opened engine tells it all anew
+            state["rule_is_stale"] = np.array(True)  # an opened engine rebuilds the rule from all outcomes
         else:
             state |= {f"rule.{name}": buffer.numpy().copy() for name, buffer in self.rule.state_dict().items()}
         if not self.gate.asleep:

@@ -175,7 +175,7 @@ class RobotCalls:
             "verified_share": 1.0 if share is None else share,
             "accepted": ever.accepted,
             "rejected": ever.rejected,
-            "bad": ever.stops,
+            "bad": ever.false_accepts,
             **{name: getattr(found, name) for name in ("version", "safe_mode", "shadow", "alarm")},
             **{name: getattr(service, name) for name in ("waiting", "late", "busy")},
         }

@@ -4,10 +4,10 @@ from .opening import open_store as open_store
 from .records import Change as Change
 from .records import Correction as Correction
 from .records import Event as Event
-from .records import Evidence as Evidence
 from .records import Labelled as Labelled
 from .records import ModelVersion as ModelVersion
 from .records import NewLabel as NewLabel
+from .records import OutcomeRecord as OutcomeRecord
 from .records import Outcomes as Outcomes
 from .records import StoredDecision as StoredDecision
 from .records import StoredVersion as StoredVersion

@@ -113,11 +113,11 @@ def counted(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
     return sa.func.coalesce(newest, sa.cast(LABEL.c.success, sa.Integer))
 
 
-def how_looked() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
+def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
     """What the model alone would have done, as a position in `ACTIONS`, and `Decision.inclusion_probability`."""
     positions = {action.value: position for position, action in enumerate(ACTIONS)}
     asked = sa.case((DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0)
-    return sa.case(positions, value=DECISION.c.predicted).label("predicted"), asked.label("looked")
+    return sa.case(positions, value=DECISION.c.predicted).label("predicted"), asked.label("inclusion_probability")
 
 
 SAID: sa.ColumnElement[int | None] = sa.func.nullif(counted(), FORGOTTEN)  # as it counts now; NULL: none, or forgotten

@@ -1,4 +1,8 @@
-"""What stores take and hand back: decisions, labels, traces, versions, events; and how a row holds each."""
+"""The records that a store takes and returns: decisions, labels, traces, versions, events.
+
+`to_row` and `from_row` convert a record to the row of a table and back; the columns of a table are
+the fields of its record (see schema.py).
+"""
 
 import io
 import json
@@ -16,25 +20,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision.certificate import Outcomes as Outcomes  # counted by every store
-from ..errors import DataError, ReportConflictError, ReportError, StoreError, UnknownDecisionError, instead, shortened
+from ..errors import (
+    DataError,
+    ReportConflictError,
+    ReportError,
+    StoreError,
+    UnknownDecisionError,
+    instead,
+    shortened,
+)
 from ..files import read_archive
 from ..records import Action, Decision, RetrainReport, Source
 
-SAFE_MODE_BEGAN, SAFE_MODE_ENDED = "safe mode", "safe mode ended"  # kinds of events
-POLICY_CHANGED, SHADOW_CHANGED = "policy", "shadow"  # kinds of events whose data holds the old and the new policy
+# Kinds of events.
+SAFE_MODE_BEGAN = "safe mode"
+SAFE_MODE_ENDED = "safe mode ended"
+POLICY_CHANGED = "policy"  # its data holds the old and the new policy
+SHADOW_CHANGED = "shadow"  # likewise
 T = TypeVar("T")
 NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
-LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)  # what stands, and what comes: silence was no success after all
-FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
+# The first label and a second one that replaces it: silence confirmed the part, then it stopped the
+# line.
+LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)
+FORGOTTEN = 2  # beside 0 and 1: a label that takes part in nothing any more
 CHUNK = 500  # rows sent or fetched at a time
 KEEP = 5  # newest versions that keep their states
-# Beginnings of names in a version's state: what its maker's parts taught its rule.
-RULE = ("rule.", "untold", "told_to", "owed", "overdue_to")
-OF_DECISION = ("content_hash", "quarantined", "time")  # of a `StoredDecision`, beside the decision itself
+# Prefixes of the arrays in a version's state that its own cell's outcomes taught its rule.
+RULE = ("rule.", "rule_is_stale", "rule_last_seq", "includes_overdue", "overdue_to")
+# columns of `StoredDecision`, beside those of `Decision`
+OF_DECISION = ("content_hash", "quarantined", "time")
 
 
 def _when(record: Any) -> datetime:
-    """`time` as a datetime in UTC."""
+    """Return a record's time as a datetime in UTC."""
     return datetime.fromtimestamp(record.time, UTC)
 
 
@@ -45,40 +63,74 @@ def unknown_decision(decision_id: str) -> ReportError:
     return UnknownDecisionError(f"Expected the id of a stored decision, got {got}; {do}.")
 
 
-def already_reported(decision_id: str, first: tuple[bool, Source], second: tuple[bool, Source]) -> ReportError:
-    """Return the error for a second label; it names the first, which stands."""
-    said, says = (f"{'success' if success else 'failure'} from {source.value}" for success, source in (first, second))
+def already_reported(
+    decision_id: str, first: tuple[bool, Source], second: tuple[bool, Source]
+) -> ReportError:
+    """Return the error for a second label of a decision; it names the first one, which stands."""
+    stored, new = (
+        f"{'success' if success else 'failure'} from {source.value}"
+        for success, source in (first, second)
+    )
     same = first[0] == second[0]
-    advice = "nothing more needs reporting" if same else "if the first was wrong, look at how the part was checked"
-    both = f"{said} was reported first and stands, now came {says}"
-    return ReportConflictError(f"Expected one report a decision, got a second on {decision_id!r}: {both}; {advice}.")
+    advice = (
+        "nothing more needs reporting"
+        if same
+        else "if the first was wrong, look at how the part was checked"
+    )
+    both = f"{stored} was reported first and stands, now came {new}"
+    return ReportConflictError(
+        f"Expected one report a decision, got a second on {decision_id!r}: {both}; {advice}."
+    )
 
 
 def nothing_to_correct(decision_id: str) -> ReportError:
-    """Return the error for a correction of a decision that was never reported."""
+    """Return the error for a correction of a decision that has no label."""
     got = f"{decision_id!r}, of which nothing was reported yet"
-    return ReportError(f"Expected a decision with a label, got {got}; there is nothing to correct: report its label.")
+    return ReportError(
+        f"Expected a decision with a label, got {got}; there is nothing to correct: report its "
+        "label."
+    )
 
 
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return an event's data as it comes back from JSON; a StoreError for what JSON has not."""
-    with instead(StoreError, "Expected an event's data as JSON has it", TypeError, ValueError, do="give numbers and text"):
+    """Return an event's data as JSON gives it back.
+
+    StoreError for values that JSON does not have.
+    """
+    with instead(
+        StoreError,
+        "Expected an event's data as JSON has it",
+        TypeError,
+        ValueError,
+        do="give numbers and text",
+    ):
         return None if data is None else dict(json.loads(json.dumps(dict(data), allow_nan=False)))
 
 
 def as_text(text: str) -> str:
-    """Return a text for people, with escapes for what a database refuses: NUL, and half a surrogate pair."""
+    """Return a text with escapes for what a database refuses: NUL, and half a surrogate pair."""
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
 
 
-def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None) -> dict[str, NDArray[Any]] | None:
-    """Copy a version's arrays; an accepted version needs them, and none may hold Python objects (a pickle)."""
+def check_state(
+    report: RetrainReport, state: Mapping[str, NDArray[Any]] | None
+) -> dict[str, NDArray[Any]] | None:
+    """Return a copy of a version's arrays.
+
+    Raises StoreError for an accepted version without arrays, and for an array of Python objects,
+    which would need a pickle.
+    """
     if state is None and report.accepted:
-        raise StoreError(f"Expected the arrays of accepted version {report.version}, got None; pass its state.")
+        raise StoreError(
+            f"Expected the arrays of accepted version {report.version}, got None; pass its state."
+        )
     copies = None if state is None else {name: np.array(values) for name, values in state.items()}
     for name, values in (copies or {}).items():
         if values.dtype.hasobject:
-            raise StoreError(f"Expected plain arrays, got dtype {values.dtype} for {name!r}; store numbers or strings.")
+            raise StoreError(
+                f"Expected plain arrays, got dtype {values.dtype} for {name!r}; store numbers "
+                "or strings."
+            )
     return copies
 
 
@@ -86,11 +138,26 @@ def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None)
 class NewLabel:
     """A label on its way into a store.
 
-    point : (d,) where the trace joined the references of `model_version`; None where it did not.
-    silent : accepted parts that went on since the previous label, and of which nothing was heard.
-    time : when it was reported, in seconds.  content_hash, decided : of its decision, and when that was.
-    overdue_to : number of the newest decision whose check was overdue when the rule was told of the
-        label; None where that is not known.
+    Attributes
+    ----------
+    decision_id : str
+    success : bool
+    source : Source
+    model_version : int
+        The version that answered when the label came.
+    point : array of float32, shape (d,), or None
+        Where the trace was added to that version's references; None if it was not added.
+    silent : int
+        Number of accepted parts since the previous label of which nothing was reported.
+    time : float
+        When the label was reported, in seconds since 1970.
+    content_hash : int
+        Of its decision.
+    decided : float
+        When its decision was made, in seconds since 1970.
+    overdue_to : int or None
+        Number of the newest decision whose check was overdue when the rule was updated with this
+        label; None if unknown.
     """
 
     decision_id: str
@@ -107,17 +174,30 @@ class NewLabel:
 
 @dataclass(frozen=True, slots=True)
 class StoredDecision:
-    """A decision as a store holds it, with the label that counts.
+    """A decision as a store holds it, with its label.
 
-    trace : (C, T) float32; (0, 0) where a list of decisions leaves it out.
-    content_hash : signed 64 bit, of the trace's content, or of its part's number where one is given. It deals the
-        permanent fold, and says who may vote once: equal traces share it, or the traces of one part.
-    quarantined : kept, but never given to training.
-    time : of the decision, in seconds.
-    success, source : the label as it counts, if one was reported: of a corrected one the newest correction's, of a
-        forgotten one None, beside the source that it had.
-    label_seq, label_time : number of the label, and when it came.
-    number : of the decision, 1, 2, ... in each cell; 0 where that is not known.
+    Attributes
+    ----------
+    decision : Decision
+    trace : array of float32, shape (C, T)
+        Shape (0, 0) where decisions are listed without their traces.
+    content_hash : int
+        Signed 64 bit hash of the trace's content, or of the part's number where one was given. It
+        determines the trace's permanent fold. Traces with the same hash have one vote together.
+    quarantined : bool
+        The trace is stored and never used in training.
+    time : float
+        Of the decision, in seconds since 1970.
+    success : bool or None
+        The label after corrections; None without a label, and if the label was forgotten.
+    source : Source or None
+        Of the label, a forgotten one included; None without a label.
+    label_seq : int or None
+        Number of the label.
+    label_time : float or None
+        When the label came, in seconds since 1970.
+    number : int
+        Number of the decision, 1, 2, ... in each cell; 0 if unknown.
     """
 
     decision: Decision = field(metadata={"flat": True})
@@ -135,18 +215,26 @@ class StoredDecision:
 
     @property
     def label(self) -> str:
-        """good, bad or none."""
-        return "none" if self.success is None else "good" if self.success else "bad"
+        """The label in a word: good, bad or none."""
+        if self.success is None:
+            return "none"
+        return "good" if self.success else "bad"
 
 
 @dataclass(frozen=True, slots=True)
 class Labelled:
-    """Labelled traces without the quarantined ones, oldest label first.
+    """Labelled traces, oldest label first, without the quarantined ones.
 
-    seq : (n,) label sequence numbers, increasing.
-    traces : (n, C, T); (0, 0, 0) where there is none.
-    labels : (n,) 1 success, 0 failure.
-    hashes : (n,) content hashes: of the trace's content, or of its part's number where one is given.
+    Attributes
+    ----------
+    seq : array of int64, shape (n,)
+        Numbers of the labels, increasing.
+    traces : array of float32, shape (n, C, T)
+        Shape (0, 0, 0) if there are none.
+    labels : array of int8, shape (n,)
+        1 for success, 0 for failure.
+    hashes : array of int64, shape (n,)
+        Content hash of each, as in `StoredDecision`.
     """
 
     seq: NDArray[np.int64]
@@ -157,10 +245,16 @@ class Labelled:
 
 @dataclass(frozen=True, slots=True)
 class News:
-    """What became known in a product.
+    """What the cells of a product stored since an engine last asked.
 
-    labelled : labels of all its cells, this one's too, oldest first, as they count now.
-    version : number of its newest accepted version; 0 before the first.  correction : of its newest one; 0 likewise.
+    Attributes
+    ----------
+    labelled : Labelled
+        New labels of all cells, this one included, oldest first, as corrected.
+    version : int
+        Number of the newest accepted version; 0 before the first.
+    correction : int
+        Number of the newest correction; 0 before the first.
     """
 
     labelled: Labelled
@@ -168,14 +262,25 @@ class News:
     correction: int = 0
 
 
-class Evidence(NamedTuple):
-    """What became of a decision, as a rule is told of it.
+class OutcomeRecord(NamedTuple):
+    """The outcome of one part, as a decision rule is updated with it.
 
-    seq : number of its label, which is `success`; 0 where a check is overdue.
-    lower, upper : the bound that it was decided by.
-    novel : whether it was decided as unlike all that was learned from, `Reason.NOVEL`.
-    silent : accepted parts of which nothing was heard between the previous label and this one.
-    predicted : position in `Action` of what the model alone would have done.  looked : as `Decision.inclusion_probability`.
+    Attributes
+    ----------
+    seq : int
+        Number of the label; 0 for an overdue check.
+    lower, upper : float
+        Bounds of the success rate by which the part was decided.
+    success : bool
+        The label.
+    novel : bool
+        Whether the part was decided as novel, `Reason.NOVEL`.
+    silent : int
+        Number of accepted parts since the previous label of which nothing was reported.
+    predicted : int
+        Position in `ACTIONS` of what the model alone would have done.
+    inclusion_probability : float
+        Probability, fixed beforehand, that this part's outcome would be asked for.
     """
 
     seq: int
@@ -185,26 +290,47 @@ class Evidence(NamedTuple):
     novel: bool
     silent: int
     predicted: int
-    looked: float
+    inclusion_probability: float
 
 
-def overdue_evidence(decision: Decision) -> list[Evidence]:
-    """Return what a rule is told of a check that was not reported in time: the decision was wrong, whichever it was."""
-    told = []
+def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
+    """Return the outcomes that a rule counts for an overdue check.
+
+    Whatever the decision was, it counts as wrong: as a failure for the accept side if the part had
+    evidence for success (lower > 0), as a success for the reject side if it had evidence for
+    failure (upper < 1). So there are none, one or two.
+    """
+    outcomes = []
     if decision.lower > 0.0:
         accepts = int(decision.predicted is Action.ACCEPT)
-        told.append(Evidence(0, decision.lower, 1.0, False, False, 0, accepts, decision.inclusion_probability))
+        outcomes.append(
+            OutcomeRecord(0, decision.lower, 1.0, False, False, 0, accepts, decision.inclusion_probability)
+        )
     if decision.upper < 1.0:
         rejects = 2 * int(decision.predicted is Action.REJECT)
-        told.append(Evidence(0, 0.0, decision.upper, True, False, 0, rejects, decision.inclusion_probability))
-    return told
+        outcomes.append(
+            OutcomeRecord(0, 0.0, decision.upper, True, False, 0, rejects, decision.inclusion_probability)
+        )
+    return outcomes
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What happened to an engine, for people; number : 1, 2, ... in each cell.  time : in seconds.
+    """Something that happened to an engine, for people to read.
 
-    data : the same for machines, as JSON has it; None where there is none.  author : who did it; "" for the engine itself.
+    Attributes
+    ----------
+    number : int
+        1, 2, ... in each cell.
+    time : float
+        In seconds since 1970.
+    kind : str
+        A word, for example `SAFE_MODE_BEGAN`.
+    text : str
+    data : dict or None
+        The same for machines, as JSON has it.
+    author : str
+        Who did it; "" for the engine itself.
     """
 
     number: int
@@ -219,12 +345,20 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a person changed, on its way into a store: one event, and what it changes, all or none.
+    """A change that a person makes: one event and everything it changes, committed together.
 
-    kind, text, data, author : of the event.
-    decisions : whose labels are corrected to `success`, None for a forgotten one.
-    version : the retrain's report, its newest label, its state, of a version that takes the present one's place.
-    settings : in the place of the present ones; None leaves these.
+    Attributes
+    ----------
+    kind, text, data, author
+        Of the event, as in `Event`.
+    decisions : sequence of str
+        Ids of the decisions whose labels are corrected.
+    success : bool or None
+        The new label of these; None: their labels are forgotten.
+    version : (RetrainReport, int, mapping) or None
+        A version that replaces the present one: its report, its newest label, its arrays.
+    settings : mapping or None
+        New settings, all of them; None leaves the present ones.
     """
 
     kind: str
@@ -239,13 +373,26 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A later word on a label. Nothing is overwritten: the newest one of a decision counts.
+    """A correction of a label. Nothing is overwritten: the newest correction of a decision counts.
 
-    number : 1, 2, ... in each cell.  time : in seconds.
-    success : the label from now on; None: it is forgotten, and takes no part in anything that is learned or counted.
-    was : the label until then, None likewise.
-    author : who said so.  event : number of its event.  newest_seq : number of the cell's newest label at that moment.
-    seq : number of the label that it corrects.
+    Attributes
+    ----------
+    number : int
+        1, 2, ... in each cell.
+    time : float
+        In seconds since 1970.
+    decision_id : str
+    success : bool or None
+        The label from now on; None: the label is forgotten, and counts nowhere.
+    was : bool or None
+        The label until then; None if it was forgotten.
+    author : str
+    event : int
+        Number of the event that records it.
+    newest_seq : int
+        Number of the cell's newest label at that moment.
+    seq : int
+        Number of the label that is corrected.
     """
 
     number: int
@@ -261,10 +408,15 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class ModelVersion:
-    """A model that was swapped in.
+    """An accepted version of the model with its arrays.
 
-    last_seq : newest label that its references hold.
-    state : weights, references, training ids: plain arrays by name.
+    Attributes
+    ----------
+    version : int
+    last_seq : int
+        Number of the newest label among its references.
+    state : dict of str to array
+        Weights, references, ids of the training traces, state of the rule.
     """
 
     version: int
@@ -273,113 +425,165 @@ class ModelVersion:
 
 
 def without_rule(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """A version's arrays but for what its maker's own parts taught its rule."""
+    """Return a version's arrays without its rule's, which its own cell's outcomes set."""
     return {name: values for name, values in state.items() if not name.startswith(RULE)}
 
 
 class CellAddress(str):
-    """A store's file or URL, and whose rows of it: wherever the name of a store is taken, this is too.
+    """A store's file or URL together with a cell; accepted wherever a store's name is.
 
-    cell_id : the cell.  product : what it makes; None: as the store says, or nothing that is shared.
+    Attributes
+    ----------
+    cell_id : str
+    product : str or None
+        What the cell makes; None: as the store says, or nothing shared.
     """
 
     cell_id: str
     product: str | None
 
     def __new__(cls, url: str, cell_id: str, product: str | None = None) -> Self:
-        made = super().__new__(cls, url)
-        made.cell_id, made.product = cell_id, product
-        return made
+        address = super().__new__(cls, url)
+        address.cell_id = cell_id
+        address.product = product
+        return address
 
 
-def address(store: str | os.PathLike[str], cell_id: str | None = None, product: str | None = None) -> str:
-    """A store's file or URL with its cell and product, as far as they were given."""
+def address(
+    store: str | os.PathLike[str], cell_id: str | None = None, product: str | None = None
+) -> str:
+    """Return a store's file or URL; a `CellAddress` if a cell or product is given."""
     url = os.fspath(store)
-    return url if cell_id is None and product is None else CellAddress(url, cell_id or "cell", product)
+    return (
+        url if cell_id is None and product is None else CellAddress(url, cell_id or "cell", product)
+    )
 
 
 @lru_cache
-def columns(kind: Any) -> dict[str, tuple[type, bool]]:
-    """The fields of a record by name: the type that a column holds, and whether None is a value too."""
-    found: dict[str, tuple[type, bool]] = {}
-    for name, hint in get_type_hints(kind).items():
-        kinds = [each for each in (get_args(hint) if isinstance(hint, UnionType) else (hint,)) if each is not type(None)]
-        found[name] = (get_origin(kinds[0]) or kinds[0], isinstance(hint, UnionType))
-    return found
+def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
+    """Return, by name, each field of a record type.
+
+    The type of its column, and whether it may be None.
+    """
+    fields: dict[str, tuple[type, bool]] = {}
+    for name, hint in get_type_hints(record_type).items():
+        is_union = isinstance(hint, UnionType)
+        types = [
+            option
+            for option in (get_args(hint) if is_union else (hint,))
+            if option is not type(None)
+        ]
+        fields[name] = (get_origin(types[0]) or types[0], is_union)
+    return fields
 
 
 def to_row(record: Any, *names: str) -> dict[str, Any]:
-    """A record's fields as a row holds them; names : these alone."""
-    of: Any = type(record)
-    kinds = columns(of)
-    return {name: _written(getattr(record, name), kinds[name][0]) for name in names or kinds}
+    """Return the fields of a record as the columns of a row, by name.
 
-
-def from_row(kind: Callable[..., T], row: Mapping[str, Any], **given: Any) -> T:
-    """The record that `to_row` wrote; a row may hold more, and lack what is given or has a default.
-
-    Raises StoreError for what was not written so.
+    Only `names` if they are given.
     """
-    wanted = {name: each for name, (each, _) in columns(kind).items() if name in row and name not in given}
+    record_type: Any = type(record)
+    fields = columns(record_type)
+    return {name: _to_column(getattr(record, name), fields[name][0]) for name in names or fields}
+
+
+def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any) -> T:
+    """Make a record from a row that `to_row` wrote.
+
+    Parameters
+    ----------
+    record_type : type
+    row : mapping of str to value
+        It may have more columns, and may lack those that are given or have a default.
+    **given
+        Values of fields that replace those of the row.
+
+    Raises
+    ------
+    StoreError
+        For a row that `to_row` did not write.
+    """
+    wanted = {
+        name: type_
+        for name, (type_, _) in columns(record_type).items()
+        if name in row and name not in given
+    }
     try:
-        return kind(**{name: _read(row[name], each) for name, each in wanted.items()}, **given)
+        return record_type(
+            **{name: _from_column(row[name], type_) for name, type_ in wanted.items()}, **given
+        )
     except (ValueError, TypeError) as error:
-        name, do = getattr(kind, "__name__", kind), "see `dengine verify`, and restore the store from a copy"
-        raise StoreError(f"Expected a row of {name} as it was written, got another: {error}; {do}.") from error
+        name = getattr(record_type, "__name__", record_type)
+        do = "see `dengine verify`, and restore the store from a copy"
+        raise StoreError(
+            f"Expected a row of {name} as it was written, got another: {error}; {do}."
+        ) from error
 
 
-def _written(value: Any, kind: type) -> Any:
+def _to_column(value: Any, type_: type) -> Any:
+    """Return a field's value as its column holds it.
+
+    An enumeration's value, JSON, or packed float32.
+    """
     if value is None:
         return None
-    if issubclass(kind, StrEnum):
-        return kind(value).value
+    if issubclass(type_, StrEnum):
+        return type_(value).value
     as_json = partial(json.dumps, default=float)
     writers: dict[type, Callable[[Any], Any]] = {tuple: as_json, dict: as_json, np.ndarray: pack}
-    return writers.get(kind, kind)(value)
+    return writers.get(type_, type_)(value)
 
 
-def _read(value: Any, kind: type) -> Any:
-    if value is None or kind in (str, int, float):
+def _from_column(value: Any, type_: type) -> Any:
+    """Return the field's value that `_to_column` wrote to a column."""
+    if value is None or type_ in (str, int, float):
         return value
-    if kind is tuple:
+    if type_ is tuple:
         return tuple(tuple(row) for row in json.loads(value))
     readers: dict[type, Callable[[Any], Any]] = {dict: json.loads, np.ndarray: unpack}
-    return readers.get(kind, kind)(value)
+    return readers.get(type_, type_)(value)
 
 
 def decision_row(item: StoredDecision) -> dict[str, Any]:
+    """Return the row of the table `decision`, without its number."""
     return to_row(item.decision) | to_row(item, *OF_DECISION)
 
 
 def trace_row(item: StoredDecision) -> dict[str, Any]:
+    """Return the row of the table `trace`."""
     channels, samples = item.trace.shape
-    return {"decision_id": item.decision.id, "channels": channels, "samples": samples, "data": pack(item.trace)}
+    return {
+        "decision_id": item.decision.id,
+        "channels": channels,
+        "samples": samples,
+        "data": pack(item.trace),
+    }
 
 
 def read_decision(row: Any) -> StoredDecision:
-    """A row of `decision`, joined with its label where it has one, and with its trace where it is wanted."""
-    held = row._mapping
-    trace = unpack(row.data).reshape(row.channels, row.samples) if "data" in held else NO_TRACE
-    return from_row(StoredDecision, held, decision=from_row(Decision, held), trace=trace)
+    """Make a decision from a row of `decision`, with its label and trace if selected."""
+    values = row._mapping
+    trace = unpack(row.data).reshape(row.channels, row.samples) if "data" in values else NO_TRACE
+    return from_row(StoredDecision, values, decision=from_row(Decision, values), trace=trace)
 
 
 def pack(values: NDArray[np.float32]) -> bytes:
-    """Values as little-endian float32, without their shape."""
+    """Return the values as little-endian float32, without their shape."""
     return values.astype("<f4", copy=False).tobytes()
 
 
 def unpack(blob: bytes) -> NDArray[np.float32]:
-    """What `pack` wrote, flat."""
+    """Return what `pack` wrote as a flat array of float32."""
     return np.frombuffer(blob, dtype="<f4").astype(np.float32)
 
 
 def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
-    """The rows in parts of at most CHUNK."""
+    """Return the rows in pieces of at most CHUNK."""
     return (rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK))
 
 
 def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
-    """Arrays as an npz file; written member by member, since `np.savez` reserves the name `file`."""
+    """Return arrays as an npz file, member by member: `np.savez` reserves the name `file`."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in state.items():
@@ -389,21 +593,40 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
-    """What `to_npz` wrote; a pickle in it is refused."""
-    with instead(StoreError, "Expected a version of plain arrays", DataError, do=f"restore {name} from a copy"):
+    """Return the arrays that `to_npz` wrote.
+
+    StoreError, which names the store, for anything else and for a pickle.
+    """
+    with instead(
+        StoreError,
+        "Expected a version of plain arrays",
+        DataError,
+        do=f"restore {name} from a copy",
+    ):
         return read_archive(blob, name=f"a version in {name}")[0]
 
 
 class VersionError(StoreError):
-    """A version whose state is not kept, or is damaged; the store itself is well."""
+    """A version's state is not kept, or is damaged; the store itself is well."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoredVersion:
-    """A retrain as a store lists it: 1, 2, ... in each cell, or product.
+    """A retrain as a store lists it.
 
-    time : in seconds.  last_seq : the newest label that it knew of.
-    n_bytes : of its state; 0 where none is kept.  kept : whether `load_version` can load it.
+    Attributes
+    ----------
+    number : int
+        1, 2, ... in each cell, or product.
+    time : float
+        In seconds since 1970.
+    last_seq : int
+        Number of the newest label that it knew of.
+    report : RetrainReport
+    n_bytes : int
+        Size of its state; 0 if none is kept.
+    kept : bool
+        Whether `load_version` can load it.
     """
 
     number: int
@@ -417,10 +640,11 @@ class StoredVersion:
 
 
 def keeps_state(version: int, newest: int, keep: int | None) -> bool:
-    """Say whether a version keeps its state: the first, the `keep` newest (None: all), and of older ones ever fewer.
+    """Return whether a version keeps its state when `newest` is the newest version.
 
-    Of the newest hundred every tenth, of the newest thousand every hundredth, and so on: what is kept grows with the
-    logarithm of what was trained.
+    The first version and the `keep` newest do (None: all do), and of older ones ever fewer: of the
+    newest hundred every tenth, of the newest thousand every hundredth, and so on. So the number of
+    states grows with the logarithm of the number of versions.
     """
     age = newest - version
     if keep is None or version == 1 or age < keep:

@@ -32,8 +32,8 @@ from .queries import (
     TRACE_OF_DECISION,
     WITH_LABELS,
     Scope,
+    audit_columns,
     counted,
-    how_looked,
     n_decisions,
     past_query,
     stretches_query,
@@ -48,11 +48,11 @@ from .records import (
     Change,
     Correction,
     Event,
-    Evidence,
     Labelled,
     ModelVersion,
     NewLabel,
     News,
+    OutcomeRecord,
     StoredDecision,
     StoredVersion,
     VersionError,
@@ -64,7 +64,7 @@ from .records import (
     from_row,
     keeps_state,
     nothing_to_correct,
-    overdue_evidence,
+    overdue_outcomes,
     read_decision,
     to_npz,
     to_row,
@@ -73,7 +73,7 @@ from .records import (
     without_rule,
 )
 from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT, RESERVED, SETTING, TRACE, VERSION, hold
-from .views import LABELS, HistoryFilter, Kind, PastLabel, Stretch, Tally
+from .views import LABELS, DecisionGroup, HistoryFilter, PastLabel, Stretch, Tally
 
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
@@ -198,16 +198,16 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         first: int = 1,
         last: int | None = None,
         corrected_to: int | None = None,
-        own: bool = False,
+        cell_only: bool = False,
     ) -> Labelled:
         """Return the newest `limit` labelled traces, all where it is None, with their labels as they count.
 
         first, last : sequence numbers between which they lie.
         corrected_to : number of the last correction that counts, for labels as they stood then; None: all do.
-        own : of this cell alone, where others share its product.
+        cell_only : of this cell alone, where others share its product.
         A trace that is not as it was stored is left out; an event names its decision.
         """
-        scope = Scope(self.cell_id) if own else self._scope
+        scope = Scope(self.cell_id) if cell_only else self._scope
         query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
         query = query if first <= 1 else query.where(LABEL.c.seq >= int(first))
         query = query if last is None else query.where(LABEL.c.seq <= last)
@@ -278,7 +278,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
     # What became of decisions
 
-    def evidence_since(self, seq: int, since_version: int = 0, overdue_to: int = 0) -> list[Evidence]:
+    def outcomes_since(self, seq: int, since_version: int = 0, overdue_to: int = 0) -> list[OutcomeRecord]:
         """Return what a rule is told of the labels after number `seq`, in their order, of this cell alone.
 
         It is not told of rejected parts, of which those come back that somebody chose.
@@ -289,7 +289,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """
         label = counted()
         novel = DECISION.c.reason == Reason.NOVEL.value
-        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label == 1, novel, LABEL.c.silent, *how_looked())
+        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label == 1, novel, LABEL.c.silent, *audit_columns())
         # A label that does not know came right after its decision, as most do.
         known_overdue = sa.func.coalesce(LABEL.c.overdue_to, DECISION.c.number)
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > int(seq))
@@ -297,19 +297,19 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = sa.select(*of, known_overdue).select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
         query = query.where(mine, label != FORGOTTEN, DECISION.c.model_version >= since_version)
         rows = self._read(query.order_by(LABEL.c.seq))
-        overdue = deque(each for each in self.owed(since_version) if each.number <= overdue_to) if overdue_to else deque()
-        told: list[Evidence] = []
+        overdue = deque(each for each in self.pending_decisions(since_version) if each.number <= overdue_to) if overdue_to else deque()
+        told: list[OutcomeRecord] = []
         for *values, known in rows:
             while overdue and overdue[0].number <= known:
-                told += overdue_evidence(overdue.popleft().decision)
-            told.append(Evidence(*values))
-        return told + [each for owed in overdue for each in overdue_evidence(owed.decision)]
+                told += overdue_outcomes(overdue.popleft().decision)
+            told.append(OutcomeRecord(*values))
+        return told + [each for owed in overdue for each in overdue_outcomes(owed.decision)]
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first, without the quarantined ones."""
         return [row.id for row in self._read(self._unheard_of(Action.ACCEPT, since_version, DECISION.c.id))]
 
-    def owed(self, since_version: int = 0) -> list[StoredDecision]:
+    def pending_decisions(self, since_version: int = 0) -> list[StoredDecision]:
         """Return the decisions whose checks were not reported, oldest first."""
         return [read_decision(row) for row in self._read(self._unheard_of(Action.VERIFY, since_version, *DECISION.c))]
 
@@ -345,7 +345,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         every = self.tally()
         actions, reasons = every.by("action"), every.by("reason")
         sources: Counter[Any] = Counter()
-        for kind in every.kinds:
+        for kind in every.groups:
             sources[kind.source] += kind.n if kind.success is not None else 0
         forgotten = every.by("label")["forgotten"]
         corrected = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct()))
@@ -441,18 +441,18 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         with instead(VersionError, f"Version {row.version} cannot be read", StoreError):
             state = from_npz(row.state, self.database.name)
         if row.cell_id != self.cell_id:  # what a peer's parts taught its rule says nothing certain of this cell
-            state = without_rule(state) | {"told_to": np.array(0)}
+            state = without_rule(state) | {"rule_last_seq": np.array(0)}
         return ModelVersion(row.version, row.last_seq, state)
 
-    def versions(self, own: bool = False) -> list[StoredVersion]:
+    def versions(self, cell_only: bool = False) -> list[StoredVersion]:
         """Return every retrain, oldest first: its number, time, report, and whether its state is kept.
 
-        own : this cell's alone.
+        cell_only : this cell's alone.
         """
         kept = VERSION.c.state.is_not(None).label("kept")
         n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")
         query = sa.select(*(c for c in VERSION.c if c.name != "state"), VERSION.c.retrain.label("number"), n_bytes, kept)
-        scope = Scope(self.cell_id) if own else self._scope
+        scope = Scope(self.cell_id) if cell_only else self._scope
         rows = self._read(query.where(scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain))
         return [from_row(StoredVersion, row._mapping, report=from_row(RetrainReport, row._mapping)) for row in rows]
 
@@ -563,7 +563,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         One that is not as it was stored is left out; an event names its decision.
         """
-        query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *how_looked())
+        query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
         query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
         query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
@@ -587,7 +587,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version)
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
         first, latest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))
-        kinds = tuple(from_row(Kind, row._mapping) for row in rows)
+        kinds = tuple(from_row(DecisionGroup, row._mapping) for row in rows)
         return Tally(kinds, min(first, default=None), max(latest, default=None), max(label, default=None))
 
     def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:

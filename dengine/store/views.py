@@ -47,7 +47,7 @@ class HistoryFilter:
 
 @dataclass(frozen=True, slots=True)
 class PastLabel:
-    """A label as it was recorded, and of its decision what a rule was told; fields as in `NewLabel` and `Evidence`."""
+    """A label as it was recorded, and of its decision what a rule was told; fields as in `NewLabel` and `OutcomeRecord`."""
 
     seq: int
     time: float
@@ -64,11 +64,11 @@ class PastLabel:
     upper: float
     novel: bool
     predicted: int
-    looked: float
+    inclusion_probability: float
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class DecisionGroup:
     """How many decisions of one kind there are; fields as in `StoredDecision`.
 
     aged : so many came after them that a check that they asked for is overdue.
@@ -104,19 +104,19 @@ class Tally:
     first, last : times of the oldest and the newest.  last_label : when the newest label came.  None: there is none.
     """
 
-    kinds: tuple[Kind, ...]
+    kinds: tuple[DecisionGroup, ...]
     first: float | None
     last: float | None
     last_label: float | None = None
 
-    def count(self, takes: Callable[[Kind], bool] = lambda kind: True) -> int:
+    def count(self, takes: Callable[[DecisionGroup], bool] = lambda kind: True) -> int:
         """How many decisions there are of the kinds that are meant; of all by default."""
-        return sum(kind.n for kind in self.kinds if takes(kind))
+        return sum(kind.n for kind in self.groups if takes(kind))
 
     def by(self, field: str) -> Counter[Any]:
-        """How many decisions there are of each value of a field of `Kind`."""
+        """How many decisions there are of each value of a field of `DecisionGroup`."""
         found: Counter[Any] = Counter()
-        for kind in self.kinds:
+        for kind in self.groups:
             found[getattr(kind, field)] += kind.n
         return found
 
@@ -124,20 +124,20 @@ class Tally:
     def outcomes(self) -> Outcomes:
         """What became of what the model was certain of."""
         done, audited = Counter[tuple[Action, str]](), Counter[tuple[Action, str]]()
-        for kind in self.kinds:
+        for kind in self.groups:
             done[kind.action, kind.label] += kind.n
             audited[kind.predicted, kind.label] += kind.n if kind.audit else 0
         actions, accept, reject = self.by("action"), Action.ACCEPT, Action.REJECT
         return Outcomes(
             accepted=actions[accept],
-            stops=done[accept, "bad"],
+            false_accepts=done[accept, "bad"],
             confirmed=done[accept, "good"],
             audited_accepts=audited[accept, "bad"] + audited[accept, "good"],
             audited_accepts_bad=audited[accept, "bad"],
             rejected=actions[reject] - self.count(lambda kind: (kind.action, kind.reason) == (reject, Reason.OUTSIDE)),
             audited_rejects=audited[reject, "bad"] + audited[reject, "good"],
             audited_rejects_good=audited[reject, "good"],
-            false_rejects=sum(kind.n for kind in self.kinds if kind.is_false_reject),
+            false_rejects=sum(kind.n for kind in self.groups if kind.is_false_reject),
             forgotten_accepts=done[accept, "forgotten"],
             forgotten_audited_accepts=audited[accept, "forgotten"],
             forgotten_audited_rejects=audited[reject, "forgotten"],

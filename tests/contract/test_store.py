@@ -131,11 +131,11 @@ def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_qu
         made = decision(str(i), reason=Reason.NOVEL if i == 3 else Reason.CERTAIN)
         put_decision(store, replace(made, lower=0.1 * i, upper=0.2 * i), trace(i), i, quarantined)
         put_label(store, str(i), i % 2 == 0, Source.VERIFICATION, 1, None, silent=i)
-    found = store.evidence_since(1)
+    found = store.outcomes_since(1)
     assert found == [(3, 0.2, 0.4, True, False, 2, 0, 1.0), (4, 0.1 * 3, 0.2 * 3, False, True, 3, 0, 1.0)]
     assert [type(each) for each in found[0]] == [int, float, float, bool, bool, int, int, float]  # for compiled code
     assert store.silent_total() == 0 + 2 + 3
-    assert store.evidence_since(4) == []
+    assert store.outcomes_since(4) == []
 
 
 def test_unreported_accepts_are_those_without_a_label_oldest_first_whatever_the_clock_said(store: SqlStore) -> None:
@@ -165,7 +165,7 @@ def test_outcomes_count_what_became_of_what_was_certain(store: SqlStore) -> None
             put_label(store, str(i), success, Source.AUDIT, 0, None)
     assert store.tally().outcomes == Outcomes(
         accepted=6,
-        stops=2,
+        false_accepts=2,
         confirmed=1,
         audited_accepts=3,
         audited_accepts_bad=1,
@@ -337,7 +337,7 @@ def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
         with plans(tmp_path / "a.db") as found:
             store.labelled(100)
             store.get_decision("a")
-            store.evidence_since(0)
+            store.outcomes_since(0)
             store.silent_total()
             store.events(5)
             put_label(store, "a", True, Source.VERIFICATION, 0, None)

@@ -139,7 +139,7 @@ def test_known_escapes_stand_first_in_status_which_never_says_that_none_is_known
         accepted = next(each for each in reversed(cycles) if each.decision.action is Action.ACCEPT and each.success is None)
         engine.report(accepted.decision.id, False)
     words = " ".join(succeed("status", store).split())
-    assert (words.split("│")[1].strip(), document("status", store)["ever"]["stops"]) == ("accepted, and bad", 1)
+    assert (words.split("│")[1].strip(), document("status", store)["ever"]["false_accepts"]) == ("accepted, and bad", 1)
     assert "1 stop; else unknown" in words
 
 

@@ -63,7 +63,7 @@ def test_where_nothing_can_be_said_the_sentence_says_what_to_set() -> None:
 
 @given(counts.filter(lambda c: c[0] > 5), alphas)
 def test_a_sentence_never_promises_more_than_the_bound(c: tuple[int, int], alpha: float) -> None:
-    found = certificate("all", 0.0, alpha, accepted=c[0], stops=c[1])
+    found = certificate("all", 0.0, alpha, accepted=c[0], false_accepts=c[1])
     if "at most" in found.sentence:
         said = float(found.sentence.split("at most ")[1].split(" %")[0]) / 100
         assert found.accepted.upper - 1e-12 <= said <= found.accepted.upper * 1.11
@@ -96,9 +96,9 @@ def test_the_mean_capital_is_one_at_the_tolerance_and_less_above_it(n: int, q: f
 @pytest.mark.parametrize(
     ("stops", "audit_rate", "seen", "known"),
     [
-        ("all", 0.0, {"accepted": 1203, "stops": 24}, (1203, 1203, 24, 1.0)),
-        ("some", 0.0, {"accepted": 1203, "stops": 24, "confirmed": 1179}, (1203, 1203, 24, 1.0)),  # of each is known
-        ("some", 0.0, {"accepted": 1203, "stops": 24, "confirmed": 1178}, (1203, 0, 0, 0.0)),  # silence is no success
+        ("all", 0.0, {"accepted": 1203, "false_accepts": 24}, (1203, 1203, 24, 1.0)),
+        ("some", 0.0, {"accepted": 1203, "false_accepts": 24, "confirmed": 1179}, (1203, 1203, 24, 1.0)),
+        ("some", 0.0, {"accepted": 1203, "false_accepts": 24, "confirmed": 1178}, (1203, 0, 0, 0.0)),
         ("some", 0.02, {"accepted": 9800, "audited_accepts": 200, "audited_accepts_bad": 3}, (10_000, 200, 3, 0.02)),
     ],
 )
@@ -110,23 +110,24 @@ def test_what_is_known_of_accepted_parts(stops: str, audit_rate: float, seen: di
 
 def test_by_prices_it_says_what_was_saved_at_least_and_nothing_where_that_is_not_certain() -> None:
     policy = Policy(0.05, guarantee="cost", stops="all", prices=(5, 120, 47.5))
-    found = policy.certificate(Outcomes(accepted=1203, confirmed=1179, stops=24))
-    upper = certificate("all", accepted=1203, stops=24).accepted.upper
+    found = policy.certificate(Outcomes(accepted=1203, confirmed=1179, false_accepts=24))
+    upper = certificate("all", accepted=1203, false_accepts=24).accepted.upper
     assert (found.tolerance, found.saved) == (5 / 120, pytest.approx(1203 * 5 - 120 * 1203 * upper))
     assert found.sentence.endswith(f"not checking them saved at least {int(found.saved):,}.")
-    assert policy.certificate(Outcomes(accepted=60, confirmed=58, stops=2)).sentence.endswith("saved nothing for certain.")
-    assert certificate("all", accepted=1203, stops=24).saved is None
+    outcomes = Outcomes(accepted=60, confirmed=58, false_accepts=2)
+    assert policy.certificate(outcomes).sentence.endswith("saved nothing for certain.")
+    assert certificate("all", accepted=1203, false_accepts=24).saved is None
 
 
 def test_one_sentence_says_what_was_kept_or_what_audits_tell_which_alone_know_of_rejected_parts() -> None:
     found = certificate("all", 0.1, rejected=3600, audited_rejects=400, audited_rejects_good=2).rejected
     assert (found.n, found.n_looked_at, found.n_bad, certificate("all", rejected=9).rejected.upper) == (4000, 400, 2, 1.0)
     end = " were bad on average, with 95 % confidence, however often one looks; the tolerance is 5 %."
-    kept = certificate("all", accepted=1203, stops=24)
+    kept = certificate("all", accepted=1203, false_accepts=24)
     assert kept.kept
     assert kept.accepted.upper == pytest.approx(0.0349, abs=5e-5)  # golden
     assert kept.sentence == "Of 1,203 parts that went on without a check, at most 3.5 %" + end
     audited = certificate("some", 0.1, accepted=9000, audited_accepts=1000, audited_accepts_bad=20)
     of = "Of 10,000 parts that the model would accept, of which 1,000 were audited, at most 3.8 %"
     assert audited.sentence == of + end
-    assert not certificate("all", accepted=1203, stops=60).kept
+    assert not certificate("all", accepted=1203, false_accepts=60).kept

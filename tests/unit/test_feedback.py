@@ -53,7 +53,7 @@ def spoiled(stream: Dataset) -> Dataset:
 
 def beyond(engine: DataEngine) -> list[int]:
     """Members of LB's own level that the rule counts beyond those of which the store has labels, and the bad ones."""
-    known = engine.store.evidence_since(0)
+    known = engine.store.outcomes_since(0)
     n, bad = engine.model.rule.evidence.level_counts_since_alarm[0, 0].sum(0).tolist()
     reached = [each.success for each in known if each.lower >= 0.9]
     return [n - len(reached), bad - reached.count(False)]
@@ -116,11 +116,12 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     assert (held.success, engine.store.labelled().labels[held.label_seq - 1]) == (False, 0)
     (past,) = [past for past in engine.history() if past.decision.id == stopped.id]
     assert {held.source, past.source, engine.find(stopped.id).source} == {Source.STOP}
-    assert engine.status().sources["stop"] == engine.status().ever.stops == engine.store.tally().outcomes.stops
+    status = engine.status()
+    assert status.sources["stop"] == status.ever.false_accepts == engine.store.tally().outcomes.false_accepts
     with pytest.raises(ReportError, match="failure from stop was reported first and stands, now came failure from stop"):
         engine.report(stopped.id, False)
     assert labels[engine.model.index.held("numbers") == held.label_seq].tolist() == [0]
-    assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.stops > 0
+    assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.false_accepts > 0
     engine.close()
     with DataEngine.open(tmp_path / "late.db", replaying=True) as engine:
         assert (engine.find(stopped.id).source, engine.find(stopped.id).success) == (Source.STOP, False)
@@ -296,7 +297,7 @@ def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_n
     with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
         assert engine.safe_mode == ""
         assert engine.store.overdue_to(50) > 0
-        told = [each.seq for each in engine.store.evidence_since(0, 0, 450)]
+        told = [each.seq for each in engine.store.outcomes_since(0, 0, 450)]
         assert told[-5:] == sorted(told[-5:])  # not last, in one burst
         engine.report(engine.decide(stream.X[0]).id, True)
     assert verify_history(str(tmp_path / "e.db")).ok
@@ -309,7 +310,7 @@ def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(
         engine.decide(x + np.float32(0.02))
     engine.start_retrain()
     assert beyond(engine) == [0, 0]
-    assert engine.store.last_version().last_seq == engine.store.evidence_since(0)[-1].seq
+    assert engine.store.last_version().last_seq == engine.store.outcomes_since(0)[-1].seq
 
 
 def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
@@ -322,7 +323,7 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
     assert engine.safe_mode
     status = engine.store.status()
     outcomes = engine.store.tally().outcomes
-    assert status["labels"] == status["actions"]["verify"] + outcomes.stops + outcomes.confirmed
+    assert status["labels"] == status["actions"]["verify"] + outcomes.false_accepts + outcomes.confirmed
 
 
 def test_a_decision_at_once_leaves_it_to_settle_to_say_that_safe_mode_begins(stream: Dataset) -> None:

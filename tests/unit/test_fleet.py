@@ -229,7 +229,7 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
     first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
     learn(first, parts, range(120))
     learn(second, parts, range(120, 160))
-    evidence = [len(engine.store.evidence_since(0)) for engine in (first, second)]
+    evidence = [len(engine.store.outcomes_since(0)) for engine in (first, second)]
     assert evidence == [engine.store.status()["labels"] for engine in (first, second)]
     assert rule(first) != rule(second)
     assert first.store.tally().outcomes != second.store.tally().outcomes
@@ -418,7 +418,7 @@ def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset
     assert [row["product"] for row in listed if row["cell_id"] in (cell, peer)] == [product, product]
     assert cell[:10] in succeed("status", fleet.url)
     with SqlStore(fleet.url, peer) as store:
-        assert len(store.labelled().seq) > len(store.labelled(own=True).seq) > 0
+        assert len(store.labelled().seq) > len(store.labelled(cell_only=True).seq) > 0
 
 
 @pytest.mark.parametrize("verb", ["status", "export"])

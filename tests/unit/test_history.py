@@ -161,7 +161,7 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: SqlS
     assert [label.seq for label in every] == list(range(1, len(every) + 1))
     assert [label.seq for label in store.past_labels(3, 7)] == [4, 5, 6, 7]
     assert all(label.point == pytest.approx(np.ones(2)) for label in every)
-    known = store.evidence_since(0)
+    known = store.outcomes_since(0)
     told = [label for label in every if not label.quarantined]
     assert [(label.seq, label.novel) for label in told] == [(each.seq, each.novel) for each in known]
     by_id = {past.decision.id: past for past in everything(store)}

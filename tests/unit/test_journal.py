@@ -90,7 +90,7 @@ def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp
         n = 6 if stops == "all" else 5
         assert (report.imported, report.quarantined, report.known) == ((0, 0, n) if again else (n, 0, 0))
         with DataEngine.open(path) as engine:
-            known, last = engine.store.evidence_since(200), engine.store.labelled(n)
+            known, last = engine.store.outcomes_since(200), engine.store.labelled(n)
             outcomes, sources = engine.store.tally().outcomes, engine.store.status()["sources"]
             members = engine.model.rule.state_dict()["evidence.level_totals"].clone()
         lower, success = [0.25, 0.925, 0.9375, 0.9375, 0.9375, 0.0], [True, True, False, True, False, False]
@@ -102,7 +102,7 @@ def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp
         told = [(each.lower, each.success, each.silent, each.novel) for each in known]
         assert told == list(zip(lower, success, silent, [False] * (n - 1) + [True], strict=True))
         assert last.hashes.tolist() == hashes
-        assert (outcomes.stops, outcomes.audited_accepts, outcomes.audited_accepts_bad) == (1, 1, 1)
+        assert (outcomes.false_accepts, outcomes.audited_accepts, outcomes.audited_accepts_bad) == (1, 1, 1)
         assert (outcomes.accepted, outcomes.confirmed) == ((3, 2) if stops == "all" else (4, 1))
         assert sources == {"verification": 202, "audit": 1, "stop": 1, "confirmed": outcomes.confirmed, "inspection": 0}
         assert int(members.sum()) > 0
@@ -117,7 +117,7 @@ def test_a_journal_that_grew_adds_what_is_new(data: Dataset, make_data, tmp_path
         for n in cuts:
             import_journal(path, write_lines(tmp_path / "cell.csv", X, CELL[:n]))
         with DataEngine.open(path) as engine:
-            known = engine.store.evidence_since(200)
+            known = engine.store.outcomes_since(200)
             found[len(cuts)] = ([(each.lower, each.silent) for each in known], engine.store.tally().outcomes)
             engine.decide(X[0])
             engine.report(engine.decide(make_data(1, seed=8, noise=9.0).X[0]).id, True)  # silence adds up: no StoreError
@@ -162,7 +162,7 @@ def test_late_labels_are_imported_once_by_their_own_ids(data: Dataset, make_data
         held = [engine.store.get_decision(f"a-{i}") for i in range(1, 7)]
         assert [known and known.success for known in held] == [True, False, None, True, True, None]
         outcomes = engine.store.tally().outcomes
-        assert (outcomes.accepted, outcomes.stops, outcomes.confirmed) == (3, 1, 2)
+        assert (outcomes.accepted, outcomes.false_accepts, outcomes.confirmed) == (3, 1, 2)
     contrary = write_lines(tmp_path / "contrary.csv", X, [line.replace("label,a-5,1", "label,a-5,0") for line in LATE])
     assert import_journal(path, contrary).contradicted == 1
 

@@ -38,7 +38,7 @@ def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: SqlStore) ->
     assert (found.seq.tolist(), found.labels.tolist(), found.hashes.tolist()) == ([1, 3, 5], [1, 1, 1], [100, 102, 104])
     np.testing.assert_array_equal(found.traces, np.stack([trace(i) for i in (0, 2, 4)]))
     assert store.labelled(2).seq.tolist() == [3, 5]
-    assert [each.seq for each in store.evidence_since(0)] == [1, 3, 5]
+    assert [each.seq for each in store.outcomes_since(0)] == [1, 3, 5]
     held = store.get_decision("1")
     assert (held.success, held.source, held.trace.tolist()) == (None, Source.VERIFICATION, trace(1).tolist())
     assert (store.status()["labels"], store.status()["forgotten"], store.status()["corrected"]) == (3, 2, 0)
@@ -112,11 +112,11 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
     correct(store, False, "0", "1", "2")
     correct(store, None, "3", "4", "5")
     o = store.tally().outcomes
-    assert (o.accepted, o.stops, o.confirmed, o.forgotten_accepts) == (2, 1, 0, 1)
+    assert (o.accepted, o.false_accepts, o.confirmed, o.forgotten_accepts) == (2, 1, 0, 1)
     assert (o.audited_accepts, o.audited_accepts_bad, o.forgotten_audited_accepts) == (1, 1, 1)
     assert (o.audited_rejects, o.audited_rejects_good, o.forgotten_audited_rejects) == (1, 0, 1)
     later = store.tally(since_version=1).outcomes
-    assert (later.accepted, later.stops, later.forgotten_accepts, later.audited_accepts) == (1, 0, 1, 0)
+    assert (later.accepted, later.false_accepts, later.forgotten_accepts, later.audited_accepts) == (1, 0, 1, 0)
 
 
 def test_what_an_earlier_version_decided_can_be_left_out(store: SqlStore) -> None:
@@ -128,7 +128,7 @@ def test_what_an_earlier_version_decided_can_be_left_out(store: SqlStore) -> Non
         put_labels(store, NewLabel(f"{version}-0", True, Source.CONFIRMED, version, None, silent=version))
     assert store.unreported_accepts(2) == ["2-1", "2-2"]
     assert (store.silent_total(2), store.silent_total()) == (2, 3)
-    assert ([each.seq for each in store.evidence_since(0, 2)], len(store.evidence_since(0))) == ([2], 2)
+    assert ([each.seq for each in store.outcomes_since(0, 2)], len(store.outcomes_since(0))) == ([2], 2)
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -147,7 +147,7 @@ def test_any_corrections_leave_what_plain_python_would(store: SqlStore, said: li
     kept = {begin + 1 + i: success for i, success in now.items() if success is not None}
     found = store.labelled(first=begin + 1)
     assert dict(zip(found.seq.tolist(), found.labels.tolist(), strict=True)) == kept
-    assert {each.seq: each.success for each in store.evidence_since(begin)} == kept
+    assert {each.seq: each.success for each in store.outcomes_since(begin)} == kept
     assert [store.get_decision(f"{run}-{i}").success for i in range(6)] == list(now.values())
     as_reported = store.labelled(first=begin + 1, corrected_to=before)
     assert as_reported.labels.tolist() == [1, 0, 1, 0, 1, 0]

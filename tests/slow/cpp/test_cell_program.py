@@ -105,10 +105,10 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
     found = []
     for name in ("imported", "own"):
         with DataEngine.open(tmp_path / f"{name}.db") as engine:
-            known, outcomes = engine.store.evidence_since(400), engine.store.tally().outcomes
+            known, outcomes = engine.store.outcomes_since(400), engine.store.tally().outcomes
             rule = {key: value.tolist() for key, value in engine.model.rule.state_dict().items()}
             evidence = [(each.lower, each.upper, each.success, each.novel, each.silent) for each in known]
-            certain = outcomes.stops, outcomes.confirmed, outcomes.audited_accepts, outcomes.audited_accepts_bad
+            certain = outcomes.false_accepts, outcomes.confirmed, outcomes.audited_accepts, outcomes.audited_accepts_bad
             hashes = engine.store.labelled().hashes.tolist()
             found.append([evidence, rule, engine.store.status()["sources"], hashes, certain])
     assert found[0] == found[1]

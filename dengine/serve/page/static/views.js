@@ -51,7 +51,7 @@ const figure = (id, title, ...children) => el("section", { class: "card tile", i
 const saved = (doing) => figure("saved", "Check time saved",
   big(duration((doing.ever.accepted + doing.ever.rejected) * doing.check_seconds)),
   small(`${number(doing.ever.accepted + doing.ever.rejected)} checks left out, ${number(doing.check_seconds)} s each`,
-    doing.ever.stops > 0 && `; system stops, not taken off: ${number(doing.ever.stops)}`));
+    doing.ever.false_accepts > 0 && `; system stops, not taken off: ${number(doing.ever.false_accepts)}`));
 
 const verified = (doing) => figure("verified", "Verified", big(percent(doing.newest.verified_share)),
   small(`Newest ${number(doing.newest.decisions)} parts`), el("p", {}, `Since the beginning: ${percent(doing.ever.verified_share)}`));
@@ -67,14 +67,14 @@ function pace(recent) {
 
 const verdict = (judged, text) => el("p", { class: `big verdict ${judged.verdict}` }, icon(judged.verdict), text);
 
-const knownBad = ({ stops }) => stops > 0 && el("p", { class: "verdict broken" }, icon("bad"), el("b", {}, `${number(stops)} known bad`));
+const knownBad = ({ false_accepts: wrong }) => wrong > 0 && el("p", { class: "verdict broken" }, icon("bad"), el("b", {}, `${number(wrong)} known bad`));
 
 function badAccepts(doing) {
   const bad = doing.ever.bad_accepts;
   return el("section", { class: "card tile wide", id: "bad", "data-part": true }, el("h2", {}, "Bad accepted parts"),
     knownBad(doing.ever), verdict(bad, VERDICT[bad.verdict]), judgedChart(bad),
     el("p", {}, `${percent(bad.lower, 1)} to ${percent(bad.upper, 1)}, tolerance ${percent(bad.tolerance, 1)}`),
-    small(BY[bad.by](bad, doing.ever.stops)));
+    small(BY[bad.by](bad, doing.ever.false_accepts)));
 }
 
 function wouldHave(doing) {
@@ -211,9 +211,9 @@ async function overview(get, query, doing) {
   ]);
   const { newest, ever } = doing;
   const report = ever.retrains > 0 && course.retrains.filter((each) => each.report.accepted).at(-1);
-  const escapes = escaped.length > 0 && card("escapes", `Accepted, and bad: ${number(ever.stops)}`,
+  const escapes = escaped.length > 0 && card("escapes", `Accepted, and bad: ${number(ever.false_accepts)}`,
     el("ul", { class: "chips" }, escaped.map((each) => el("li", {}, el("a", { href: partAddress(each.id) }, nameOf(each.part, each.id)), ` ${moment(each.time)}`)),
-      ever.stops > escaped.length && el("li", {}, el("a", { href: "history?action=accept&label=bad" }, "All of them"))));
+      ever.false_accepts > escaped.length && el("li", {}, el("a", { href: "history?action=accept&label=bad" }, "All of them"))));
   const drift = doing.watch
     ? [["accepts", "bad among the accepted"], ["rejects", "good among the rejected"], ["novelty", "novel parts"]].map(([name, title]) => el("p", { class: "watched" },
       el("label", { for: `watch-${name}` }, title), el("meter", { id: `watch-${name}`, min: 0, max: 1, high: 0.5, value: Math.min(1, doing.watch[name]) }), percent(doing.watch[name])))

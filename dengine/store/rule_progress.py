@@ -1,0 +1,81 @@
+"""How far the decision rule of a stored version was updated, read when an engine resumes.
+
+A rule is updated with the outcome of one part after another. An engine that resumes reads here
+which outcomes the stored rule already includes, so that none is counted twice and none is missed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from .records import ModelVersion, overdue_outcomes
+
+if TYPE_CHECKING:
+    from .sql import SqlStore
+
+
+@dataclass(frozen=True, slots=True)
+class RuleProgress:
+    """Which outcomes a stored rule includes.
+
+    Attributes
+    ----------
+    last_seq : int
+        Number of the newest label that the rule includes. 0: the rule must be rebuilt from all
+        outcomes, since a label was corrected meanwhile, a check is overdue (it counts as wrong
+        until its label comes), the stored state is incomplete, or the version was made under an
+        earlier policy or by a peer.
+    overdue_to : int
+        Number of the newest decision whose check was overdue.
+    overdue_ids : frozenset of str
+        Ids of the decisions whose overdue checks the rule includes as errors.
+    """
+
+    last_seq: int
+    overdue_to: int
+    overdue_ids: frozenset[str]
+
+
+def read_rule_progress(
+    store: SqlStore,
+    version: ModelVersion | None,
+    since_version: int,
+    within: int,
+    policy_since: int,
+) -> RuleProgress:
+    """Read how far the stored rule was updated.
+
+    Parameters
+    ----------
+    store : SqlStore
+    version : ModelVersion or None
+        The newest version; None before the first.
+    since_version : int
+        The rule counts only decisions made by this version or a later one.
+    within : int
+        Number of decisions after which a check without a label is overdue.
+    policy_since : int
+        The first version since `within` is in force.
+
+    Returns
+    -------
+    RuleProgress
+    """
+    state = {} if version is None else version.state
+    overdue_to = max(store.overdue_to(within, policy_since), int(state.get("overdue_to", 0)))
+    pending = store.pending_decisions(since_version) if overdue_to > 0 else []
+    overdue_ids = frozenset(
+        item.decision.id
+        for item in pending
+        if item.number <= overdue_to and overdue_outcomes(item.decision)
+    )
+    if version is None:
+        return RuleProgress(0, overdue_to, overdue_ids)
+    # 0: a peer's, which knows nothing of this cell
+    last_seq = int(state.get("rule_last_seq", version.last_seq))
+    is_incomplete = not state.keys().isdisjoint(("rule_is_stale", "includes_overdue"))
+    is_earlier = version.version < since_version
+    is_corrected = bool(store.corrections(int(state.get("corrected_to", 0))))
+    must_rebuild = bool(overdue_ids) or is_incomplete or is_earlier or is_corrected
+    return RuleProgress(0 if must_rebuild else last_seq, overdue_to, overdue_ids)
