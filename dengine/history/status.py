@@ -269,7 +269,7 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         would_accept=_judged(*accepts, by=by),
         would_reject=_judged(*rejects, by=by),
         bad_accepts=bad_accepts(outcomes, policy),
-        unlabelled=tally.count(lambda kind: kind.action is Action.VERIFY and kind.success is None),
+        unlabelled=tally.count(lambda group: group.action is Action.VERIFY and group.success is None),
         retrains=len(here),
         dropped=dict(Counter(report.reason for report in here if not report.accepted)),
         verified_share=verified / n if n else None,

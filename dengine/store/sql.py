@@ -345,8 +345,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         every = self.tally()
         actions, reasons = every.by("action"), every.by("reason")
         sources: Counter[Any] = Counter()
-        for kind in every.groups:
-            sources[kind.source] += kind.n if kind.success is not None else 0
+        for group in every.groups:
+            sources[group.source] += group.n if group.success is not None else 0
         forgotten = every.by("label")["forgotten"]
         corrected = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct()))
         return {
@@ -587,8 +587,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version)
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
         first, latest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))
-        kinds = tuple(from_row(DecisionGroup, row._mapping) for row in rows)
-        return Tally(kinds, min(first, default=None), max(latest, default=None), max(label, default=None))
+        groups = tuple(from_row(DecisionGroup, row._mapping) for row in rows)
+        return Tally(groups, min(first, default=None), max(latest, default=None), max(label, default=None))
 
     def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
         """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter.

@@ -1,4 +1,8 @@
-"""What people look back on: past labels, and counts of decisions and of what became of them."""
+"""Records for looking back on a store: filters, past labels, and counts of decisions by outcome.
+
+`SqlStore.decisions`, `past_labels`, `tally` and `stretches` return them; the status, the history
+and the explanations are computed from them.
+"""
 
 from collections import Counter
 from collections.abc import Callable
@@ -12,18 +16,30 @@ from ..errors import SettingError, expect, shortened
 from ..records import Action, Reason, Source
 from .records import Outcomes
 
-KINDS = {"action": Action, "predicted": Action, "reason": Reason}
+ENUMERATIONS = {"action": Action, "predicted": Action, "reason": Reason}
 LABELS: dict[str, bool | None] = {"good": True, "bad": False, "none": None}
 
 
 @dataclass(frozen=True, slots=True)
 class HistoryFilter:
-    """Which decisions are meant; None: all.
+    """A selection of decisions; a field that is None selects all.
 
-    action, reason : an `Action` and a `Reason`, or their values.  label : good, bad or none.  part : its number.
-    predicted : an `Action` or its value: what the model alone would have done, as in an audit or in the shadow mode.
-    since, until : times in seconds since 1970; the first included, the last not.
-    Raises SettingError for a value that is none of these.
+    Attributes
+    ----------
+    action : Action or str, optional
+    reason : Reason or str, optional
+    label : {"good", "bad", "none"}, optional
+    since, until : float, optional
+        Seconds since 1970; `since` is included, `until` is not.
+    predicted : Action or str, optional
+        What the model alone would have done, as in an audit or in shadow mode.
+    part : str, optional
+        The part's number.
+
+    Raises
+    ------
+    SettingError
+        For a value that a field cannot have.
     """
 
     action: Action | None = None
@@ -35,19 +51,28 @@ class HistoryFilter:
     part: str | None = None
 
     def __post_init__(self) -> None:
-        for name, kind in KINDS.items():
+        for name, enumeration in ENUMERATIONS.items():
             try:
                 if (value := getattr(self, name)) is not None:
-                    object.__setattr__(self, name, kind(value))
+                    object.__setattr__(self, name, enumeration(value))
             except ValueError:
-                known = ", ".join(kind)
-                raise SettingError(f"Expected {name} to be one of {known}, got {shortened(value)}.") from None
-        expect(self.label is None or self.label in LABELS, f"label to be one of {', '.join(LABELS)}", self.label)
+                options = ", ".join(enumeration)
+                raise SettingError(
+                    f"Expected {name} to be one of {options}, got {shortened(value)}."
+                ) from None
+        expect(
+            self.label is None or self.label in LABELS,
+            f"label to be one of {', '.join(LABELS)}",
+            self.label,
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class PastLabel:
-    """A label as it was recorded, and of its decision what a rule was told; fields as in `NewLabel` and `OutcomeRecord`."""
+    """A label as it was recorded, with what a rule was updated with.
+
+    The fields up to `decided` are those of `NewLabel`, the others those of `OutcomeRecord`.
+    """
 
     seq: int
     time: float
@@ -69,9 +94,16 @@ class PastLabel:
 
 @dataclass(frozen=True, slots=True)
 class DecisionGroup:
-    """How many decisions of one kind there are; fields as in `StoredDecision`.
+    """A group of decisions that are equal in all these fields, and their number.
 
-    aged : so many came after them that a check that they asked for is overdue.
+    Attributes
+    ----------
+    action, predicted, reason, audit, quarantined, success, source
+        As in `Decision` and `StoredDecision`.
+    aged : bool
+        So many decisions came after them that a check without a label is overdue.
+    n : int
+        Number of decisions in the group.
     """
 
     action: Action
@@ -86,59 +118,82 @@ class DecisionGroup:
 
     @property
     def is_false_reject(self) -> bool:
-        """Whether the model rejected parts that were found good."""
-        return self.action is Action.REJECT and self.reason is not Reason.OUTSIDE and self.label == "good"
+        """Whether the model rejected these parts, and they were good."""
+        return (
+            self.action is Action.REJECT
+            and self.reason is not Reason.OUTSIDE
+            and self.label == "good"
+        )
 
     @property
     def label(self) -> str:
-        """good, bad, forgotten, overdue or none."""
+        """The label in a word: good, bad, forgotten, overdue or none."""
         if self.source is not None:
-            return "forgotten" if self.success is None else "good" if self.success else "bad"
-        return "overdue" if self.aged and self.action is Action.VERIFY and not self.quarantined else "none"
+            if self.success is None:
+                return "forgotten"
+            return "good" if self.success else "bad"
+        is_overdue = self.aged and self.action is Action.VERIFY and not self.quarantined
+        return "overdue" if is_overdue else "none"
 
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Counted decisions.
+    """Decisions counted in groups.
 
-    first, last : times of the oldest and the newest.  last_label : when the newest label came.  None: there is none.
+    Attributes
+    ----------
+    groups : tuple of DecisionGroup
+    first, last : float or None
+        Times of the oldest and the newest decision, in seconds since 1970; None without decisions.
+    last_label : float or None
+        When the newest label came; None without labels.
     """
 
-    kinds: tuple[DecisionGroup, ...]
+    groups: tuple[DecisionGroup, ...]
     first: float | None
     last: float | None
     last_label: float | None = None
 
-    def count(self, takes: Callable[[DecisionGroup], bool] = lambda kind: True) -> int:
-        """How many decisions there are of the kinds that are meant; of all by default."""
-        return sum(kind.n for kind in self.groups if takes(kind))
+    def count(self, is_counted: Callable[[DecisionGroup], bool] = lambda group: True) -> int:
+        """Return the number of decisions in the groups for which `is_counted` is true.
+
+        By default all.
+        """
+        return sum(group.n for group in self.groups if is_counted(group))
 
     def by(self, field: str) -> Counter[Any]:
-        """How many decisions there are of each value of a field of `DecisionGroup`."""
-        found: Counter[Any] = Counter()
-        for kind in self.groups:
-            found[getattr(kind, field)] += kind.n
-        return found
+        """Return the number of decisions for each value of a field of `DecisionGroup`."""
+        counts: Counter[Any] = Counter()
+        for group in self.groups:
+            counts[getattr(group, field)] += group.n
+        return counts
 
     @property
     def outcomes(self) -> Outcomes:
-        """What became of what the model was certain of."""
-        done, audited = Counter[tuple[Action, str]](), Counter[tuple[Action, str]]()
-        for kind in self.groups:
-            done[kind.action, kind.label] += kind.n
-            audited[kind.predicted, kind.label] += kind.n if kind.audit else 0
-        actions, accept, reject = self.by("action"), Action.ACCEPT, Action.REJECT
+        """Counts of accepted, rejected and audited parts by label, for the certificate.
+
+        Parts that an operator's limits rejected (`Reason.OUTSIDE`) are not counted as rejected.
+        """
+        by_action = Counter[tuple[Action, str]]()
+        audited = Counter[tuple[Action, str]]()  # by what the model alone would have done
+        for group in self.groups:
+            by_action[group.action, group.label] += group.n
+            audited[group.predicted, group.label] += group.n if group.audit else 0
+        actions = self.by("action")
+        accept = Action.ACCEPT
+        reject = Action.REJECT
+        outside = self.count(lambda group: (group.action, group.reason) == (reject, Reason.OUTSIDE))
         return Outcomes(
             accepted=actions[accept],
-            false_accepts=done[accept, "bad"],
-            confirmed=done[accept, "good"],
+            false_accepts=by_action[accept, "bad"],
+            confirmed=by_action[accept, "good"],
             audited_accepts=audited[accept, "bad"] + audited[accept, "good"],
             audited_accepts_bad=audited[accept, "bad"],
-            rejected=actions[reject] - self.count(lambda kind: (kind.action, kind.reason) == (reject, Reason.OUTSIDE)),
+            rejected=actions[reject] - outside,
             audited_rejects=audited[reject, "bad"] + audited[reject, "good"],
             audited_rejects_good=audited[reject, "good"],
-            false_rejects=sum(kind.n for kind in self.groups if kind.is_false_reject),
-            forgotten_accepts=done[accept, "forgotten"],
+            false_rejects=self.count(lambda group: group.is_false_reject),
+            forgotten_accepts=by_action[accept, "forgotten"],
             forgotten_audited_accepts=audited[accept, "forgotten"],
             forgotten_audited_rejects=audited[reject, "forgotten"],
             overdue_audited_accepts=audited[accept, "overdue"],
@@ -148,9 +203,24 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Consecutive decisions, or those of a batch.  n : of them.  last : time of the newest.  batch : its name.
+    """Counts over consecutive decisions, or over the decisions of a batch of parts.
 
-    verified, novel, outside : decided so.  accepted, rejected : by the model, without a check.  bad : accepted, known so.
+    Attributes
+    ----------
+    n : int
+        Number of decisions.
+    last : float
+        Time of the newest, in seconds since 1970.
+    verified, novel : int
+        Decided VERIFY; decided with `Reason.NOVEL`.
+    accepted, rejected : int
+        By the model, without a check.
+    false_accepts : int
+        Accepted parts that are known to be bad.
+    outside : int
+        Decided by an operator's limits.
+    batch : str or None
+        Name of the batch.
     """
 
     n: int
@@ -158,7 +228,7 @@ class Stretch:
     verified: int
     novel: int
     accepted: int
-    bad: int
+    false_accepts: int
     rejected: int
     outside: int
     batch: str | None = None

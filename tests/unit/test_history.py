@@ -124,7 +124,7 @@ def test_counts_of_a_store_are_those_of_its_history(store: SqlStore) -> None:
         kinds = Counter(
             (*(getattr(p.decision, name) for name in KIND), p.quarantined, False, p.success, p.source) for p in some
         )
-        assert {astuple(kind) for kind in found.kinds} == {(*kind, n) for kind, n in kinds.items()}
+        assert {astuple(group) for group in found.groups} == {(*kind, n) for kind, n in kinds.items()}
         assert (found.first, found.last) == (some[0].time, some[-1].time)
 
 

@@ -174,7 +174,7 @@ export function courseChart(course) {
     ctx.strokeStyle = colour("bad");
     ctx.lineWidth = 3 * devicePixelRatio;
     course.stretches.forEach((each, i) => {
-      if (!each.bad) return;
+      if (!each.false_accepts) return;
       const [x, y] = [at((ends[i] + ends[i + 1]) / 2), bbox.top + 2 * size];
       ctx.beginPath();
       ctx.moveTo(x - size, y - size);

@@ -199,7 +199,7 @@ async function trend(get, asked, parts) {
   const { stretches } = await get(`course?${by === "batch" ? `batch=${encodeURIComponent("-_/. ")}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
   const begun = (last) => start + Math.floor((last - start) / (3600 * HOURS[by])) * 3600 * HOURS[by];
   const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch || "no batch" : el("time", {}, moment(begun(each.last)).slice(0, 16)), number(each.n),
-    percent((each.accepted + each.rejected) / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad), number(each.outside)]);
+    percent((each.accepted + each.rejected) / each.n), percent(each.verified / each.n), number(each.accepted), number(each.false_accepts), number(each.outside)]);
   const ways = [...Object.keys(HOURS), ...(batch ? ["batch"] : [])].map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
   return card("trend", "The trend", el("ul", { class: "chips" }, ways), rows.length === 0 ? small("It begins with the first part.")
     : table([[by === "batch" ? "Batch" : "From"], ["Parts", "num"], ["Certain", "num more"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"], ["Outside a window", "num more"]], rows));
@@ -230,7 +230,7 @@ async function overview(get, query, doing) {
       el("p", {}, `Waiting for a result: ${number(ever.unlabelled)}`),
       el("p", {}, `Model errors: ${number(newest.errors)} · Bad traces, kept out of training: ${number(newest.quarantined)}`)),
   ];
-  const rows = course.stretches.map((each) => [moment(each.last), number(each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad)]).reverse();
+  const rows = course.stretches.map((each) => [moment(each.last), number(each.n), percent(each.verified / each.n), number(each.accepted), number(each.false_accepts)]).reverse();
   const lines = card("course", "From the first part to the newest", course.stretches.length === 0
     ? small("Drawn once a part was decided on.")
     : [courseChart(course), el("details", { id: "course-table" }, el("summary", {}, "The same as a table"),
