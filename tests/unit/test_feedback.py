@@ -104,7 +104,7 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     engine.flush()
     assert engine.store.get_decision(stopped.id).source is Source.CONFIRMED
     if away:
-        monkeypatch.setattr(engine.store, "take", lambda records: (_ for _ in ()).throw(StoreError("away")))
+        monkeypatch.setattr(engine.store, "apply_records", lambda records: (_ for _ in ()).throw(StoreError("away")))
     engine.report(stopped.id, False)
     monkeypatch.undo()
     while engine.store_fault:

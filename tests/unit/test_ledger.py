@@ -218,10 +218,10 @@ def test_a_changed_row_with_a_sum_that_fits_is_found_in_its_entry(file: Path) ->
         connection.execute("UPDATE label SET success = ?, sum = ? WHERE seq = 2", (row["success"], row_sum("label", row)))
     assert faults(file) == [("ledger", f"entry {row['entry']}")]
     with SqlStore(str(file)) as store:  # as an engine does that opens it, whatever it reads of it
-        assert [store.database.doubt(window) for window in (100, 10)] == [
+        assert [store.database.check_integrity(window) for window in (100, 10)] == [
             "the rows of label are not those of the ledger"
         ] * 2
-        assert store.database.doubt(3) == store.database.doubt(100, since=10) == ""
+        assert store.database.check_integrity(3) == store.database.check_integrity(100, since=10) == ""
 
 
 def test_entries_after_a_changed_one_are_not_blamed(file: Path) -> None:
