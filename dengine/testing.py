@@ -48,7 +48,7 @@ QUERIES = toy_traces(20, seed=5)[0]
 
 
 def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
-    """`embed` gives (n, K, d) finite float32, the same from two clones, `transform` (n, d), `embed_own` each fold's row.
+    """`embed` gives (n, K, d) finite float32, the same from two clones, `transform` (n, d), `embed_references` each fold's row.
 
     The caller's traces are not written to.
     """
@@ -57,7 +57,7 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     assert trained.n_spaces >= 1 + trained.uses_labels, "in one space every label would be counted where it was seen"
     Z, fold = trained.embed(Q), np.arange(20) % trained.n_spaces
     np.testing.assert_array_equal(_trained(reducer).embed(Q), Z, err_msg="two fits differ: give it a random_state")
-    np.testing.assert_array_equal(trained.embed_own(Q, fold), Z[np.arange(20), fold])
+    np.testing.assert_array_equal(trained.embed_references(Q, fold), Z[np.arange(20), fold])
     assert Z.ndim == 3, f"expected (n, K, d), got {Z.shape}"
     assert Z.shape[:2] == (20, trained.n_spaces), f"expected 20 traces in {trained.n_spaces} spaces, got {Z.shape}"
     assert Z.dtype == np.float32, f"expected float32, got {Z.dtype}"

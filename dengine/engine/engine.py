@@ -421,7 +421,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         if self._unseen and self.trace is not None and np.isfinite(x).all():
             self._unseen = False
             if not self.version:  # what will answer is compiled before there is much to do
-                self._versions.template.look_ahead_safely(x[None])
+                self._versions.template.precompute_safely(x[None])
         return x
 
     def report(

@@ -156,14 +156,14 @@ class ModelVersions:
         self.overdue, self.overdue_to = set(past.overdue_ids), past.overdue_to
         if version is None or model is None:
             if len(labelled.seq) >= 500:  # and no retrain yet: they were imported
-                self._look_ahead(template, labelled)
+                self._precompute(template, labelled)
             template.begin_safely_in(self.evidence.began_in)
             tell(template, self._evidence)
             self.new_labels = len(labelled.seq)
             self.corrected_to = max((each.number for each in store.corrections()), default=0)
         else:
             self.answering, self.version, trained_on = model, version.version, TrainedOn.from_state(version.state)
-            self._look_ahead(model, labelled)
+            self._precompute(model, labelled)
             model.prepare_safely(template)
             self.corrected_to = join_since(model, store, version, self.retrainer.window)
             if past.last_seq:
@@ -180,10 +180,10 @@ class ModelVersions:
         self.outbox.check_integrity(after)
         return self.store.outcomes_since(after, self.evidence.since, self.overdue_to)
 
-    def _look_ahead(self, model: EngineModel, labelled: Labelled) -> None:
+    def _precompute(self, model: EngineModel, labelled: Labelled) -> None:
         """Compute beside the cell what a retrain on these begins with: an opening need not wait for it."""
         pool = ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,))
-        self._ahead = pool.submit(model.look_ahead_safely, labelled.traces, labelled.seq)
+        self._ahead = pool.submit(model.precompute_safely, labelled.traces, labelled.seq)
         pool.shutdown(wait=False)
 
     @property

@@ -98,8 +98,8 @@ class EngineModel(ABC):
     def warm_up(self) -> None:  # noqa: B027  # a default: nothing to load
         """Load what the first training would load, beside the engine; see `Reducer.warm_up`."""
 
-    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default: nothing to begin with
-        """Begin with a training on traces (n, C, T) with labels of these numbers; see `Reducer.look_ahead`."""
+    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default: nothing to begin with
+        """Begin with a training on traces (n, C, T) with labels of these numbers; see `Reducer.precompute`."""
 
     @abstractmethod
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
@@ -193,9 +193,9 @@ class EngineModel(ABC):
 
     # No exception inside a model reaches the cell or costs a label. The engine's calls go through these five.
 
-    def look_ahead_safely(self, X: Floats, numbers: Ints | None = None) -> None:
-        """`look_ahead`, or nothing where it fails."""
-        _guarded(lambda: self.look_ahead(X, numbers), "traces could not be looked at ahead of a retrain")
+    def precompute_safely(self, X: Floats, numbers: Ints | None = None) -> None:
+        """`precompute`, or nothing where it fails."""
+        _guarded(lambda: self.precompute(X, numbers), "traces could not be looked at ahead of a retrain")
 
     def tell_safely(self, *told: Any) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""

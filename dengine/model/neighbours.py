@@ -279,12 +279,12 @@ class ModelPrediction(EngineModel):
     def warm_up(self) -> None:
         self.spaces.warm_up()
 
-    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
+    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         X = clip_extremes(X)
-        """`Reducer.look_ahead`; and where nothing answers yet, compile what will: a first retrain has no time for that."""
-        blank = self.spaces.blank(X)
+        """`Reducer.precompute`; and where nothing answers yet, compile what will: a first retrain has no time for that."""
+        blank = self.spaces.untrained_module(X)
         with ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,)) as pool:
-            ahead = pool.submit(self.spaces.look_ahead, X, numbers)
+            ahead = pool.submit(self.spaces.precompute, X, numbers)
             if blank is not None and self.rule.scriptable and "index" not in vars(self) and _compiles(self.rule, blank):
                 shape, own = X.shape[1:], self.classifier
                 gate = NoveltyGate(*shape)

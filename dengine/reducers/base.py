@@ -1,13 +1,15 @@
-"""What a reducer is: trace -> embedding, and everything that the model asks of one.
+"""`Reducer`, the base class of everything that embeds traces, and adapters for scikit-learn's.
 
-A reducer of one's own is a subclass with `fit` and `transform`; the rest has defaults. `dengine.testing.check_reducer` runs
-the contract on it. Any scikit-learn transformer works as well: label-free ones as they are, label-using ones cross-fitted.
+A reducer of your own is a subclass with `fit` and `transform`; all else has defaults, and
+`dengine.testing.check_reducer` checks it. Any scikit-learn transformer works as well: `as_reducer`
+wraps one that needs no labels in `LabelFree`, and one that uses labels in `CrossFitted`.
 
-    >>> as_reducer(PCA(2), folds=5)                          # LabelFree: never handed a label, one space
+    >>> as_reducer(PCA(2), folds=5)                          # LabelFree: one space
     >>> as_reducer(LinearDiscriminantAnalysis(), folds=5)    # CrossFitted: five clones, five spaces
 
-Embeddings have K spaces: a label may be counted for a query only in a space that never saw that label, so fold k's
-references live in space k, which was fitted without fold k's labels. A reducer that uses no labels has one space.
+An embedding has K spaces. A label may be counted for a query only in a space that was fitted
+without that label. So references of fold k live in space k, which is fitted without the labels of
+fold k. A reducer that uses no labels has one space.
 """
 
 import time
@@ -20,7 +22,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, TransformerMixin, clone
 from sklearn.utils import ClassifierTags, get_tags
-from sklearn.utils.validation import assert_all_finite, check_array, check_is_fitted, column_or_1d, validate_data
+from sklearn.utils.validation import (
+    assert_all_finite,
+    check_array,
+    check_is_fitted,
+    column_or_1d,
+    validate_data,
+)
 
 from ..decision.classifier import classes_of
 from ..errors import SettingError, TraceError, expect
@@ -32,15 +40,25 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 State = dict[str, NDArray[Any]]
-FAR_OUT, FEW = 50.0, 0.05  # times the median distance from the middle, and the share of such points
+OUTLIER_DISTANCE = 50.0  # times the median distance from the median point
+OUTLIER_SHARE = 0.05  # more points than this share are not outliers
 
 
 @dataclass
 class StopRule:
-    """When an iterative fit must stop; asked before each step.
+    """When an iterative fit stops: after a number of steps, at a deadline, or both.
 
-    deadline : reading of `clock` after which no step may begin; None: time decides nothing, so that a seed repeats exactly.
-    late : whether the deadline ended the fit.
+    Attributes
+    ----------
+    deadline : float, optional
+        Value of `clock` after which no further step begins. None: no deadline, so that a fit
+        repeats exactly for a seed.
+    max_steps : int, optional
+        Largest number of steps.
+    clock : callable
+        Returns the present time in seconds.
+    late : bool
+        Whether the deadline, and not the number of steps, ended the fit.
     """
 
     deadline: float | None = None
@@ -49,7 +67,10 @@ class StopRule:
     late: bool = False
 
     def exhausted(self, step: int, least: int = 0) -> bool:
-        """Whether step number `step`, from 0, may no longer begin; the first `least` may, after the deadline too."""
+        """Return whether step number `step`, counted from 0, may not begin any more; set `late`.
+
+        The first `least` steps are taken even after the deadline.
+        """
         if self.max_steps is not None and step >= self.max_steps:
             return True
         self.late = self.deadline is not None and self.clock() >= self.deadline and step >= least
@@ -60,8 +81,15 @@ class StopRule:
 class FitReport:
     """What a fit reports.
 
-    n_steps : optimiser steps that it took.  note : one line for the operator.
-    n_steps_left : steps that are missing until training is complete; the engine then retrains after every cycle.
+    Attributes
+    ----------
+    n_steps : int
+        Optimiser steps that it took.
+    note : str
+        One line for the operator.
+    n_steps_left : int
+        Steps that are missing until training is complete. While there are some, the engine
+        retrains after every cycle.
     """
 
     n_steps: int = 0
@@ -69,16 +97,27 @@ class FitReport:
     n_steps_left: int = 0
 
 
-class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
-    """A scikit-learn transformer of traces, (n, T) or (n, C, T), into points (n, d), and the model's view of it.
+class Reducer(  # type: ignore[misc]  # scikit-learn ships no types
+    ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator
+):
+    """Base class of reducers: a scikit-learn transformer from traces to points.
 
-    uses_labels : whether `fit` reads `y`. One that does, and does not cross-fit by itself, is cross-fitted from outside.
-    scores : whether the first axis is the predicted probability of success.
-    own_unit : whether the embedding has a unit of its own, a probability say, that must not be scaled away.
-    min_traces : how many labelled traces the first training in an engine waits for.
-    default_radius : radius of the ball whose labels count, where a recipe names none. The embedding is scaled to a root
-        mean square radius of 1 first, unless it has a unit of its own.
-    default_retrain_every : new labels between two retrains, where a recipe names none.
+    Attributes
+    ----------
+    uses_labels : bool
+        Whether `fit` reads `y`. A reducer that does, and has a single space, is cross-fitted by
+        `as_reducer`.
+    scores : bool
+        Whether the first coordinate is the predicted probability of success.
+    own_unit : bool
+        Whether the embedding has a unit, a probability for example. It is then not scaled.
+    min_traces : int
+        Number of labelled traces that an engine collects before the first training.
+    default_radius : float
+        Radius of the neighbourhood whose labels count, where a recipe names none. Unless
+        `own_unit`, the embedding is first scaled to a root mean square radius of 1.
+    default_retrain_every : int
+        New labels between two retrains, where a recipe names none.
     """
 
     uses_labels = False
@@ -90,89 +129,166 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     @abstractmethod
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit on traces (n, T) or (n, C, T) and, where labels are used, y (n,), the larger value being the success.
+        """Fit anew and forget earlier fits. Engines call `train`, which may go on from the last.
 
-        Starts afresh: what an earlier fit learned is forgotten. `train` is the engine's way, which may go on from it.
+        Parameters
+        ----------
+        X : array of float, shape (n, T) or (n, C, T)
+            Traces.
+        y : array, shape (n,), optional
+            Labels of two classes, the larger one for success. Only read if `uses_labels`.
         """
 
     def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, d); of several spaces their mean, for pictures, never counted in.
+        """Embed traces for pictures: the mean of all spaces. Labels are never counted in it.
 
-        Give this or `embed`. Each trace alone, as a cell decides: in a batch its last bits depend on what is beside it.
+        A subclass defines this method or `embed`. Traces are embedded one by one, as a cell does,
+        since in a batch the last bits of a result depend on the other traces.
+
+        Parameters
+        ----------
+        X : array of float, shape (n, T) or (n, C, T)
+
+        Returns
+        -------
+        array of float32, shape (n, d)
         """
         traces = self.check_traces(X)
-        return np.concatenate([self.embed(traces[i : i + 1]).mean(axis=1) for i in range(max(1, len(traces)))])
+        return np.concatenate(
+            [self.embed(traces[i : i + 1]).mean(axis=1) for i in range(max(1, len(traces)))]
+        )
 
     @property
     def n_spaces(self) -> int:
-        """K, embedding spaces."""
+        """Return K, the number of embedding spaces."""
         return 1
 
-    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
-        """Fit for an engine, from where an earlier training ended if the kind can; returns the traces' own places (n, d).
+    def train(
+        self,
+        X: Floats,
+        y: Ints,
+        folds: Ints,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
+    ) -> Floats:
+        """Train for an engine, and return the embedding of the traces as references.
 
-        X : (n, C, T).  y : (n,) 1 success, 0 failure.  folds : (n,) permanent folds; space k uses no label of fold k.
-        stop : asked before each step of a fit that has steps; None: until done.
-        numbers : (n,) of the labels, increasing: the same number is the same trace in every training; None: all are new.
-        Row i of the result lies in space folds[i], where it will live as a reference.
+        The default fits anew. A reducer that can goes on from the last training.
+
+        Parameters
+        ----------
+        X : array of float32, shape (n, C, T)
+            Traces.
+        y : array of int64, shape (n,)
+            Labels: 1 success, 0 failure.
+        folds : array of int64, shape (n,)
+            Permanent fold of each trace. Space k must not depend on the labels of fold k.
+        stop : StopRule, optional
+            Asked before each step of an iterative fit. None: until the fit is complete.
+        numbers : array of int64, shape (n,), optional
+            Increasing numbers of the labels. A number belongs to the same trace in every
+            training, so that earlier results can be reused. None: all traces are new.
+
+        Returns
+        -------
+        array of float32, shape (n, d)
+            Row i lies in space ``folds[i]``, where the trace is a reference.
         """
         self.fit(X, y if self.uses_labels else None)
-        return self.embed_own(X, folds)
+        return self.embed_references(X, folds)
 
-    def blank(self, X: Floats) -> Any:
-        """A module as `module` will give after `train` on X (n, C, T), its dimension `dim`; None: that is not known."""
+    def untrained_module(self, X: Floats) -> Any:
+        """Return a module like the one that `module` returns after training on X (n, C, T).
+
+        Its attribute `dim` is the number of coordinates. None: it is not known before training.
+        The engine compiles this module ahead of the first version.
+        """
 
     def warm_up(self) -> None:  # a default: nothing to load
-        """Load what the first training would load; an engine calls it in a thread when it starts."""
+        """Import what the first training needs. An engine calls it in a thread when it starts."""
 
-    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Do now what `train` on X (n, C, T) with labels of these numbers would begin with, as far as no label is read."""
+    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
+        """Compute now what the next `train` needs from traces X (n, C, T), without their labels.
+
+        numbers : of the labels, as in `train`.
+        """
 
     def embed(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, K, d) float32, every trace in every space."""
+        """Embed traces (n, C, T) in every space; return float32 (n, K, d)."""
         return as_points(self.transform(X))[:, None, :]
 
-    def embed_own(self, X: Floats, folds: Ints) -> Floats:
-        """(n, C, T) -> (n, d), row i in space folds[i]."""
-        return own_places(self.embed(X), folds)
+    def embed_references(self, X: Floats, folds: Ints) -> Floats:
+        """Embed traces (n, C, T) as references; return (n, d), row i in space ``folds[i]``."""
+        return points_in_own_space(self.embed(X), folds)
 
     def module(self) -> "nn.Module | None":
-        """The embedding as a module that TorchScript compiles, (B, C, T) -> (B, K, d); None: it stays in Python."""
+        """Return the embedding as a module that TorchScript can compile, (B, C, T) -> (B, K, d).
+
+        None: the reducer has none, so it answers in Python and is not exported.
+        """
         return None
 
     def get_state(self) -> State | None:
-        """Plain arrays that `set_state` restores bit for bit; None where only a refit can."""
+        """Return arrays from which `set_state` restores the reducer bit for bit.
+
+        None: it can only be restored by fitting it again.
+        """
         return None
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Become what `get_state` was taken from; the parameters must be the same."""
-        raise NotImplementedError(f"{type(self).__name__} gives no state, so it is restored by a refit.")
+        """Restore what `get_state` returned; the parameters must be the same."""
+        raise NotImplementedError(
+            f"{type(self).__name__} gives no state, so it is restored by a refit."
+        )
 
     @property
     def report(self) -> FitReport:
-        """What the last fit says of itself."""
+        """Return the report of the last fit."""
         return FitReport()
 
     def check_traces(self, X: Any, *, reset: bool = False) -> Floats:
-        """Traces (n, T) or (n, C, T), arrays or data frames, as (n, C, T) float32; ValueError for a NaN or another shape.
+        """Check traces and return them as float32 (n, C, T).
 
-        reset : whether these traces set the shape that later ones must have, as in `fit`.
+        Parameters
+        ----------
+        X : array or DataFrame, shape (n, T) or (n, C, T)
+        reset : bool, default False
+            Whether these traces set the shape that later ones must have, as in `fit`.
+
+        Raises
+        ------
+        ValueError
+            If a value is not finite.
+        TraceError
+            If the shape is another than in `fit`.
         """
         if not reset:
             check_is_fitted(self)
-        said = {"ensure_min_samples": int(reset), "estimator": self, "input_name": "X"}
+        options = {"ensure_min_samples": int(reset), "estimator": self, "input_name": "X"}
         # Writeable, since torch warns of an array that it could not write to.
-        x = np.asarray(check_array(X, dtype=np.float32, order="C", allow_nd=True, force_writeable=True, **said))
+        x = np.asarray(
+            check_array(
+                X, dtype=np.float32, order="C", allow_nd=True, force_writeable=True, **options
+            )
+        )
         if x.ndim > 3 or 0 in x.shape[1:]:
-            raise TraceError(f"Expected traces (n, samples) or (n, channels, samples) with samples, got shape {x.shape}.")
+            raise TraceError(
+                "Expected traces (n, samples) or (n, channels, samples) with samples, "
+                f"got shape {x.shape}."
+            )
         traces = x[:, None, :] if x.ndim == 2 else x
         if reset or x.ndim == 2:  # only a table's columns have names and a number to compare
-            validate_data(self, X if x.ndim == 2 else as_rows(traces), reset=reset, skip_check_array=True)
+            validate_data(
+                self, X if x.ndim == 2 else as_rows(traces), reset=reset, skip_check_array=True
+            )
         if reset:
             self.trace_shape_ = traces.shape[1:]
         elif traces.shape[1:] != self.trace_shape_:
-            wanted, got = ("{} channels x {} samples".format(*shape) for shape in (self.trace_shape_, traces.shape[1:]))
-            raise TraceError(f"Expected traces of {wanted}, as in fit, got {got}; resample, or fit anew.")
+            expected = "{} channels x {} samples".format(*self.trace_shape_)
+            actual = "{} channels x {} samples".format(*traces.shape[1:])
+            raise TraceError(
+                f"Expected traces of {expected}, as in fit, got {actual}; resample, or fit anew."
+            )
         return traces
 
     @property
@@ -184,58 +300,99 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         tags = super().__sklearn_tags__()
         tags.target_tags.required = self.uses_labels
         if self.uses_labels:
-            tags.classifier_tags = ClassifierTags(multi_class=False)  # no classifier, but its labels are of two classes
+            tags.classifier_tags = ClassifierTags(
+                multi_class=False
+            )  # no classifier, but its labels are of two classes
         tags.transformer_tags.preserves_dtype = ["float32"]
         return tags
 
 
 def as_points(Z: Any) -> Floats:
-    """An embedding (n, d) as float32."""
+    """Return an embedding (n, d) as a contiguous float32 array."""
     return np.ascontiguousarray(Z, dtype=np.float32)
 
 
 def as_rows(traces: Floats) -> Floats:
-    """(n, C, T) -> (n, C * T), of no traces as well."""
+    """Flatten traces (n, C, T) to (n, C * T); n may be 0."""
     n, channels, samples = traces.shape
     return traces.reshape(n, channels * samples)
 
 
-def own_places(Z: Floats, folds: Ints) -> Floats:
-    """(n, K, d) -> (n, d), row i of space folds[i]; of one space, all of it."""
-    own = np.asarray(folds) if Z.shape[1] > 1 else np.zeros(len(Z), dtype=np.int64)
-    return np.ascontiguousarray(Z[np.arange(len(Z)), own])
+def points_in_own_space(Z: Floats, folds: Ints) -> Floats:
+    """Return (n, d) of an embedding (n, K, d): row i in space ``folds[i]`` or the only space."""
+    spaces = np.asarray(folds) if Z.shape[1] > 1 else np.zeros(len(Z), dtype=np.int64)
+    return np.ascontiguousarray(Z[np.arange(len(Z)), spaces])
 
 
 def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
-    """(K,) root mean square radius of each fold's points in its own space; 1 where a fold is empty or has no spread.
+    """Return the scale of each space: the root mean square radius of its fold's points.
 
-    A few points that lie absurdly far out are left out: one of them would draw all others together.
+    Outliers are left out, since a single one would draw all other points together.
+
+    Parameters
+    ----------
+    points : array of float32, shape (n, d)
+        Row i lies in space ``folds[i]``.
+    folds : array of int64, shape (n,)
+    n_spaces : int
+        K.
+
+    Returns
+    -------
+    array of float32, shape (K,)
+        1 where a fold has no points, or points without spread.
     """
     scale = np.ones(n_spaces, dtype=np.float32)
     for k in range(n_spaces):
-        own = points[folds == k]
-        if len(own):
-            distances = np.abs(own - np.median(own, axis=0)).max(axis=1)
-            near = distances <= FAR_OUT * np.median(distances)
-            own = own[near] if (~near).sum() <= max(1.0, FEW * len(own)) else own
-        rms = float(np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean())) if len(own) else 0.0
-        scale[k] = rms if np.isfinite(rms) and rms > 1e-12 else 1.0
+        inside = points[folds == k]
+        if not len(inside):
+            continue
+        distances = np.abs(inside - np.median(inside, axis=0)).max(axis=1)
+        is_near = distances <= OUTLIER_DISTANCE * np.median(distances)
+        if (~is_near).sum() <= max(1.0, OUTLIER_SHARE * len(inside)):
+            inside = inside[is_near]
+        if len(inside):
+            rms = float(np.sqrt(((inside - inside.mean(axis=0)) ** 2).sum(axis=1).mean()))
+            scale[k] = rms if np.isfinite(rms) and rms > 1e-12 else 1.0
     return scale
 
 
 def binary_labels(y: Any, n: int, name: str) -> Ints:
-    """Labels (n,) of two classes as 1, the larger one, and 0; those of 0 and 1 as they are. SettingError for others."""
+    """Return labels of two classes as int64 (n,): 1 for the larger class, 0 for the other.
+
+    Labels of 0 and 1 stay as they are, also if only one of them occurs.
+
+    Parameters
+    ----------
+    y : array, shape (n,)
+    n : int
+        Number of traces.
+    name : str
+        Of the reducer, for the message of an error.
+
+    Raises
+    ------
+    SettingError
+        If there are no labels, more than two classes, or another number than n.
+    """
     if y is None:
-        raise SettingError(f"{name} uses labels: requires y to be passed, but the target y is None.")
+        raise SettingError(
+            f"{name} uses labels: requires y to be passed, but the target y is None."
+        )
     try:
         labels = column_or_1d(y, warn=True)
         assert_all_finite(labels, input_name="y")
         classes = classes_of(labels)
-    except ValueError as error:  # scikit-learn's words for one that is continuous, not finite or not one column
+    except (
+        ValueError
+    ) as error:  # scikit-learn's words for one that is continuous, not finite or not one column
         raise SettingError(str(error)) from error
     labels = np.asarray(labels)
     if len(labels) != n:
-        raise SettingError(f"Expected a label for each of {n} traces, got inconsistent numbers of samples: {len(labels)}.")
+        raise SettingError(
+            f"Expected a label for each of {n} traces, "
+            f"got inconsistent numbers of samples: {len(labels)}."
+        )
     if np.isin(classes, (0, 1)).all():
         return labels.astype(np.int64)
     return np.asarray(labels == classes[-1], dtype=np.int64)
@@ -254,54 +411,69 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     return given
 
 
-def one_class_outside(fold: int, n: int, classes: int) -> SettingError:
-    """What is said where clone or head `fold` would learn from n traces of fewer than two classes."""
-    got = f"{n} traces of {classes} class; collect more labels before the first fit."
+def single_class_error(fold: int, n: int, classes: int) -> SettingError:
+    """Return the error for a fold outside of which n traces have fewer than two classes."""
+    problem = f"{n} traces of {classes} class; collect more labels before the first fit."
     if n == 0:
-        got = "0 traces: all share one fold, the same to 1/65536 of their unit; look at the sensor, or the unit."
-    return SettingError(f"Expected both classes outside fold {fold}, got {got}")
+        problem = (
+            "0 traces: all are in one fold, since they are the same to 1/65536 of their unit; "
+            "check the sensor and the unit."
+        )
+    return SettingError(f"Expected both classes outside fold {fold}, got {problem}")
 
 
 def seed_of(random_state: Any) -> int | None:
-    """scikit-learn's `random_state` (None, an integer or a RandomState) as a seed for NumPy's and torch's generators."""
+    """Return scikit-learn's `random_state` as a seed for NumPy and torch; None for None.
+
+    Raises SettingError unless it is None, an integer or a RandomState.
+    """
     if random_state is None:
         return None
     if isinstance(random_state, int | np.integer):
         return int(random_state)
     if isinstance(random_state, np.random.RandomState):
         return int(random_state.randint(2**31 - 1))
-    raise SettingError(f"Expected random_state None, an integer or a RandomState, got {random_state!r}.")
+    raise SettingError(
+        f"Expected random_state None, an integer or a RandomState, got {random_state!r}."
+    )
 
 
 def uses_labels(transformer: Any) -> bool:
-    """Whether `fit` uses labels: scikit-learn's `target_tags.required`. A transformer without the tag is given none."""
+    """Return whether a transformer's `fit` needs labels, by its tag `target_tags.required`."""
     return bool(get_tags(transformer).target_tags.required)
 
 
 def as_reducer(transformer: Any, folds: int) -> Reducer:
-    """The transformer as a `Reducer`, cross-fitted by `folds` clones where it uses labels and has but one space.
+    """Return a transformer as a `Reducer`.
 
-    A transformer that uses no labels is never handed any, so its one space is honest by construction.
+    A `Reducer` that cross-fits by itself, or uses no labels, is returned as it is. Another
+    transformer that uses labels is wrapped in `CrossFitted` with `folds` clones. One that uses no
+    labels is wrapped in `LabelFree` and never gets any, so its single space has seen no label.
     """
-    if isinstance(transformer, Reducer) and (transformer.n_spaces > 1 or not transformer.uses_labels):
+    if isinstance(transformer, Reducer) and (
+        transformer.n_spaces > 1 or not transformer.uses_labels
+    ):
         return transformer
     return CrossFitted(transformer, folds) if uses_labels(transformer) else LabelFree(transformer)
 
 
 @dataclass(eq=False, repr=False)
 class _Wrapping(Reducer):
-    """A reducer that hands traces on to a transformer of somebody else's."""
+    """A reducer that wraps a transformer, its parameter `reducer`."""
 
     reducer: Any
 
     @property
-    def own_unit(self) -> bool:  # type: ignore[override]  # a constant of a kind; here the wrapped one's
-        """What a wrapped `Reducer` says; a transformer has no word on it and is scaled."""
+    def own_unit(self) -> bool:  # type: ignore[override]  # elsewhere a constant of the class
+        """Return `own_unit` of a wrapped `Reducer`; False for other transformers."""
         return self.reducer.own_unit if isinstance(self.reducer, Reducer) else False
 
-    def handed(self, X: Floats) -> Any:
-        """Traces (n, C, T) as the transformer takes them: ours as they are, scikit-learn's as rows."""
-        return X if isinstance(self.reducer, Reducer) else as_rows(X).copy()  # which a transformer may write to
+    def as_input(self, X: Floats) -> Any:
+        """Return traces (n, C, T) as the wrapped transformer takes them.
+
+        A `Reducer` takes them as they are, others rows (n, C * T), as a copy that they may change.
+        """
+        return X if isinstance(self.reducer, Reducer) else as_rows(X).copy()
 
     @property
     def _n_features_out(self) -> int:
@@ -310,28 +482,35 @@ class _Wrapping(Reducer):
 
 
 class LabelFree(_Wrapping):
-    """A transformer that uses no labels: one space serves every fold.
+    """Wraps a transformer that uses no labels: one space for all folds.
 
-    reducer : the transformer; `fit` works on a clone, `reducer_`.
+    Parameters
+    ----------
+    reducer : transformer
+        It is not fitted itself; `fit` fits a clone of it, `reducer_`.
     """
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         traces = self.check_traces(X, reset=True)
-        self.reducer_ = clone(self.reducer).fit(self.handed(traces))
-        self.dim_ = as_points(self.reducer_.transform(self.handed(traces[:1]))).shape[1]
+        self.reducer_ = clone(self.reducer).fit(self.as_input(traces))
+        self.dim_ = as_points(self.reducer_.transform(self.as_input(traces[:1]))).shape[1]
         return self
 
     def transform(self, X: ArrayLike) -> Floats:
-        handed = self.handed(self.check_traces(X))
-        return as_points(self.reducer_.transform(handed))
+        inputs = self.as_input(self.check_traces(X))
+        return as_points(self.reducer_.transform(inputs))
 
 
 @dataclass(eq=False, repr=False)
 class CrossFitted(_Wrapping):
-    """Any label-using transformer, K times: clone k is fitted on every trace outside fold k.
+    """Wraps a transformer that uses labels: clone k is fitted on all traces outside fold k.
 
-    reducer : the transformer; it is cloned, never fitted itself.
-    folds : K, 2 or more. A trace's fold is an integer hash of its content (see `folds.py`).
+    Parameters
+    ----------
+    reducer : transformer
+        It is not fitted itself; `fit` fits K clones of it, `clones_`.
+    folds : int, default 2
+        K, at least 2. The fold of a trace is an integer hash of its content; see `folds.py`.
     """
 
     uses_labels = True
@@ -343,9 +522,20 @@ class CrossFitted(_Wrapping):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Fit the K clones; SettingError where one of them would see a single class.
+        """Fit the clones.
 
-        folds : (n,) of the traces; None: by their content.
+        Parameters
+        ----------
+        X : array of float, shape (n, T) or (n, C, T)
+        y : array, shape (n,)
+            Labels of two classes.
+        folds : array of int64, shape (n,), optional
+            Fold of each trace. None: by its content.
+
+        Raises
+        ------
+        SettingError
+            If the traces outside a fold have a single class.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)
@@ -354,17 +544,24 @@ class CrossFitted(_Wrapping):
         self.clones_ = [clone(self.reducer) for _ in range(self.folds)]
         for k in range(self.folds):
             outside = folds != k
-            # Fold k never trains clone k, or its labels would count themselves.
+            # Clone k never sees the labels of fold k: they are counted in its space.
             classes = len(np.unique(labels[outside]))
             if classes < 2:
-                raise one_class_outside(k, int(outside.sum()), classes)
-            self.clones_[k].fit(self.handed(traces[outside]), labels[outside])
+                raise single_class_error(k, int(outside.sum()), classes)
+            self.clones_[k].fit(self.as_input(traces[outside]), labels[outside])
         self.dim_ = self.embed(traces[:1]).shape[2]
         return self
 
-    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
-        return self.fit(X, y, folds=folds).embed_own(X, folds)
+    def train(
+        self,
+        X: Floats,
+        y: Ints,
+        folds: Ints,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
+    ) -> Floats:
+        return self.fit(X, y, folds=folds).embed_references(X, folds)
 
     def embed(self, X: Floats) -> Floats:
-        handed = self.handed(self.check_traces(X))
-        return np.stack([as_points(each.transform(handed)) for each in self.clones_], axis=1)
+        inputs = self.as_input(self.check_traces(X))
+        return np.stack([as_points(fitted.transform(inputs)) for fitted in self.clones_], axis=1)

@@ -49,9 +49,9 @@ from .base import (
     StopRule,
     binary_labels,
     folds_of,
-    one_class_outside,
-    own_places,
+    points_in_own_space,
     seed_of,
+    single_class_error,
 )
 from .preprocessing import averaging
 
@@ -572,14 +572,14 @@ class RocketReducer(Reducer):
         self._fit_heads(raw, binary_labels(y, len(X), type(self).__name__), folds, stop, numbers)
         with torch.inference_mode():
             places = in_chunks(lambda some: self.net_.places(self.net_.features.clipped(some)), raw, 16 * CHUNK)
-            return own_places(places.numpy(), folds)
+            return points_in_own_space(places.numpy(), folds)
 
-    def blank(self, X: Floats) -> FeatureEmbedding:
+    def untrained_module(self, X: Floats) -> FeatureEmbedding:
         new: Self = self if len(X) >= MIN_TRACES or "net_" in vars(self) else clone(self)
         new._checked(X)
         return new.net_
 
-    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
+    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Compute the features of traces that a store brings: in the first retrain it would take too long."""
         if len(X) >= MIN_TRACES:
             self.raw_features(self._checked(X), numbers)
@@ -625,7 +625,7 @@ class RocketReducer(Reducer):
             for k, training in enumerate(outside):
                 classes = len(np.unique(labels[rows][training]))
                 if classes < 2:
-                    raise one_class_outside(k, int(training.sum()), classes)
+                    raise single_class_error(k, int(training.sum()), classes)
             f = self.net_.features.clipped(raw)
             y = torch.from_numpy(labels[rows])
             rows_of = torch.from_numpy(outside)

@@ -325,7 +325,7 @@ class TorchReducer(Reducer):
     def warm_up(self) -> None:
         warm_optimizer()
 
-    def blank(self, X: Floats) -> Encoder | None:
+    def untrained_module(self, X: Floats) -> Encoder | None:
         if "encoder_" in vars(self):
             return self.module()
         new: Self = clone(self)

@@ -784,7 +784,7 @@ class UmapReducer(Reducer):
         due = self.n_steps_left_ or max(LEAST_EPOCHS, WORK // n_traces)
         return min(due, most)
 
-    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
+    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Search the neighbours of these traces, which the next training need not do."""
         if numbers is None:
             return
@@ -877,7 +877,7 @@ class UmapReducer(Reducer):
         traces = torch.from_numpy(self.check_traces(X))
         return torch.cat([self.encoder_(chunk) for chunk in torch.split(traces, CHUNK)]).numpy()
 
-    def blank(self, X: Floats) -> UmapEncoder:
+    def untrained_module(self, X: Floats) -> UmapEncoder:
         if self._is_fitted:
             return self.encoder_
         n = max(len(X), self.n_neighbors + 1)

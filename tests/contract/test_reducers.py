@@ -91,7 +91,7 @@ class Peeking(Means):
 
     def train(self, X: Any, y: Any, folds: Any, stop: Any = None, numbers: Any = None) -> np.ndarray:
         self.rate_ = float(np.mean(y * np.arange(len(y))))
-        return self.fit(X).embed_own(X, folds)
+        return self.fit(X).embed_references(X, folds)
 
     def embed(self, X: Any) -> np.ndarray:
         Z = self.transform(X) * getattr(self, "rate_", 1.0)

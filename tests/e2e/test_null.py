@@ -45,7 +45,7 @@ class SeesEverything(LabelFree):
 
     def train(self, X, y, folds, stop=None, numbers=None):
         self.reducer_ = clone(self.reducer).fit(X.reshape(len(X), -1), y)
-        return self.embed_own(X, folds)
+        return self.embed_references(X, folds)
 
     def embed(self, X):
         return as_points(self.reducer_.transform(X.reshape(len(X), -1)))[:, None, :]

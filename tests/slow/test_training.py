@@ -94,8 +94,8 @@ def test_a_trained_encoder_beats_the_base_rate_and_starts_conv(run: Run, tmp_pat
     assert curve["log_loss"].min() < 0.8 * base_rate
     assert (out / "curve.png").stat().st_size > 0
 
-    fresh = ConvReducer(folds=2).blank(X).members.state_dict()
-    started = ConvReducer(folds=2, checkpoint=str(out / "encoder.pt")).blank(X).members.state_dict()
+    fresh = ConvReducer(folds=2).untrained_module(X).members.state_dict()
+    started = ConvReducer(folds=2, checkpoint=str(out / "encoder.pt")).untrained_module(X).members.state_dict()
     assert fresh.keys() == started.keys()
     assert not fresh["weight"].equal(started["weight"])
     assert started["weight"][0].equal(started["weight"][1])  # both members start from one encoder

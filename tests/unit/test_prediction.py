@@ -65,7 +65,7 @@ def test_a_label_added_later_is_counted_in_its_own_folds_space(data: Dataset) ->
     ring, fold = model.index, content_fold(data.X, 2)
     assert (ring.spaces[:200].numpy() == fold).all()
     assert (ring.labels[1, :200].numpy() == data.y).all()
-    own = model.spaces.embed_own(data.X[150:, None, :], fold[150:]) / model.scale[fold[150:], None]
+    own = model.spaces.embed_references(data.X[150:, None, :], fold[150:]) / model.scale[fold[150:], None]
     np.testing.assert_allclose(ring.points[:, 150:200].numpy().T, own, atol=1e-5)
 
 

@@ -113,7 +113,7 @@ def test_references_lie_where_the_same_traces_are_embedded_later() -> None:
     X, y = toy_traces(90)
     reducer, folds = quick(), content_fold(X, 3)
     points = reducer.train(X, y, folds)
-    np.testing.assert_allclose(points, reducer.embed_own(X, folds), atol=1e-5)
+    np.testing.assert_allclose(points, reducer.embed_references(X, folds), atol=1e-5)
 
 
 def test_after_training_good_parts_have_a_higher_probability_than_bad_ones_never_seen() -> None:

@@ -215,7 +215,7 @@ def test_looking_ahead_changes_no_place(insertion: Traces) -> None:
     X, _ = insertion
     plain, ahead = UmapReducer(), UmapReducer()
     for n in (200, 260):
-        ahead.look_ahead(X[:n], NUMBERS[:n])
+        ahead.precompute(X[:n], NUMBERS[:n])
         found = train(ahead, X, NUMBERS[:n])
         np.testing.assert_array_equal(found, train(plain, X, NUMBERS[:n]))
 

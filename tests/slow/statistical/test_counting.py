@@ -104,7 +104,7 @@ def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
 
 
 def references_at_the_mean_of_heads(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(rocket, "own_places", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
+    patch.setattr(rocket, "points_in_own_space", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
 
 
 def one_gate_for_all_heads(patch: pytest.MonkeyPatch) -> None:
