@@ -97,9 +97,7 @@ class FitReport:
     n_steps_left: int = 0
 
 
-class Reducer(  # type: ignore[misc]  # scikit-learn ships no types
-    ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator
-):
+class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Base class of reducers: a scikit-learn transformer from traces to points.
 
     Attributes
