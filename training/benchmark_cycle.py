@@ -17,7 +17,7 @@ from typing import Any
 from common import POLICY, options, quantiles, tell, wall_time
 
 from dengine import DataEngine, Dataset, Recipe, ReplayCell, load_dataset, make_reducer, replay
-from dengine.engine.engine import frozen_objects, uncollected
+from dengine.engine.engine import core_of, frozen_objects, uncollected
 from dengine.engine.trainer import LATE
 from dengine.traces import as_traces
 
@@ -81,7 +81,7 @@ def busy_cores() -> Iterator[None]:
 
 def filled_engine(data: Dataset, recipe: Recipe, executor: Executor | None = None) -> DataEngine:
     """An engine that has verified the whole set: every trace a reference of the model that answers."""
-    engine = DataEngine.from_recipe(recipe, executor=executor)
+    engine = DataEngine(recipe=recipe, executor=executor)
     for trace, label in zip(data.X, data.y, strict=True):
         decision = engine.decide(trace)
         if decision.action != "reject":
@@ -97,8 +97,8 @@ def beside(data: Dataset, recipe: Recipe, executor: Executor) -> tuple[list[floa
     swapping: list[float] = []
     with executor:
         for i in range(len(data)):
-            if not engine.retraining:
-                engine.start_retrain()
+            if not core_of(engine).is_retraining:
+                core_of(engine).start_retrain()
             version, (took, _) = engine.version, wall_time(engine.decide, cell.insert())
             if i > WARM_UP * len(data):  # the pool starts its worker on the first
                 (seconds if engine.version == version else swapping).append(took)

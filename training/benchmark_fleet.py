@@ -39,6 +39,7 @@ import sqlalchemy as sa
 from common import POLICY, noisy, options, quantiles, tell, wall_time
 
 from dengine import Action, DataEngine, Dataset, Recipe, RetrainReport, SqlStore, load_dataset
+from dengine.engine.engine import core_of
 from dengine.errors import NotTakenError
 from dengine.experiments.tables import write_csv
 from dengine.store.journal import journal_path
@@ -137,11 +138,11 @@ def work(plan: Plan, data: Dataset, cell: int) -> Worked:
                 took, retrain = wall_time(told, engine, decision.id, bool(y[0]))
                 seconds["report" if retrain is None else "report that retrains"].append(took)
                 sent[decision.id] = cycle, bool(y[0])
-            seconds["settle, with news of peers"].append(wall_time(engine.settle)[0])
+            seconds["settle, with news of peers"].append(wall_time(core_of(engine).process_retrains)[0])
             time.sleep(plan.pause)
         until = time.monotonic() + BACK
         engine.flush()
-        while engine.store_fault and time.monotonic() < until:
+        while core_of(engine).store_fault and time.monotonic() < until:
             time.sleep(0.1)
             engine.flush()
         seen = engine.store.labelled().traces if plan.products else ()

@@ -44,7 +44,7 @@ def _verified(name: str) -> Decision:
 def measure_store(data: Dataset, recipe: Recipe, n: int, repeats: int, folder: Path) -> dict[str, Any]:
     """Times of one store of n labelled traces, in seconds."""
     path = folder / f"{n}.db"
-    with DataEngine.from_recipe(recipe, store=path) as engine:
+    with DataEngine(recipe=recipe, store=path) as engine:
         fill(engine, data, n)
     opened, engine = wall_time(DataEngine.open, path)
     retrains = [wall_time(engine.retrain)[0] for _ in range(repeats)]

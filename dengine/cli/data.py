@@ -104,7 +104,7 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     command goes on from there.
     """
     from ..datasets.importing import form_in, import_labelled
-    from ..engine.engine import DataEngine
+    from ..engine.engine import DataEngine, core_of
     from ..experiments.tables import retrain_line
     from ..store.opening import UNHURRIED
 
@@ -120,7 +120,7 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     with DataEngine.open_or_create(store, wait=UNHURRIED, **asked) as engine:
         name = short_name(engine.recipe.name)
         record = {"store": store, "faults": data.faults, "notes": data.notes, "import": imported}
-        if not (imported.imported or engine.new_labels) and engine.version:
+        if not (imported.imported or core_of(engine).new_labels) and engine.version:
             said = f"{store} knows all of {data.name}, nothing was done. Version {engine.version} of {name} answers."
             tell(record | {"retrain": None}, said)
             return

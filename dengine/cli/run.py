@@ -65,7 +65,7 @@ def run(
     """
     if kind == "simulated":
         options.must_have("the simulated cell", "sim", "mujoco")
-    from ..engine.engine import DataEngine
+    from ..engine.engine import DataEngine, core_of
 
     used = DataEngine.open_or_create(store, seed, recipe=choice.if_asked(), allow_import=allow_import)
     with ExitStack() as opened, used as engine:
@@ -74,7 +74,7 @@ def run(
         cell_of |= {"store": engine.store, "seed": engine.seed, "cycles": cycles, "check_s": check_seconds}
         cell, name, form = CELLS[kind](**cell_of)
         if form is not None:
-            engine.agree_on(form)
+            core_of(engine).set_trace_spec(form)
         opened.callback(getattr(cell, "close", lambda: None))
         log, changes, failure = _drive(engine, cell, cycles, name)
         said: dict[str, Any] = {"check_seconds": check_seconds, "safe_mode": engine.safe_mode, "safe_mode_changes": changes}

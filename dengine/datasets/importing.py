@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..decision.policy import Policy
 from ..engine.decide import as_part
-from ..engine.engine import DataEngine
+from ..engine.engine import DataEngine, core_of
 from ..errors import StoreError, TraceError
 from ..folds import content_hash, own_hash
 from ..recipe import Recipe
@@ -108,7 +108,7 @@ def import_labelled(
     data = load_dataset(dataset, **form_in(store, dataset))
     engine = DataEngine.open_or_create(store, seed, wait=UNHURRIED, recipe=recipe, allow_import=allow_import)
     try:
-        agreed = engine.agree_on(data.spec)
+        agreed = core_of(engine).set_trace_spec(data.spec)
         must_agree(data, agreed)
         traces = as_traces(data.X, agreed)
         parts = list(zip(_verified(traces, data), traces, map(as_success, data.y), strict=True))

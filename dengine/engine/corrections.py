@@ -18,7 +18,6 @@ from ..decision.members import SAFE_MODES
 from ..decision.policy import Policy
 from ..errors import ReportError, SettingError, expect, listed
 from ..records import as_success
-from ..store.outbox import Outbox
 from ..store.records import (
     POLICY_CHANGED,
     SHADOW_CHANGED,
@@ -27,14 +26,15 @@ from ..store.records import (
     nothing_to_correct,
     unknown_decision,
 )
-from .feedback import Feedback
-from .settings import EvidenceWindow, SettingsInForce
-from .trainer import HUNG
-from .versions import ModelVersions
+from .core import EngineCore
+from .settings import EvidenceWindow
 
 # What a rule is made of, and its evidence measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
-SHADOW = {True: "shadow mode: every part is verified from now on", False: "the shadow mode ended: the model decides again"}
+SHADOW = {
+    True: "shadow mode: every part is verified from now on",
+    False: "the shadow mode ended: the model decides again",
+}
 SAID = {True: "success", False: "failure"}
 
 
@@ -56,9 +56,9 @@ class Changed:
 class Corrections:
     """Puts things right in a store, and in what an engine has learned."""
 
-    def __init__(self, outbox: Outbox, settings: SettingsInForce, versions: ModelVersions, feedback: Feedback) -> None:
-        self._outbox, self._settings, self._versions, self._feedback = outbox, settings, versions, feedback
-        self._store = outbox.store
+    def __init__(self, core: EngineCore) -> None:
+        self._core = core
+        self._store = core.store
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Say that a label was wrong, or that a forgotten one counts again, from the next decision on.
@@ -71,7 +71,9 @@ class Corrections:
         label = as_success(success)
         (known,) = self._to_correct([decision_id])
         if known.success is label:
-            return self._unchanged("correct", f"Decision {known.decision.id} counts as a {SAID[label]} already")
+            return self._unchanged(
+                "correct", f"Decision {known.decision.id} counts as a {SAID[label]} already"
+            )
         was = "forgotten" if known.success is None else f"a {SAID[known.success]}"
         text = f"decision {known.decision.id} counts as a {SAID[label]}, was {was}"
         data = {"decisions": {known.decision.id: {"was": known.success, "now": label}}}
@@ -86,13 +88,20 @@ class Corrections:
         Raises ReportError for an unknown decision, and for one without a label; then none is forgotten.
         """
         if not decision_ids:
-            raise ReportError("Expected the ids of decisions to forget, got none; name at least one.")
+            raise ReportError(
+                "Expected the ids of decisions to forget, got none; name at least one."
+            )
         known = self._to_correct(list(dict.fromkeys(decision_ids)))
         was = {each.decision.id: each.success for each in known if each.success is not None}
         if not was:
-            return self._unchanged("forget", f"{_labels([each.decision.id for each in known])} forgotten already")
+            return self._unchanged(
+                "forget", f"{_labels([each.decision.id for each in known])} forgotten already"
+            )
         text = f"{_labels(list(was))} forgotten" + (f": {reason}" if reason else "")
-        data = {"decisions": {id_: {"was": label, "now": None} for id_, label in was.items()}, "reason": reason}
+        data = {
+            "decisions": {id_: {"was": label, "now": None} for id_, label in was.items()},
+            "reason": reason,
+        }
         return self._correct(Change("forget", text, data, author, tuple(was), None))
 
     def rollback(self, version: int, author: str = "") -> Changed:
@@ -104,14 +113,16 @@ class Corrections:
         Raises StoreError for a version that is not kept, which names those that are.
         """
         if isinstance(version, bool) or not isinstance(version, int | np.integer):
-            raise SettingError(f"Expected the number of a version, got {version!r}; `store.retrains()` lists them.")
+            raise SettingError(
+                f"Expected the number of a version, got {version!r}; `store.retrains()` lists them."
+            )
         self._make_ready()
-        if version == self._versions.version and version > 0:
+        if version == self._core.live.version and version > 0:
             return self._unchanged("rollback", f"Version {version} answers already")
-        before, now = self._versions.version, self._versions.next_number
+        before, now = self._core.live.version, self._core.live.next_version
         text = f"version {version} answers again, as version {now} after {before}"
         event = Change("rollback", text, {"to": int(version), "was": before, "now": now}, author)
-        self._versions.roll_back(int(version), event)
+        self._core.learner.roll_back(int(version), event)
         return self._done(event)
 
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
@@ -128,44 +139,60 @@ class Corrections:
         Raises SettingError for what is no policy, for windows that the traces cannot hold, and, of a model that was handed
         in, for anything but audit_rate, stops, label_within, windows and shadow.
         """
-        expect(isinstance(policy, Policy), "a Policy", policy, "for example Policy(alpha=0.05, lower_bound=0.95)")
-        now, versions = self._settings.now, self._versions
+        expect(
+            isinstance(policy, Policy),
+            "a Policy",
+            policy,
+            "for example Policy(alpha=0.05, lower_bound=0.95)",
+        )
+        now = self._core.settings.now
+        live = self._core.live
         was, wished = now.recipe.policy.to_values(), policy.to_values()
         new = {name: value for name, value in wished.items() if value != was[name]}
         if not new:
             return self._unchanged("policy", "The policy is in force already")
         own = now.model is not None  # a model that was handed in keeps its rule
-        idle = sorted(set(new) - {"audit_rate", "stops", "shadow", "label_within", "windows"}) if own else []
+        idle = (
+            sorted(set(new) - {"audit_rate", "stops", "shadow", "label_within", "windows"})
+            if own
+            else []
+        )
         if idle:
             said = f"so {', '.join(idle)} would have no effect"
             do = "change only audit_rate, stops, label_within, windows and shadow"
-            raise SettingError(f"A model that was handed in decides by its own numbers, {said}; {do}.")
+            raise SettingError(
+                f"A model that was handed in decides by its own numbers, {said}; {do}."
+            )
         self._make_ready()
         # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.
         asked = policy.guarantee in SORTING_GUARANTEES and policy.known_share != now.recipe.policy.known_share
         anew = not own and (asked or any(name in new for name in SCORING))
-        since = 0 if versions.answering is None else versions.next_number
-        evidence = EvidenceWindow(since, SAFE_MODES.index(versions.newest.safe_mode)) if anew else now.evidence
-        settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, evidence=evidence)
+        since = 0 if live.answering is None else live.next_version
+        evidence = (
+            EvidenceWindow(since, SAFE_MODES.index(live.newest.safe_mode)) if anew else now.evidence
+        )
+        settings = replace(
+            now, recipe=replace(now.recipe, policy=policy), policy_since=since, evidence=evidence
+        )
         kind, text = (
             POLICY_CHANGED,
-            "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items()),
+            "the policy's "
+            + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items()),
         )
         if list(new) == ["shadow"]:
             kind, text = SHADOW_CHANGED, SHADOW[policy.shadow]
-        event = Change(kind, text, {"old": was, "new": wished}, author, settings=settings.to_store())
-        versions.set_policy(policy if anew else None, evidence, event)
-        self._settings.change(settings)
-        self._feedback.begin_policy()
+        event = Change(
+            kind, text, {"old": was, "new": wished}, author, settings=settings.to_store()
+        )
+        self._core.learner.set_policy(policy if anew else None, evidence, event)
+        self._core.settings.change(settings)
+        self._core.feedback.begin_policy()
         return self._done(event, "the rule of the policy in force has none")
 
     def _make_ready(self) -> None:
         """Swap in what an executor trains, and store what waits: a correction comes after all that was known before."""
-        self._outbox.check_usable()
-        self._versions.collect(HUNG)
-        self._feedback.store_all()
-        if self._versions.fleet is not None:
-            self._versions.fleet.complete()
+        self._core.outbox.check_usable()
+        self._core.learner.make_ready()
 
     def _to_correct(self, ids: Sequence[Any]) -> list[StoredDecision]:
         self._make_ready()
@@ -182,17 +209,19 @@ class Corrections:
     def _correct(self, change: Change) -> Changed:
         self._store.record(change)
         for name in change.decisions:
-            self._outbox.evict_decision(name)
-        self._versions.correct()
+            self._core.outbox.evict_decision(name)
+        self._core.learner.apply_corrections()
         return self._done(change)
 
-    def _done(self, change: Change, safe_again: str = "what was told anew keeps the tolerance") -> Changed:
+    def _done(
+        self, change: Change, reason_ended: str = "what was told anew keeps the tolerance"
+    ) -> Changed:
         number = self._store.events(1)[0].number
-        self._feedback.announce(safe_again)
-        return Changed(change.kind, _sentence(f"{change.text}."), number, self._versions.version)
+        self._core.feedback.announce_safe_mode(reason_ended)
+        return Changed(change.kind, _sentence(f"{change.text}."), number, self._core.live.version)
 
     def _unchanged(self, kind: str, text: str) -> Changed:
-        return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._versions.version)
+        return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._core.live.version)
 
 
 def _sentence(text: str) -> str:

@@ -39,7 +39,10 @@ class DecisionMaker:
     def agree_on(self, trace: TraceSpec) -> None:
         """Set the contract that the gate checks."""
         gate = TraceGate(trace)
-        self._gate, self._limit = script(gate).forward, gate.limit  # once: a scripted module looks its methods up each time
+        self._gate, self._limit = (
+            script(gate).forward,
+            gate.limit,
+        )  # once: a scripted module looks its methods up each time
 
     def first_contract(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
         """The contract that a first trace (C, T) sets; None for a bad one: it is verified, and the contract stays open."""
@@ -65,9 +68,15 @@ class DecisionMaker:
         if model is not None and unasked is None:
             try:
                 fault, content, said = model.look(x, number, self._gate, self._limit)
-                if said is not None and not 0.0 <= said.lower <= said.upper <= 1.0:  # a NaN is refused too
-                    raise ValueError(f"Expected bounds 0 <= lower <= upper <= 1, got {said.lower} and {said.upper}.")
-            except Exception:  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
+                if (
+                    said is not None and not 0.0 <= said.lower <= said.upper <= 1.0
+                ):  # a NaN is refused too
+                    raise ValueError(
+                        f"Expected bounds 0 <= lower <= upper <= 1, got {said.lower} and {said.upper}."
+                    )
+            except (
+                Exception
+            ):  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
                 log.exception("the model failed on a trace; the part is verified")
                 said, unasked = None, Reason.MODEL_ERROR
         if said is None:
@@ -78,7 +87,11 @@ class DecisionMaker:
         if outside:  # its place is kept, and nothing else of what the model says of it
             said = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, said.embedding, Reason.OUTSIDE)
         certain, rate = said.action is not Action.VERIFY, self._settings.audited_share
-        audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
+        audit = (
+            certain
+            and rate > 0.0
+            and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
+        )
         decision = Decision(
             id=decision_id or f"{self._run}-{next(self._count)}",
             action=Action.REJECT if outside == 2 else Action.VERIFY if audit else said.action,
@@ -95,13 +108,19 @@ class DecisionMaker:
             part=part,
         )
         hash_ = content if number is None else number
-        return StoredDecision(decision, x.copy(), hash_, fault != 0, self._clock())  # the caller may change his own
+        return StoredDecision(
+            decision, x.copy(), hash_, fault != 0, self._clock()
+        )  # the caller may change his own
 
-    def lost_accept(self, x: NDArray[np.float32], part: str | None, version: int, decision_id: str) -> StoredDecision:
+    def lost_accept(
+        self, x: NDArray[np.float32], part: str | None, version: int, decision_id: str
+    ) -> StoredDecision:
         """The decision behind a system stop whose own row was lost: an accept without a check, on no known evidence."""
         item, accept = self.decide(x, part, None, version, None, decision_id), Action.ACCEPT
         rate = self._settings.audited_share
-        made = replace(item.decision, action=accept, predicted=accept, reason=Reason.CERTAIN, propensity=rate)
+        made = replace(
+            item.decision, action=accept, predicted=accept, reason=Reason.CERTAIN, propensity=rate
+        )
         return replace(item, decision=made)
 
 
@@ -117,7 +136,9 @@ def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) ->
 def unasked(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
     """A decision on which no model was asked."""
     verify = Action.VERIFY
-    return Decision(decision_id, verify, verify, 0.0, 1.0, 0, 0, None, version, reason, False, 1.0, part)
+    return Decision(
+        decision_id, verify, verify, 0.0, 1.0, 0, 0, None, version, reason, False, 1.0, part
+    )
 
 
 def as_part(part: Any) -> str | None:

@@ -1,219 +1,275 @@
-"""What becomes of parts: labels on their way to the store, the rule, the references and the next retrain.
+"""Collects the outcomes of decided parts and turns them into stored labels.
 
-With `Policy(stops="all")` a bad part stops the system before the next decision, so that one confirms an accepted part: the
-rule is told, the trace becomes a reference, and its label, CONFIRMED, is stored with the next report, before the next
-retrain, or when 100 wait. A stop that comes later takes that back, in the store as a correction. With "some" it is counted
-as unobserved, which is no success.
+With `Policy(stops="all")` a bad part stops the system before the next decision, so the next decision confirms an accepted
+part: the rule is updated, the trace becomes a reference, and its label, CONFIRMED, is stored with the next report, before
+the next retrain, or when 100 of them wait. A line stop that comes later takes the confirmation back, in the store as a
+correction. With "some" the part counts as unobserved, which is no success.
 """
 
 import logging
 from collections import OrderedDict
 from collections.abc import Callable
-from contextlib import suppress
+from enum import Enum
 
-from ..errors import StoreError
 from ..records import Action, Reason, Source, source_of
 from ..store.outbox import Outbox
-from ..store.records import LATE_STOP, SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision, already_reported
+from ..store.records import (
+    LATE_STOP,
+    SAFE_MODE_BEGAN,
+    SAFE_MODE_ENDED,
+    NewLabel,
+    StoredDecision,
+    already_reported,
+)
+from .labels import CellLabels, ProductLabels
+from .live_model import LiveModel
 from .settings import SettingsInForce
-from .versions import ModelVersions
 
 log = logging.getLogger("dengine")
+MOST_CONFIRMED = 100  # labels of confirmed parts that wait for a report
 RECENT = 50  # decisions that the share of novel ones fades over
 NEARLY_ALL = 0.8  # of them, and somebody should look
 ALL_NOVEL = "nearly every trace is novel: the sensor or the parts have changed, or parts come twice without numbers (part=)"
 
 
-class Feedback:
-    """Takes in what became of decided parts.
+class Remedy(Enum):
+    """What must be done, once the store has every label, because something that was learned did not happen."""
 
-    settings : whether silence until the next decision confirms an accepted part, and since which version.
-    on_safe_mode : called with the reason, "" where it ends, when the safe mode begins or ends; it is recorded before.
+    REBUILD_RULE = "rebuild the rule"
+    CORRECT = "apply the stored correction, and rebuild the rule"
+
+
+class Feedback:
+    """Takes in the outcomes of decided parts.
+
+    Parameters
+    ----------
+    outbox : Outbox
+        Takes the labels.
+    live : LiveModel
+        Learns from them.
+    labels : CellLabels or ProductLabels
+        Takes each label that the store has numbered.
+    settings : SettingsInForce
+        Whether silence until the next decision confirms an accepted part, and since which version.
+    on_safe_mode : callable, optional
+        Called with the reason when a safe mode begins and with "" when it ends, after that was recorded.
+
+    Attributes
+    ----------
+    remedy : Remedy or None
+        What waits until the store has every label; `learner.Learner` does it.
     """
 
     def __init__(
         self,
         outbox: Outbox,
-        versions: ModelVersions,
+        live: LiveModel,
+        labels: CellLabels | ProductLabels,
         settings: SettingsInForce,
         on_safe_mode: Callable[[str], object] | None = None,
     ) -> None:
-        self.outbox, self.versions, self.settings = outbox, versions, settings
-        self.on_safe_mode = on_safe_mode
-        self._went_on: OrderedDict[str, StoredDecision] = OrderedDict()  # accepted, nothing heard of them yet
-        self._waiting: dict[str, tuple[StoredDecision, NewLabel]] = {}  # confirmed, not on their way into the store
-        self._unsynced: dict[str, bool] = {}  # learned, and not known to be on the disk
-        # Decisions that asked for a check of which nothing was reported and which is not overdue, oldest first.
-        self._owed: OrderedDict[str, StoredDecision] = OrderedDict()
-        self._unobserved = 0
-        self._mode = ""
-        self.remedy: Callable[[], None] | None = None  # where what the rule was told, or what is stored, did not happen
-        self._novel, self._told_novel = 0.0, False  # share of the recent decisions, and whether that it is large was told
-        versions.store_waiting = self.store_all
-        versions.journal_cleared = self.journal_cleared
+        self._outbox = outbox
+        self._live = live
+        self._labels = labels
+        self._settings = settings
+        self._on_safe_mode = on_safe_mode
+        self.remedy: Remedy | None = None
+        # Accepted parts without an outcome yet.
+        self._unreported: OrderedDict[str, StoredDecision] = OrderedDict()
+        # Labels of confirmed parts that were not handed to the outbox.
+        self._pending: dict[str, tuple[StoredDecision, NewLabel]] = {}
+        # Reports that were learned and are not known to be on disk.
+        self._unsynced: dict[str, bool] = {}
+        # Decisions whose check was asked for, not reported and not overdue, oldest first.
+        self._awaiting_check: OrderedDict[str, StoredDecision] = OrderedDict()
+        self._unobserved = 0  # accepted parts that went on without an outcome since the last label
+        self._safe_mode = ""
+        self._novel_share = 0.0  # of the recent decisions
+        self._novelty_reported = False
 
     @property
     def _stops_all(self) -> bool:
-        return self.settings.now.recipe.policy.stops == "all"
+        """Whether every bad part stops the system, so that silence confirms an accepted part."""
+        return self._settings.now.recipe.policy.stops == "all"
 
     def resume(self) -> None:
-        """Go on from the store: what was accepted and not reported."""
-        self._mode = self.versions.newest.safe_mode
-        store = self.outbox.store
-        for owed in store.pending_decisions(self.settings.now.evidence.since):
-            if owed.number > self.versions.overdue_to:
-                self._owed[owed.decision.id] = owed
-        ids = store.unreported_accepts(self.settings.now.policy_since)
+        """Go on from the store: which checks are pending, and which accepted parts have no outcome."""
+        self._safe_mode = self._live.newest.safe_mode
+        store = self._outbox.store
+        for stored in store.pending_decisions(self._settings.now.evidence.since):
+            if stored.number > self._live.overdue_to:
+                self._awaiting_check[stored.decision.id] = stored
+        policy_since = self._settings.now.policy_since
+        ids = store.unreported_accepts(policy_since)
         if not self._stops_all:
-            self._unobserved = len(ids) - store.silent_total(self.settings.now.policy_since)
+            self._unobserved = len(ids) - store.silent_total(policy_since)
             return
         for id_ in ids:
-            known = store.get_decision(id_)
-            if known is not None:
-                self._went_on[id_] = known
+            accepted = store.get_decision(id_)
+            if accepted is not None:
+                self._unreported[id_] = accepted
 
-    def settle(self) -> None:
-        """The next trace comes: accepted parts of which nothing was heard went on."""
-        self.arrive()
-        if not self._went_on:
+    def record_decision(self, stored: StoredDecision) -> None:
+        """Note a decision whose outcome is pending, and record an event where nearly every trace is novel."""
+        decision = stored.decision
+        if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
+            self._awaiting_check[decision.id] = stored
+        self._count_overdue()
+        if decision.action is Action.ACCEPT:
+            self._unreported[decision.id] = stored
+        is_novel = decision.reason is Reason.NOVEL
+        self._novel_share += (is_novel - self._novel_share) / RECENT
+        if self._novel_share > NEARLY_ALL and not self._novelty_reported:
+            self._outbox.record_event("novelty", ALL_NOVEL)
+        # Reported again only after the share has fallen to one half.
+        limit = 0.5 if self._novelty_reported else NEARLY_ALL
+        self._novelty_reported = self._novel_share > limit
+
+    def confirm_silent(self) -> None:
+        """Take accepted parts without an outcome as confirmed or unobserved, because the next trace has come."""
+        if not self._unreported:
             return
-        while self._went_on:
-            _, known = self._went_on.popitem(last=False)
+        while self._unreported:
+            id_, stored = self._unreported.popitem(last=False)
             if self._stops_all:
-                self._waiting[known.decision.id] = known, self._learn(known, True, Source.CONFIRMED)
+                self._pending[id_] = stored, self._learn(stored, True, Source.CONFIRMED)
             else:
                 self._unobserved += 1
-        if len(self._waiting) >= 100:  # so many confirmed parts wait for a report
-            self.store_waiting()
+        if len(self._pending) >= MOST_CONFIRMED:
+            self.store_pending()
+
+    def take_in(self, stored: StoredDecision, success: bool) -> bool:
+        """Learn a reported label and hand it to the outbox, unless the same report was learned before.
+
+        Returns whether the part counted as confirmed until now and was not. Raises ReportError where another label
+        was reported for it.
+        """
+        id_ = stored.decision.id
+        confirmed_wrongly = False
+        if self._unsynced.get(id_) is not success:
+            confirmed_wrongly = self._take_in_new(stored, success)
+        self._unsynced[id_] = success
+        return confirmed_wrongly
+
+    def note_synced(self, decision_id: str) -> None:
+        """Note that the reported label of this decision is on disk."""
+        del self._unsynced[decision_id]
+
+    def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
+        """Learn a label and hand it to the outbox; returns whether the part counted as confirmed, and was not."""
+        decision = stored.decision
+        source = source_of(decision.action, decision.audit, success)
+        if stored.source is not None:
+            earlier = (bool(stored.success), stored.source)
+            reported = (success, source)
+            if (earlier, reported) != LATE_STOP:
+                raise already_reported(decision.id, earlier, reported)
+            self.store_pending()
+            self.remedy = Remedy.CORRECT
+            label = NewLabel(decision.id, False, source, self._live.version, None)
+            self._outbox.record_labels([(stored, label)])
+            return True
+        confirmed_wrongly = self._pending.pop(decision.id, None) is not None
+        self.store_pending()
+        if confirmed_wrongly:
+            self._live.unlearn(stored)
+            self._labels.count_unlearned()
+        label = self._learn(stored, success, source)
+        self._outbox.record_labels([(stored, label)])
+        self._unreported.pop(decision.id, None)
+        self._awaiting_check.pop(decision.id, None)
+        if self._live.clear_overdue(decision.id) or confirmed_wrongly:
+            self.remedy = self.remedy or Remedy.REBUILD_RULE
+        return confirmed_wrongly
+
+    def _learn(self, stored: StoredDecision, success: bool, source: Source) -> NewLabel:
+        """Update the rule and the references with the outcome of a part; returns its label for the store.
+
+        The rule is not updated with a rejected part: which of them come back is somebody's choice, and no sample.
+        """
+        decision = stored.decision
+        version = self._live.version
+        point = None
+        silent = 0
+        if stored.quarantined:
+            pass  # an unusable trace teaches nothing
+        elif source is Source.INSPECTION:
+            point = self._live.learn(stored, success, None)
+            self._labels.count_learned()
+        else:
+            silent = self._unobserved - self._was_unobserved(stored)
+            self._unobserved = 0
+            point = self._live.learn(stored, success, silent)
+            self._labels.count_learned()
+        overdue_to = self._live.overdue_to
+        return NewLabel(decision.id, success, source, version, point, silent, overdue_to=overdue_to)
+
+    def _was_unobserved(self, stored: StoredDecision) -> bool:
+        """Return whether a part was counted among the unobserved before its label came."""
+        decision = stored.decision
+        if decision.action is not Action.ACCEPT or self._stops_all:
+            return False
+        is_of_policy = decision.model_version >= self._settings.now.policy_since
+        return decision.id not in self._unreported and is_of_policy
+
+    def store_pending(self) -> bool:
+        """Hand the labels of confirmed parts to the outbox, without waiting; returns whether there were any."""
+        if not self._pending:
+            return False
+        self._outbox.record_labels(self._pending.values())
+        self._pending.clear()
+        self.number_labels()
+        return True
+
+    def number_labels(self) -> None:
+        """Give labels that the store has numbered to the training window, and count overdue checks as wrong decisions."""
+        self._count_overdue()
+        for id_, seq in self._outbox.pop_label_numbers():
+            learned = self._live.assign_number(id_, seq)
+            if learned is not None:
+                stored, success = learned
+                self._labels.add(stored.trace, int(success), stored.content_hash, seq)
 
     def _count_overdue(self) -> None:
-        """A check that was not reported in time counts as a wrong decision."""
-        overdue_to = self.outbox.n_decisions - self.settings.now.recipe.policy.label_within
-        while self._owed and next(iter(self._owed.values())).number <= overdue_to:
-            self.versions.owe(self._owed.popitem(last=False)[1].decision)
-        self.versions.overdue_to = max(overdue_to, self.versions.overdue_to)
+        """Update the rule as if decisions whose check was not reported in time were wrong."""
+        label_within = self._settings.now.recipe.policy.label_within
+        overdue_to = self._outbox.n_decisions - label_within
+        pending = self._awaiting_check
+        while pending and next(iter(pending.values())).number <= overdue_to:
+            _, stored = pending.popitem(last=False)
+            self._live.count_overdue(stored.decision)
+        self._live.examined_to(overdue_to)
 
-    def decided(self, known: StoredDecision) -> None:
-        """A part was decided on."""
-        if known.decision.action is Action.VERIFY and not known.quarantined and known.number:
-            self._owed[known.decision.id] = known
-        self._count_overdue()
-        if known.decision.action is Action.ACCEPT:
-            self._went_on[known.decision.id] = known
-        self._novel += ((known.decision.reason is Reason.NOVEL) - self._novel) / RECENT
-        if self._novel > NEARLY_ALL and not self._told_novel:
-            self.outbox.record_event("novelty", ALL_NOVEL)
-        self._told_novel = self._novel > (0.5 if self._told_novel else NEARLY_ALL)
-
-    def report(self, known: StoredDecision, success: bool) -> None:
-        """Take in a report, and return once it is on the disk; NotTakenError where it is not."""
-        id_, untrue = known.decision.id, False
-        self.arrive()
-        if self._unsynced.get(id_) is not success:  # else it is said again, and learned already
-            untrue = self._take_in(known, success)
-        self._unsynced[id_] = success
-        self.outbox.sync()
-        del self._unsynced[id_]
-        if untrue:
-            with suppress(StoreError):  # then it is put right when the store is back
-                self.outbox.drain()
-        self.arrive()
-        self.announce()
-
-    def _take_in(self, known: StoredDecision, success: bool) -> bool:
-        """Learn a label, which goes into the journal; whether the part was taken for confirmed until now, and was not."""
-        made = known.decision
-        source = source_of(made.action, made.audit, success)
-        if known.source is not None:
-            stands, now = (bool(known.success), known.source), (success, source)
-            if (stands, now) != LATE_STOP:
-                raise already_reported(made.id, stands, now)
-            self.store_waiting()
-            self.remedy = self.versions.take_back
-            self.outbox.record_labels([(known, NewLabel(made.id, False, source, self.versions.version, None))])
-            return True
-        untrue = self._waiting.pop(made.id, None) is not None
-        self.store_waiting()
-        if untrue:
-            self.versions.unlearn(known)
-        label = self._learn(known, success, source)
-        self.outbox.record_labels([(known, label)])
-        self._went_on.pop(made.id, None)
-        self._owed.pop(made.id, None)
-        if untrue or made.id in self.versions.overdue:
-            self.versions.overdue.discard(made.id)
-            self.remedy = self.remedy or self.versions.tell_anew
-        return untrue
-
-    def arrive(self) -> None:
-        """Do what had to wait for the store: labels that it has numbered train, and the rule is told the truth."""
-        self._count_overdue()
-        for id_, seq in self.outbox.pop_label_numbers():
-            self.versions.keep(id_, seq)
-        if self.remedy and self.outbox.is_drained and not self.outbox.fault:
-            if self._waiting:  # else the rule would forget them
-                self.store_waiting()
-            else:
-                self._put_right(self.remedy)
-
-    def _put_right(self, remedy: Callable[[], None]) -> None:
-        """Tell the rule the truth, and let references and the next retrain know of what was taken back."""
+    def take_remedy(self) -> Remedy | None:
+        """Return what must be put right, once; None where there is nothing."""
+        remedy = self.remedy
         self.remedy = None
-        try:
-            remedy()
-        except StoreError:
-            self.remedy = remedy
-            log.exception("the rule is told anew when the store is back")
+        return remedy
 
-    def store_waiting(self) -> None:
-        """Put the labels of confirmed parts into the journal, without waiting."""
-        if self._waiting:
-            self.outbox.record_labels(self._waiting.values())
-            self._waiting.clear()
-            self.arrive()
-
-    def store_all(self) -> None:
-        """Have every label in the store, and its number; StoreError where the store is away."""
-        self.store_waiting()
-        self.journal_cleared()
-
-    def journal_cleared(self) -> None:
-        """The same for what is in the journal: of a product's news one may be that very label."""
-        if self.outbox.request_label_drain():
-            self.outbox.drain()
-        self.arrive()
-
-    def _learn(self, known: StoredDecision, success: bool, source: Source) -> NewLabel:
-        """Tell rule and references what became of a part; returns its label.
-
-        The rule is not told of a rejected part: which of them come back is somebody's choice, and no sample.
-        """
-        made, version, point, silent = known.decision, self.versions.version, None, 0
-        if source is Source.INSPECTION:
-            if not known.quarantined:
-                point = self.versions.learn(known, success, None)
-        elif not known.quarantined:
-            counted = made.action is Action.ACCEPT and made.id not in self._went_on and not self._stops_all
-            # It was counted among the unobserved before its label came.
-            silent = self._unobserved - (counted and made.model_version >= self.settings.now.policy_since)
-            self._unobserved = 0
-            point = self.versions.learn(known, success, silent)
-        return NewLabel(made.id, success, source, version, point, silent, overdue_to=self.versions.overdue_to)
+    def retry_remedy(self, remedy: Remedy) -> None:
+        """Put a remedy back that failed because the store is away."""
+        self.remedy = remedy
 
     def begin_policy(self) -> None:
-        """Go on under another policy. What was accepted under the last one and not heard of stays unheard of."""
-        self._went_on.clear()
+        """Go on under another policy: parts accepted under the last one and not reported stay without an outcome."""
+        self._unreported.clear()
         self._unobserved = 0
 
-    def announce(self, safe_again: str = "fresh evidence keeps the tolerance") -> None:
-        """Record that safe mode began or ended, and tell; last of all, for either may fail and must cost no label."""
-        now = self.versions.newest.safe_mode
-        if now == self._mode:
+    def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
+        """Record that a safe mode began or ended, and call `on_safe_mode`, where it did since the last call.
+
+        It comes last in every cycle, because either may fail and must cost no label; a failure is logged.
+        """
+        safe_mode = self._live.newest.safe_mode
+        if safe_mode == self._safe_mode:
             return
-        self._mode = now
+        self._safe_mode = safe_mode
         try:
-            self.outbox.record_event(SAFE_MODE_BEGAN if now else SAFE_MODE_ENDED, now or safe_again)
-            if self.on_safe_mode is not None:
-                self.on_safe_mode(now)
+            kind = SAFE_MODE_BEGAN if safe_mode else SAFE_MODE_ENDED
+            self._outbox.record_event(kind, safe_mode or reason_ended)
+            if self._on_safe_mode is not None:
+                self._on_safe_mode(safe_mode)
         except Exception:
-            log.exception("safe mode %s, and that could not be told", f"began: {now}" if now else "ended")
+            change = f"began: {safe_mode}" if safe_mode else "ended"
+            log.exception("safe mode %s, and that could not be announced", change)

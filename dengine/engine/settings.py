@@ -24,8 +24,22 @@ log = logging.getLogger("dengine")
 
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 # What counts for any model.
-LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate", "stops", "windows")
-MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set, as the store has them
+LOOP = (
+    "seed",
+    "trace",
+    "retrain_every",
+    "budget",
+    "max_steps",
+    "window",
+    "audit_rate",
+    "stops",
+    "windows",
+)
+MARKS = (
+    "policy_since",
+    "told_since",
+    "began_in",
+)  # of what a change of policy set, as the store has them
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +72,11 @@ class EngineSettings:
     evidence: EvidenceWindow = EvidenceWindow()
 
     def __post_init__(self) -> None:
-        expect(is_whole(self.seed, 0, SEEDS), f"a seed of 0 or more, an integer of at most {SEEDS}", self.seed)
+        expect(
+            is_whole(self.seed, 0, SEEDS),
+            f"a seed of 0 or more, an integer of at most {SEEDS}",
+            self.seed,
+        )
         known = self.trace is None or isinstance(self.trace, TraceSpec)
         expect(known, "a TraceSpec as trace", self.trace, "TraceSpec(samples=1000) for one")
         if self.trace is not None:
@@ -67,7 +85,11 @@ class EngineSettings:
     def to_store(self) -> dict[str, str]:
         """As `SqlStore.save_settings` takes them."""
         known = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
-        known |= {name: text for name in ("model", "described") if (text := getattr(self, name)) is not None}
+        known |= {
+            name: text
+            for name in ("model", "described")
+            if (text := getattr(self, name)) is not None
+        }
         if self.trace is not None:
             known["trace"] = json.dumps(asdict(self.trace))
         if self.inferred:
@@ -90,65 +112,109 @@ class EngineSettings:
         Raises StoreError for an unused store, SettingError for a missing object, or another than it was made with.
         """
         if "recipe" not in known:
-            raise StoreError(f"Expected a store that an engine has used, {name} is empty; make a DataEngine with it.")
+            raise StoreError(
+                f"Expected a store that an engine has used, {name} is empty; make a DataEngine with it."
+            )
         recipe = Recipe.from_store(known, f"the recipe in {name}")
         made_with = known.get("described")
         if "model" in known and model is None:
-            raise SettingError(f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...).")
+            raise SettingError(
+                f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...)."
+            )
         if "model" not in known and model is not None:
-            raise SettingError(f"The engine of {name} has its own model, {recipe.name}; leave model=... out.")
+            raise SettingError(
+                f"The engine of {name} has its own model, {recipe.name}; leave model=... out."
+            )
         if model is not None or recipe.name.startswith(OBJECT_PREFIX):
             if model is None and (reducer is None or isinstance(reducer, str)):
                 unnamed = f"{recipe.reducer}, has no name in TOML"
-                raise SettingError(f"The reducer of {name}, {unnamed}: hand it in again, reducer=...")
+                raise SettingError(
+                    f"The reducer of {name}, {unnamed}: hand it in again, reducer=..."
+                )
             given = describe_estimator(reducer) if model is None else as_engine_model(model).description
             if made_with is not None and given != made_with:
-                raise SettingError(f"{name} was made with {made_with}, got {given}: its labels were counted by that one.")
+                raise SettingError(
+                    f"{name} was made with {made_with}, got {given}: its labels were counted by that one."
+                )
             recipe = recipe if model is not None else replace(recipe, reducer=reducer, params={})
         elif reducer is not None and not isinstance(reducer, str):
             again = Recipe.from_toml(Recipe(reducer).to_toml())
             if (again.reducer, again.params) != (recipe.reducer, recipe.params):
-                got = describe_estimator(reducer)
-                raise SettingError(f"Expected reducer {recipe.name} of {name}, got {got}; leave it out.")
-        must_allow(recipe, name, allow_import is True or {*(allow_import or ()), *classes_of(reducer)})
+                raise SettingError(
+                    f"Expected reducer {recipe.name} of {name}, got {describe_estimator(reducer)}; leave it out."
+                )
+        must_allow(
+            recipe, name, allow_import is True or {*(allow_import or ()), *classes_of(reducer)}
+        )
         inferred = "inferred" in known
         seed = known.get("seed", "0")
         sound = seed.isdecimal() and seed.isascii() and len(seed) < 100
-        expect(sound, "a seed in the store's settings", seed, "restore the store from a copy", StoreError)
+        expect(
+            sound,
+            "a seed in the store's settings",
+            seed,
+            "restore the store from a copy",
+            StoreError,
+        )
         policy_since, *evidence = (int(known.get(name, "0")) for name in MARKS)
         own, trace = known.get("model"), stored_trace_spec(known)
-        return cls(recipe, int(seed), own, made_with, trace, inferred, policy_since, EvidenceWindow(*evidence))
+        return cls(
+            recipe,
+            int(seed),
+            own,
+            made_with,
+            trace,
+            inferred,
+            policy_since,
+            EvidenceWindow(*evidence),
+        )
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
         if model is None:
             own = self.recipe.reducer
             described_ = None if isinstance(own, str) else describe_estimator(own)
-            return replace(self, described=described_), ModelPrediction.from_recipe(self.recipe, self.seed)
+            return replace(self, described=described_), ModelPrediction.from_recipe(
+                self.recipe, self.seed
+            )
         template = as_engine_model(model)
-        in_force = template.in_force(self.recipe)  # of our own kind its numbers count, a baseline's are its own affair
-        return replace(self, recipe=in_force, model=template.name, described=template.description), template
+        in_force = template.effective_recipe(
+            self.recipe
+        )  # of our own kind its numbers count, a baseline's are its own affair
+        return replace(
+            self, recipe=in_force, model=template.name, described=template.description
+        ), template
 
     def must_agree_with(self, asked: Mapping[str, Any]) -> None:
         """SettingError where what is asked for, as `DataEngine` takes it, is not what is set; None asks for nothing."""
         given = {name: value for name, value in asked.items() if value is not None}
-        reducer, recipe, policy = (given.pop(name, None) for name in ("reducer", "recipe", "policy"))
+        reducer, recipe, policy = (
+            given.pop(name, None) for name in ("reducer", "recipe", "policy")
+        )
         have = flat(self.recipe) | {"seed": self.seed, "trace": self.trace or given.get("trace")}
         unknown = sorted(set(given) - set(have))
         if unknown:
-            raise SettingError(f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not.")
+            raise SettingError(
+                f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not."
+            )
         wished = {} if recipe is None else flat(chosen_recipe(reducer, recipe, {}))
         wished |= given | ({} if policy is None else policy.to_values())
         wished |= {} if reducer is None else {"reducer": reducer}
-        if not isinstance(wished.get("reducer"), str):  # an object was compared when the store was opened
-            wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
+        if not isinstance(
+            wished.get("reducer"), str
+        ):  # an object was compared when the store was opened
+            wished = {
+                name: value for name, value in wished.items() if name not in ("reducer", "params")
+            }
         # A program's settings are the same in the shadow mode, which a person begins and ends.
         counts = LOOP if self.model is not None else [name for name in have if name != "shadow"]
         if wished.get("windows") == NO_WINDOWS:  # these are an operator's, too
             wished.pop("windows", None)
         other = sorted(name for name in wished if name in counts and wished[name] != have[name])
         if other:
-            stored, got = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished))
+            stored, got = (
+                ", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished)
+            )
             raise SettingError(
                 f"Expected the store's own settings ({stored}), got {got}; leave them out, or name another store."
             )
@@ -158,14 +224,20 @@ def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recip
     """The recipe that was asked for, or the reducer's own, with settings beside it; SettingError where the two differ."""
     base = Recipe.load(recipe if recipe is not None else "conv" if reducer is None else reducer)
     if recipe is not None and reducer is not None and reducer != base.reducer:
-        raise SettingError(f"The recipe names its reducer, {base.name}; got reducer {reducer!r} beside it: leave one out.")
+        raise SettingError(
+            f"The recipe names its reducer, {base.name}; got reducer {reducer!r} beside it: leave one out."
+        )
     return base.with_settings(**beside)
 
 
-def classes_of(reducer: Any = None, recipe: Any = None, policy: Policy | None = None, **others: Any) -> list[str]:
+def classes_of(
+    reducer: Any = None, recipe: Any = None, policy: Policy | None = None, **others: Any
+) -> list[str]:
     """Each `module:Class` that a caller names himself, in settings as `DataEngine` takes them."""
     said = [Recipe.load(each) for each in (reducer, recipe) if each is not None]
-    return [name for each in (*said, Recipe(policy=policy or Policy())) for name in each.user_classes]
+    return [
+        name for each in (*said, Recipe(policy=policy or Policy())) for name in each.user_classes
+    ]
 
 
 def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
@@ -173,7 +245,11 @@ def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str])
 
     allow_import : True: any may; else the names of those that may.
     """
-    refused = [] if allow_import is True else [name for name in recipe.user_classes if name not in (allow_import or ())]
+    refused = (
+        []
+        if allow_import is True
+        else [name for name in recipe.user_classes if name not in (allow_import or ())]
+    )
     if refused:
         again = "name it again (reducer=, recipe=, policy=; --reducer, --guarantee)"
         allow = "allow it, where you trust the store (allow_import=True; --allow-import)"
@@ -186,7 +262,9 @@ def peers_trace(store: "SqlStore") -> TraceSpec | None:
     return next(filter(None, map(stored_trace_spec, store.peers_settings().values())), None)
 
 
-def as_peers(asked: Mapping[str, Any], store: "SqlStore", allow_import: bool | Collection[str]) -> dict[str, Any]:
+def as_peers(
+    asked: Mapping[str, Any], store: "SqlStore", allow_import: bool | Collection[str]
+) -> dict[str, Any]:
     """What a new engine is asked for; what was left open, as a peer has it if there is one, where `must_allow` lets it."""
     known = next(iter(store.peers_settings().values()), {})
     filled = dict(asked)
@@ -214,7 +292,9 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
 
 def flat(recipe: Recipe) -> dict[str, Any]:
     """Every setting of a recipe by its name, the policy's among them."""
-    return {f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name != "policy"} | recipe.policy.to_values()
+    return {
+        f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name != "policy"
+    } | recipe.policy.to_values()
 
 
 class SettingsInForce:
@@ -235,7 +315,9 @@ class SettingsInForce:
         policy, trace = settings.recipe.policy, settings.trace
         self.now, self.audited_share = settings, policy.audited_share
         self.outside = (
-            script(ForceLimitsGate(policy.limits, trace)).forward if policy.windows and trace is not None else None
+            script(ForceLimitsGate(policy.limits, trace)).forward
+            if policy.windows and trace is not None
+            else None
         )
 
     def save(self) -> None:

@@ -1,6 +1,7 @@
-"""A retrain inside its time budget, in line or in an executor, which may die or hang: neither stops the cell.
+"""Training of a new version within its time budget, in line or in an executor; no failure of either stops the cell.
 
-The window that it sees: the newest labelled traces, in memory.
+`TrainingWindow` holds the newest labelled traces in memory. `Retrainer` trains a successor of the present model on a
+snapshot of it; `learner.Learner` decides when, and what becomes of the result.
 """
 
 import logging
@@ -27,19 +28,27 @@ LATE = "ended by the clock, before its last step"
 Clock = Callable[[], float]
 
 
-class Window:
-    """The newest `capacity` labelled traces, in memory, blind to labels. Work on it does not grow with the store.
+class TrainingWindow:
+    """The newest labelled traces, in memory, up to a capacity. Work on it does not grow with the store.
 
-    They lie in one block that is filled from its front and never overwritten, so that a snapshot is a view of it. A full
-    one is left to those who look at it, and what the window holds goes on in another, half as long again.
+    The traces lie in one block that is filled from its front and never overwritten, so a snapshot is a view of it. When
+    the block is full, the window goes on in another, half as long again, and the old one stays with those who hold a
+    snapshot.
+
+    Parameters
+    ----------
+    capacity : int
+        Number of labelled traces that the window holds at most.
     """
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self._block: list[NDArray[Any]] = []
-        self._first = self._end = 0  # what of it is held
+        self._block: list[NDArray[Any]] = []  # sequence numbers, traces, labels, hashes
+        self._first = 0  # the window is the rows from here of the block
+        self._end = 0
         nothing = np.zeros(0, np.int64)
-        self.refill(Labelled(nothing, np.zeros((0, 1, 1), np.float32), nothing.astype(np.int8), nothing))
+        no_traces = np.zeros((0, 1, 1), np.float32)
+        self.refill(Labelled(nothing, no_traces, nothing.astype(np.int8), nothing))
 
     def __len__(self) -> int:
         return self._end - self._first
@@ -50,48 +59,64 @@ class Window:
         return int(self._block[0][self._end - 1]) if self._end else 0
 
     def add(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
-        """Take in one labelled trace (C, T); on a full window the oldest one leaves."""
-        row = seq, trace, label, hash_
+        """Add one labelled trace (channels, samples); the oldest one leaves a full window."""
         if self._end == len(self._block[0]):
-            held, n = [each[self._first :] for each in self._block], self._end - self._first
-            room = n + max(n // 2, 64)
-            shapes: list[tuple[int, ...]] = [(room,), (room, *trace.shape), (room,), (room,)]
-            self._block = [np.empty(shape, each.dtype) for shape, each in zip(shapes, held, strict=True)]
-            for new, each in zip(self._block, held if n else (), strict=False):
-                new[:n] = each
-            self._first, self._end = 0, n
+            self._enlarge(trace.shape)
+        row = (seq, trace, label, hash_)
         for column, value in zip(self._block, row, strict=True):
             column[self._end] = value
         self._end += 1
         self._first = max(self._first, self._end - self.capacity)
 
+    def _enlarge(self, trace_shape: tuple[int, ...]) -> None:
+        """Copy the window to the front of a new block, half as long again, for traces of this shape."""
+        n = len(self)
+        columns = [column[self._first :] for column in self._block]
+        room = n + max(n // 2, 64)
+        shapes: list[tuple[int, ...]] = [(room,), (room, *trace_shape), (room,), (room,)]
+        self._block = [
+            np.empty(shape, column.dtype) for shape, column in zip(shapes, columns, strict=True)
+        ]
+        if n:  # an empty window does not know the traces' shape
+            for new, old in zip(self._block, columns, strict=True):
+                new[:n] = old
+        self._first = 0
+        self._end = n
+
     def refill(self, labelled: Labelled) -> None:
-        """Hold these, oldest first, in the place of all that was held."""
+        """Hold the newest of these labelled traces, which are ordered by number, in place of all others."""
         self._block = [labelled.seq, labelled.traces, labelled.labels, labelled.hashes]
         self._end = len(labelled.seq)
         self._first = max(0, self._end - self.capacity)
 
     def snapshot(self) -> Labelled:
-        """What is held, oldest first; it stays as it is, and is not to be written to."""
+        """Return the labelled traces, oldest first; the arrays never change, and are not to be written to."""
         return Labelled(*(column[self._first : self._end] for column in self._block))
 
     def newer(self, seq: int) -> list[int]:
-        """Sequence numbers of the labels after this one, in the order in which they came."""
-        held = self._block[0][self._first : self._end]
-        newer: list[int] = held[np.searchsorted(held, seq, "right") :].tolist()
+        """Return the sequence numbers of the window's labels after this one, in ascending order."""
+        numbers = self._block[0][self._first : self._end]
+        newer: list[int] = numbers[np.searchsorted(numbers, seq, "right") :].tolist()
         return newer
 
     def row(self, seq: int) -> tuple[NDArray[np.float32], int, int]:
-        """Trace (C, T), label and hash of a label that is held."""
+        """Return the trace (channels, samples), the label and the hash of a label of the window."""
         i = int(np.searchsorted(self._block[0][: self._end], seq))
         return self._block[1][i], int(self._block[2][i]), int(self._block[3][i])
 
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """What a version was trained on: labels seq (n,), corrected up to corrected_to.
+    """The labels that a version was trained on.
 
-    counts_from : newest label that the next retrain does not wait for.
+    Attributes
+    ----------
+    seq : array of int64, shape (n,)
+        Their sequence numbers.
+    corrected_to : int
+        Number of the newest correction that they had.
+    counts_from : int
+        Number of the newest label that the next retrain does not wait for.
     """
 
     seq: NDArray[np.int64]
@@ -99,19 +124,30 @@ class TrainedOn:
     counts_from: int
 
     def to_state(self) -> dict[str, NDArray[Any]]:
-        """Plain arrays for the store."""
-        numbers = {"trained_as": np.array(self.corrected_to), "counts_from": np.array(self.counts_from)}
-        return {"trained_on": self.seq} | numbers
+        """Return the fields as arrays by name, for the store."""
+        return {
+            "trained_on": self.seq,
+            "trained_as": np.array(self.corrected_to),
+            "counts_from": np.array(self.counts_from),
+        }
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
-        """What `to_state` gave."""
+        """Return the record that `to_state` turned into arrays."""
         return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]))
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a retrain may use: seconds of wall time, and optimiser steps; None: no limit."""
+    """Limits of a retrain; None is no limit.
+
+    Attributes
+    ----------
+    budget : float or None
+        Seconds of wall time.
+    max_steps : int or None
+        Optimiser steps.
+    """
 
     budget: float | None = None
     max_steps: int | None = None
@@ -121,9 +157,20 @@ class Limits:
 class Trained:
     """The outcome of a training.
 
-    model : to swap in; None: dropped.  reason : why, in words.
-    seconds : of the training.  begin : when work on it began, by the retrainer's clock.
-    seq : the labels it was trained on.
+    Attributes
+    ----------
+    model : EngineModel or None
+        To be swapped in; None where the training is dropped.
+    reason : str
+        Why it is accepted or dropped, in words.
+    n_steps : int
+        Optimiser steps that were done.
+    seconds : float
+        Duration of the training.
+    begin : float
+        When work on the retrain began, by the retrainer's clock.
+    seq : array of int64, shape (n,)
+        Sequence numbers of the labels that it was trained on.
     """
 
     model: EngineModel | None
@@ -135,87 +182,131 @@ class Trained:
 
 
 class Retrainer:
-    """Trains candidates on a window, in line or beside the cell.
+    """Trains successors of a model on the window, in line or in an executor.
 
-    clock : in seconds; it must pickle for a process executor.
+    Parameters
+    ----------
+    window : TrainingWindow
+    limits : Limits
+    executor : concurrent.futures.Executor or None
+        Set to None when it died, hangs or takes no more work: then retrains are in line.
+    clock : callable
+        Seconds, of any origin; it must pickle for a process executor.
+
+    Attributes
+    ----------
+    future : Future or None
+        The training under way in the executor.
     """
 
-    def __init__(self, window: Window, limits: Limits, executor: Executor | None, clock: Clock = time.perf_counter) -> None:
-        self.window, self.limits, self.executor, self.clock = window, limits, executor, clock
+    def __init__(
+        self,
+        window: TrainingWindow,
+        limits: Limits,
+        executor: Executor | None,
+        clock: Clock = time.perf_counter,
+    ) -> None:
+        self.window = window
+        self.limits = limits
+        self.executor = executor
+        self.clock = clock
         self.future: Future[Trained] | None = None
-        self._began = 0.0  # monotonic seconds
-        self._seq = np.zeros(0, dtype=np.int64)  # labels that it was given
+        self._began = 0.0  # when the training in the executor began, by `time.monotonic`
+        self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
 
     def train(self, current: EngineModel, begin: float) -> Trained:
-        """Train a successor of the current model, in line; begin : when work on it began."""
-        return replace(train_candidate(current.successor(), self.window.snapshot(), self.limits, self.clock), begin=begin)
+        """Train a successor of the current model in line; `begin` is when work on the retrain began."""
+        data = self.window.snapshot()
+        trained = train_candidate(current.successor(), data, self.limits, self.clock)
+        return replace(trained, begin=begin)
 
     def start(self, current: EngineModel) -> bool:
-        """Train a successor of the current model beside the cell; False without an executor that takes work."""
+        """Begin to train a successor in the executor; returns False without an executor that takes work."""
         if self.executor is None:
             return False
         data = self.window.snapshot()
         if not self._began:
             log.info("the first retrain begins, on %d labels", len(data.seq))
+        arguments = (current.successor(), data, self.limits, self.clock)
         try:
-            self.future = self.executor.submit(train_candidate, current.successor(), data, self.limits, self.clock)
-        except RuntimeError as error:  # it is broken or shut down, and the caller's: it cannot be made anew here
-            log.error("the executor takes no more work, retrains are in line from now on: %s", error)
+            self.future = self.executor.submit(train_candidate, *arguments)
+        except (
+            RuntimeError
+        ) as error:  # the executor is the caller's, so it cannot be made anew here
+            log.error(
+                "the executor takes no more work, retrains are in line from now on: %s", error
+            )
             self.executor = None
-        self._began, self._seq = time.monotonic(), data.seq
+        self._began = time.monotonic()
+        self._seq = data.seq
         return self.future is not None
 
     def collect(self, wait: float = 0.0) -> Trained | None:
-        """What was trained beside the cell, once it is done, or after `wait` seconds: what is not done then is dropped."""
-        future, left = self.future, self._began + HUNG - time.monotonic()
+        """Return the outcome of the training in the executor, once; None where there is none or it is not done.
+
+        With `wait` above 0 a training that is not done after so many seconds is given up, and its outcome is dropped.
+        So is one that takes longer than `HUNG`.
+        """
+        future = self.future
+        left = self._began + HUNG - time.monotonic()
         if future is None or not (future.done() or wait > 0.0 or left <= 0.0):
             return None
         self.future = None
         try:
             trained = future.result(timeout=max(0.0, min(wait, left)))
-        except Exception as error:  # recorded, and the old version goes on answering
-            trained = Trained(None, self._failed(future, error), seq=self._seq)
+        except Exception as error:  # the failure is recorded, and the old version goes on answering
+            trained = Trained(None, self._give_up(future, error), seq=self._seq)
         return replace(trained, begin=self.clock() - trained.seconds)
 
-    def _failed(self, future: Future[Trained], error: Exception) -> str:
-        """Why a training is dropped; an executor that died or hangs is of no more use."""
-        own = future.done() and not isinstance(error, BrokenExecutor)
-        log.error("a retrain in the executor failed: %s", error, exc_info=own)
-        if own:
+    def _give_up(self, future: Future[Trained], error: Exception) -> str:
+        """Return why a training is dropped, and stop using an executor that died or hangs."""
+        training_raised = future.done() and not isinstance(error, BrokenExecutor)
+        log.error("a retrain in the executor failed: %s", error, exc_info=training_raised)
+        if training_raised:
             return _dropped(error)
         self.executor = None
         future.cancel()
-        what = f"{type(error).__name__}: {error}"
+        failure = f"{type(error).__name__}: {error}"
         if isinstance(error, TimeoutError):
-            what = f"not done after {time.monotonic() - self._began:.0f} s in the executor."
-        return f"dropped: RuntimeError: {what} Retrains are in line from now on."
+            seconds = time.monotonic() - self._began
+            failure = f"not done after {seconds:.0f} s in the executor."
+        return f"dropped: RuntimeError: {failure} Retrains are in line from now on."
 
 
-def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Trained:
-    """Train a successor on the data; a plain function, so that any executor can run it.
+def train_candidate(
+    successor: EngineModel, data: Labelled, limits: Limits, clock: Clock
+) -> Trained:
+    """Train a successor on labelled traces; any exception becomes a dropped outcome.
 
-    The gate reads no label: one on held-out loss would let fold k's labels choose encoder k.
+    A plain function, so that any executor can run it. Whether the model is accepted depends on no label: with a gate on
+    held-out loss, the labels of fold k would choose encoder k.
     """
-    torch.set_num_threads(1)  # per thread, and first thing in each
+    torch.set_num_threads(1)  # it holds for the present thread only
     begin = clock()
     deadline = None if limits.budget is None else begin + STEPS * limits.budget
     stop = StopRule(deadline, limits.max_steps, clock)
-    n_steps, reason = 0, ""
+    model: EngineModel | None = None
+    n_steps = 0
     try:
         if not len(data.seq):
             raise SettingError("there is no labelled trace yet; report one first")
         report = successor.train(data.traces, data.labels, data.hashes, stop, data.seq).report
-        n_steps, defect = report.n_steps, successor.defect()
-        model = None if defect else successor
-        said = ("accepted", report.note, LATE if stop.late else "")
-        reason = f"dropped: {defect}" if defect else "; ".join(filter(None, said))
+        n_steps = report.n_steps
+        defect = successor.defect()
+        if defect:
+            reason = f"dropped: {defect}"
+        else:
+            model = successor
+            remarks = ("accepted", report.note, LATE if stop.late else "")
+            reason = "; ".join(filter(None, remarks))
     except DengineError as error:
-        model, reason = None, f"dropped: {error}"
-    except Exception as error:  # no exception inside a model reaches the cell: it is recorded
-        model, reason = None, _dropped(error)
+        reason = f"dropped: {error}"
+    except Exception as error:  # no exception inside a model reaches the cell
+        reason = _dropped(error)
     return Trained(model, reason, n_steps, clock() - begin, seq=data.seq)
 
 
 def _dropped(error: Exception) -> str:
+    """Return the reason of a training that raised: the error's type and its first line."""
     lines = str(error).splitlines() or [""]
     return f"dropped: {type(error).__name__}: {lines[0]}"

@@ -1,6 +1,6 @@
 """Baseline methods for the same loop, by name; each decides by its own rule, on the same traces and the same feedback.
 
->>> DataEngine.from_recipe("conv", model=make_baseline("knn", Policy(alpha=0.1, lower_bound=0.9), seed=0))
+>>> DataEngine(recipe="conv", model=make_baseline("knn", Policy(alpha=0.1, lower_bound=0.9), seed=0))
 
 Without a bound: always, never, k neighbours that agree. With one of their own: kernel densities, a Gaussian process, and
 thresholds with a guaranteed risk. A baseline's settings are the keyword-only fields of its class.

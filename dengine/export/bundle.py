@@ -31,6 +31,7 @@ from ..decision.code import is_code_changed
 from ..decision.intervals import SCALAR_BOUNDS
 from ..decision.members import SAFE_MODES
 from ..decision.policy import RULES
+from ..engine.engine import DataEngine, core_of
 from ..errors import ExportError, instead
 from ..files import UNREADABLE, check_output, read_key, write_output
 from ..model.base import Exportable
@@ -84,6 +85,8 @@ def prepared(
     where `path` must not be written: before the work of an export.
     """
     _check_outputs(path, force)
+    if isinstance(engine_or_model, DataEngine):
+        engine_or_model = core_of(engine_or_model)
     try:
         source: Exportable = engine_or_model.exported(trace)
     except AttributeError as error:
@@ -99,7 +102,7 @@ def prepared(
     if changed:
         named = type(changed[0]).__name__
         raise ExportError(f"The code of {named} was changed after it was compiled; start Python anew, then export.")
-    if model.untold:
+    if model.rule_is_stale:
         raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
     if model.spaces.module() is None:
         raise ExportError(

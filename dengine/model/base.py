@@ -1,16 +1,16 @@
-"""Two contracts: what a baseline method must give (`Model`), and what the engine drives (`EngineModel`).
+"""The two contracts of a model: `Model`, which a baseline method implements, and `EngineModel`, which the engine drives.
 
-`BaselineAdapter` makes an `EngineModel` of a baseline; our own, `neighbours.ModelPrediction`, is both.
+`BaselineAdapter` makes an `EngineModel` of a baseline. dengine's own `neighbours.ModelPrediction` implements both. Calls
+that must not raise into the cell go through `engine.guard.GuardedModel`.
 """
 
 from __future__ import annotations
 
 import copy
-import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import torch
 from numpy.typing import NDArray
@@ -23,10 +23,7 @@ from ..records import Action, Reason, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
 from ..traces import clip_extremes
 
-log = logging.getLogger("dengine")
-
 Embedding = tuple[tuple[float, ...], ...]  # (K, d)
-T = TypeVar("T")
 
 
 class Prediction(NamedTuple):
@@ -42,7 +39,9 @@ class Prediction(NamedTuple):
 
 
 Gate = Callable[[Any], tuple[int, int]]  # a trace (C, T) -> fault, content hash
-Looked = tuple[int, int, Prediction | None]  # fault, content hash, what a model says of a trace without a fault
+Looked = tuple[
+    int, int, Prediction | None
+]  # fault, content hash, what a model says of a trace without a fault
 
 
 @runtime_checkable
@@ -66,44 +65,86 @@ class Model(Protocol):
 
 
 class EngineModel(ABC):
-    """What the engine drives: it predicts, takes references, trains a successor, and is stored.
+    """The model that the engine drives: it predicts, takes references, trains a successor, and is stored.
 
-    user_model : what `DataEngine.model` shows, the model as its author knows it.  name : in a status or a table.
-    description : what it is, its numbers included, the same at every start: a store compares it.
-    untold : whether its rule missed what became of a part; it then raises instead of predicting.
-    keeps_references : whether its state and the points stored with labels restore its references; a baseline is refitted.
-    min_traces : how many labelled traces the first training waits for.
-    is_compiled : whether no Python runs where it is asked, once it is trained.
+    A subclass implements `train`, `predict_one`, `add_reference` and `successor`; every other method has a default
+    that fits a model without a rule, without a safe mode and without a stored state.
+
+    Attributes
+    ----------
+    user_model : object
+        What `DataEngine.model` shows: the model as its author knows it.
+    name : str
+        Shown in a status or a table.
+    description : str
+        The model and its numbers, the same at every start: a store compares it with the model that made it.
+    rule_is_stale : bool
+        An update of the rule failed, so the model raises instead of predicting until the engine is opened again.
+    rule_learns : bool
+        Whether outcomes change the rule at all.
+    keeps_references : bool
+        Whether `get_state`, and the points that are stored with labels, restore the references. Otherwise the model
+        is trained again on the traces of its version.
+    min_traces : int
+        Number of labelled traces that the first training waits for.
+    is_compiled : bool
+        Whether a trained model predicts without running Python.
     """
 
     keeps_references = True
     is_compiled = False
     min_traces = 1
-    untold = False
+    rule_is_stale = False
+    rule_learns = False
 
     user_model: Any
     name: str
     description: str
 
-    def in_force(self, recipe: Recipe) -> Recipe:
-        """A recipe with this model's own numbers in the place of those that have no effect on it."""
+    def effective_recipe(self, recipe: Recipe) -> Recipe:
+        """Return the recipe with this model's own settings in place of those that have no effect on it."""
         return recipe
 
     @abstractmethod
     def train(
-        self, X: Floats, y: NDArray[Any], hashes: Ints, stop: StopRule | None = None, numbers: Ints | None = None
+        self,
+        X: Floats,
+        y: NDArray[Any],
+        hashes: Ints,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
     ) -> Self:
-        """Learn from traces (n, C, T), labels, parts' hashes and labels' numbers (n,), from where a training ended."""
+        """Learn from labelled traces, starting where an earlier training ended.
+
+        Parameters
+        ----------
+        X : array of float32, shape (n, channels, samples)
+        y : array of int, shape (n,)
+            1 is success, 0 is failure.
+        hashes : array of int64, shape (n,)
+            Hash of each trace's part, or of its content; it deals the fold.
+        stop : StopRule, optional
+            Ends the training by steps or by the clock; None: the reducer's own number of steps.
+        numbers : array of int64, shape (n,), optional
+            The labels' sequence numbers in the store.
+
+        Returns
+        -------
+        self
+        """
 
     def warm_up(self) -> None:  # noqa: B027  # a default: nothing to load
-        """Load what the first training would load, beside the engine; see `Reducer.warm_up`."""
+        """Load the libraries that the first training needs; called in a thread of its own."""
 
-    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default: nothing to begin with
-        """Begin with a training on traces (n, C, T) with labels of these numbers; see `Reducer.precompute`."""
+    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default
+        """Compute in advance, and keep, what a training on these traces (n, channels, samples) begins with."""
 
     @abstractmethod
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """What it says of one trace (C, T) of the part with this hash (0: it is nobody's), which has no vote on itself."""
+        """Predict one trace (channels, samples).
+
+        `hash_` is the hash of its part, whose references have no vote; 0 excludes none.
+        """
 
     def look(self, x: Floats, part: int | None, gate: Gate, limit: float) -> Looked:
         """Fault and content hash of one trace (C, T), and what it says of it where there is no fault.
@@ -111,123 +152,128 @@ class EngineModel(ABC):
         part : the hash of its part's number; None: it goes by its content.  gate : `TraceGate` by the sensor's `limit`.
         """
         fault, content = gate(torch.from_numpy(x))
-        return fault, content, None if fault else self.predict_one(x, content if part is None else part)
+        return (
+            fault,
+            content,
+            None if fault else self.predict_one(x, content if part is None else part),
+        )
 
     @abstractmethod
-    def reference_point(self, x: Floats, hash_: int, embedding: Embedding | None = None) -> Floats:
-        """Where a trace (C, T) with this hash lies as a reference; embedding : (K, d), where it is computed already."""
+    def add_reference(
+        self,
+        x: Floats,
+        y: int,
+        hash_: int,
+        number: int = 0,
+        *,
+        embedding: Embedding | None = None,
+        point: Floats | None = None,
+    ) -> Floats:
+        """Make a labelled trace a reference.
 
-    @abstractmethod
-    def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
-        """Make a labelled trace a reference, by its point; number : of its label."""
+        Parameters
+        ----------
+        x : array of float32, shape (channels, samples)
+        y : int
+            1 is success, 0 is failure.
+        hash_ : int
+            Hash of the trace's part, or of its content.
+        number : int
+            Sequence number of the label; negative while the store has given none.
+        embedding : tuple, shape (K, d), optional
+            The trace's embedding by this version, where it was computed for the decision.
+        point : array of float32, shape (d,), optional
+            The reference point itself, where it is known.
 
-    def renumber_reference(self, was: int, number: int) -> None:  # noqa: B027  # a default: a baseline numbers nothing
-        """Give a reference the number that its label has by now."""
+        Returns
+        -------
+        array of float32, shape (d,)
+            The reference point, which is stored with the label so that it need not be computed again.
+        """
+
+    def renumber_reference(self, old: int, new: int) -> None:  # noqa: B027  # a default
+        """Replace the provisional number of a reference by the sequence number of its label."""
 
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
-        """Give the reference of a label another one, or take it out where `y` is None; False where it is another hash's."""
+        """Relabel the reference of this number, or remove it where `y` is None.
+
+        Returns False, and changes nothing, where the reference has another hash, or the model cannot change one.
+        """
         return False
 
-    @property
-    def remembers(self) -> bool:
-        """Whether its rule learns anything from being told what became of parts."""
-        return False
-
-    def under(self, policy: Policy) -> Self:
-        """The same model, references shared, under another policy, with a rule that was told nothing yet."""
+    def with_policy(self, policy: Policy) -> Self:
+        """Return a model under another policy that shares the references and whose rule has learned nothing yet."""
         return self
 
-    def begin_safely_in(self, mode: int) -> None:  # noqa: B027  # a default: it has no safe mode
-        """Verify everything for this reason, a position in `SAFE_MODES`, until fresh evidence keeps the tolerance."""
+    def update_rule(  # noqa: B027  # a default: no rule that learns
+        self,
+        lower: float,
+        upper: float,
+        success: bool,
+        novel: bool,
+        unobserved: int,
+        predicted: int = 0,
+        inclusion_probability: float = 1.0,
+    ) -> None:
+        """Update the rule with the outcome of one part.
+
+        Parameters
+        ----------
+        lower, upper : float
+            The bounds that the part was decided by, before its label was known.
+        success : bool
+            The label.
+        novel : bool
+            Whether the decision's reason was `Reason.NOVEL`.
+        unobserved : int
+            Accepted parts without a known outcome since the previous update.
+        predicted : int
+            Position in `ACTIONS` of what the model alone would have done.
+        inclusion_probability : float
+            Probability, fixed beforehand, that the outcome would be asked for.
+        """
+
+    def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
+        """Make the rule forget every outcome and start in a safe mode, a position in `SAFE_MODES`; 0 is none."""
 
     @abstractmethod
     def successor(self) -> EngineModel:
-        """A model to train next, from where this one is; nothing that training changes is shared, so this one goes on."""
+        """Return a model to train next, starting from this one, that shares nothing which training changes."""
 
     def prepare(self, previous: EngineModel) -> None:  # noqa: B027  # a default: nothing to prepare
-        """Be ready to answer at once, in the place of `previous`."""
-
-    def tell(  # noqa: B027  # a default: nothing to learn
-        self, lower: float, upper: float, success: bool, novel: bool, unobserved: int,
-        predicted: int = 0, looked: float = 1.0,
-    ) -> None:  # fmt: skip
-        """Learn what became of a part.
-
-        lower, upper : the bound that it was decided by, before its label was known.  success : its label.
-        novel : whether it was like nothing learned from.  unobserved : accepted parts of no known outcome since the last.
-        predicted, looked : as in `DecisionRule.tell`.
-        """
-
-    def forget(self) -> None:  # noqa: B027  # a default: nothing was learned
-        """Be as if nothing had been told."""
+        """Take over the rule of the previous model, stale or not, and be ready to predict at once."""
 
     @property
     def safe_mode(self) -> str:
-        """Why everything is verified at present; "" where it is not."""
+        """Why every part is verified at present; "" outside a safe mode."""
         return ""
 
     def defect(self) -> str:
-        """Why it must not answer after a training, label-free reasons only; "" where there is nothing against it."""
+        """Return why the trained model must not answer, for reasons that read no label; "" where there is none."""
         return ""
 
     @property
     def report(self) -> FitReport:
-        """What the last training says of itself."""
+        """The report of the last training."""
         return FitReport()
 
     def get_state(self) -> State:
-        """Plain arrays for the store."""
+        """Return the model's state as arrays by name, for the store."""
         return {}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore what `get_state` gave."""
+        """Restore the state that `get_state` returned; returns self."""
         return self
 
     def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
-        """Whether a training on the very traces of that state must come before `set_state`."""
+        """Return whether the model must be trained on the very traces of that state before `set_state`."""
         return True
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
-        """What an exporter starts from; ExportError where there is nothing that can be exported."""
-        raise ExportError(f"{self.name} is a baseline and stays in Python; only dengine's own model can be exported.")
-
-    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these five.
-
-    def precompute_safely(self, X: Floats, numbers: Ints | None = None) -> None:
-        """`precompute`, or nothing where it fails."""
-        _guarded(lambda: self.precompute(X, numbers), "traces could not be looked at ahead of a retrain")
-
-    def tell_safely(self, *told: Any) -> None:
-        """`tell`; a model whose rule fails at it must not decide any more: `untold`."""
-        try:
-            self.tell(*told)
-        except Exception:
-            self.untold = True
-            log.exception("the rule cannot be told of a part; every part is verified until the engine is opened again")
-
-    def prepare_safely(self, previous: EngineModel) -> None:
-        """`prepare`; one that fails at it will verify, and say so, on every part."""
-        _guarded(lambda: self.prepare(previous), "the model that was trained cannot be made to answer")
-
-    def place_safely(self, x: Floats, hash_: int, embedding: Embedding | None = None) -> Floats | None:
-        """`reference_point`, or None where it fails."""
-        failed = "the model cannot place a labelled trace; the next version learns it from the store"
-        return _guarded(lambda: self.reference_point(x, hash_, embedding), failed)
-
-    def add_safely(self, point: Floats | None, y: int, hash_: int, number: int) -> None:
-        """`add_reference`, where there is a point; nothing where it fails."""
-        if point is not None:
-            failed = "the model cannot take a labelled trace; the next version learns it from the store"
-            _guarded(lambda: self.add_reference(point, y, hash_, number), failed)
-
-
-def _guarded(call: Callable[[], T], failed: str) -> T | None:
-    """What the call returns; None, logged, where it raises."""
-    try:
-        return call()
-    except Exception:
-        log.exception(failed)
-        return None
+        """Return what an exporter starts from; raises ExportError where nothing can be exported."""
+        raise ExportError(
+            f"{self.name} is a baseline and stays in Python; only dengine's own model can be exported."
+        )
 
 
 def as_engine_model(model: Model) -> EngineModel:
@@ -235,7 +281,9 @@ def as_engine_model(model: Model) -> EngineModel:
     if isinstance(model, EngineModel):
         return model
     if isinstance(model, type) or not isinstance(model, Model):
-        raise SettingError(f"Expected a model with fit, add, count, predict_interval and decide, got {model!r}.")
+        raise SettingError(
+            f"Expected a model with fit, add, count, predict_interval and decide, got {model!r}."
+        )
     return BaselineAdapter(model)
 
 
@@ -246,10 +294,15 @@ class BaselineAdapter(EngineModel):
 
     def __init__(self, model: Model) -> None:
         self.model = self.user_model = model
-        self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
+        self.name, self.description = (
+            type(model).__name__,
+            type(model).__qualname__,
+        )  # its settings are its author's affair
 
     def train(self, X: Floats, y: NDArray[Any], *_: object, **__: object) -> Self:
-        self.model.fit(clip_extremes(X).copy(), y)  # the window's own, which a baseline may write to
+        self.model.fit(
+            clip_extremes(X).copy(), y
+        )  # the window's own, which a baseline may write to
         return self
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
@@ -261,14 +314,24 @@ class BaselineAdapter(EngineModel):
         reason = Reason.UNCERTAIN if action is Action.VERIFY else Reason.CERTAIN
         counts = int(n_success), int(n_failure)
         if counts != (n_success, n_failure) or not all(0 <= n < 2**63 for n in counts):
-            raise ValueError(f"Expected whole numbers of labels below 2**63, got {shortened((n_success, n_failure))}.")
+            raise ValueError(
+                f"Expected whole numbers of labels below 2**63, got {shortened((n_success, n_failure))}."
+            )
         return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
-    def reference_point(self, x: Floats, hash_: int, embedding: Embedding | None = None) -> Floats:
+    def add_reference(
+        self,
+        x: Floats,
+        y: int,
+        hash_: int,
+        number: int = 0,
+        *,
+        embedding: Embedding | None = None,
+        point: Floats | None = None,
+    ) -> Floats:
+        """Let the baseline take in the labelled trace; returns the trace, which serves as its reference point."""
+        self.model.add(x, y)
         return x
-
-    def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
-        self.model.add(point, y)
 
     def successor(self) -> BaselineAdapter:
         return BaselineAdapter(copy.deepcopy(self.model))

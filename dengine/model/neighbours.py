@@ -37,7 +37,16 @@ from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, describe_estimator
 from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
 from ..reducers import make_reducer, own_default
-from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, space_scale
+from ..reducers.base import (
+    FitReport,
+    Floats,
+    Ints,
+    Reducer,
+    State,
+    StopRule,
+    as_reducer,
+    space_scale,
+)
 from ..traces import TraceGate, as_labels, as_traces, clip_extremes
 from .base import Embedding, EngineModel, Exportable, Gate, Looked, Prediction
 
@@ -62,7 +71,12 @@ class Predictor(nn.Module):
     scale: Tensor
 
     def __init__(
-        self, gate: TraceGate, encoder: nn.Module, scale: Tensor, novelty: NoveltyGate, neighbours: RadiusNeighbours
+        self,
+        gate: TraceGate,
+        encoder: nn.Module,
+        scale: Tensor,
+        novelty: NoveltyGate,
+        neighbours: RadiusNeighbours,
     ) -> None:
         super().__init__()
         self.gate, self.encoder = gate, encoder
@@ -114,7 +128,9 @@ class InPython(nn.Module):
 
 
 CONSTANTS = bool, int, float, str, list, tuple, dict, FunctionType, type(None)
-_COMPILED: dict[Any, Any] = {}  # a module of each structure: to script takes 24 ms and more, a copy of one 1 ms
+_COMPILED: dict[
+    Any, Any
+] = {}  # a module of each structure: to script takes 24 ms and more, a copy of one 1 ms
 
 
 def mould_of(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
@@ -124,7 +140,9 @@ def mould_of(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
         mould = script(eager)
         with torch.inference_mode():
             for _ in range(3):  # TorchScript's first calls compile; a cell should not wait for that
-                said = mould.look(torch.linspace(0.0, 1.0, math.prod(trace_shape)).view(trace_shape), 0, math.inf)[2]
+                said = mould.look(
+                    torch.linspace(0.0, 1.0, math.prod(trace_shape)).view(trace_shape), 0, math.inf
+                )[2]
                 mould.at(said[-1], 1)
         while len(_COMPILED) >= KINDS:
             _COMPILED.pop(next(iter(_COMPILED)), None)
@@ -141,7 +159,11 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
         (
             name,
             type(module),
-            *sorted((key, _as_key(value)) for key, value in vars(module).items() if is_compiled_in(key, value)),
+            *sorted(
+                (key, _as_key(value))
+                for key, value in vars(module).items()
+                if is_compiled_in(key, value)
+            ),
             *((key, tuple(tensor.shape)) for key, tensor in _tensors_of(module)),
         )
         for name, module in eager.named_modules()
@@ -163,7 +185,11 @@ def _compiles(*modules: nn.Module) -> bool:
     changed = [type(module).__name__ for module in modules if is_code_changed(module)]
     if changed:
         do = "start Python anew to have it compiled"
-        log.warning("the code of %s was changed after it was compiled: it answers in Python; %s", listed(changed), do)
+        log.warning(
+            "the code of %s was changed after it was compiled: it answers in Python; %s",
+            listed(changed),
+            do,
+        )
     return not changed
 
 
@@ -205,7 +231,9 @@ class ModelPrediction(EngineModel):
     ) -> None:
         self.novelty = novelty
         self.reducer = make_reducer(reducer) if isinstance(reducer, str) else reducer
-        self.classifier = classifier or WilsonRadiusClassifier(own_default(self.reducer, "default_radius"))
+        self.classifier = classifier or WilsonRadiusClassifier(
+            own_default(self.reducer, "default_radius")
+        )
         self.folds, self.name = folds, type(self.reducer).__name__
         self.rule = rule or self.classifier.policy().rule()
         self.spaces: Reducer = as_reducer(clone(self.reducer), folds)
@@ -218,7 +246,9 @@ class ModelPrediction(EngineModel):
         policy = recipe.policy
         own = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         classifier = WilsonRadiusClassifier(recipe.radius, **own, capacity=recipe.window)
-        return cls(recipe.make_reducer(seed), classifier, recipe.folds, policy.rule(), recipe.novelty)
+        return cls(
+            recipe.make_reducer(seed), classifier, recipe.folds, policy.rule(), recipe.novelty
+        )
 
     @property
     def user_model(self) -> "ModelPrediction":  # itself: an attribute would be a circle
@@ -229,11 +259,15 @@ class ModelPrediction(EngineModel):
         own = f"{describe_estimator(self.reducer)} under {describe_estimator(self.classifier)}"
         return f"{own}, {self.folds} folds, {type(self.rule).__name__}"
 
-    def in_force(self, recipe: Recipe) -> Recipe:
-        """The recipe with the classifier's numbers."""
+    def effective_recipe(self, recipe: Recipe) -> Recipe:
+        """Return the recipe with the classifier's numbers, the folds and the novelty of this model."""
         own = self.classifier
-        policy = replace(recipe.policy, alpha=own.alpha, lower_bound=own.lower_bound, interval=own.interval)
-        return replace(recipe, radius=own.radius, policy=policy, folds=max(2, self.folds), novelty=self.novelty)
+        policy = replace(
+            recipe.policy, alpha=own.alpha, lower_bound=own.lower_bound, interval=own.interval
+        )
+        return replace(
+            recipe, radius=own.radius, policy=policy, folds=max(2, self.folds), novelty=self.novelty
+        )
 
     @property
     def n_spaces(self) -> int:
@@ -256,10 +290,17 @@ class ModelPrediction(EngineModel):
         """
         X, y = as_traces(X), as_labels(y)
         self.spaces = as_reducer(clone(self.reducer), self.folds)
-        return self.train(X, y, content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64))
+        return self.train(
+            X, y, content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64)
+        )
 
     def train(
-        self, X: Floats, y: NDArray[Any], hashes: Ints, stop: StopRule | None = None, numbers: Ints | None = None
+        self,
+        X: Floats,
+        y: NDArray[Any],
+        hashes: Ints,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
     ) -> Self:
         """Train the reducer, warm where it can be, and make every trace a reference."""
         X, y = clip_extremes(X), y.astype(np.int64)
@@ -267,12 +308,18 @@ class ModelPrediction(EngineModel):
         points = self.spaces.train(X, y, folds, stop, numbers)
         self.trace_shape = X.shape[1:]
         own_unit = self.spaces.own_unit
-        self.scale = np.ones(self.n_spaces, np.float32) if own_unit else space_scale(points, folds, self.n_spaces)
+        self.scale = (
+            np.ones(self.n_spaces, np.float32)
+            if own_unit
+            else space_scale(points, folds, self.n_spaces)
+        )
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
         self.index.add(points / self.scale[folds, None], y, folds, hashes, numbers)
         self.index.weigh()
         self._note = repeats_note(X, hashes)
-        self.gate = fit_novelty(X, self.novelty, hashes) if self.novelty else NoveltyGate(*self.trace_shape)
+        self.gate = (
+            fit_novelty(X, self.novelty, hashes) if self.novelty else NoveltyGate(*self.trace_shape)
+        )
         self._predictor = None  # built by `prepare`, or when it is asked
         return self
 
@@ -280,34 +327,57 @@ class ModelPrediction(EngineModel):
         self.spaces.warm_up()
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
+        """Let the reducer compute in advance; before the first training also compile the predictor's template."""
         X = clip_extremes(X)
-        """`Reducer.precompute`; and where nothing answers yet, compile what will: a first retrain has no time for that."""
         blank = self.spaces.untrained_module(X)
         with ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,)) as pool:
             ahead = pool.submit(self.spaces.precompute, X, numbers)
-            if blank is not None and self.rule.scriptable and "index" not in vars(self) and _compiles(self.rule, blank):
+            if (
+                blank is not None
+                and self.rule.scriptable
+                and "index" not in vars(self)
+                and _compiles(self.rule, blank)
+            ):
                 shape, own = X.shape[1:], self.classifier
                 gate = NoveltyGate(*shape)
                 gate.asleep = not self.novelty
-                around = own.neighbours_over(RadiusIndex(blank.dim, own.capacity), self.rule, self.spaces.scores)
-                mould_of(Predictor(trace_gate(shape), blank, torch.ones(self.n_spaces), gate, around).eval(), shape)
+                around = own.neighbours_over(
+                    RadiusIndex(blank.dim, own.capacity), self.rule, self.spaces.scores
+                )
+                mould_of(
+                    Predictor(
+                        trace_gate(shape), blank, torch.ones(self.n_spaces), gate, around
+                    ).eval(),
+                    shape,
+                )
             ahead.result()
 
     def prepare(self, previous: EngineModel) -> None:
-        """Take over the rule of an earlier model, and be compiled."""
-        if isinstance(previous, ModelPrediction):
-            self.rule, self.untold = previous.rule, previous.untold
+        """Take over the rule of the previous model, stale or not, and compile the predictor unless that is done."""
+        if not isinstance(previous, ModelPrediction):
+            return
+        compiled_with_rule = self._predictor is not None and self.rule is previous.rule
+        self.rule = previous.rule
+        self.rule_is_stale = self.rule_is_stale or previous.rule_is_stale
+        if not compiled_with_rule:
             self._predictor = self._compile()
 
     def _compile(self) -> Any:
         own, encoder, gate = self.classifier, self.spaces.module(), trace_gate(self.trace_shape)
         around = own.neighbours_over(self.index, self.rule, self.spaces.scores)
-        scale, compiles = torch.from_numpy(self.scale), self.rule.scriptable and _compiles(self.rule)
+        scale, compiles = (
+            torch.from_numpy(self.scale),
+            self.rule.scriptable and _compiles(self.rule),
+        )
         encoder = encoder if encoder is not None and _compiles(encoder) else None
         if encoder is not None and compiles:
-            return compiled(Predictor(gate, encoder, scale, self.gate, around).eval(), self.trace_shape)
+            return compiled(
+                Predictor(gate, encoder, scale, self.gate, around).eval(), self.trace_shape
+            )
         encoder = InPython(self.spaces) if encoder is None else script(encoder)
-        return Predictor(gate, encoder, scale, script(self.gate), script(around) if compiles else around).eval()
+        return Predictor(
+            gate, encoder, scale, script(self.gate), script(around) if compiles else around
+        ).eval()
 
     @property
     def is_compiled(self) -> bool:  # type: ignore[override]  # asked when there is a predictor
@@ -326,20 +396,36 @@ class ModelPrediction(EngineModel):
         """Take in one labelled trace, (T,) or (C, T), as a reference."""
         X = as_traces(np.asarray(x)[None])
         hash_ = int(content_hash(X)[0])
-        self.add_reference(self.reference_point(X[0], hash_), int(as_success(np.asarray(y))), hash_)
+        self.add_reference(X[0], int(as_success(np.asarray(y))), hash_)
         return self
 
-    def reference_point(self, x: Floats, hash_: int, embedding: Embedding | None = None) -> Floats:
+    def add_reference(
+        self,
+        x: Floats,
+        y: int,
+        hash_: int,
+        number: int = 0,
+        *,
+        embedding: Embedding | None = None,
+        point: Floats | None = None,
+    ) -> Floats:
+        """Add one labelled trace (channels, samples) to the index, in the space of its fold; returns its point (d,)."""
+        if point is None:
+            point = self._reference_point(x, hash_, embedding)
+        self.index.keep(
+            torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number
+        )
+        return point
+
+    def _reference_point(self, x: Floats, hash_: int, embedding: Embedding | None) -> Floats:
+        """Return the scaled point (d,) of a trace in the space of its fold, computed where `embedding` is None."""
         if embedding is not None:
             return np.array(embedding[self._fold(hash_)], dtype=np.float32)
         with torch.inference_mode():
             return np.asarray(self.predictor.embed(torch.from_numpy(x))[self._fold(hash_)].numpy())
 
-    def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
-        self.index.keep(torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number)
-
-    def renumber_reference(self, was: int, number: int) -> None:
-        self.index.renumber(was, number)
+    def renumber_reference(self, old: int, new: int) -> None:
+        self.index.renumber(old, new)
 
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
         return self.index.relabel(number, hash_, y)
@@ -347,36 +433,48 @@ class ModelPrediction(EngineModel):
     def _fold(self, hash_: int) -> int:
         return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
 
-    def tell(
-        self, lower: float, upper: float, success: bool, novel: bool, unobserved: int,
-        predicted: int = 0, looked: float = 1.0,
-    ) -> None:  # fmt: skip
+    def update_rule(
+        self,
+        lower: float,
+        upper: float,
+        success: bool,
+        novel: bool,
+        unobserved: int,
+        predicted: int = 0,
+        inclusion_probability: float = 1.0,
+    ) -> None:
+        """Update the rule in place with the outcome of one part; an update that fails leaves `rule_is_stale` set."""
+        was_stale = self.rule_is_stale
+        self.rule_is_stale = True
         before = dict(self.rule.state_dict())
         self.rule.observe(unobserved, novel)
-        self.rule.update(lower, upper, success, predicted, looked)
-        for name, now in self.rule.state_dict().items():
-            if now.data_ptr() != before[name].data_ptr():  # bound anew: the compiled module reads the tensor it shares
-                before[name].copy_(now)
+        self.rule.update(lower, upper, success, predicted, inclusion_probability)
+        for name, value in self.rule.state_dict().items():
+            # The compiled module reads the tensor that it shares, so a tensor that was bound anew is copied into it.
+            if value.data_ptr() != before[name].data_ptr():
+                before[name].copy_(value)
                 path, _, leaf = name.rpartition(".")
                 setattr(self.rule.get_submodule(path), leaf, before[name])
+        self.rule_is_stale = was_stale
 
-    def forget(self) -> None:
-        """The rule as it was before it was told anything; in place, for the compiled module reads it."""
+    def reset_rule(self, safe_mode: int) -> None:
+        """Reset the rule in place, because the compiled module shares its tensors, and start it in a safe mode."""
         self.rule.load_state_dict(self.rule.clone().state_dict())
+        self.rule.start_in_safe_mode(safe_mode)
 
     @property
-    def remembers(self) -> bool:
+    def rule_learns(self) -> bool:  # type: ignore[override]  # it depends on the rule
         return self.rule.learns()
 
-    def under(self, policy: Policy) -> Self:
-        """Another rule, and another module around the same references."""
-        new, own = copy.copy(self), {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
-        new.classifier = clone(self.classifier).set_params(**own)
-        new.rule, new.untold, new._predictor = policy.rule(), False, None
-        return new
-
-    def begin_safely_in(self, mode: int) -> None:
-        self.rule.start_in_safe_mode(mode)
+    def with_policy(self, policy: Policy) -> Self:
+        """Return a model under another policy, to be compiled anew around the same references."""
+        settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
+        model = copy.copy(self)
+        model.classifier = clone(self.classifier).set_params(**settings)
+        model.rule = policy.rule()
+        model.rule_is_stale = False
+        model._predictor = None
+        return model
 
     @property
     def safe_mode(self) -> str:
@@ -385,24 +483,34 @@ class ModelPrediction(EngineModel):
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """The whole prediction on one trace (C, T); the part with this hash, if it is known, has no vote."""
         with torch.inference_mode():
-            return self._prediction(self.predictor(torch.from_numpy(x), hash_ if hash_ in self.index.known else 0))
+            return self._prediction(
+                self.predictor(torch.from_numpy(x), hash_ if hash_ in self.index.known else 0)
+            )
 
     def look(self, x: Floats, part: int | None, gate: Gate, limit: float) -> Looked:
         predictor, known = self.predictor, self.index.known
-        with torch._C._InferenceMode(True):  # as `torch.inference_mode`, whose entering costs 3 % of a decision
-            fault, content, said = predictor.look(torch.from_numpy(x), part if part in known else 0, limit)
-            if part is None and content in known and not fault and said[1] != NOVEL:  # the same trace is a reference
+        with torch._C._InferenceMode(
+            True
+        ):  # as `torch.inference_mode`, whose entering costs 3 % of a decision
+            fault, content, said = predictor.look(
+                torch.from_numpy(x), part if part in known else 0, limit
+            )
+            if (
+                part is None and content in known and not fault and said[1] != NOVEL
+            ):  # the same trace is a reference
                 said = predictor.at(said[-1], content)
         if fault:
             return fault, content, None
         return fault, content, self._prediction(said)
 
     def _prediction(self, said: Predicted) -> Prediction:
-        if self.untold:
+        if self.rule_is_stale:
             raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
         action, reason, lower, upper, n_success, n_failure, z = said
         embedding = tuple(map(tuple, z.tolist()))
-        return Prediction(ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
+        return Prediction(
+            ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason]
+        )
 
     def predict_many(self, X: ArrayLike) -> list[Prediction]:
         """The prediction on each trace of (n, T) or (n, C, T)."""
@@ -411,7 +519,9 @@ class ModelPrediction(EngineModel):
     def count(self, X: ArrayLike) -> Counts:
         """(n_success, n_failure), each (n,): labels in the balls around each trace, summed over the K spaces."""
         found = self.predict_many(X)
-        return np.array([p.n_success for p in found], dtype=np.int64), np.array([p.n_failure for p in found], np.int64)
+        return np.array([p.n_success for p in found], dtype=np.int64), np.array(
+            [p.n_failure for p in found], np.int64
+        )
 
     def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(lower, upper), each (n,): the bound on each trace's success probability."""
@@ -429,23 +539,42 @@ class ModelPrediction(EngineModel):
         return new
 
     def defect(self) -> str:
-        return "" if np.isfinite(self.index.held("points")).all() else "the embedding of a reference is not finite"
+        return (
+            ""
+            if np.isfinite(self.index.held("points")).all()
+            else "the embedding of a reference is not finite"
+        )
 
     def get_state(self) -> State:
         """Plain arrays: references always; the reducer's and the rule's own where they have any ("reducer.", "rule.")."""
-        state = {"trace_shape": np.array(self.trace_shape), "scale": self.scale} | self.index.get_state()
-        if self.untold:
-            state["rule_is_stale"] = np.array(True)  # an opened engine rebuilds the rule from all outcomes
+        state = {
+            "trace_shape": np.array(self.trace_shape),
+            "scale": self.scale,
+        } | self.index.get_state()
+        if self.rule_is_stale:
+            state["rule_is_stale"] = np.array(
+                True
+            )  # an engine that opens the store rebuilds the rule
         else:
-            state |= {f"rule.{name}": buffer.numpy().copy() for name, buffer in self.rule.state_dict().items()}
+            state |= {
+                f"rule.{name}": buffer.numpy().copy()
+                for name, buffer in self.rule.state_dict().items()
+            }
         if not self.gate.asleep:
-            state |= {f"novelty.{name}": buffer.numpy().copy() for name, buffer in self.gate.state_dict().items()}
-        return state | {f"reducer.{name}": value for name, value in (self.spaces.get_state() or {}).items()}
+            state |= {
+                f"novelty.{name}": buffer.numpy().copy()
+                for name, buffer in self.gate.state_dict().items()
+            }
+        return state | {
+            f"reducer.{name}": value for name, value in (self.spaces.get_state() or {}).items()
+        }
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
-        elif self.spaces.get_state() is not None:  # another reducer of that name, whose points lie elsewhere
+        elif (
+            self.spaces.get_state() is not None
+        ):  # another reducer of that name, whose points lie elsewhere
             raise incompatible_model_error(f"{type(self.spaces).__name__} has no state")
         self.trace_shape = tuple(int(n) for n in state["trace_shape"])
         self.scale = np.asarray(state["scale"])
@@ -464,8 +593,12 @@ class ModelPrediction(EngineModel):
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
         if "trace_shape" not in vars(self):
-            raise ExportError("Nothing was trained yet; report labels until the first retrain, then export.")
-        return Exportable(self, trace or TraceSpec(channels=self.trace_shape[0], samples=self.trace_shape[1]))
+            raise ExportError(
+                "Nothing was trained yet; report labels until the first retrain, then export."
+            )
+        return Exportable(
+            self, trace or TraceSpec(channels=self.trace_shape[0], samples=self.trace_shape[1])
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.
@@ -492,10 +625,14 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     whole = x[:, :, : samples // length * length].astype(np.float64)
     means = whole.reshape(n, channels, -1, length).mean(3)
     scale = means.std((0, 2), keepdims=True)
-    rows = torch.from_numpy(((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1))
+    rows = torch.from_numpy(
+        ((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1)
+    )
     distances = torch.cdist(rows, rows)
     distances[torch.from_numpy(own[:, None] == own)] = torch.inf
-    tenth = np.partition(distances.numpy(), NEIGHBOURS)[:, NEIGHBOURS]  # a quarter of the time of `kthvalue`
+    tenth = np.partition(distances.numpy(), NEIGHBOURS)[
+        :, NEIGHBOURS
+    ]  # a quarter of the time of `kthvalue`
     return int(((distances.numpy().min(1) < NEAR * tenth) & (tenth > 1e-6)).sum())
 
 

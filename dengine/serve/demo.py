@@ -50,7 +50,7 @@ async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
             if action is Action.VERIFY or stopped:
                 await service.report(name, cell.verify())
             await asyncio.sleep(due - loop.time())
-            while cycle < BEFORE and service.engine.retraining:
+            while cycle < BEFORE and service.core.is_retraining:
                 await asyncio.sleep(READY)
         log.info("all parts of the recording are through; the page stays until Ctrl-C")
     except Exception:

@@ -30,7 +30,7 @@ from starlette.staticfiles import StaticFiles
 from .. import __version__
 from ..decision.policy import Policy
 from ..engine.corrections import Changed
-from ..engine.engine import DataEngine
+from ..engine.engine import DataEngine, core_of
 from ..errors import expect
 from ..history.explain import explain, of_part
 from ..history.map import part_map
@@ -166,10 +166,10 @@ class HttpApi:
         """Begin a retrain on all labels known by now, where none is under way."""
 
         def begin(engine: DataEngine, by: str) -> Changed:
-            if engine.retraining:
+            if core_of(engine).is_retraining:
                 return Changed("retrain", "A retrain is under way already; nothing changed.", None, engine.version)
             engine.store.put_event("retrain", "asked for by hand", author=by)
-            engine.start_retrain()
+            core_of(engine).start_retrain()
             return Changed("retrain", "The retrain has begun.", engine.store.events(1)[-1].number, engine.version)
 
         return await self._change(author, begin)
@@ -181,7 +181,7 @@ class HttpApi:
         """
 
         def copied(engine: DataEngine) -> Exportable:
-            found = engine.exported()
+            found = core_of(engine).exported()
             return replace(found, model=copy.deepcopy(found.model))  # the engine goes on learning meanwhile
 
         by, source = _name(author), await self.service.ask(copied)
@@ -280,8 +280,8 @@ class HttpApi:
 
         Degraded: the store cannot be written, or retrains are dropped again and again.
         """
-        engine, alive = self.service.engine, self.service.silent < HUNG
-        faults = engine.store_fault, engine.retrain_fault
+        core, alive = self.service.core, self.service.silent < HUNG
+        faults = core.store_fault, core.retrain_fault
         state = "down" if not alive else "degraded" if any(faults) else "ok"
         return api.answered(api.Health(state, *faults, self.service.waiting), 200 if alive else 503)
 

@@ -42,15 +42,17 @@ class Metrics:
 
     def collect(self) -> Iterator[Metric]:
         """How the service stands, at the moment that Prometheus's registry asks, also while its store is away."""
-        service, engine = self._service, self._service.engine
+        service = self._service
+        engine = service.engine
+        core = service.core
         for name, about, value in (
             ("model_version", "Of the model that answers; 0 before the first retrain.", engine.version),
             ("safe_mode", "1 while everything is verified for what went wrong.", bool(engine.safe_mode)),
-            ("shadow", "1 while everything is verified, and the model is only asked.", engine.shadow),
-            ("store_fault", "1 while the store or its journal cannot be written.", bool(engine.store_fault)),
-            ("store_lag_seconds", "Age of the oldest record that the store has not taken; 0: none.", engine.store_lag),
-            ("retraining", "1 while a retrain is under way.", engine.retraining),
-            ("new_labels", "Labels since the last retrain began.", engine.new_labels),
+            ("shadow", "1 while everything is verified, and the model is only asked.", engine.policy.shadow),
+            ("store_fault", "1 while the store or its journal cannot be written.", bool(core.store_fault)),
+            ("store_lag_seconds", "Age of the oldest record that the store has not taken; 0: none.", core.store_lag),
+            ("retraining", "1 while a retrain is under way.", core.is_retraining),
+            ("new_labels", "Labels since the last retrain began.", core.new_labels),
             ("waiting", "Requests in line.", service.waiting),
         ):
             yield GaugeMetricFamily(f"dengine_{name}", about, value=float(value))

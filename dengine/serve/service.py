@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from numpy.typing import ArrayLike
 
-from ..engine.engine import DataEngine
+from ..engine.engine import DataEngine, core_of
 from ..errors import BusyError
 from ..history.status import NEWEST, Status, status
 from ..records import Decision, Reason, RetrainReport, as_id, as_success
@@ -119,6 +119,7 @@ class CellService:
         self._thread = threading.Thread(target=self._serve, args=(make, opened), name="dengine-engine")
         self._thread.start()
         self.engine = opened.result()  # its facts may be read in any thread, its verbs only by `ask`
+        self.core = core_of(self.engine)
         self.reading = self.engine.store if store is None else open_store(store)
 
     async def decide(self, trace: ArrayLike, request: str | None = None, part: str | int | None = None) -> Answer:
@@ -130,7 +131,7 @@ class CellService:
         begin = time.monotonic()
         if request is None and not (self.waiting or self._closing) and self._using.acquire(blocking=False):
             try:
-                at_once = self.engine.decide_at_once(trace, part)
+                at_once = self.core.try_decide(trace, part)
             finally:
                 self._using.release()
             if at_once is not None:
@@ -141,7 +142,7 @@ class CellService:
 
         def work(engine: DataEngine, late: bool) -> Decision:
             given = id_ if late or request is not None else None
-            return engine.decide(trace, part, decision_id=given, late=late)
+            return core_of(engine).decide(trace, part, given, timed_out=late)
 
         future = self._put(work)
         answer = asyncio.wrap_future(future)
@@ -149,8 +150,8 @@ class CellService:
         if answer.done() or not future.cancel():
             decision = await answer
         else:
-            decide_late = partial(self.engine.decide_late, trace, part, decision_id=id_)
-            decision = await asyncio.get_running_loop().run_in_executor(self._late, decide_late)
+            record = partial(self.core.record_timeout, trace, part, decision_id=id_)
+            decision = await asyncio.get_running_loop().run_in_executor(self._late, record)
             self.late += 1
         return self._heard(Answer(decision, time.monotonic() - begin))
 
@@ -201,7 +202,7 @@ class CellService:
 
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
         """How the cell is doing, as `history.status`: by its store, and by what the running engine alone knows."""
-        return self.engine.as_it_runs(await self.look(lambda store: status(store, last, watching)))
+        return self.core.complete_status(await self.look(lambda store: status(store, last, watching)))
 
     @property
     def waiting(self) -> int:
@@ -276,7 +277,7 @@ class CellService:
         try:
             engine = make()
             try:
-                engine.know_ids()
+                core_of(engine).load_decision_ids()
             except BaseException:
                 engine.close()
                 raise
@@ -294,6 +295,7 @@ class CellService:
 
     def _next(self, engine: DataEngine) -> Job | None:
         """The next one in line; while nobody asks, the engine does what it has to do: a new version is swapped in."""
+        core = core_of(engine)
         patience = SOON  # right behind an answer, for the next part is farthest away then
         while True:
             self._beat = time.monotonic()
@@ -301,13 +303,13 @@ class CellService:
                 return self._jobs.get(timeout=patience)
             try:
                 with self._using:
-                    report = engine.settle(brief=True)
+                    report = core.process_retrains(brief=True)
                 if report is not None:
                     self._heard(report)
                     self._tell()
             except Exception:  # whatever it is, the next request is answered
                 log.exception("what the engine does between requests failed")
-            patience = SOON if engine.swapping else IDLE
+            patience = SOON if core.is_swapping else IDLE
 
     def _tell(self) -> None:
         for loop, changed in tuple(self._listeners):

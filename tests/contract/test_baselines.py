@@ -151,7 +151,7 @@ def test_a_risk_above_the_tolerance_is_vouched_for_in_no_more_than_delta_of_all_
 
 @every_baseline
 def test_a_baseline_plays_in_the_engines_loop(name: str) -> None:
-    engine = DataEngine.from_recipe(Recipe(retrain_every=50), model=new(name), seed=0, replaying=True)
+    engine = DataEngine(recipe=Recipe(retrain_every=50), model=new(name), seed=0, replaying=True)
     played = replay("insertion", engine, cycles=150)
     assert (played.version[50:] >= 1).all()  # it answers after the first retrain
     assert all(report.accepted for report in played.retrains)  # and no training failed

@@ -103,7 +103,7 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
     make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any
 ) -> None:
     settings = recipe(audit_rate=0.1, guarantee=guarantee, stops=stops, label_within=2000, windows=["0.1:0.15:-20:"])
-    engine = DataEngine.from_recipe(settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True)
+    engine = DataEngine(recipe=settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True)
     rng, happened, modes, saved = np.random.default_rng(7), Counter[str](), set(), False
     with engine:
         for x, y, part in a_stream(make_data, 500, 1):
@@ -323,7 +323,7 @@ def test_a_missing_file_or_sum_is_named(copy: Path) -> None:
 
 def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Dataset, tmp_path: Path) -> None:
     missed = fitted(data)
-    missed.untold = True
+    missed.rule_is_stale = True
     for what, words in (
         (fitted(data, PCA(2)), r"PCA cannot be exported, for it has no module: give it `module\(\)`, .* nn\.Module"),
         (fitted(data, interval="jeffreys"), "use wilson or binomial"),

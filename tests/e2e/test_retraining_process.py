@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine.engine.engine import core_of
 from dengine.serve.retraining import RetrainingProcess
 from tests.support.driving import learn
 
@@ -22,8 +23,8 @@ CONV = replace(Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Polic
 
 def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
     learn(engine, data, range(40))
-    while engine.retraining:
-        engine.settle()
+    while core_of(engine).is_retraining:
+        core_of(engine).process_retrains()
         time.sleep(0.01)
 
 
@@ -80,5 +81,5 @@ def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retr
         with pytest.raises(BrokenExecutor):
             process.submit(os.getpid).result(300)
         learn_and_settle(engine, data)
-        engine.start_retrain()
+        core_of(engine).start_retrain()
     assert engine.version >= 1

@@ -278,7 +278,7 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(st
         events = client.get("/events").json()["events"]
         assert [each["kind"] for each in events] == ["shadow", "policy", "policy", "forget", "correct"]
         assert {each["author"] for each in events} == {"Kim Lee"}
-        assert (service.engine.policy.alpha, service.engine.shadow) == (0.2, True)
+        assert (service.engine.policy.alpha, service.engine.policy.shadow) == (0.2, True)
         assert [client.get(f"/decisions/wrong-{i}").json()["success"] for i in range(3)] == [False, None, None]
 
 

@@ -71,7 +71,7 @@ def test_the_shadow_lasts_over_a_restart_and_its_end_brings_the_audit_rate_back(
         engine.set_shadow(True)
         assert engine.set_shadow(True).event is None
     with DataEngine.open_or_create(tmp_path / "engine.db", recipe=recipe) as engine:  # the program's own settings
-        assert engine.shadow
+        assert engine.policy.shadow
         engine.set_policy(replace(engine.policy, lower_bound=0.8))
         cycles = drive(engine, stream, 200, 240)
         would = [cycle for cycle in cycles if cycle.decision.predicted is not Action.VERIFY]
@@ -81,4 +81,4 @@ def test_the_shadow_lasts_over_a_restart_and_its_end_brings_the_audit_rate_back(
         assert engine.policy == replace(recipe.policy, lower_bound=0.8)
         assert Action.ACCEPT in {cycle.decision.action for cycle in drive(engine, stream, 240, 400)}
     with DataEngine.open(tmp_path / "engine.db") as engine:
-        assert not engine.shadow
+        assert not engine.policy.shadow

@@ -24,7 +24,7 @@ def recipe(**settings: Any) -> Recipe:
 def trained(data: Dataset, store: Path | None = None, trace: TraceSpec | None = None, **settings: Any) -> DataEngine:
     """An engine that saw every label and retrained on all of them."""
     spec, place = trace or TraceSpec(data.X.shape[-1], limit=LIMIT), None if store is None else str(store)
-    engine = DataEngine.from_recipe(recipe(**settings), place, trace=spec, seed=3, replaying=True)
+    engine = DataEngine(recipe=recipe(**settings), store=place, trace=spec, seed=3, replaying=True)
     learn(engine, data, range(len(data)))
     engine.retrain()
     return engine

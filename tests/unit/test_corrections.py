@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from dengine import Action, DataEngine, Dataset, Reason
+from dengine.engine.engine import core_of
 from dengine.errors import ReportError, SettingError
 from dengine.folds import fold_of
 from tests.support.driving import RECIPE, Counting, evidence, make
@@ -43,7 +44,7 @@ def state(engine: DataEngine) -> tuple:
     rule = engine.model and {name: t.tolist() for name, t in engine.model.rule.state_dict().items()}
     numbers = engine.model and sorted(engine.model.index.held("numbers").tolist())
     return (
-        (engine.version, engine.new_labels, engine.safe_mode, engine.policy, engine.certificate(), rule),
+        (engine.version, core_of(engine).new_labels, engine.safe_mode, engine.policy, engine.certificate(), rule),
         (held.seq.tolist(), held.labels.tolist(), numbers),
     )
 
@@ -267,7 +268,7 @@ def test_a_late_stop_leaves_the_same_references_as_a_reopened_engine_has(data: D
     play(engine, data, 0, 120, confirm=True)
     accepted = [d for d in (engine.decide(x) for x in data.X[120:150]) if d.action is Action.ACCEPT]
     engine.report(accepted[3].id, False)
-    engine.settle()
+    core_of(engine).process_retrains()
     reopened = again(engine, Path())
     assert asked(reopened, data) == asked(engine, data)
 
@@ -298,7 +299,7 @@ def test_an_earlier_version_answers_again_as_a_new_one_with_what_came_since(data
     assert engine.store.events(1)[0].data == {"to": number, "was": version, "now": version + 1}
     assert engine.model.spaces is not old
     assert len(engine.model.index) == len(engine.store.labelled().seq)
-    assert engine.new_labels == 0
+    assert core_of(engine).new_labels == 0
     assert engine.decide(data.X[199]).model_version == version + 1
     first = engine.store.load_version(number).state
     np.testing.assert_array_equal(engine.model.get_state()["scale"], first["scale"])
@@ -342,8 +343,8 @@ def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bou
     assert said.text == "The policy's alpha 0.1 -> 0.001, lower_bound 0.9 -> 0.99."
     event = engine.store.events(1)[0]
     assert (event.data["old"]["alpha"], event.data["new"]["alpha"], event.author) == (0.1, 0.001, "kim")
-    assert engine.exported().recipe == engine.recipe.to_toml()
-    assert "alpha = 0.001" in engine.exported().recipe
+    assert core_of(engine).exported().recipe == engine.recipe.to_toml()
+    assert "alpha = 0.001" in core_of(engine).exported().recipe
 
 
 def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data: Dataset) -> None:

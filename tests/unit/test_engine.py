@@ -13,6 +13,7 @@ import pytest
 from sklearn.decomposition import PCA
 
 from dengine import Action, DataEngine, Dataset, Reason, ReplayCell, Source, TraceError, TraceSpec
+from dengine.engine.engine import core_of
 from dengine.errors import ReportError, SettingError, StoreError
 from dengine.folds import audited, content_hash
 from dengine.store import SqlStore
@@ -174,7 +175,7 @@ def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(reaso
     limit = None if reason is Reason.TOO_LARGE else 150.0
     engine = make(trace=TraceSpec(samples=100, limit=limit))
     play(engine, data, 0, 100)
-    before = engine.version, engine.new_labels, len(engine.model.index)
+    before = engine.version, core_of(engine).new_labels, len(engine.model.index)
     x = damage(good(data).astype(np.float64))
     decision = engine.decide(x)
     assert (decision.action, decision.reason, decision.embedding) == (Action.VERIFY, reason, None)
@@ -182,7 +183,7 @@ def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(reaso
     stored = engine.store.get_decision(decision.id)
     assert (stored.quarantined, stored.success) == (True, True)
     np.testing.assert_array_equal(stored.trace[0], x.astype(np.float32))
-    assert (engine.version, engine.new_labels, len(engine.model.index)) == before
+    assert (engine.version, core_of(engine).new_labels, len(engine.model.index)) == before
     assert content_hash(x[None])[0] not in engine.store.labelled().hashes
 
 
@@ -275,7 +276,7 @@ def test_retrains_that_are_dropped_three_times_in_a_row_are_an_alarm_until_one_i
     said = []
     for _ in range(3):
         assert not engine.retrain().accepted
-        said.append((engine.retrain_fault, engine.status().alarm))
+        said.append((core_of(engine).retrain_fault, engine.status().alarm))
     alarm = (
         "The last 3 retrains were dropped, so nothing new is learned; the last was dropped: PCA needs more than 500 traces"
     )
@@ -284,10 +285,10 @@ def test_retrains_that_are_dropped_three_times_in_a_row_are_an_alarm_until_one_i
     assert said[2][0].startswith(alarm)
     engine.close()
     with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
-        assert (engine.retrain_fault, engine.status().alarm) == said[2]
+        assert (core_of(engine).retrain_fault, engine.status().alarm) == said[2]
         assert engine.model.spaces.n_components == sound
         assert engine.retrain().accepted
-        assert (engine.retrain_fault, engine.status().alarm) == ("", "")
+        assert (core_of(engine).retrain_fault, engine.status().alarm) == ("", "")
 
 
 @pytest.mark.parametrize("second", [True, False])
@@ -295,11 +296,12 @@ def test_a_second_report_is_an_error_and_the_first_stands(trained: DataEngine, d
     decision = trained.decide(np.roll(good(data), 15))
     assert decision.action is Action.VERIFY
     trained.report(decision.id, True)
-    counts, labels, held = trained.new_labels, len(trained.store.labelled().labels), len(trained.model.index)
+    counts, labels, held = core_of(trained).new_labels, len(trained.store.labelled().labels), len(trained.model.index)
     with pytest.raises(ReportError, match="success from verification was reported first and stands"):
         trained.report(decision.id, second)
     assert trained.store.get_decision(decision.id).success is True
-    assert (trained.new_labels, len(trained.store.labelled().labels), len(trained.model.index)) == (counts, labels, held)
+    n_labels = len(trained.store.labelled().labels)
+    assert (core_of(trained).new_labels, n_labels, len(trained.model.index)) == (counts, labels, held)
 
 
 def test_a_stop_whose_decision_was_lost_is_accepted_with_its_trace(trained: DataEngine, data: Dataset) -> None:
@@ -373,7 +375,7 @@ def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(kind: str, data: 
     pool = ThreadPoolExecutor(1) if kind == "thread" else ProcessPoolExecutor(1, mp_context=get_context("spawn"))
     with pool:
         beside = learn(make(recipe, executor=pool))
-    beside.settle()  # swaps in what the pool has finished
+    core_of(beside).process_retrains()  # swaps in what the pool has finished
     assert inline.version == beside.version == 1
     assert len(beside.model.index) == 100
     assert [evidence(beside.decide(x)) for x in data.X[100:]] == [evidence(inline.decide(x)) for x in data.X[100:]]

@@ -12,6 +12,7 @@ import pytest
 
 from dengine import Action, DataEngine, Dataset, Decision, Policy, Reason, Recipe, Source, load_dataset
 from dengine.engine import feedback
+from dengine.engine.engine import core_of
 from dengine.errors import ReportError, StoreError
 from dengine.folds import content_hash, fold_of, part_hash
 from dengine.history.status import status
@@ -107,7 +108,7 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
         monkeypatch.setattr(engine.store, "apply_records", lambda records: (_ for _ in ()).throw(StoreError("away")))
     engine.report(stopped.id, False)
     monkeypatch.undo()
-    while engine.store_fault:
+    while core_of(engine).store_fault:
         time.sleep(0.01)
     engine.decide(stream.X[1])
     engine.flush()
@@ -169,7 +170,7 @@ HISTORIES = {
 def learned(engine: DataEngine, probes: np.ndarray) -> tuple:
     """What an engine's rule was told, and what it says of some traces."""
     rule = {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
-    return rule, engine.model.predict_many(probes), engine.safe_mode, engine.new_labels, engine.version
+    return rule, engine.model.predict_many(probes), engine.safe_mode, core_of(engine).new_labels, engine.version
 
 
 class RandomHistory:
@@ -308,7 +309,7 @@ def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(
     play(engine, stream)
     for x in stream.X[stream.y == 1][:12]:
         engine.decide(x + np.float32(0.02))
-    engine.start_retrain()
+    core_of(engine).start_retrain()
     assert beyond(engine) == [0, 0]
     assert engine.store.last_version().last_seq == engine.store.outcomes_since(0)[-1].seq
 
@@ -330,9 +331,9 @@ def test_a_decision_at_once_leaves_it_to_settle_to_say_that_safe_mode_begins(str
     heard: list[str] = []
     engine = make(replace(POOLED, stops="some", audit_rate=0.5, label_within=2), on_safe_mode=heard.append)
     play(engine, stream)
-    assert all(engine.decide_at_once(x) for x in spoiled(stream).X)  # their audits are owed
+    assert all(core_of(engine).try_decide(x) for x in spoiled(stream).X)  # their audits are owed
     assert (bool(engine.safe_mode), heard) == (True, [])
-    engine.settle()
+    core_of(engine).process_retrains()
     assert heard == [engine.safe_mode]
 
 
@@ -440,14 +441,14 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
         bad = replace(stream, X=stream.X + np.float32(0.001))
         found = rejected(engine, bad)
         assert len(found) > 3
-        engine.settle()
+        core_of(engine).process_retrains()
         engine.flush()
         before = told(engine)
-        n, labels = engine.store.status()["labels"], engine.new_labels
+        n, labels = engine.store.status()["labels"], core_of(engine).new_labels
         engine.report(found[0].id, True)
         engine.report(found[1].id, False)
         assert told(engine) == before
-        assert engine.new_labels == labels + 2
+        assert core_of(engine).new_labels == labels + 2
         status = engine.status()
         assert (status.sources["inspection"], status.labels, status.ever.false_rejects) == (2, n + 2, 1)
         known = engine.find(found[0].id)

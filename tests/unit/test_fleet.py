@@ -13,6 +13,7 @@ import pytest
 from sklearn.decomposition import PCA
 
 from dengine import Action, DataEngine, Dataset, Recipe, SqlStore
+from dengine.engine.engine import core_of
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.records import RetrainReport
 from dengine.store import verify_history
@@ -89,7 +90,7 @@ def taught(fleet: Fleet, parts: Dataset, n: int, recipe: Recipe = RECIPE) -> tup
     for i in range(n):
         learn(cells[i % 2], parts, [i])
     for engine in cells:
-        engine.settle()
+        core_of(engine).process_retrains()
     return cells
 
 
@@ -109,14 +110,14 @@ def test_one_retrain_serves_all(recipe: Recipe, fleet: Fleet, parts: Dataset, pr
     for i in range(150):
         learn(cells[i % 3], parts, [i])
     for engine in cells:
-        engine.settle()
+        core_of(engine).process_retrains()
     labels = sum(engine.store.status()["labels"] for engine in cells)
     retrains = cells[0].store.retrains()
     assert [report.version for report in retrains] == list(range(1, labels // EVERY + 1))
     assert {engine.version for engine in cells} == {len(retrains)}
     assert said(cells[0], probe) == said(cells[1], probe) == said(cells[2], probe)
     assert {len(engine.model.index) for engine in cells} == {labels}
-    assert {engine.new_labels for engine in cells} == {labels - EVERY * len(retrains)}
+    assert {core_of(engine).new_labels for engine in cells} == {labels - EVERY * len(retrains)}
 
 
 def test_the_cell_whose_label_makes_it_due_retrains_and_another_where_it_does_not(fleet: Fleet, parts: Dataset) -> None:
@@ -134,12 +135,12 @@ def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(f
     with ThreadPoolExecutor(1) as executor:
         first, second = fleet.engine("a", executor=executor), fleet.engine("b")
         learn(first, parts, range(30))
-        first.start_retrain()
+        core_of(first).start_retrain()
         learn(second, parts, range(30, 40))
         learn(first, parts, range(40, 45))
         executor.shutdown(wait=True)
         for engine in (first, second, first, second):
-            engine.settle()
+            core_of(engine).process_retrains()
         assert first.version == second.version
         assert counts(first, probe) == counts(second, probe)
         assert len(first.model.index) == len(second.model.index) == sum(e.store.status()["labels"] for e in (first, second))
@@ -149,7 +150,7 @@ def test_a_reducer_without_arrays_is_refitted_on_the_same_traces(fleet: Fleet, p
     first, second = (fleet.engine(name, recipe=Recipe(PCA(2), radius=0.4, retrain_every=EVERY)) for name in "ab")
     learn(first, parts, range(50))
     learn(second, parts, range(50, 55))
-    first.settle()
+    core_of(first).process_retrains()
     assert second.version == first.version > 0
     np.testing.assert_array_equal(counts(first, probe), counts(second, probe))
 
@@ -157,12 +158,12 @@ def test_a_reducer_without_arrays_is_refitted_on_the_same_traces(fleet: Fleet, p
 def test_a_trace_that_came_in_two_cells_votes_once(fleet: Fleet, parts: Dataset) -> None:
     first, second = fleet.engine("a"), fleet.engine("b")
     learn(first, parts, range(30))
-    second.settle()
+    core_of(second).process_retrains()
     (before,) = counts(second, parts.X[100][None, None] + np.float32(0.01))
     for engine in (first, second):
         learn(engine, parts, [100])
-        engine.settle()
-    first.settle()
+        core_of(engine).process_retrains()
+    core_of(first).process_retrains()
     for engine in (first, second):
         (after,) = counts(engine, parts.X[100][None, None] + np.float32(0.01))
         assert sum(after) == sum(before) + 1
@@ -173,7 +174,7 @@ def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_g
     for i in range(60, 70):
         first.report(first.decide(np.full(100, np.nan)).id, False)
         learn((first, second)[i % 2], parts, [i])
-    first.settle(), second.settle()
+    core_of(first).process_retrains(), core_of(second).process_retrains()
     newest = first.store.labelled(30)
     np.testing.assert_array_equal(newest.seq, second.store.labelled(30).seq)
     assert len(newest.seq) == len(first.model.index) == len(second.model.index) == 30
@@ -195,10 +196,10 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
     learn(first, parts, range(15))
     reports.append(second.retrain())
     assert [report.version for report in reports] == [1, 2]
-    first.settle()
+    core_of(first).process_retrains()
     assert first.version == second.version == 2
     learn(first, parts, range(15, 20))
-    second.settle()
+    core_of(second).process_retrains()
     assert said(first, probe) == said(second, probe)
 
 
@@ -207,17 +208,17 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet: Fl
     wrong, *gone = [past.decision.id for past in first.history() if past.success is not None][20:24]
     first.correct(wrong, not first.store.get_decision(wrong).success)
     first.forget(*gone)
-    second.settle()
+    core_of(second).process_retrains()
     assert first.version == second.version > 0
     assert counts(first, probe) == counts(second, probe)
     assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
-    assert second.new_labels == first.new_labels
+    assert core_of(second).new_labels == core_of(first).new_labels
     found = [verify_history(fleet.url, engine.store.cell_id) for engine in (first, second)]
     assert [report.faults for report in found] == [(), ()]
     assert found[0].cells[0].digest != found[1].cells[0].digest  # each has a ledger of its own
     newest = first.version
     second.rollback(1)
-    first.settle()
+    core_of(first).process_retrains()
     assert first.version == second.version == newest + 1
     assert counts(first, probe) == counts(second, probe)
     before = counts(second, probe), rule(second)
@@ -240,11 +241,11 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
 def test_a_peers_version_leaves_the_rule_as_it_was(fleet: Fleet, parts: Dataset) -> None:
     first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
     learn(first, parts, range(60))
-    second.settle()
+    core_of(second).process_retrains()
     learn(second, parts, range(60, 75))
     own = rule(second)
     first.retrain()
-    second.settle()
+    core_of(second).process_retrains()
     assert second.version == first.version
     assert rule(second) == own
 
@@ -259,10 +260,10 @@ def reopened(fleet: Fleet, engine: DataEngine) -> SqlStore:
 @pytest.mark.parametrize("recipe", [RECIPE, POOLED], ids=["local", "pooled"])
 def test_a_reopened_cell_decides_the_same_bit_for_bit(recipe: Recipe, fleet: Fleet, parts: Dataset, probe) -> None:
     for engine in taught(fleet, parts, 130, recipe):
-        engine.settle()
-        before = said(engine, probe), rule(engine), engine.version, engine.new_labels
+        core_of(engine).process_retrains()
+        before = said(engine, probe), rule(engine), engine.version, core_of(engine).new_labels
         again = fleet.engine("", recipe=None, store=reopened(fleet, engine))
-        assert (said(again, probe), rule(again), again.version, again.new_labels) == before
+        assert (said(again, probe), rule(again), again.version, core_of(again).new_labels) == before
 
 
 def test_nothing_is_mixed_between_products_and_cells_without(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
@@ -275,7 +276,7 @@ def test_nothing_is_mixed_between_products_and_cells_without(fleet: Fleet, parts
         if name == "d":
             learn(alone, parts, [i])
     for engine in cells.values():
-        engine.settle()
+        core_of(engine).process_retrains()
     assert said(cells["d"], probe) == said(alone, probe)
     rows = {name: np.arange(i, 120, 4) for i, name in enumerate("abcd")}
     for name, kin in {"a": "ab", "b": "ab", "c": "c", "d": "d"}.items():
@@ -313,7 +314,7 @@ def test_a_cell_without_news_goes_on_and_says_so_once(fleet: Fleet, parts: Datas
     shaky = fleet.store("b", kind=ShakyStore)
     first, second = fleet.engine("a"), fleet.engine("b", store=shaky)
     learn(first, parts, range(30))
-    second.settle()
+    core_of(second).process_retrains()
     asked = shaky.asked
     for x in parts.X[:10]:
         second.decide(x)
@@ -321,12 +322,12 @@ def test_a_cell_without_news_goes_on_and_says_so_once(fleet: Fleet, parts: Datas
     shaky.lost = True
     for i in range(40):
         learn((first, second)[i % 2], parts, [100 + i])
-        second.settle()
+        core_of(second).process_retrains()
     second.retrain()
     assert [r.levelname for r in caplog.records if "news" in r.message] == ["WARNING"]
     shaky.lost = False
     for engine in (second, first, second):
-        engine.settle()
+        core_of(engine).process_retrains()
     assert "comes again" in caplog.text
     assert first.version == second.version
     assert counts(first, probe) == counts(second, probe)

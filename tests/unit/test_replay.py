@@ -70,7 +70,7 @@ class Silent:
 
 def test_a_live_run_and_a_replay_by_recipe_or_engine_keep_the_same_record(data: Dataset, played: Replay) -> None:
     def engine() -> DataEngine:
-        return DataEngine.from_recipe(RECIPE, seed=1, replaying=True)
+        return DataEngine(recipe=RECIPE, seed=1, replaying=True)
 
     order = np.random.default_rng(1).permutation(len(data))  # as in a replay of seed 1
     log = watch(engine(), ReplayCell(data, order), 200)

@@ -24,6 +24,7 @@ from dengine import (
     load_exported,
 )
 from dengine.decision.scripting import script
+from dengine.engine.engine import core_of
 from dengine.errors import SettingError
 from dengine.records import FITS, stored_trace_spec
 from dengine.traces import REASONS, TraceGate, as_trace, can_fit_length, fit_length, spec_of
@@ -210,10 +211,10 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(fit: s
         lost = not can_fit_length(len(x), SAMPLES, FITS.index(fit)) or np.isnan(x[:SAMPLES]).any()
         assert (one.reason is Reason.NOT_FINITE) == lost
     assert {one.action for _, one in decided} >= {Action.VERIFY, Action.ACCEPT}
-    lost, labels = engine.decide(np.linspace(0, 9, 30)), engine.new_labels
+    lost, labels = engine.decide(np.linspace(0, 9, 30)), core_of(engine).new_labels
     engine.report(lost.id, True)
     kept = engine.store.get_decision(lost.id)  # and never learned from
-    assert (lost.reason, kept.quarantined, engine.new_labels) == (Reason.NOT_FINITE, True, labels)
+    assert (lost.reason, kept.quarantined, core_of(engine).new_labels) == (Reason.NOT_FINITE, True, labels)
     np.testing.assert_array_equal(kept.trace[0, :30], np.linspace(0, 9, 30, dtype=np.float32))
 
 

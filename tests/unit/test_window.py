@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dengine.engine.trainer import Window
+from dengine.engine.trainer import TrainingWindow
 from dengine.store.records import Labelled
 
 
-def add(window: Window, *seqs: int) -> None:
+def add(window: TrainingWindow, *seqs: int) -> None:
     for seq in seqs:
         window.add(np.full((1, 3), float(seq), np.float32), seq % 2, 100 + seq, seq)
 
@@ -26,7 +26,7 @@ def seqs_of(labelled: Labelled) -> list[int]:
 @settings(deadline=None)
 @given(capacity=st.integers(1, 200), steps=st.lists(st.integers(0, 90), max_size=6))
 def test_every_snapshot_is_of_the_newest_then_and_never_changes(capacity: int, steps: list[int]) -> None:
-    window, handed_out, last = Window(capacity), [], 0
+    window, handed_out, last = TrainingWindow(capacity), [], 0
     for n in steps:
         if n % 7 == 1:
             window.refill(window.snapshot())
@@ -39,7 +39,7 @@ def test_every_snapshot_is_of_the_newest_then_and_never_changes(capacity: int, s
 
 @pytest.mark.parametrize("capacity", [4, 100])
 def test_what_is_newer_than_a_label_is_found_with_its_trace(capacity: int) -> None:
-    window = Window(capacity)
+    window = TrainingWindow(capacity)
     add(window, 2, 3, 5, 8, 9)
     assert (window.newer(5), window.newer(9)) == ([8, 9], [])
     trace, label, hash_ = window.row(8)

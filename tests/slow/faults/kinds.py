@@ -21,6 +21,7 @@ import sqlalchemy as sa
 
 from dengine import Action, DataEngine, Decision, Reason, ReplayCell, load_dataset
 from dengine.engine import trainer
+from dengine.engine.engine import core_of
 from dengine.errors import DataError, ReportError, StoreError, TraceError
 from dengine.store import StoredDecision, verify_history
 from dengine.store.journal import HEADER, RESERVE, journal_path
@@ -56,7 +57,7 @@ def during(cell: Cell, fault: Any, away: bool = False) -> None:
         if away:
             decisions = [cell.engine.decide(x) for x in stream().X[:5]]
             cell.outcome.must(Reason.NO_STORE not in {d.reason for d in decisions}, "verified, though the journal is well")
-            cell.outcome.must(bool(cell.engine.store_fault), "nobody was told that the store is away")
+            cell.outcome.must(bool(core_of(cell.engine).store_fault), "nobody was told that the store is away")
     cell.until_back()
     cell.play(AFTER)
     cell.finish()
@@ -148,7 +149,7 @@ def lost_file(outcome: Outcome, place: Place) -> None:
         outcome.injected += 1
         cell.acknowledged.clear()  # they went with the file; what is acknowledged after must be in the journal
         cell.play(DURING)
-        outcome.must("deleted, moved or replaced" in cell.engine.store_fault, "a lost file was not noticed")
+        outcome.must("deleted, moved or replaced" in core_of(cell.engine).store_fault, "a lost file was not noticed")
         cell.engine.close()
         copy.replace(file)
         cell.engine = DataEngine.open(cell.place.store())
@@ -273,7 +274,7 @@ def hung_disk(outcome: Outcome, place: Place, do: str = "hang") -> None:
     cell, data = _before_a_disk(outcome, place, full=do == "hang"), stream()
     with _syncs(do):
         told = {i: _unsynced(cell, i) for i in range(60, 63)}
-        fault = cell.timed(lambda: cell.engine.store_fault)
+        fault = cell.timed(lambda: core_of(cell.engine).store_fault)
     outcome.must(bool(fault), "the engine says that its disk is well")
     cell.until_back()
     for i, known in told.items():
@@ -438,7 +439,7 @@ def changed(outcome: Outcome, place: Place) -> None:
             said = [again.decide(x) for x in stream().X[:20]]
             outcome.must({(d.action, d.reason) for d in said} == {(Action.VERIFY, Reason.NO_STORE)}, f"decided on: {sql}")
             again.report(said[0].id, True)
-            outcome.must("see `dengine verify`" in again.store_fault, f"nobody was told of: {sql}")
+            outcome.must("see `dengine verify`" in core_of(again).store_fault, f"nobody was told of: {sql}")
             outcome.lost += missing(again.store, {said[0].id: True})
         outcome.must(not verify_history(other.url).ok, f"verified: {sql}")
         with contextlib.suppress(DataError):
@@ -457,7 +458,7 @@ def changed_long_ago(outcome: Outcome, place: Place) -> None:
     with DataEngine.open(place.store()) as again:
         name, good = cell.acknowledged.popitem()
         again.correct(name, not good)
-        outcome.must("see `dengine verify`" in again.store_fault, "the rule was told what was changed")
+        outcome.must("see `dengine verify`" in core_of(again).store_fault, "the rule was told what was changed")
 
 
 def flipped(file: Path, rng: np.random.Generator, size: int | None = None) -> None:
@@ -480,7 +481,7 @@ def flipped_store(outcome: Outcome, place: Place) -> None:
         outcome.injected += 1
         with contextlib.suppress(StoreError), DataEngine.open(other.store()) as again:  # else it is refused, and said
             same = bounds(again) == before and not missing(again.store, cell.acknowledged)
-            told = again.store_fault or any(event.kind == "damaged" for event in again.store.events())
+            told = core_of(again).store_fault or any(event.kind == "damaged" for event in again.store.events())
             outcome.must(same or bool(told), f"flip {i}: nobody is told of it")
 
 
@@ -542,7 +543,7 @@ def asked_again(outcome: Outcome, place: Place, stored: int = 0) -> None:
     known = [cell.timed(lambda i=i: cell.engine.decide(X[i], decision_id=f"part-{i}")) for i in range(IDS)]
     cell.engine.close()
     cell.engine = engine = DataEngine.open(place.store())  # which has none of them by heart
-    engine.know_ids()
+    core_of(engine).load_decision_ids()
     with away(place):
         outcome.injected += 1
         cell.play(1)

@@ -108,7 +108,7 @@ def weak_signal(n: int, strength: float, seed: int, samples: int = 40) -> Datase
 def places(recipe: Recipe, data: Dataset, seed: int) -> NDArray[np.float64]:
     """(n, K, d) where each trace lay in every space when it was decided; NaN before the first retrain."""
     sure_of_nothing = replace(recipe.with_policy(alpha=1e-6, lower_bound=0.999), novelty=0.0)  # every label becomes known
-    engine = DataEngine.from_recipe(sure_of_nothing, seed=seed, replaying=True)
+    engine = DataEngine(recipe=sure_of_nothing, seed=seed, replaying=True)
     found = [cycle.decision.embedding for cycle in engine.run(ReplayCell(data), len(data))]
     shape = np.shape(found[-1])
     return np.array([np.full(shape, np.nan) if each is None else each for each in found])

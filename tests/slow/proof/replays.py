@@ -108,7 +108,7 @@ def judge(seed: int, case: Case) -> Row:
     owed: deque[tuple[int, float]] = deque()  # checks that are never reported, and when they count as bad
     stops: deque[tuple[int, Decision]] = deque()  # that come late
     numbers = [None] * case.cycles if stream.data.part is None else stream.data.part
-    with DataEngine.from_recipe(case.recipe, seed=seed, replaying=True) as engine:
+    with DataEngine(recipe=case.recipe, seed=seed, replaying=True) as engine:
         for i, (x, number, p) in enumerate(zip(stream.data.X, numbers, wrong, strict=True)):
             while stops and stops[0][0] <= i:
                 engine.report(stops.popleft()[1].id, False)
@@ -144,7 +144,7 @@ def spend(seed: int, case: Case) -> Row:
     stream, policy = planted(case.truth, case.cycles, case.lower_bound, seed, case.rate, case.order), case.recipe.policy
     (check, escape, _), accepted = policy.prices, Mean()
     account, most, bound, untrue = 0.0, float("nan"), 0.0, False
-    with DataEngine.from_recipe(case.recipe, seed=seed, replaying=True) as engine:
+    with DataEngine(recipe=case.recipe, seed=seed, replaying=True) as engine:
         for i, (x, y, p) in enumerate(zip(stream.data.X, stream.data.y, stream.p, strict=True)):
             decision, before = engine.decide(x), _members(engine, 0)
             if decision.action is Action.ACCEPT:

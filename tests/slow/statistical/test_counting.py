@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from dengine import Decision, load_dataset
-from dengine.engine.versions import ModelVersions
+from dengine.engine.learner import Learner
+from dengine.engine.live_model import LiveModel
 from dengine.folds import content_fold
 from dengine.model import neighbours as prediction
 from dengine.model.neighbours import ModelPrediction
@@ -134,23 +135,28 @@ def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
 
 
 def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
-    whole = ModelVersions.learn
+    whole = LiveModel.learn
 
     def learn(self: Any, known: Any, success: bool, silent: int) -> Any:
         if (model := self.answering) is not None:
-            point = model.place_safely(known.trace, known.content_hash, None)
-            model.add_safely(point, int(success), known.content_hash, 0)
+            model.add_reference(known.trace, int(success), known.content_hash)
             now = model.predict_one(known.trace)
             known = replace(known, decision=replace(known.decision, lower=now.lower, upper=now.upper))
         return whole(self, known, success, silent)
 
-    patch.setattr(ModelVersions, "learn", learn)
+    patch.setattr(LiveModel, "learn", learn)
 
 
-TAKEN_BACK = [(ModelVersions, name, lambda self: None) for name in ("take_back", "tell_anew")]
+TAKEN_BACK = [
+    (Learner, "apply_corrections", lambda self, may_retrain=True: None),
+    (LiveModel, "rebuild_rule", lambda self: None),
+]
 SAID: list[tuple[list[Any], Case]] = [
     ([(Decision, "inclusion_probability", 1.0)], replace(WORSENS, stops="some", audit_rate=0.3, confirms=True)),
-    ([(ModelVersions, "owe", lambda self, made: None)], replace(WORSENS, truth="edge", missing=0.9, label_within=20)),
+    (
+        [(LiveModel, "count_overdue", lambda self, decision: None)],
+        replace(WORSENS, truth="edge", missing=0.9, label_within=20),
+    ),
     (TAKEN_BACK, replace(WORSENS, late=5)),
 ]
 

@@ -1,0 +1,476 @@
+"""What `DataEngine` is made of: its objects are composed here, and a decision and a report walk through them.
+
+`DataEngine` is the public face of `EngineCore`. `dengine serve` uses the core itself, by `engine.core_of`, for what only a
+server needs: a decision that must not wait, one that came too late, retrains step by step, and the state of the store.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor
+from contextlib import suppress
+from dataclasses import replace
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
+from ..history.status import Status, retrain_fault
+from ..model.base import EngineModel, Exportable
+from ..records import Action, Decision, Reason, RetrainReport, TraceSpec, as_id, as_success
+from ..store.outbox import CLOSE_SECONDS, Outbox
+from ..store.records import StoredDecision
+from ..traces import convert_trace
+from .decide import DecisionMaker, as_part, decided_before, unasked
+from .feedback import Feedback
+from .fleet import Peers
+from .guard import GuardedModel
+from .labels import CellLabels, ProductLabels
+from .learner import Learner
+from .live_model import LiveModel
+from .settings import EngineSettings, SettingsInForce, peers_trace
+from .trainer import Clock, Limits, Retrainer, TrainingWindow
+
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
+
+log = logging.getLogger("dengine")
+
+
+class ExclusiveUse:
+    """A block that one thread enters at a time, and that SIGINT does not interrupt.
+
+    Another thread gets a StoreError. A SIGINT that comes meanwhile is handled when the block ends, so that a label is
+    stored and counted, or neither.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._handlers: list[Any] = []  # of SIGINT before each block, of blocks within one another
+        self._delayed: list[tuple[int, FrameType | None]] = []
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(blocking=False):
+            raise StoreError(
+                "Expected an engine that one thread uses, got a call while another thread is in one; use it in one thread."
+            )
+        try:
+            # Python delivers signals to the main thread alone. An ignored signal interrupts nothing, nor does one
+            # that C code handles.
+            is_main = threading.current_thread() is threading.main_thread()
+            handler = signal.getsignal(signal.SIGINT) if is_main else None
+            if callable(handler):
+                signal.signal(signal.SIGINT, self._delay)
+        except BaseException:
+            self._lock.release()
+            raise
+        self._handlers.append(handler)
+
+    def _delay(self, number: int, frame: FrameType | None) -> None:
+        """Keep a signal for the end of the block."""
+        self._delayed.append((number, frame))
+
+    def __exit__(self, *exception: object) -> None:
+        handler = self._handlers.pop()
+        try:
+            if callable(handler):
+                signal.signal(signal.SIGINT, handler)
+                delayed = self._delayed
+                self._delayed = []
+                if delayed:
+                    handler(*delayed[0])
+        finally:
+            self._lock.release()
+
+
+class EngineCore:
+    """The objects of one engine, and the way of a decision and of a report through them.
+
+    Parameters
+    ----------
+    settings : EngineSettings
+    template : EngineModel
+        Untrained; the first version is trained from it.
+    store : SqlStore
+    executor : concurrent.futures.Executor, optional
+        Trains while the cell goes on; None trains in line.
+    replaying : bool
+        End a retrain by steps alone, and wait for the store without a time limit, so that a seed repeats exactly.
+    clock : callable
+        Seconds, of any origin, by which retrains are timed.
+    on_safe_mode : callable, optional
+        As `DataEngine` takes it.
+    reading : bool
+        Only read a store that another engine may own.
+
+    Attributes
+    ----------
+    exclusive : ExclusiveUse
+        Held by every call that decides or learns.
+    settings : SettingsInForce
+    live : LiveModel
+    learner : Learner
+    feedback : Feedback
+    outbox : Outbox
+    """
+
+    def __init__(
+        self,
+        settings: EngineSettings,
+        template: EngineModel,
+        store: SqlStore,
+        executor: Executor | None = None,
+        replaying: bool = False,
+        clock: Clock = time.perf_counter,
+        on_safe_mode: Callable[[str], object] | None = None,
+        reading: bool = False,
+    ) -> None:
+        torch.set_num_threads(1)
+        recipe = settings.recipe
+        self.store = store
+        self.clock = clock
+        self.exclusive = ExclusiveUse()
+        self.outbox = Outbox(store, recipe.window, not reading, replaying)
+        self.settings = SettingsInForce(settings, self.outbox)
+        window = TrainingWindow(recipe.window)
+        self.live = LiveModel(template, window, self.outbox, settings.evidence)
+        labels: CellLabels | ProductLabels = CellLabels(window)
+        peers = None
+        if store.product is not None:
+            labels = ProductLabels(window, self.live)
+            peers = Peers(self.outbox, self.live, window, labels, clock)
+        self.feedback = Feedback(self.outbox, self.live, labels, self.settings, on_safe_mode)
+        limits = Limits(None if replaying else recipe.budget, recipe.max_steps)
+        retrainer = Retrainer(window, limits, executor, clock)
+        self.learner = Learner(
+            self.outbox, self.live, window, labels, self.feedback, peers, retrainer, clock
+        )
+        self._maker = DecisionMaker(self.settings, store.clock)
+        self._is_first_trace = True
+        if replaying:
+            template.warm_up()  # no cell waits, and the first retrain is timed without it
+        elif not reading:
+            threading.Thread(target=template.warm_up, name="dengine-warm-up").start()
+
+    def resume(self) -> None:
+        """Go on from the store, with the same version and the same decisions, bit for bit."""
+        settings = self.settings.now
+        self.learner.resume(settings.recipe.policy.label_within, settings.policy_since)
+        self.feedback.resume()
+
+    # A decision
+
+    def decide(
+        self,
+        trace: ArrayLike,
+        part: str | int | None = None,
+        decision_id: str | None = None,
+        timed_out: bool = False,
+    ) -> Decision:
+        """Decide on one trace and record the decision; arguments, result and errors as of `DataEngine.decide`.
+
+        With `timed_out` the caller waits no more and verifies, so the decision is VERIFY, `Reason.LATE`.
+        """
+        self.outbox.check_usable()
+        with self.exclusive:
+            id_ = None if decision_id is None else as_id(decision_id)
+            number = as_part(part)
+            if id_ is not None:
+                try:
+                    earlier = self.outbox.find_earlier(id_)
+                except StoreError as error:
+                    return self._verify_unrecorded(id_, number, error)
+                if earlier is not None:
+                    return decided_before(earlier, trace, self.settings.now.trace)
+            self.learner.collect()
+            stored = self._record(trace, number, timed_out, id_)
+            if id_ is not None:
+                stored = self._sync_decision(stored)
+            self.feedback.record_decision(stored)
+            self.feedback.announce_safe_mode()
+        return stored.decision
+
+    def try_decide(self, trace: ArrayLike, part: str | int | None = None) -> Decision | None:
+        """Decide as `decide` does where that waits for nothing; else do nothing and return None.
+
+        It may be called in any thread while no other uses the engine. It waits for neither store nor disk, and runs no
+        code of the user's, nor umap-learn's. `process_retrains` later swaps versions and announces safe mode.
+        """
+        self.outbox.check_usable()
+        with self.outbox.try_lock() as is_free, self.exclusive:
+            answering = self.live.answering
+            is_own_code = (
+                self.live.newest.keeps_references and not self.settings.now.recipe.user_classes
+            )
+            is_quick = is_own_code and (answering is None or answering.is_compiled)
+            has_work = self._is_first_trace or self.settings.waiting or self.feedback.remedy
+            if not (is_free and is_quick) or has_work:
+                return None
+            torch.set_num_threads(1)  # it holds for the present thread only
+            stored = self._record(trace, as_part(part))
+            self.feedback.record_decision(stored)
+            return stored.decision
+
+    def record_timeout(
+        self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str
+    ) -> Decision:
+        """Record VERIFY, `Reason.LATE`, for a caller that timed out, without asking the model; in any thread.
+
+        The decision is on disk when this returns, and an id that has a decision keeps it. With a store in memory, and
+        before the first trace, it is returned unrecorded: `decide` must record it, with `timed_out`. Errors as of
+        `DataEngine.decide`.
+        """
+        self.outbox.check_usable()
+        id_ = as_id(decision_id)
+        number = as_part(part)
+        spec = self.settings.now.trace
+        try:
+            stored = self.outbox.find_earlier(id_)
+        except StoreError as error:
+            return self._verify_unrecorded(id_, number, error)
+        if stored is None:
+            if spec is None or self.store.wait is None:
+                return unasked(id_, number, self.live.version, Reason.LATE)
+            reason = Reason.NO_STORE if self.outbox.verify_all_reason else Reason.LATE
+            x = convert_trace(trace, spec, False)
+            item = self._maker.decide(x, number, None, self.live.version, reason, id_)
+            stored = self.outbox.record_decision(item)
+        with suppress(NotTakenError):
+            self.outbox.sync()
+        return decided_before(stored, trace, spec)
+
+    def _record(
+        self,
+        trace: ArrayLike,
+        part: str | None,
+        timed_out: bool = False,
+        decision_id: str | None = None,
+    ) -> StoredDecision:
+        """Decide on a trace and hand the decision to the outbox, without waiting; returns it with its number."""
+        x = self._check_trace(trace)
+        self.learner.catch_up()
+        self.feedback.confirm_silent()
+        reason = Reason.LATE if timed_out else None
+        if self.outbox.verify_all_reason:
+            reason = Reason.NO_STORE
+        version = self.live.version
+        item = self._maker.decide(x, part, self.live.answering, version, reason, decision_id)
+        return self.outbox.record_decision(item)
+
+    def _sync_decision(self, stored: StoredDecision) -> StoredDecision:
+        """Wait until a decision is on disk; one that cannot be written becomes VERIFY. Returns the one that counts."""
+        try:
+            self.outbox.sync()
+        except NotTakenError:
+            # A decision that lets a part go on unchecked must outlive this process, or its id would have two answers.
+            decision = stored.decision
+            if decision.action is not Action.VERIFY:
+                item = self._maker.decide(
+                    stored.trace,
+                    decision.part,
+                    None,
+                    self.live.version,
+                    Reason.NO_STORE,
+                    decision.id,
+                )
+                return self.outbox.replace_decision(item)
+        return stored
+
+    def _verify_unrecorded(self, decision_id: str, part: str | None, error: StoreError) -> Decision:
+        """Return VERIFY for an id that may have a decision which cannot be looked up; nothing is recorded."""
+        log.warning(
+            "whether %r was decided before cannot be looked up; it is verified: %s",
+            decision_id,
+            error,
+        )
+        return unasked(decision_id, part, self.live.version, Reason.NO_STORE)
+
+    # The contract of traces
+
+    def set_trace_spec(self, spec: TraceSpec, inferred: bool = False) -> TraceSpec:
+        """Set the contract of traces where none is set yet, in the store as well; returns the one in force.
+
+        A product's peers may have set one before. `inferred` says that it comes from a first trace.
+        """
+        if self.settings.now.trace is not None:
+            return self.settings.now.trace
+        try:
+            if self.store.product is not None:
+                spec = self.outbox.call_store(lambda: peers_trace(self.store)) or spec
+        except StoreError:  # the cell's own first trace stands
+            log.exception("the product's contract of traces cannot be had")
+        settings = replace(self.settings.now, trace=spec, inferred=inferred)
+        self._maker.agree_on(spec)
+        self.settings.change(settings)
+        self.settings.save()
+        return spec
+
+    def _check_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
+        """Return a trace as float32, shape (channels, samples), held to the contract.
+
+        A first sound trace sets the contract. Raises TraceError where the shape is wrong.
+        """
+        settings = self.settings.now
+        has_learned = self.live.version + self.learner.labels.new_labels > 0
+        x = convert_trace(trace, settings.trace, settings.inferred and not has_learned)
+        spec = self._maker.first_contract(x, trace) if settings.trace is None else None
+        if spec is not None:
+            if self.set_trace_spec(spec, inferred=True) != spec:  # a peer's trace came first
+                return convert_trace(trace, self.settings.now.trace, False)
+        elif self.settings.waiting:
+            self.settings.save()
+        if self._is_first_trace and self.settings.now.trace is not None and np.isfinite(x).all():
+            self._is_first_trace = False
+            if not self.live.version:  # what will answer is compiled before there is much to do
+                GuardedModel(self.live.template).precompute(x[None])
+        return x
+
+    # A report, and what follows from it
+
+    def report(
+        self, decision_id: str, success: bool, trace: ArrayLike | None, part: str | int | None
+    ) -> RetrainReport | None:
+        """Learn the outcome of a decision; arguments, result and errors as of `DataEngine.report`."""
+        label = as_success(success)  # refused before anything is written
+        id_ = as_id(decision_id)
+        self.outbox.check_usable()
+        with self.exclusive:
+            self.learner.collect()
+            stored = self.outbox.find_decision(id_, unsynced=True)
+            if stored is None:
+                stored = self._record_lost_accept(id_, label, trace, part)
+            self.learner.report(stored, label)
+            if stored.quarantined:
+                return None
+            return self.learner.retrain_if_due(self.settings.now.recipe)
+
+    def _record_lost_accept(
+        self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any
+    ) -> StoredDecision:
+        """Record the accept behind a line stop whose decision was lost; UnknownDecisionError without its trace."""
+        if trace is None or success:
+            raise UnknownDecisionError(
+                f"Expected the id of a decision of this cell, got {decision_id!r}, which is unknown; "
+                "a system stop whose decision was lost can be reported with its trace."
+            )
+        x = self._check_trace(trace)
+        item = self._maker.lost_accept(x, as_part(part), self.live.version, decision_id)
+        stored = self.outbox.record_decision(item)
+        self.feedback.record_decision(stored)
+        return stored
+
+    def retrain(self) -> RetrainReport:
+        """Retrain in line, as `DataEngine.retrain`."""
+        self.outbox.check_usable()
+        with self.exclusive:
+            return self.learner.retrain()
+
+    def start_retrain(self) -> RetrainReport | None:
+        """Begin to retrain in the executor, and return None; without one retrain in line and return the report."""
+        return self.learner.start_retrain()
+
+    def process_retrains(self, brief: bool = False) -> RetrainReport | None:
+        """Swap in a trained version, retrain where one is due, and announce safe mode: between two parts.
+
+        With `brief` a version that an executor has trained comes one step further, a few milliseconds, and not to the
+        end. Returns the report of the newest retrain, once; None without one.
+        """
+        with self.exclusive:
+            self.learner.collect(to_the_end=not brief)
+            self.learner.retrain_if_due(self.settings.now.recipe, once=True)
+            self.feedback.announce_safe_mode()
+            return self.learner.take_report()
+
+    # The store
+
+    def load_decision_ids(self) -> None:
+        """Load the ids of all decisions (a second for a million), so that `decide` looks up no new id in the store."""
+        self.flush()
+        self.outbox.load_ids()
+
+    def flush(self, wait: float | None = None) -> None:
+        """Return when everything is on disk; NotTakenError after `wait` seconds, None: the store's own limit."""
+        self.feedback.store_pending()
+        self.outbox.flush(wait)
+        self.learner.catch_up()
+
+    def close(self) -> None:
+        """Bring in a retrain under way, write everything, and close the store; a second call does nothing."""
+        with self.exclusive:
+            if self.outbox.is_usable:
+                self.feedback.store_pending()
+                self.learner.collect(CLOSE_SECONDS)
+            self.outbox.close()
+
+    def exported(self, trace: TraceSpec | None = None) -> Exportable:
+        """Return the decision as an exporter takes it; `trace` is another contract of traces.
+
+        Raises ExportError before the first retrain, for a baseline, and where the store was changed from outside.
+        """
+        if self.outbox.integrity_error:
+            error = self.outbox.integrity_error
+            raise ExportError(f"Expected a store as it was written, to export from: {error}")
+        settings = self.settings.now
+        policy = settings.recipe.policy
+        return replace(
+            self.live.newest.exported(trace or settings.trace),
+            audit_rate=policy.audited_share,
+            seed=settings.seed,
+            stops_all=policy.stops == "all",
+            windows=policy.limits,
+            model_version=self.live.version,
+            recipe=settings.recipe.to_toml(),
+            note=self.outbox.record_event,
+        )
+
+    # What only the running engine knows
+
+    @property
+    def new_labels(self) -> int:
+        """Labels since the last retrain began."""
+        return self.learner.labels.new_labels
+
+    @property
+    def is_retraining(self) -> bool:
+        """Whether a retrain is under way in the executor, or its version waits to be swapped in."""
+        return self.learner.is_busy
+
+    @property
+    def is_swapping(self) -> bool:
+        """Whether a trained version is being swapped in, one step with each call of the engine."""
+        return self.learner.is_swapping
+
+    @property
+    def store_fault(self) -> str:
+        """Why the store, or its journal, cannot be written at present; "" where both can."""
+        return self.outbox.fault
+
+    @property
+    def store_lag(self) -> float:
+        """Age in seconds of the oldest record in the journal that the store has not taken; 0.0 where it has all."""
+        return self.outbox.lag
+
+    @property
+    def retrain_fault(self) -> str:
+        """Why nothing new is learned where retrains are dropped again and again; "" where they are not."""
+        return retrain_fault(self.learner.dropped, self.live.version)
+
+    def complete_status(self, status: Status) -> Status:
+        """Return a status that was read from the store with the fields that only the running engine knows."""
+        return replace(
+            status,
+            version=self.live.version,
+            shadow=self.settings.now.recipe.policy.shadow,
+            safe_mode=self.live.newest.safe_mode,
+            new_labels=self.new_labels,
+            store_fault=self.store_fault,
+            store_lag=self.store_lag,
+            retraining=self.is_retraining,
+        )

@@ -1,0 +1,139 @@
+"""What a cell takes in of its product: the labels of the other cells, and their newest version.
+
+News is asked for between two cycles, never by `decide`. A cell whose connection is lost goes on with what it has.
+`learner.Learner` asks for news in the order that `Learner.take_in_news` shows.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from ..errors import StoreError
+from ..store.outbox import Outbox
+from ..store.records import ModelVersion, News, without_rule
+from .guard import GuardedModel
+from .labels import ProductLabels
+from .live_model import LiveModel
+from .resume import add_labels_since, newest_reference, restore_model
+from .trainer import Clock, TrainedOn, TrainingWindow
+
+log = logging.getLogger("dengine")
+NEWS_SECONDS = 1.0  # between two questions for news
+MOST = 200  # labels taken in at once: each is embedded, some tenths of a millisecond
+ROUNDS = 5  # of them before a retrain: after a long absence it need not know all
+
+
+class Peers:
+    """The other cells of a product, as the store knows them.
+
+    Parameters
+    ----------
+    outbox : Outbox
+    live : LiveModel
+        Gives way to a peer's newer version.
+    window : TrainingWindow
+    labels : ProductLabels
+        Takes the peers' labels.
+    clock : callable
+        Seconds, of any origin.
+
+    Attributes
+    ----------
+    is_lost : bool
+        The last question for news failed.
+    """
+
+    def __init__(
+        self,
+        outbox: Outbox,
+        live: LiveModel,
+        window: TrainingWindow,
+        labels: ProductLabels,
+        clock: Clock,
+    ) -> None:
+        self._outbox = outbox
+        self._live = live
+        self._window = window
+        self._labels = labels
+        self._clock = clock
+        self.is_lost = False
+        self._asked = -np.inf  # when news was asked for, by the clock
+        self._refused = 0  # a version that could not be taken over
+
+    def resume(self) -> None:
+        """Count the time to the next question from now, because the store was just read."""
+        self._asked = self._clock()
+
+    @property
+    def is_news_due(self) -> bool:
+        """Whether news was not asked for lately."""
+        return self._clock() - self._asked >= NEWS_SECONDS
+
+    def fetch_news(self) -> tuple[News, bool]:
+        """Return the labels after the window's newest, at most `MOST`, and whether a peer's version is newer.
+
+        Raises StoreError where the store gives no answer in time.
+        """
+        store = self._outbox.store
+        newest = self._window.newest_seq
+        news = self._outbox.call_store(lambda: store.news_since(newest, MOST))
+        has_newer_version = news.version > max(self._live.version, self._refused)
+        if has_newer_version or len(news.labelled.seq):
+            self._outbox.call_store(lambda: self._outbox.check_integrity(since=newest))
+        return news, has_newer_version
+
+    def fetch_version(self) -> ModelVersion | None:
+        """Return the newest version of the product; StoreError where the store gives no answer in time."""
+        return self._outbox.call_store(self._outbox.store.last_version)
+
+    def note_loss(self, error: StoreError) -> None:
+        """Note that news cannot be had; it is logged once, and asked for again later."""
+        if not self.is_lost:
+            product = self._outbox.store.product
+            log.warning(
+                "news of product %s cannot be had; the cell goes on without: %s", product, error
+            )
+        self.is_lost = True
+        self._asked = self._clock()
+
+    def note_connection(self) -> None:
+        """Note that news was had; that it comes again is logged once."""
+        if self.is_lost:
+            log.warning("news of product %s comes again", self._outbox.store.product)
+        self.is_lost = False
+
+    def take_in(self, news: News) -> None:
+        """Add the labels of the news to the window and the references, in their order."""
+        labelled = news.labelled
+        rows = zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True)
+        for trace, label, hash_, seq in rows:
+            self._labels.admit(trace, int(label), int(hash_), int(seq))
+
+    def note_taken(self, n_labels: int) -> None:
+        """Note how many labels were taken in; where more may be waiting, the next cycle asks again at once."""
+        self._asked = self._clock() if n_labels < MOST else -np.inf
+
+    def take_over(self, version: ModelVersion) -> None:
+        """Let a peer's version answer, with every label since and this cell's own rule.
+
+        A version that cannot be restored is logged and left alone, and the version before goes on answering.
+        """
+        store = self._outbox.store
+        trained_on = TrainedOn.from_state(version.state)
+        try:
+            model = restore_model(self._outbox, self._live.template, without_rule(version.state))
+            if model is None:
+                raise StoreError("a trace that it was fitted on has changed; see `dengine verify`.")
+            add_labels_since(model, store, version, self._window)
+        except Exception as error:  # no exception inside a model reaches the cell
+            log.exception(
+                "version %d of product %s cannot be taken over", version.version, store.product
+            )
+            if not isinstance(error, StoreError):
+                self._refused = version.version
+            return
+        GuardedModel(model).prepare(self._live.newest)
+        self._labels.take_over(model, newest_reference(version), trained_on.counts_from)
+        self._live.swap_in(model, version.version, trained_on)

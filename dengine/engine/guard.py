@@ -1,0 +1,71 @@
+"""The guard of an engine's calls into its model: an exception inside a model is logged and never reaches the cell.
+
+`live_model.LiveModel`, `resume` and the training make these calls. A prediction that fails is guarded where decisions are
+made, because its reason is recorded with the decision.
+"""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from numpy.typing import NDArray
+
+from ..model.base import Embedding, EngineModel
+from ..reducers.base import Floats, Ints
+
+log = logging.getLogger("dengine")
+
+
+@contextmanager
+def logged_failure(consequence: str) -> Iterator[None]:
+    """Log an exception of the block together with its consequence, and suppress it."""
+    try:
+        yield
+    except Exception:
+        log.exception(consequence)
+
+
+class GuardedModel:
+    """Calls a model's methods and turns each exception into a log entry and a safe result.
+
+    Parameters
+    ----------
+    model : EngineModel
+    """
+
+    def __init__(self, model: EngineModel) -> None:
+        self.model = model
+
+    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
+        """Compute in advance what a training on traces (n, channels, samples) begins with; nothing where it fails."""
+        with logged_failure("computing in advance of a retrain failed"):
+            self.model.precompute(X, numbers)
+
+    def prepare(self, previous: EngineModel) -> None:
+        """Make the model ready to predict in place of the previous one; where it fails, every prediction will fail."""
+        with logged_failure("the model that was trained cannot be made ready to predict"):
+            self.model.prepare(previous)
+
+    def update_rule(self, *outcome: Any) -> None:
+        """Update the rule, arguments as of `EngineModel.update_rule`; where it fails, the model refuses to predict."""
+        with logged_failure(
+            "an update of the rule failed; every part is verified until the engine is opened again"
+        ):
+            self.model.update_rule(*outcome)
+
+    def add_reference(
+        self,
+        x: Floats,
+        y: int,
+        hash_: int,
+        number: int,
+        embedding: Embedding | None = None,
+        point: NDArray[Any] | None = None,
+    ) -> Floats | None:
+        """Make a labelled trace a reference and return its point (d,); None, and no reference, where it fails."""
+        with logged_failure(
+            "the model cannot take a labelled trace; the next version learns it from the store"
+        ):
+            return self.model.add_reference(x, y, hash_, number, embedding=embedding, point=point)
+        return None

@@ -1,0 +1,203 @@
+"""How labels enter the training window, and how many came since the last retrain began: for one cell, and for a product.
+
+`CellLabels` is for a cell that learns alone. `ProductLabels` is for a cell that shares a product with others, whose labels
+have one sequence in the store. `feedback.Feedback` adds labels; `learner.Learner` asks whether a retrain is due.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.base import EngineModel
+from ..reducers.base import State
+from .guard import GuardedModel
+from .live_model import LiveModel
+from .trainer import TrainingWindow
+
+Trace = NDArray[np.float32]  # (channels, samples)
+
+
+class CellLabels:
+    """Labels of a cell that learns alone: each one counts when it is learned, before the store has numbered it.
+
+    Parameters
+    ----------
+    window : TrainingWindow
+        Takes each label that the store has numbered.
+
+    Attributes
+    ----------
+    new_labels : int
+        Labels since the last retrain began.
+    """
+
+    last_to_read: int | None = (
+        None  # of the store's labels, when the window is filled anew; None: all of them
+    )
+
+    def __init__(self, window: TrainingWindow) -> None:
+        self._window = window
+        self.new_labels = 0
+
+    def resume(self, counts_from: int) -> None:
+        """Count the labels of the window after this number, as when the engine was closed."""
+        self.new_labels = len(self._window.newer(counts_from))
+
+    def recount(self, counts_from: int) -> None:
+        """Count again, after the window was filled anew because labels were corrected."""
+        self.resume(counts_from)
+
+    def count_learned(self) -> None:
+        """Count a label that was just learned."""
+        self.new_labels += 1
+
+    def count_unlearned(self) -> None:
+        """Count a label no more that was learned and taken back before the store had it."""
+        self.new_labels -= 1
+
+    def add(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
+        """Add a learned label that the store has numbered to the window."""
+        self._window.add(trace, label, hash_, seq)
+
+    def is_due(self, retrain_every: int) -> bool:
+        """Return whether there are enough new labels for a retrain."""
+        return self.new_labels >= retrain_every
+
+    def begin_retrain(self) -> None:
+        """Count from zero, because a retrain begins."""
+        self.new_labels = 0
+
+    def give_back(self, n_labels: int) -> None:
+        """Count the labels of a retrain that was dropped again, so that the next one comes soon."""
+        self.new_labels += n_labels
+
+    def complete(self, model: EngineModel) -> None:
+        """Do nothing: a trained version has every label of the window, and there are no others."""
+
+    def get_state(self) -> State:
+        """Return what a stored version must know of these labels: nothing."""
+        return {}
+
+
+class ProductLabels:
+    """Labels of all cells of a product, which enter the window in the order of their sequence in the store.
+
+    A label of this cell is a reference at once, and waits for the peers' labels before it until it enters the window.
+
+    Parameters
+    ----------
+    window : TrainingWindow
+    live : LiveModel
+        Takes the peers' labels as references.
+    """
+
+    def __init__(self, window: TrainingWindow, live: LiveModel) -> None:
+        self._window = window
+        self._live = live
+        # This cell's labels whose predecessors are missing, by number: trace, label, hash.
+        self._waiting: dict[int, tuple[Trace, int, int]] = {}
+        # Labels since the newest retrain began: number, and whether the label is this cell's.
+        self._since: list[tuple[int, bool]] = []
+        self._trained_to = 0  # number of the newest label that the newest retrain had
+        self._updated_to = (
+            0  # number of this cell's newest label; the rule was updated with all until there
+        )
+        # The references of a version that was taken over hold every label up to this number; the window may not yet.
+        self._references_to = 0
+
+    @property
+    def new_labels(self) -> int:
+        """Labels of all cells since the newest retrain began."""
+        return len(self._since)
+
+    @property
+    def last_to_read(self) -> int:
+        """Number of the last label to read when the window is filled anew; later ones come as the peers' news."""
+        return self._window.newest_seq
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether labels of this cell wait for peers' labels before them."""
+        return bool(self._waiting)
+
+    def resume(self, counts_from: int) -> None:
+        """Count the labels of the window after this number, as when the engine was closed."""
+        n_new = len(self._window.newer(counts_from))
+        numbers = self._window.newer(0)
+        self._since = [(number, False) for number in numbers[len(numbers) - n_new :]]
+        self._trained_to = numbers[-n_new - 1] if len(numbers) > n_new else 0
+        self._updated_to = self._window.newest_seq
+
+    def recount(self, counts_from: int) -> None:
+        """Count again after the window was filled anew: forgotten labels count no more, restored ones do."""
+        own = {number for number, is_own in self._since if is_own}
+        newer = self._window.newer(self._trained_to)
+        self._since = [(number, number in own) for number in newer]
+
+    def count_learned(self) -> None:
+        """Do nothing: a label counts when it enters the window."""
+
+    def count_unlearned(self) -> None:
+        """Do nothing: a label counts when it enters the window."""
+
+    def add(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
+        """Take a label of this cell that the store has numbered; it enters the window when none before it is missing."""
+        self._waiting[seq] = trace, label, hash_
+        self._updated_to = max(seq, self._updated_to)
+        if seq == self._window.newest_seq + 1:
+            self.admit(trace, label, hash_, seq)
+
+    def admit(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
+        """Add the next label of the product to the window, and a peer's label to the references as well."""
+        is_own = self._waiting.pop(seq, None) is not None
+        self._window.add(trace, label, hash_, seq)
+        if seq > self._trained_to:
+            self._since.append((seq, is_own))
+        model = self._live.answering
+        if not is_own and seq > self._references_to and model is not None:
+            GuardedModel(model).add_reference(trace, label, hash_, seq)
+
+    def is_due(self, retrain_every: int) -> bool:
+        """Return whether a retrain is this cell's turn.
+
+        It is where the label that makes it due is this cell's own, or where a peer missed its turn and twice as many
+        labels have come.
+        """
+        due = self._since[retrain_every - 1 : retrain_every]
+        missed = self._since[2 * retrain_every - 1 :]
+        return any(is_own for _, is_own in (*due, *missed))
+
+    def begin_retrain(self) -> None:
+        """Count from zero, because a retrain on every label of the window begins."""
+        self._trained_to = self._window.newest_seq
+        self._since = []
+
+    def give_back(self, n_labels: int) -> None:
+        """Do nothing after a dropped retrain: the next one is the turn of whichever cell is due."""
+
+    def complete(self, model: EngineModel) -> None:
+        """Add this cell's waiting labels to a version that it trained, which has those of the window only."""
+        self._references_to = 0
+        self._add_waiting(model)
+
+    def take_over(self, model: EngineModel, references_to: int, counts_from: int) -> None:
+        """Add this cell's waiting labels to a peer's version, and count from the label that it counts from.
+
+        The version's references hold every label up to `references_to` already.
+        """
+        self._references_to = references_to
+        self._add_waiting(model)
+        self._trained_to = counts_from
+        self._since = [(number, own) for number, own in self._since if number > counts_from]
+
+    def _add_waiting(self, model: EngineModel) -> None:
+        """Make this cell's waiting labels references, but for those that the version's references hold."""
+        guarded = GuardedModel(model)
+        for seq, (trace, label, hash_) in self._waiting.items():
+            if seq > self._references_to:
+                guarded.add_reference(trace, label, hash_, seq)
+
+    def get_state(self) -> State:
+        """Return, for a stored version, the number up to which this cell's labels have updated the rule."""
+        return {"rule_last_seq": np.array(self._updated_to)}

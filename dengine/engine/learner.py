@@ -1,0 +1,489 @@
+"""The order of the steps by which an engine learns: store what waits, update the rule, train, swap, take in news.
+
+`Learner` is the only object that calls the others in this order. `Feedback` turns outcomes into labels, `LiveModel` learns
+them, `Retrainer` trains a candidate, and `Peers` reads what other cells of the product made; none of them knows the
+learner. `core.EngineCore` calls it once per decision, report and cycle.
+"""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..decision.policy import Policy
+from ..errors import StoreError
+from ..model.base import EngineModel
+from ..recipe import Recipe
+from ..records import RetrainReport
+from ..store.outbox import Outbox
+from ..store.records import Change, Labelled, StoredDecision, without_rule
+from .candidate import Candidate
+from .feedback import Feedback, Remedy
+from .fleet import MOST, ROUNDS, Peers
+from .guard import GuardedModel
+from .labels import CellLabels, ProductLabels
+from .live_model import LiveModel
+from .resume import add_labels_since, refit
+from .settings import EvidenceWindow
+from .trainer import HUNG, Clock, Retrainer, Trained, TrainedOn, TrainingWindow
+
+log = logging.getLogger("dengine")
+STEP = 0.0005  # seconds of catching up in one step: a label or two
+IMPORTED = (
+    500  # labels without any retrain: they were imported, and a first training is worth preparing
+)
+
+
+class Learner:
+    """Takes an engine's model from each outcome to the next version.
+
+    Parameters
+    ----------
+    outbox : Outbox
+    live : LiveModel
+    window : TrainingWindow
+    labels : CellLabels or ProductLabels
+    feedback : Feedback
+    peers : Peers or None
+        None where the cell shares no product.
+    retrainer : Retrainer
+    clock : callable
+        Seconds, of any origin, by which retrains are timed.
+
+    Attributes
+    ----------
+    dropped : list of str
+        Reasons of the retrains that were dropped since the last accepted one.
+    """
+
+    def __init__(
+        self,
+        outbox: Outbox,
+        live: LiveModel,
+        window: TrainingWindow,
+        labels: CellLabels | ProductLabels,
+        feedback: Feedback,
+        peers: Peers | None,
+        retrainer: Retrainer,
+        clock: Clock,
+    ) -> None:
+        self.live = live
+        self.labels = labels
+        self.dropped: list[str] = []
+        self._outbox = outbox
+        self._store = outbox.store  # called without a time limit, so never while the cell waits
+        self._window = window
+        self._feedback = feedback
+        self._peers = peers
+        self._retrainer = retrainer
+        self._clock = clock
+        self._candidate: Candidate | None = None
+        self._report: RetrainReport | None = None  # of the newest retrain, until it is taken
+        self._was_accepted = True  # the last retrain
+        self._precomputed: Future[None] | None = None  # what the next retrain begins with
+
+    def resume(self, within: int, policy_since: int) -> None:
+        """Go on from the store, bit for bit; arguments as of `LiveModel.resume`."""
+        version = self._store.last_version()  # before the labels: a peer may store both meanwhile
+        labelled = self._store.labelled(self._window.capacity)
+        self._window.refill(labelled)
+        reports = self._store.retrains()
+        for report in reports:
+            self._note_outcome(report)
+        newest_version = max((report.version for report in reports), default=0)
+        self.live.resume(version, newest_version, within, policy_since)
+        if self.live.answering is not None or len(labelled.seq) >= IMPORTED:
+            self._precompute(labelled)
+        self.labels.resume(self._counts_from)
+        if self._peers is not None:
+            self._peers.resume()
+
+    @property
+    def _counts_from(self) -> int:
+        """Number of the newest label that the next retrain does not wait for; 0 before the first retrain."""
+        trained_on = self.live.trained_on
+        return 0 if trained_on is None else trained_on.counts_from
+
+    def _precompute(self, labelled: Labelled) -> None:
+        """Begin, in a thread, to compute what a retrain on these labels starts with: opening does not wait for it."""
+        pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
+        model = GuardedModel(self.live.newest)
+        self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)
+        pool.shutdown(wait=False)
+
+    # One outcome
+
+    def report(self, stored: StoredDecision, success: bool) -> None:
+        """Learn a reported label, and return once it is on disk; NotTakenError where it is not."""
+        self.catch_up()
+        confirmed_wrongly = self._feedback.take_in(stored, success)
+        self._outbox.sync()
+        self._feedback.note_synced(stored.decision.id)
+        if confirmed_wrongly:
+            with suppress(StoreError):  # then it is put right when the store is back
+                self._outbox.drain()
+        self.catch_up()
+        self._feedback.announce_safe_mode()
+
+    def catch_up(self) -> None:
+        """Do what had to wait for the store: number its labels, and put right what was learned and did not happen."""
+        self._feedback.number_labels()
+        if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
+            return
+        # A rule that is rebuilt from the store would forget labels that are pending.
+        if self._feedback.store_pending() and not self._outbox.is_drained:
+            return
+        remedy = self._feedback.take_remedy()
+        if remedy is None:
+            return
+        try:
+            if remedy is Remedy.CORRECT:
+                self.collect(HUNG)  # what is being trained does not have the correction
+                self.apply_corrections()
+            else:
+                self.live.rebuild_rule()
+        except StoreError:
+            self._feedback.retry_remedy(remedy)
+            log.exception("the rule is rebuilt when the store is back")
+
+    def store_labels(self) -> None:
+        """Have every label in the store, with its number; StoreError where the store is away."""
+        self._feedback.store_pending()
+        self._drain_labels()
+
+    def _drain_labels(self) -> None:
+        """Wait until the store has the labels that are in the journal; StoreError where it is away."""
+        if self._outbox.request_label_drain():
+            self._outbox.drain()
+        self.catch_up()
+
+    # A retrain
+
+    def retrain(self) -> RetrainReport:
+        """Train a version and let it answer, in line; one that cannot be stored is dropped and recorded."""
+        self.collect(HUNG)
+        self.store_labels()
+        begin = self._clock()
+        self._begin_retrain()
+        trained = self._retrainer.train(self.live.newest, begin)
+        candidate = self._candidate = self._as_candidate_of(trained)
+        self._report = None
+        self._advance(to_the_end=True)
+        return self._report or candidate.report  # a stored one may wait for the labels since
+
+    def start_retrain(self) -> RetrainReport | None:
+        """Begin to train in the executor, unless it trains already, and return None; retrain in line without one."""
+        self.collect()
+        if self.is_busy:
+            return None
+        if self._retrainer.executor is not None:
+            self.store_labels()
+            self._begin_retrain()
+            if self._retrainer.start(self.live.newest):
+                return None
+        return self.retrain()
+
+    def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
+        """Retrain, or begin to, where the recipe says so, there are enough labels, and the store is there.
+
+        `once` leaves a training that lacks steps as it is until the report of the last one was taken. Returns the
+        report of a retrain in line; None without one.
+        """
+        is_due = self._is_due(recipe.retrain_every)
+        lacks_steps = self._lacks_steps and not (once and self._report is not None)
+        n_labels = max(self.labels.new_labels, len(self._window))
+        has_enough = n_labels >= self.live.newest.min_traces
+        if not (is_due and has_enough) and not lacks_steps:
+            return None
+        try:
+            self.store_labels()
+        except StoreError:  # logged by the outbox; the labels wait in its journal
+            return None
+        precomputed = self._precomputed
+        is_preparing = precomputed is not None and not precomputed.done()
+        if self._outbox.fault or (self._retrainer.executor is not None and is_preparing):
+            return None
+        return self.start_retrain()
+
+    @property
+    def _lacks_steps(self) -> bool:
+        """Whether the answering version lacks training steps, as after many labels were imported at once.
+
+        Not where the last retrain was dropped: its labels wait for the next one. Nor where cells share a product: each
+        of them would train the same version.
+        """
+        is_alone = self._peers is None and self.live.answering is not None
+        return is_alone and self._was_accepted and self.live.newest.report.n_steps_left > 0
+
+    @property
+    def is_swapping(self) -> bool:
+        """Whether a trained version is on its way to answering, a step each time that the engine is called."""
+        return self._candidate is not None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a training is under way in the executor, or its version on its way to answering."""
+        return self._retrainer.future is not None or self.is_swapping
+
+    def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
+        """Bring a version that the executor trained a step further, or to the end.
+
+        `wait` is how many seconds to wait for a training that is not done; then the version is brought to the end.
+        """
+        if self._retrainer.future is None and self._candidate is None:
+            return
+        # Versions and corrections of peers must not come in between two steps.
+        to_the_end = to_the_end or wait > 0.0 or self._peers is not None
+        trained = self._retrainer.collect(wait)
+        if trained is not None:
+            self._candidate = self._as_candidate_of(trained)
+        if self._candidate is not None and (to_the_end or trained is None):  # taking it was a step
+            self._advance(to_the_end)
+
+    def _as_candidate_of(self, trained: Trained) -> Candidate:
+        """Return the outcome of a training as a candidate, prepared to answer in place of the present version."""
+        return Candidate(trained, self.live.newest, self.live.version, self._clock)
+
+    def _begin_retrain(self) -> None:
+        """Know all that can be known before a training, and count the labels of the next one from here."""
+        if self._precomputed is not None:
+            self._precomputed.result()
+            self._precomputed = None
+        self._take_in_all_news()
+        self.labels.begin_retrain()
+
+    def _advance(self, to_the_end: bool) -> None:
+        """Bring the candidate a step further: catch up on labels, store it, swap it in. One not stored is dropped."""
+        candidate = self._candidate
+        if candidate is None:
+            return
+        try:
+            is_stored = self._store_candidate(candidate, to_the_end)
+        except StoreError as error:  # a version that is not stored would be gone with the process
+            self._drop(candidate, error)
+            return
+        if not is_stored or self._waits_for_labels(candidate, to_the_end):
+            return
+        try:
+            self.store_labels()  # what was confirmed since is to be among its references
+        except StoreError as error:
+            version = candidate.report.version
+            log.warning(
+                "version %d is stored, and answers once the labels since are: %s", version, error
+            )
+            return
+        candidate.catch_up(self._window)
+        self._candidate = None
+        self._swap(candidate)
+
+    def _store_candidate(self, candidate: Candidate, to_the_end: bool) -> bool:
+        """Return whether the candidate is in the store; False where another step is needed.
+
+        Raises StoreError where it cannot be stored.
+        """
+        if candidate.storing is None:
+            if not candidate.catch_up(self._window, np.inf if to_the_end else STEP):
+                return False
+            if self._waits_for_labels(candidate, to_the_end):
+                return False
+            self.store_labels()
+            candidate.catch_up(self._window)
+            candidate.begin_storing(self._begin_storing(candidate), self._outbox.limit)
+        if candidate.storing is None or (not to_the_end and candidate.may_go_on_storing()):
+            return False
+        candidate.number(self._outbox.wait_for_result(candidate.storing))
+        return True
+
+    def _begin_storing(self, candidate: Candidate) -> Future[int]:
+        """Begin to store a candidate, with its model where it has one; the future returns its number."""
+        report = candidate.accept(self.live.next_version, self.live.corrected_to)
+        newest_seq = self._window.newest_seq
+        state = None
+        if candidate.model is not None and candidate.trained_on is not None:
+            state = self._state_of(candidate.model, candidate.trained_on)
+        return self._outbox.submit(lambda: self._store.put_version(report, newest_seq, state))
+
+    def _state_of(self, model: EngineModel, trained_on: TrainedOn) -> dict[str, Any]:
+        """Return the arrays of a version of this model, for the store."""
+        return self.live.get_state(model, trained_on) | self.labels.get_state()
+
+    def _waits_for_labels(self, candidate: Candidate, to_the_end: bool) -> bool:
+        """Return whether labels are on their way into the store and the cell need not wait for that."""
+        has_lost_patience = candidate.lose_patience()
+        return not to_the_end and not has_lost_patience and self._outbox.request_label_drain()
+
+    def _swap(self, candidate: Candidate) -> None:
+        """Let a stored candidate answer: one reference is swapped."""
+        self._report = candidate.report
+        self._was_accepted = candidate.model is not None
+        self._note_outcome(candidate.report)
+        if candidate.model is not None:
+            # An update of the rule may have failed since the candidate took it over.
+            GuardedModel(candidate.model).prepare(self.live.newest)
+            self.live.swap_in(candidate.model, candidate.report.version, candidate.trained_on)
+            self.labels.complete(candidate.model)
+
+    def _drop(self, candidate: Candidate, error: StoreError) -> None:
+        """Drop a candidate that could not be stored; its labels count as new, so that the next retrain is soon."""
+        log.warning("a retrain was dropped, for it could not be stored: %s", error)
+        self._candidate = None
+        self._was_accepted = False
+        self.labels.give_back(candidate.report.n_traces)
+        self._report = replace(
+            candidate.report,
+            version=self.live.version,
+            accepted=False,
+            reason=f"dropped: not stored: {error}",
+        )
+        self._note_outcome(self._report)
+
+    def _note_outcome(self, report: RetrainReport) -> None:
+        """Keep the reasons of the retrains that were dropped since the last accepted one."""
+        self.dropped = [] if report.accepted else [*self.dropped, report.reason]
+
+    def take_report(self) -> RetrainReport | None:
+        """Return the report of the newest retrain, once; None where it was taken."""
+        report = self._report
+        self._report = None
+        return report
+
+    # News of a product
+
+    def _is_due(self, retrain_every: int) -> bool:
+        """Return whether a retrain is due; where a product is shared, news is taken in before it is said to be."""
+        if self._peers is not None and self._peers.is_news_due:
+            self._take_in_news(self._peers)
+        if not self.labels.is_due(retrain_every):
+            return False
+        self._take_in_all_news()  # a peer's version may have come
+        return self.labels.is_due(retrain_every)
+
+    def _take_in_all_news(self) -> None:
+        """Take in the peers' news until there is no more, in a few rounds; nothing where no product is shared."""
+        peers = self._peers
+        if peers is None:
+            return
+        for _ in range(ROUNDS):
+            if self._take_in_news(peers) < MOST:
+                return
+
+    def _take_in_news(self, peers: Peers) -> int:
+        """Take in the peers' newest version, labels and corrections; returns how many labels, 0 where the store is away."""
+        version = None
+        try:
+            self._drain_labels()  # one of the news may be a label of this cell
+            news, has_newer_version = peers.fetch_news()
+            if has_newer_version:
+                self.store_labels()  # the peers' version is to have them among its references
+                version = peers.fetch_version()
+        except StoreError as error:
+            peers.note_loss(error)
+            return 0
+        peers.note_connection()
+        if version is not None:
+            peers.take_over(version)
+        peers.take_in(news)
+        if news.correction > self.live.corrected_to:
+            try:
+                self.apply_corrections(may_retrain=False)
+            except StoreError as error:  # asked for again with the next news
+                product = self._store.product
+                log.warning("corrections of product %s cannot be had yet: %s", product, error)
+        n_labels = len(news.labelled.seq)
+        peers.note_taken(n_labels)
+        return n_labels
+
+    # What people put right
+
+    def make_ready(self) -> None:
+        """Bring in every version, label and news that is under way; StoreError where that cannot be.
+
+        A change by a person comes after all that was known before.
+        """
+        self.collect(HUNG)
+        self.store_labels()
+        self._take_in_all_news()
+        if self._peers is not None and (self._peers.is_lost or self._has_gaps):
+            raise StoreError(
+                f"News of product {self._store.product!r} cannot be had now; try it again."
+            )
+
+    @property
+    def _has_gaps(self) -> bool:
+        """Whether labels of this cell wait for labels of peers that have not come."""
+        return isinstance(self.labels, ProductLabels) and self.labels.has_gaps
+
+    def apply_corrections(self, may_retrain: bool = True) -> None:
+        """Learn the store's newest corrections: window, references and rule.
+
+        A model that cannot change a reference is trained anew, where `may_retrain`: by the cell that corrected.
+        """
+        self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
+        last = self.labels.last_to_read
+        self._window.refill(self._store.labelled(self._window.capacity, last=last))
+        is_done = self.live.apply_corrections()
+        self.labels.recount(self._counts_from)
+        self.live.rebuild_rule()
+        if may_retrain and not is_done:
+            self.retrain()
+
+    def roll_back(self, number: int, event: Change) -> None:
+        """Let an earlier version answer again, as a new one, with the labels that came since among its references.
+
+        Raises StoreError for a version that is not kept, and where a trace that it was trained on is damaged.
+        """
+        self._outbox.check_integrity()
+        begin = self._clock()
+        version = self._store.load_version(number)
+        state = without_rule(version.state)  # the present rule goes on
+        model = self.live.template.successor()
+        trained_on = TrainedOn.from_state(version.state)
+        if not model.keeps_references:
+            # A baseline cannot take a label back: it is trained on the same traces as they are labelled now.
+            trained_on = replace(trained_on, corrected_to=self.live.corrected_to)
+        if model.needs_refit(state) and not refit(model, self._outbox, trained_on):
+            raise StoreError(
+                f"Expected the traces that version {number} was fitted on as they were stored, "
+                "some have changed; see `dengine verify`, and restore the store from a copy."
+            )
+        model.set_state(state)
+        GuardedModel(model).prepare(self.live.newest)
+        add_labels_since(model, self._store, version, self._window)
+        trained_on = replace(trained_on, counts_from=self._window.newest_seq)
+        reason = f"rolled back to version {number}"
+        self._record(event, model, trained_on, reason, self._clock() - begin)
+        self._begin_retrain()
+
+    def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
+        """Go on under another policy, as a new version of the same model.
+
+        With `policy` None only settings outside the model have changed, and its rule goes on.
+        """
+        live = self.live
+        template = live.template
+        model = live.answering
+        if policy is not None:
+            template, model = live.with_policy(policy, evidence)
+        if model is None or live.trained_on is None:
+            self._store.record(event)
+        else:
+            self._record(event, model, live.trained_on, "another policy, the same model", 0.0)
+        live.change_evidence(template, evidence)
+
+    def _record(
+        self, event: Change, model: EngineModel, trained_on: TrainedOn, reason: str, seconds: float
+    ) -> None:
+        """Store a version together with the event of the person who made it; then it answers."""
+        n_traces = len(trained_on.seq)
+        report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)
+        state = self._state_of(model, trained_on)
+        self._store.record(replace(event, version=(report, self._window.newest_seq, state)))
+        self.live.swap_in(model, report.version, trained_on)
+        self._report = report
+        self._note_outcome(report)

@@ -1,0 +1,275 @@
+"""The model that answers, and what it learns from outcomes: its references, its rule, and their numbers in the store.
+
+`LiveModel` knows the store and the training window below it. Which version answers, and when, is up to
+`learner.Learner`; outcomes come from `feedback.Feedback`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..decision.policy import Policy
+from ..model.base import EngineModel
+from ..records import ACTIONS, Decision, Reason
+from ..reducers.base import State
+from ..store.outbox import Outbox
+from ..store.records import (
+    ModelVersion,
+    OutcomeRecord,
+    StoredDecision,
+    overdue_outcomes,
+    without_rule,
+)
+from ..store.rule_progress import read_rule_progress
+from .guard import GuardedModel
+from .resume import add_labels_since, apply_correction, restore_model
+from .settings import EvidenceWindow
+from .trainer import TrainedOn, TrainingWindow
+
+Point = NDArray[np.float32]
+
+
+class LiveModel:
+    """The model that answers, with its decision rule and its references.
+
+    Parameters
+    ----------
+    template : EngineModel
+        Untrained; the first version is trained from it, and its rule is updated until then.
+    window : TrainingWindow
+    outbox : Outbox
+    evidence : EvidenceWindow
+        Which decisions the rule in force is updated with.
+
+    Attributes
+    ----------
+    answering : EngineModel or None
+        None before the first retrain.
+    version : int
+        Number of the answering version, from 1; 0 before the first retrain.
+    newest_version : int
+        Largest number that a version ever had; after damage an earlier version may answer.
+    trained_on : TrainedOn or None
+        Labels that the answering version was trained on.
+    corrected_to : int
+        Number of the newest correction that the references have.
+    overdue : set of str
+        Decisions that the rule counts as wrong because their checks were not reported in time.
+    overdue_to : int
+        Number of the newest decision that was examined for an overdue check.
+    """
+
+    def __init__(
+        self,
+        template: EngineModel,
+        window: TrainingWindow,
+        outbox: Outbox,
+        evidence: EvidenceWindow,
+    ) -> None:
+        self.template = template
+        self.window = window
+        self.outbox = outbox
+        self.evidence = evidence
+        self.answering: EngineModel | None = None
+        self.version = 0
+        self.newest_version = 0
+        self.trained_on: TrainedOn | None = None
+        self.corrected_to = 0
+        self.overdue: set[str] = set()
+        self.overdue_to = 0
+        # Learned labels that the store has not numbered, by decision: the decision, the label, and the provisional
+        # number of the reference; 0 where there is no reference.
+        self._unnumbered: dict[str, tuple[StoredDecision, bool, int]] = {}
+        self._provisional = itertools.count(-1, -1)
+
+    @property
+    def newest(self) -> EngineModel:
+        """The answering model, or the template before the first retrain."""
+        return self.answering or self.template
+
+    @property
+    def next_version(self) -> int:
+        """Number of the next version."""
+        return self.newest_version + 1
+
+    def resume(
+        self, version: ModelVersion | None, newest_version: int, within: int, policy_since: int
+    ) -> None:
+        """Go on from a stored version, bit for bit; stored reference points are read, not computed again.
+
+        Parameters
+        ----------
+        version : ModelVersion or None
+            None before the first retrain.
+        newest_version : int
+            Largest number that a version ever had.
+        within : int
+            Number of later decisions after which a check is overdue.
+        policy_since : int
+            First version under the policy in force.
+        """
+        store = self.outbox.store
+        since = self.evidence.since
+        self.newest_version = newest_version
+        model = None
+        if version is not None:
+            # A later version may be damaged: what an earlier one's rule learned under another policy is left out.
+            state = version.state if version.version >= since else without_rule(version.state)
+            model = restore_model(self.outbox, self.template, state)
+        past = read_rule_progress(store, None if model is None else version, since, within, policy_since)
+        self.overdue = set(past.overdue_ids)
+        self.overdue_to = past.overdue_to
+        if version is None or model is None:
+            self._rebuild_rule_of(self.template, self._read_outcomes)
+            numbers = (correction.number for correction in store.corrections())
+            self.corrected_to = max(numbers, default=0)
+            return
+        self.swap_in(model, version.version, TrainedOn.from_state(version.state))
+        GuardedModel(model).prepare(self.template)
+        self.corrected_to = add_labels_since(model, store, version, self.window)
+        if past.last_seq:
+            _update_rule(model, lambda: self._read_outcomes(past.last_seq))
+        else:
+            self._rebuild_rule_of(model, self._read_outcomes)
+
+    def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn | None) -> None:
+        """Let a model answer from now on, as the version of this number."""
+        self.answering = model
+        self.version = version
+        self.newest_version = max(version, self.newest_version)
+        self.trained_on = trained_on
+
+    def learn(self, stored: StoredDecision, success: bool, unobserved: int | None) -> Point | None:
+        """Update the rule with an outcome and make the trace a reference.
+
+        `unobserved` is the number of accepted parts without an outcome since the previous update; None leaves the
+        rule as it is. Returns the reference point (d,) to be stored with the label; None where there is none.
+        """
+        decision = stored.decision
+        if unobserved is not None and decision.model_version >= self.evidence.since:
+            GuardedModel(self.newest).update_rule(
+                decision.lower,
+                decision.upper,
+                success,
+                decision.reason is Reason.NOVEL,
+                unobserved,
+                ACTIONS.index(decision.predicted),
+                decision.inclusion_probability,
+            )
+        model = self.answering
+        number = 0 if model is None else next(self._provisional)
+        self._unnumbered[decision.id] = stored, success, number
+        if model is None:
+            return None
+        # An embedding that this very version computed for the decision is not computed again.
+        embedding = decision.embedding if decision.model_version == self.version else None
+        point = GuardedModel(model).add_reference(
+            stored.trace, int(success), stored.content_hash, number, embedding
+        )
+        return point if model.keeps_references else None
+
+    def unlearn(self, stored: StoredDecision) -> None:
+        """Remove the reference of a label that the store has not numbered, because the part was confirmed wrongly."""
+        *_, number = self._unnumbered.pop(stored.decision.id)
+        if number:
+            self.newest.change_reference(number, stored.content_hash, None)
+
+    def assign_number(self, decision_id: str, seq: int) -> tuple[StoredDecision, bool] | None:
+        """Give the reference of a learned label the sequence number that the store assigned.
+
+        Returns the decision and its label, for the training window; None where the decision taught nothing.
+        """
+        if decision_id not in self._unnumbered:
+            return None
+        stored, success, number = self._unnumbered.pop(decision_id)
+        if number:
+            self.newest.renumber_reference(number, seq)
+        return stored, success
+
+    def count_overdue(self, decision: Decision) -> None:
+        """Update the rule as if the decision was wrong, whichever it was: its check was not reported in time."""
+        if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
+            return
+        for outcome in overdue_outcomes(decision):
+            self.overdue.add(decision.id)
+            GuardedModel(self.newest).update_rule(*outcome[1:])
+
+    def examined_to(self, number: int) -> None:
+        """Note that decisions up to this number were examined for overdue checks."""
+        self.overdue_to = max(number, self.overdue_to)
+
+    def clear_overdue(self, decision_id: str) -> bool:
+        """Count a decision as overdue no more; returns whether it was counted so, and the rule must be rebuilt."""
+        if decision_id not in self.overdue:
+            return False
+        self.overdue.discard(decision_id)
+        return True
+
+    def rebuild_rule(self) -> None:
+        """Reset the rule and update it with every stored outcome; StoreError where the store is away."""
+        store = self.outbox.store
+        outcomes = self.outbox.call_store(
+            lambda: store.outcomes_since(0, self.evidence.since, self.overdue_to)
+        )
+        self._rebuild_rule_of(self.newest, lambda: outcomes)
+
+    def _rebuild_rule_of(
+        self, model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]
+    ) -> None:
+        """Reset a model's rule to the safe mode of the policy's start and update it with the outcomes."""
+        model.reset_rule(self.evidence.began_in)
+        _update_rule(model, read_outcomes)
+
+    def _read_outcomes(self, after: int = 0) -> list[OutcomeRecord]:
+        """Return the stored outcomes of labels after this number, checked against the ledger."""
+        self.outbox.check_integrity(after)
+        return self.outbox.store.outcomes_since(after, self.evidence.since, self.overdue_to)
+
+    def apply_corrections(self) -> bool:
+        """Apply the store's newest corrections to the references; False where the model must be trained again."""
+        store = self.outbox.store
+        is_done = self.newest.keeps_references or self.answering is None
+        for correction in store.corrections(self.corrected_to):
+            if self.answering is not None:
+                is_done &= apply_correction(self.answering, store, correction)
+            self.corrected_to = correction.number
+        return is_done
+
+    def with_policy(
+        self, policy: Policy, evidence: EvidenceWindow
+    ) -> tuple[EngineModel, EngineModel | None]:
+        """Return the template and the answering model under another policy, with rules that start anew."""
+        template = self.template.with_policy(policy)
+        template.reset_rule(evidence.began_in)
+        if self.answering is None:
+            return template, None
+        model = self.answering.with_policy(policy)
+        GuardedModel(model).prepare(template)
+        return template, model
+
+    def change_evidence(self, template: EngineModel, evidence: EvidenceWindow) -> None:
+        """Go on with another template, and with other decisions that the rule is updated with."""
+        self.template = template
+        self.evidence = evidence
+
+    def get_state(self, model: EngineModel, trained_on: TrainedOn) -> State:
+        """Return the arrays of a version of this model, for the store."""
+        state = model.get_state() | trained_on.to_state()
+        state["corrected_to"] = np.array(self.corrected_to)
+        state["overdue_to"] = np.array(self.overdue_to)
+        if self.overdue:
+            state["includes_overdue"] = np.array(True)  # an engine that opens the store rebuilds the rule
+        return state
+
+
+def _update_rule(model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]) -> None:
+    """Update a model's rule with outcomes in the order of their labels; they are not read for a rule that never learns."""
+    if not model.rule_learns:
+        return
+    guarded = GuardedModel(model)
+    for outcome in read_outcomes():
+        guarded.update_rule(*outcome[1:])
