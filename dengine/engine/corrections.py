@@ -207,7 +207,7 @@ class Corrections:
         return found
 
     def _correct(self, change: Change) -> Changed:
-        self._store.record(change)
+        self._store.apply_change(change)
         for name in change.decisions:
             self._core.outbox.evict_decision(name)
         self._core.learner.apply_corrections()

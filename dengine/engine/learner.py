@@ -471,7 +471,7 @@ class Learner:
         if policy is not None:
             template, model = live.with_policy(policy, evidence)
         if model is None or live.trained_on is None:
-            self._store.record(event)
+            self._store.apply_change(event)
         else:
             self._record(event, model, live.trained_on, "another policy, the same model", 0.0)
         live.change_evidence(template, evidence)
@@ -483,7 +483,7 @@ class Learner:
         n_traces = len(trained_on.seq)
         report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)
         state = self._state_of(model, trained_on)
-        self._store.record(replace(event, version=(report, self._window.newest_seq, state)))
+        self._store.apply_change(replace(event, version=(report, self._window.newest_seq, state)))
         self.live.swap_in(model, report.version, trained_on)
         self._report = report
         self._note_outcome(report)

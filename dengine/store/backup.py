@@ -1,10 +1,10 @@
-"""A copy of a store in one file, with what its journals hold; the store may be in use meanwhile.
+"""Copies a store into one file, including what its journals hold, while the store may be in use.
 
     report = backup_store("engine.db", "copy.db")
     report.decisions, report.labels, report.from_journals
 
-A copy of the file alone lacks what lies beside it: the newest transactions, in its `-wal` file, and the
-newest labels, in the journal of each cell.
+A plain copy of the file would lack what is beside it: the newest transactions, in its `-wal` file,
+and the newest labels, in the journal of each cell. `dengine backup` uses this.
 """
 
 import os
@@ -29,9 +29,15 @@ from .sql import SqlStore
 class BackupReport:
     """What `backup_store` copied.
 
-    decisions, labels : that the copy holds, of all cells.
-    from_journals : decisions, labels and events in it that the store had not taken from the journals yet.
-    without_journal : cells of which no journal was there.
+    Attributes
+    ----------
+    decisions, labels : int
+        Numbers in the copy, of all cells.
+    from_journals : int
+        Number of records that were copied from journals, since the store did not have them yet.
+    without_journal : tuple of str
+        Cells without a journal.
+
     """
 
     decisions: int
@@ -41,36 +47,49 @@ class BackupReport:
 
 
 def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> BackupReport:
-    """Copy a store in a file by SQLite's own backup, and have the copy take what the journals hold.
+    """Copy a store in a file, and add to the copy what the journals hold.
 
-    Engines may go on meanwhile: whatever they had acknowledged when this was called is in the copy. It is
-    written whole or not at all.
+    Engines may run meanwhile: everything that they had acknowledged when this was called is in the
+    copy. The copy is written in full or not at all.
+
 
     Parameters
     ----------
     url : str or path
         A file, or a URL of SQLite.
     out : str or path
-        A file that is not there yet.
+        A file that does not exist yet.
+
+    Returns
+    -------
+    BackupReport
 
     Raises
     ------
     StoreError
-        For what is no store in a file, and for a journal that cannot be read.
+        If `url` is no store in a file, and if a journal cannot be read.
     OutputError
-        Where the copy cannot be written.
+        If the copy cannot be written.
     """
     with reading(os.fspath(url)) as connection:
         if connection.dialect.name != "sqlite":
-            do = "pg_dump copies that, once the engines have ended: their journals lie on their machines"
+            do = (
+                "pg_dump copies that, once the engines have ended: their journals lie on "
+                "their machines"
+            )
             raise StoreError(f"Expected a store in a file, got {connection.dialect.name}; {do}.")
         cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
-    # Before the store: what leaves a journal meanwhile is in it by then.
+    # Journals first: a record that leaves its journal meanwhile is in the store by then.
     waiting = {cell: read_undrained(path) for cell, path in paths.items() if path.exists()}
     with output_file(out) as partial:
         try:
-            with instead(OutputError, f"Cannot write {out}", sqlite3.Error, do="choose a folder that has room"):
+            with instead(
+                OutputError,
+                f"Cannot write {out}",
+                sqlite3.Error,
+                do="choose a folder that has room",
+            ):
                 _copy(os.fspath(url), partial)
                 for cell, records in waiting.items():
                     _add_records(partial, cell, records)
@@ -83,13 +102,14 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
 
 
 def _copy(url: str, target: Path) -> None:
+    """Copy a store's file by SQLite's own backup."""
     with reading(url) as connection, closing(sqlite3.connect(target)) as copy:
         source: Any = connection.connection.driver_connection
         source.backup(copy)
 
 
 def _add_records(file: Path, cell: str, records: list[Record]) -> None:
-    """Add records to the copy; those that it has already change nothing."""
+    """Add a cell's records to the copy; those that it has already change nothing."""
     if not records:
         return
     with SqlStore(str(file), cell) as store:
@@ -98,10 +118,14 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
 
 
 def _fold_wal_and_count(file: Path) -> tuple[int, int]:
-    """Leave write-ahead logging, so that all is in one file that can be read anywhere; returns its decisions and labels."""
+    """Turn off write-ahead logging, so that everything is in one file.
+
+    Returns its numbers of decisions and labels.
+    """
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")
         decisions, labels = (
-            connection.execute(f'SELECT count(*) FROM "{table.name}"').fetchone()[0] for table in (DECISION, LABEL)
+            connection.execute(f'SELECT count(*) FROM "{table.name}"').fetchone()[0]
+            for table in (DECISION, LABEL)
         )
     return decisions, labels

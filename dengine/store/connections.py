@@ -1,6 +1,9 @@
-"""A database that one cell writes to: engine, transactions, the lease on the cell, and what goes in.
+"""Connections to a store's database, and the class `Database` through which one cell writes to it.
 
-A deleted file, a fork, and a row that the database refuses are each met here.
+`make_engine` makes the SQLAlchemy engine for SQLite or PostgreSQL; `reading` connects for reading
+only. `Database` adds transactions that end with a ledger entry, the lease on the cell, and the
+insertion of journal records. It also handles a deleted file, a forked process, and rows that the
+database refuses. `SqlStore` is built on it.
 """
 
 import hashlib
@@ -20,53 +23,113 @@ import sqlalchemy as sa
 
 from ..errors import DengineError, StoreError, expect
 from .journal import Record, describe_process, forked_error, owned_error, sqlite_file
-from .ledger import LedgerEntry, chain_writes, doubt_of, ledger_key, must_have_key, newest_entry
-from .queries import WITH_LABELS, WITH_TRACES, Scope, counted, join_product
-from .records import FORGOTTEN, LATE_STOP, Event, NewLabel, StoredDecision, as_text, chunks, decision_row, to_row, trace_row
-from .schema import CELL, CORRECTION, DECISION, EVENT, LABEL, LEDGER, TRACE, check_schema, hold, prepare_tables
+from .ledger import (
+    LedgerEntry,
+    chain_writes,
+    check_key,
+    find_integrity_error,
+    ledger_key,
+    newest_entry,
+)
+from .queries import WITH_LABELS, WITH_TRACES, Scope, corrected_label, join_product
+from .records import (
+    FORGOTTEN,
+    LATE_STOP,
+    Event,
+    NewLabel,
+    StoredDecision,
+    as_text,
+    chunks,
+    decision_row,
+    to_row,
+    trace_row,
+)
+from .schema import (
+    CELL,
+    CORRECTION,
+    DECISION,
+    EVENT,
+    LABEL,
+    LEDGER,
+    TRACE,
+    check_schema,
+    lock,
+    prepare_tables,
+)
 
 log = logging.getLogger("dengine")
 T = TypeVar("T")
 
-# Of a server that answers no more, libpq says so after some seconds, not hours.
-PATIENCE = {"connect_timeout": 5, "tcp_user_timeout": 10000}
-PATIENCE |= {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
-READ = ("setting", "correction", "model_version", "label", "decision", "ledger")  # a damaged trace is noticed as it is read
-BUSY = 10.0  # seconds to wait for another process that writes to the same SQLite file
+# With these, libpq reports a server that has stopped answering after seconds, not hours.
+TIMEOUTS = {"connect_timeout": 5, "tcp_user_timeout": 10000}
+TIMEOUTS |= {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
+# Tables that are checked when a store is opened; a damaged trace is noticed as it is read.
+CHECKED_TABLES = ("setting", "correction", "model_version", "label", "decision", "ledger")
+BUSY_SECONDS = 10.0  # wait for another process that writes to the same SQLite file
 
 
 def make_engine(url: str | None) -> sa.Engine:
-    """Return an engine for a file or URL, None: SQLite in memory; refuses what this store was never tested on."""
+    """Make an SQLAlchemy engine; it does not connect yet.
+
+    Parameters
+    ----------
+    url : str or None
+        A file (SQLite), or a URL of SQLite or PostgreSQL. None: SQLite in memory.
+
+    Raises
+    ------
+    StoreError
+        For any other database, and for a URL that cannot be read.
+    """
     if url is None:
-        one = {"poolclass": sa.pool.StaticPool, "connect_args": {"check_same_thread": False}}
-        return _sqlite(sa.create_engine("sqlite://", **one))
-    expect(as_text(url) == url, "a file or a database URL of UTF-8 without a NUL", url, "rename it", StoreError)
+        options = {"poolclass": sa.pool.StaticPool, "connect_args": {"check_same_thread": False}}
+        return _with_sqlite_events(sa.create_engine("sqlite://", **options))
+    expect(
+        as_text(url) == url,
+        "a file or a database URL of UTF-8 without a NUL",
+        url,
+        "rename it",
+        StoreError,
+    )
     try:
-        parsed = sa.make_url(url) if "://" in url else sa.URL.create("sqlite", database=str(Path(url)))
+        parsed = (
+            sa.make_url(url) if "://" in url else sa.URL.create("sqlite", database=str(Path(url)))
+        )
         if parsed.drivername in ("postgres", "postgresql"):
             parsed = parsed.set(drivername="postgresql+psycopg")
         backend = parsed.get_backend_name()
-        keeps = backend == "postgresql" or (backend == "sqlite" and parsed.database not in (None, "", ":memory:"))
-        wanted, do = "a file, an SQLite file URL or a PostgreSQL URL", "for a store that forgets use store=None"
-        expect(keeps, wanted, parsed.render_as_string(), do, StoreError)
+        in_file = backend == "sqlite" and parsed.database not in (None, "", ":memory:")
+        expected = "a file, an SQLite file URL or a PostgreSQL URL"
+        do = "for a store that forgets use store=None"
+        expect(
+            backend == "postgresql" or in_file, expected, parsed.render_as_string(), do, StoreError
+        )
         if backend == "postgresql":
-            return sa.create_engine(parsed, pool_pre_ping=True, connect_args=PATIENCE)
-        return _sqlite(sa.create_engine(parsed, connect_args={"timeout": BUSY}))
+            return sa.create_engine(parsed, pool_pre_ping=True, connect_args=TIMEOUTS)
+        return _with_sqlite_events(sa.create_engine(parsed, connect_args={"timeout": BUSY_SECONDS}))
     except (sa.exc.ArgumentError, ImportError, ValueError) as error:
-        if isinstance(error, ValueError) and "@" in url:  # what it quotes, and takes for a port, may be half of a password
-            raise _unusable(url, "it cannot be read; write @, : and / in a password as %40, %3A and %2F") from None
-        raise _unusable(url, f"{error}") from error
+        if isinstance(error, ValueError) and "@" in url:
+            # The error may quote half of a password, which it took for a port.
+            raise _unusable_url(
+                url, "it cannot be read; write @, : and / in a password as %40, %3A and %2F"
+            ) from None
+        raise _unusable_url(url, f"{error}") from error
 
 
-def _sqlite(engine: sa.Engine) -> sa.Engine:
+def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
+    """Register how an engine connects to SQLite, sets its pragmas, and begins.
+
+    Return the engine.
+    """
     sa.event.listen(engine, "do_connect", _connect)
     sa.event.listen(engine, "connect", _set_pragmas)
     sa.event.listen(engine, "begin", _begin)
     return engine
 
 
-def _unusable(url: str, said: str) -> StoreError:
-    got = f"{url.split('@')[-1]!r}: {said}. For PostgreSQL: pip install 'dengine[postgres]'"
+def _unusable_url(url: str, reason: str) -> StoreError:
+    """Return the error for a URL that cannot be used; it names the part behind the password."""
+    got = f"{url.split('@')[-1]!r}: {reason}. For PostgreSQL: pip install 'dengine[postgres]'"
     return StoreError(f"Expected a file or a database URL that can be used here, got {got}.")
 
 
@@ -74,58 +137,70 @@ class CopyConnection(sqlite3.Connection):
     """A connection to a copy of a file; the copy is deleted with it."""
 
 
-def _connect(dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
-    """Connect to a file; open one as immutable if neither it nor its folder can be written.
+def _connect(
+    dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]
+) -> Any:
+    """Return a new SQLite connection, also to a file that cannot be written.
 
-    If a `-wal` lies beside such a file without a `-shm`, both are copied to a temporary folder: SQLite has to create the
-    `-shm` to read them.
+    If neither the file nor its folder can be written, the file is opened as immutable. If in
+    addition a `-wal` is beside it without a `-shm`, both files are copied to a temporary folder and
+    the copy is opened, since SQLite must create the `-shm` to read them.
     """
     name = str(arguments[0])
-    file, log, shared = Path(name), Path(f"{name}-wal"), Path(f"{name}-shm")
+    file = Path(name)
+    log_file = Path(f"{name}-wal")
+    shared = Path(f"{name}-shm")
     if options.get("uri") or not file.is_file():
         return dialect.connect(*arguments, **options)
-    if log.exists() or os.access(file, os.W_OK):
+    if log_file.exists() or os.access(file, os.W_OK):
         connection = dialect.connect(*arguments, **options)
         try:
-            connection.execute("SELECT name FROM sqlite_master").fetchone()
-        except (sqlite3.Error, UnicodeDecodeError) as error:
+            connection.execute("PRAGMA schema_version").fetchone()  # reads the first page alone
+        except sqlite3.Error as error:
             if not _is_unwritable(error) or shared.exists():
-                return connection  # what is wrong is said as it is used
+                return connection  # the error comes again when the connection is used
             connection.close()
         else:
             return connection
-    if not log.exists():
+    if not log_file.exists():
         return dialect.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True, **options)
     folder = TemporaryDirectory(prefix="dengine-", ignore_cleanup_errors=True)
-    for each in (file, log):
-        shutil.copyfile(each, Path(folder.name) / each.name)
+    for source in (file, log_file):
+        shutil.copyfile(source, Path(folder.name) / source.name)
     copy = dialect.connect(str(Path(folder.name) / file.name), factory=CopyConnection, **options)
     weakref.finalize(copy, folder.cleanup)
     return copy
 
 
 def _is_unwritable(error: Exception) -> bool:
-    """Whether SQLite says that it cannot write to a file, or make one beside it."""
-    code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # an extended one says more in its higher bits
+    """Return whether an SQLite error says that a file cannot be written, or created beside it."""
+    # an extended code has more in its higher bits
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     return code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN)
 
 
 def _set_pragmas(connection: Any, record: Any) -> None:
-    connection.isolation_level = None  # `_begin` says when a transaction starts, not the driver
+    """Set a new SQLite connection to synced commits, and a store's or an empty file to WAL mode."""
+    connection.isolation_level = None  # `_begin` starts transactions, not the driver
     try:
         tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
-        if not tables or {"setting", "decision"} <= tables:  # another program's file is refused, and left as it is
+        # another program's file is left as it is
+        if not tables or {"setting", "decision"} <= tables:
             connection.execute("PRAGMA journal_mode = WAL")
     except sqlite3.OperationalError as error:
-        if not _is_unwritable(error):  # else it stays in the mode that it has, and is read
+        if not _is_unwritable(error):  # such a file keeps its mode, and is read
             raise
-    except UnicodeDecodeError as error:  # SQLite quotes a damaged table's name in what it says
+    except UnicodeDecodeError as error:  # SQLite's error quotes a damaged table name
         raise sqlite3.DatabaseError("the database is malformed") from error
-    connection.execute("PRAGMA synchronous = FULL")  # a returned commit survives lost power; NORMAL would not
+    # a returned commit survives lost power; NORMAL would not
+    connection.execute("PRAGMA synchronous = FULL")
 
 
 def _begin(connection: sa.Connection) -> None:
-    # busy_timeout does not cover a read that turns into a write, so a writer takes its lock at once.
+    """Begin a transaction; one that will write takes SQLite's write lock at once.
+
+    The busy timeout does not apply to a read transaction that becomes a write.
+    """
     write = connection.get_execution_options().get("dengine_write", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
@@ -139,37 +214,58 @@ ADVICE = {
     "while it was open": "Put it back, or close this store and open the new one.",
     "malformed": "The file is damaged; restore it from a copy.",
     "": "Check that the database is there and can be written.",
-}  # what to do, by what a database says
-OF_A_ROW = (sa.exc.IntegrityError, sa.exc.DataError, OverflowError, ValueError, TypeError)  # the database itself is well
+}  # what to do, by a part of the database's error
+# Errors about a row's values, while the database itself is well.
+ROW_ERRORS = (sa.exc.IntegrityError, sa.exc.DataError, OverflowError, ValueError, TypeError)
 
 
 @contextmanager
-def _told(doing: str, name: str) -> Iterator[None]:
-    """Turn what a database of this name raises into a StoreError that says what to do."""
+def _store_errors(verb: str, name: str) -> Iterator[None]:
+    """Turn a database error of the block into a StoreError that says what to do."""
     try:
         yield
     except DengineError:
         raise
-    except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError, *OF_A_ROW) as error:
+    except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError, *ROW_ERRORS) as error:
         advice = next(do for text, do in ADVICE.items() if text in str(error).lower())
-        raise StoreError(f"Could not {doing} {name}: {getattr(error, 'orig', None) or error}. {advice}") from error
+        raise StoreError(
+            f"Could not {verb} {name}: {getattr(error, 'orig', None) or error}. {advice}"
+        ) from error
 
 
 @contextmanager
 def reading(url: str) -> Iterator[sa.Connection]:
-    """Connect to a store of the present schema, and see it as it is now. StoreError where there is none."""
+    """Connect to a store for reading; the block sees one snapshot of it, and writes nothing.
+
+    Parameters
+    ----------
+    url : str
+        A file, or a URL of SQLite or PostgreSQL.
+
+    Yields
+    ------
+    sqlalchemy.Connection
+
+    Raises
+    ------
+    StoreError
+        Where there is no store of the present schema.
+    """
     engine = make_engine(url)
     name = engine.url.render_as_string(hide_password=True)
     sqlite = engine.dialect.name == "sqlite"
     options = {} if sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
     try:
         file = str(engine.url.database)
-        if sqlite and not (Path(file).is_file() or file.startswith("file:")):  # the latter is an URI of SQLite's own
+        # the latter is a URI of SQLite's own
+        if sqlite and not (Path(file).is_file() or file.startswith("file:")):
             do = "make a DataEngine with it, or let `dengine train` or `dengine run` make one"
-            raise StoreError(f"Expected a store that an engine has used, found no file {file}; {do}.")
-        with _told("read", name), engine.connect() as connection:  # rolled back at its end: there is nothing to commit
+            raise StoreError(
+                f"Expected a store that an engine has used, found no file {file}; {do}."
+            )
+        with _store_errors("read", name), engine.connect() as connection:  # rolled back at the end
             connection.execution_options(**options)
-            if sqlite:  # a text of which a byte was damaged is read too, so that it can be named
+            if sqlite:  # read a text with a damaged byte too, so that its row can be named
                 plain: Any = connection.connection.driver_connection
                 plain.text_factory = lambda text: text.decode("utf-8", "backslashreplace")
             check_schema(connection, name)
@@ -179,27 +275,61 @@ def reading(url: str) -> Iterator[sa.Connection]:
 
 
 def integrity(connection: sa.Connection, table: str = "") -> list[str]:
-    """What SQLite finds wrong in its file, or in one table and its indexes; nothing where all is well."""
+    """Run SQLite's integrity check on the file, or on one table.
+
+    Return its findings, [] if all is well.
+    """
     try:
-        lines = connection.execute(sa.text(f"PRAGMA integrity_check({table})" if table else "PRAGMA integrity_check"))
+        lines = connection.execute(
+            sa.text(f"PRAGMA integrity_check({table})" if table else "PRAGMA integrity_check")
+        )
         return [str(line) for line in lines.scalars() if line != "ok"]
     except sa.exc.DatabaseError as error:
         return [str(error.orig)]
 
 
 class Database:
-    """An open database, prepared for a cell; one thread writes at a time.
+    """An open database in which one cell reads and writes; one thread writes at a time.
 
-    url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL; None: SQLite in memory.
-    clock : the time in seconds that entries of the ledger are stamped with.
-    scope : the cell and its product.  name : the URL without its password.
-    before_use : called before each transaction, so that it sees what is on its way into the database.
-    newest : number and digest of the newest entry of the ledger, as far as this process knows; None: there is none.
-    on_entry : called once a transaction that added one is committed.
+    Parameters
+    ----------
+    url : str or None
+        A file (SQLite), or a URL of SQLite or PostgreSQL; None: SQLite in memory.
+    cell_id : str
+        The cell; it is entered if it is new. Tables are created in an empty database.
+    clock : callable
+        Returns the time, in seconds, for the ledger's entries.
+    product : str or None
+        What a new cell makes; None: as the store says.
+    before_use : callable
+        Called before each read and most writes, so that waiting records are written first.
+
+    Attributes
+    ----------
+    scope : Scope
+        The cell and its product.
+    url : sqlalchemy.URL
+        With its password.
+    name : str
+        The URL without its password.
+    newest_entry : (int, str) or None
+        Number and digest of the newest ledger entry that this process knows; None: no entry yet.
+    on_entry : callable
+        Called after a transaction that added a ledger entry is committed; set by the outbox.
+
+    Raises
+    ------
+    StoreError
+        For another program's database, another schema, or a ledger with another key.
     """
 
     def __init__(
-        self, url: str | None, cell_id: str, clock: Callable[[], float], product: str | None, before_use: Callable[[], None]
+        self,
+        url: str | None,
+        cell_id: str,
+        clock: Callable[[], float],
+        product: str | None,
+        before_use: Callable[[], None],
     ) -> None:
         self.cell_id = cell_id
         self._before_use = before_use
@@ -207,7 +337,7 @@ class Database:
         self._closed = False
         self._pid = os.getpid()
         self._writing = threading.RLock()  # one write transaction at a time in this process
-        self._asked = threading.local()  # of each thread, what says whether its commit is wanted still
+        self._commits = threading.local()  # of each thread: `is_wanted` of `commit_if`
         self._key = b"" if url is None else ledger_key()
         self.newest_entry: tuple[int, str] | None = None
         self.on_entry: Callable[[], object] = lambda: None
@@ -217,16 +347,21 @@ class Database:
         self.name = self.url.render_as_string(hide_password=True)
         self.scope = self._open(product)
         file = sqlite_file(self.url) if self.url.get_backend_name() == "sqlite" else None
-        self._file = file if file is not None and file.is_file() else None  # None: in memory, or a server
+        # None: in memory, or a server
+        self._file = file if file is not None and file.is_file() else None
         self._opened = None if self._file is None else self._file.stat()
 
     def _open(self, product: str | None) -> Scope:
+        """Create or check the tables, enter the cell, read the newest ledger entry.
+
+        Return the scope.
+        """
         try:
-            with _told("open", self.name), self._engine.connect() as plain:
+            with _store_errors("open", self.name), self._engine.connect() as plain:
                 connection = plain.execution_options(dengine_write=True)
                 with connection.begin():
                     prepare_tables(connection, self.cell_id, self.name)
-                    must_have_key(connection, self.cell_id, self._key, begin=True)
+                    check_key(connection, self.cell_id, self._key, begin=True)
                     if (last := newest_entry(connection, self.cell_id)) is not None:
                         self.newest_entry = last.number, last.digest.hex()
                     return Scope(self.cell_id, join_product(connection, self.cell_id, product))
@@ -236,32 +371,41 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """Begin a transaction that reads."""
+        """Open a transaction for reading, after waiting records were written.
+
+        Yield its connection.
+        """
         self.check_open()
         self._before_use()
-        with _told("read", self.name), self._engine.begin() as connection:
+        with _store_errors("read", self.name), self._engine.begin() as connection:
             yield connection
 
     @contextmanager
     def _transaction(self) -> Iterator[sa.Connection]:
-        """Begin a transaction that holds the cell, is chained and committed at its end, or rolled back by an error."""
-        with _told("write to", self.name), self._writer.connect() as connection:
+        """Open a write transaction that locks the cell.
+
+        Commit it with a ledger entry, or roll it back on an error.
+        """
+        with _store_errors("write to", self.name), self._writer.connect() as connection:
             connection.execution_options(dengine_write=True)
             with connection.begin():
                 self._check_file()
-                hold(connection, CELL, self.cell_id)
+                lock(connection, CELL, self.cell_id)
                 entry = LedgerEntry(connection, self.cell_id, self._key)
                 yield connection.execution_options(dengine_entry=entry)
                 newest = entry.append(self._clock)
-                if not getattr(self._asked, "wanted", lambda: True)():
-                    raise StoreError(f"Could not write to {self.name} in time, and was given up; nothing was written.")
-            self._check_file()  # nobody is told that a file holds what went into another one
+                if not getattr(self._commits, "is_wanted", lambda: True)():
+                    raise StoreError(
+                        f"Could not write to {self.name} in time, and was given up; nothing "
+                        "was written."
+                    )
+            self._check_file()  # else the rows would be in a file that nobody reads
             if newest is not None:
                 self.newest_entry = newest
                 self.on_entry()
 
     def _check_file(self) -> None:
-        """Raise an OSError where the file is not the one that was opened, which still takes writes, for nobody."""
+        """Raise an OSError if another file, or none, is at the path of the one that was opened."""
         if self._file is None or self._opened is None:
             return
         with suppress(OSError):
@@ -270,48 +414,80 @@ class Database:
         raise FileNotFoundError("the file was deleted, moved or replaced while it was open")
 
     @contextmanager
-    def commit_if(self, wanted: Callable[[], bool]) -> Iterator[None]:
-        self._asked.wanted = wanted
+    def commit_if(self, is_wanted: Callable[[], bool]) -> Iterator[None]:
+        """Commit this thread's transactions in the block only if `is_wanted()` is true by then.
+
+        Otherwise they are rolled back, and StoreError is raised.
+        """
+        self._commits.is_wanted = is_wanted
         try:
             yield
         finally:
-            del self._asked.wanted
+            del self._commits.is_wanted
 
     def has_entry(self, number: int, digest: str) -> bool:
-        mine = (LEDGER.c.cell_id == self.cell_id) & (LEDGER.c.number == number)
-        return [row.digest.hex() for row in self.read(sa.select(LEDGER.c.digest).where(mine))] == [digest]
+        """Return whether the cell's ledger has an entry with this number and hexadecimal digest."""
+        is_entry = (LEDGER.c.cell_id == self.cell_id) & (LEDGER.c.number == number)
+        return [
+            row.digest.hex() for row in self.read(sa.select(LEDGER.c.digest).where(is_entry))
+        ] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:
-        """What is read of this cell and its product that is not as the ledgers have it, in words; "" where all is.
+        """Compare what an engine reads of this cell and its product with their ledgers.
 
-        window : so many of the newest labels are read.  since : those after that number alone; None: the window.
+        Settings, corrections and versions are checked in full.
+
+        Parameters
+        ----------
+        window : int
+            Number of newest labels that are checked.
+        since : int or None
+            Labels after this number are checked instead.
+
+        Returns
+        -------
+        str
+            The first difference, in words; "" if there is none.
         """
         with self.reading() as connection:
             first = self.scope.first_label(connection, window) if since is None else since + 1
             for cell in self.scope.cells(connection):
-                if said := doubt_of(connection, cell, self._key, first):
-                    return said if cell == self.cell_id else f"of cell {cell!r} {said}"
+                if error := find_integrity_error(connection, cell, self._key, first):
+                    return error if cell == self.cell_id else f"of cell {cell!r} {error}"
         return ""
 
     def check_pages(self) -> str:
-        """What SQLite finds wrong in a table that is read, or in its indexes, in words; "" where nothing is."""
-        for name in READ if self._file is not None else ():
+        """Run SQLite's integrity check on the tables that engines read.
+
+        Return its first finding, "" if all is well.
+        """
+        for name in CHECKED_TABLES if self._file is not None else ():
             try:
                 with self.reading() as connection:
-                    if said := integrity(connection, name):
-                        return f"of the table {name} SQLite says: {said[0]}"
+                    if findings := integrity(connection, name):
+                        return f"of the table {name} SQLite says: {findings[0]}"
             except StoreError as error:
                 return f"{error}"
         return ""
 
     def check_writable(self) -> None:
-        """Raise a StoreError where SQLite can read its file, and no more."""
-        self.write(lambda connection: connection.exec_driver_sql("UPDATE setting SET value = value WHERE 0"))
+        """Raise a StoreError if SQLite cannot write to its file."""
+        self.write(
+            lambda connection: connection.exec_driver_sql(
+                "UPDATE setting SET value = value WHERE 0"
+            )
+        )
 
     def acquire_lease(self) -> None:
-        """Write from now on through one connection that holds the cell; StoreError where another engine has it."""
-        said = PATIENCE | {"application_name": f"dengine {describe_process()}"[:63]}  # so that others are told who it is
-        self._writer = sa.create_engine(self.url, pool_pre_ping=True, pool_size=1, max_overflow=0, connect_args=said)
+        """Lock the cell on a PostgreSQL server, and write from now on through that one connection.
+
+        The lock lasts as long as the connection. Raises StoreError if another engine has it.
+        """
+        # shown to an engine that finds the cell locked
+        options = TIMEOUTS | {"application_name": f"dengine {describe_process()}"[:63]}
+        self._writer = sa.create_engine(
+            self.url, pool_pre_ping=True, pool_size=1, max_overflow=0, connect_args=options
+        )
         chain_writes(self._writer)
         sa.event.listen(self._writer, "connect", self._take_lease)
         try:
@@ -322,38 +498,59 @@ class Database:
             raise
 
     def _take_lease(self, connection: Any, record: Any) -> None:
-        """Lock the cell for as long as this PostgreSQL connection lives."""
+        """Lock the cell as long as a new PostgreSQL connection lives.
+
+        Close it and raise StoreError if another has the lock.
+        """
         digest = hashlib.sha256(b"dengine " + self.cell_id.encode()).digest()
         key = int.from_bytes(digest[:8], "big", signed=True)
         taken = connection.execute("SELECT pg_try_advisory_lock(%s)", [key]).fetchone()[0]
-        asked = (
-            "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) WHERE l.locktype = 'advisory' "
+        holder_query = (
+            "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) "
+            "WHERE l.locktype = 'advisory' "
             "AND (l.classid::bigint << 32) + l.objid::bigint = %s AND l.objsubid = 1 AND l.granted"
         )
-        holder = None if taken else connection.execute(asked, [key]).fetchone()
+        holder = None if taken else connection.execute(holder_query, [key]).fetchone()
         connection.commit()
         if not taken:
             connection.close()
-            raise owned_error(holder[0] if holder else "another engine", f"cell {self.cell_id!r} of {self.name}")
+            raise owned_error(
+                holder[0] if holder else "another engine", f"cell {self.cell_id!r} of {self.name}"
+            )
 
     def check_open(self) -> None:
-        """StoreError after closing, and in a fork."""
+        """Raise a StoreError after `close`, and in a forked process."""
         if self._closed:
-            raise StoreError(f"Expected an open store, got {self.name} after close(); open it again.")
+            raise StoreError(
+                f"Expected an open store, got {self.name} after close(); open it again."
+            )
         if os.getpid() != self._pid:
             raise forked_error(self._pid, self.name)
 
-    def write(self, work: Callable[[sa.Connection], T], settled: bool = True) -> T:
-        """Commit what `work` adds, in one transaction; settled : after what is on its way into the database."""
+    def write(self, add_rows: Callable[[sa.Connection], T], flush_first: bool = True) -> T:
+        """Call `add_rows` in a write transaction, commit it, and return what it returned.
+
+        Parameters
+        ----------
+        add_rows : callable
+            Takes the connection, and adds rows.
+        flush_first : bool, default True
+            Write waiting records before.
+
+        Raises
+        ------
+        StoreError
+            Where the database fails; then nothing is written.
+        """
         self.check_open()
-        if settled:
-            self._before_use()  # not while others are kept from writing
+        if flush_first:
+            self._before_use()  # before the lock is taken: it may write
         with self._writing:
             try:
                 with self._transaction() as connection:
-                    return work(connection)
+                    return add_rows(connection)
             finally:
-                if self._closed:  # meanwhile: `close` did not wait
+                if self._closed:  # meanwhile, by a `close` that did not wait
                     self._disconnect()
 
     def read(self, query: sa.Select[Any]) -> Sequence[Any]:
@@ -362,7 +559,10 @@ class Database:
             return connection.execute(query).all()
 
     def close(self, waiting: bool = True) -> None:
-        """Disconnect; waiting : for a write that is under way."""
+        """Disconnect.
+
+        Wait for a write of another thread first if `waiting`, else let that write disconnect.
+        """
         self._closed = True
         if self._writing.acquire(blocking=waiting):
             self._disconnect()
@@ -372,114 +572,195 @@ class Database:
         self._writer.dispose()
         self._engine.dispose()
 
-    # What goes in
+    # Insertion
 
-    def insert(self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]) -> range:
-        """Add the cell's rows, numbered in this column of their table; returns the numbers."""
+    def insert(
+        self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]
+    ) -> range:
+        """Insert rows of this cell into the table of a column, which numbers them.
+
+        Return the numbers.
+        """
         if not rows:
             return range(0)
         first = self.scope.next_number(connection, column)
-        named = [{**row, "cell_id": self.cell_id, column.name: i} for i, row in enumerate(rows, first)]
-        connection.execute(sa.insert(column.table), named)
+        numbered = [
+            {**row, "cell_id": self.cell_id, column.name: i} for i, row in enumerate(rows, first)
+        ]
+        connection.execute(sa.insert(column.table), numbered)
         return range(first, first + len(rows))
 
-    def correct(self, connection: sa.Connection, rows: Sequence[Mapping[str, Any]]) -> None:
+    def insert_corrections(
+        self, connection: sa.Connection, rows: Sequence[Mapping[str, Any]]
+    ) -> None:
+        """Insert corrections, each with the number of the newest label so far."""
         newest = self.scope.next_number(connection, LABEL.c.seq) - 1
-        self.insert(connection, CORRECTION.c.number, [{**row, "newest_seq": newest} for row in rows])
+        self.insert(
+            connection, CORRECTION.c.number, [{**row, "newest_seq": newest} for row in rows]
+        )
 
-    def held(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
-        """What is stored of decisions, as labels repeat it, and of the labels that they have, by id."""
-        label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, counted().label("counted"))
-        query = sa.select(*DECISION.c["id", "content_hash", "quarantined", "time"], *label).select_from(WITH_LABELS)
-        return self._by_id(connection, query, ids)
+    def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
+        """Return a row for each stored decision, by id.
 
-    def _by_id(self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]) -> dict[str, Any]:
+        Hash, quarantined, time, and its label, NULL without one.
+        """
+        label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
+        query = sa.select(
+            *DECISION.c["id", "content_hash", "quarantined", "time"], *label
+        ).select_from(WITH_LABELS)
+        return self._rows_by_id(connection, query, ids)
+
+    def _rows_by_id(
+        self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]
+    ) -> dict[str, Any]:
+        """Run a query over decisions for these ids of the cell, in chunks.
+
+        Return the rows by id.
+        """
         query = query.where(DECISION.c.cell_id == self.cell_id)
-        return {row.id: row for part in chunks(ids) for row in connection.execute(query.where(DECISION.c.id.in_(part)))}
+        return {
+            row.id: row
+            for part in chunks(ids)
+            for row in connection.execute(query.where(DECISION.c.id.in_(part)))
+        }
 
     def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
-        """Commit what a journal held, as `SqlStore.apply_records`."""
+        """Commit records of a journal, as `SqlStore.apply_records`.
+
+        A record that the database refuses is left out, and an event says so.
+        """
         try:
-            return self.write(lambda connection: self._take(connection, records))
+            return self.write(lambda connection: self._insert_records(connection, records))
         except StoreError as error:
-            if not isinstance(error.__cause__, OF_A_ROW):
+            if not isinstance(error.__cause__, ROW_ERRORS):
                 raise
-            if len(records) > 1:  # one of them is what the database refuses
+            if len(records) > 1:  # the database refuses one of them
                 half = len(records) // 2
                 return self.apply_records(records[:half]) + self.apply_records(records[half:])
-            text = f"{_named(records[0])}, which the database refused: {error.__cause__}"
-        self.write(lambda connection: self.insert(connection, EVENT.c.number, [to_row(self._set_aside(text))]))
+            text = f"{_describe(records[0])}, which the database refused: {error.__cause__}"
+        event = self._dead_letter(text)
+        self.write(lambda connection: self.insert(connection, EVENT.c.number, [to_row(event)]))
         return []
 
-    def _take(self, connection: sa.Connection, records: Sequence[Record]) -> list[tuple[str, int]]:
-        """Insert what is not there yet; what is there must be the same, or it becomes a dead letter."""
-        events = self._new_events(connection, [each for each in records if isinstance(each, Event)])
-        events += self._take_decisions(connection, [each for each in records if isinstance(each, StoredDecision)])
-        labels = [each for each in records if isinstance(each, NewLabel)]
-        held = self.held(connection, [each.decision_id for each in labels])
-        fresh, well, late = dict[str, NewLabel](), list[str](), list[str]()
-        for each in labels:
-            name, row = each.decision_id, held.get(each.decision_id)
-            if row is None or (row.content_hash, row.time) != (each.content_hash, each.decided):
-                lacks = "which the store does not hold" if row is None else "of which the store holds another decision"
-                events.append(self._set_aside(f"{_named(each)}, {lacks}"))
+    def _insert_records(
+        self, connection: sa.Connection, records: Sequence[Record]
+    ) -> list[tuple[str, int]]:
+        """Insert the records that are not stored yet; return (decision id, number) of the labels.
+
+        A record that contradicts a stored one becomes an event, a dead letter. A late stop corrects
+        the label of a part that silence had confirmed.
+        """
+        events = self._new_events(
+            connection, [record for record in records if isinstance(record, Event)]
+        )
+        decisions = [record for record in records if isinstance(record, StoredDecision)]
+        events += self._insert_decisions(connection, decisions)
+        labels = [record for record in records if isinstance(record, NewLabel)]
+        stored = self.stored_labels(connection, [label.decision_id for label in labels])
+        new_labels: dict[str, NewLabel] = {}
+        labelled: list[str] = []  # ids of decisions that have this label, now or before
+        stopped: list[str] = []  # ids of decisions whose labels a late stop corrects
+        for label in labels:
+            id_ = label.decision_id
+            row = stored.get(id_)
+            if row is None or (row.content_hash, row.time) != (label.content_hash, label.decided):
+                problem = (
+                    "which the store does not hold"
+                    if row is None
+                    else "of which the store holds another decision"
+                )
+                events.append(self._dead_letter(f"{_describe(label)}, {problem}"))
                 continue
-            first = fresh.setdefault(name, each) if row.seq is None else row
-            said, now = (first.success, first.source), (each.success, each.source)
-            stopped = (said, now) == LATE_STOP and row.counted != FORGOTTEN
-            if said == now or stopped:
-                well.append(name)
-                late += [name] * (stopped and row.counted != 0)  # else the store has it
+            first = new_labels.setdefault(id_, label) if row.seq is None else row
+            old = (first.success, first.source)
+            new = (label.success, label.source)
+            is_late_stop = (old, new) == LATE_STOP and row.corrected != FORGOTTEN
+            if old == new or is_late_stop:
+                labelled.append(id_)
+                if is_late_stop and row.corrected != 0:  # else it is corrected already
+                    stopped.append(id_)
             else:
-                events.append(self._set_aside(f"a second label: {_named(each)}, which has one"))
-        rows = [to_row(each) | {"quarantined": held[each.decision_id].quarantined} for each in fresh.values()]
-        numbers = {name: row.seq for name, row in held.items()}
-        numbers |= zip(fresh, self.insert(connection, LABEL.c.seq, rows), strict=True)
-        self.insert(connection, EVENT.c.number, [to_row(each) for each in events])
-        if late:
-            self._take_back(connection, list(dict.fromkeys(late)))
-        return [(name, numbers[name]) for name in dict.fromkeys(well)]
+                events.append(
+                    self._dead_letter(f"a second label: {_describe(label)}, which has one")
+                )
+        rows = [
+            to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
+            for label in new_labels.values()
+        ]
+        numbers = {id_: row.seq for id_, row in stored.items()}
+        numbers |= zip(new_labels, self.insert(connection, LABEL.c.seq, rows), strict=True)
+        self.insert(connection, EVENT.c.number, [to_row(event) for event in events])
+        if stopped:
+            self._insert_late_stops(connection, list(dict.fromkeys(stopped)))
+        return [(id_, numbers[id_]) for id_ in dict.fromkeys(labelled)]
 
-    def _take_back(self, connection: sa.Connection, names: Sequence[str]) -> None:
-        """Parts that were confirmed stopped the system: their labels are corrected, with an event each."""
-        now, text = float(self._clock()), "counts as a failure, was a success: its stop came after its confirmation"
-        events = [to_row(Event(0, now, "late stop", f"decision {as_text(name)} {text}")) for name in names]
+    def _insert_late_stops(self, connection: sa.Connection, ids: Sequence[str]) -> None:
+        """Correct to failure the labels of parts that silence had confirmed and that later stopped.
+
+        Each gets an event.
+        """
+        now = float(self._clock())
+        text = "counts as a failure, was a success: its stop came after its confirmation"
+        events = [
+            to_row(Event(0, now, "late stop", f"decision {as_text(id_)} {text}")) for id_ in ids
+        ]
         numbers = self.insert(connection, EVENT.c.number, events)
-        said = {"author": "", "time": now, "success": False, "was": True}
-        self.correct(connection, [said | {"event": i, "decision_id": name} for i, name in zip(numbers, names, strict=True)])
+        common = {"author": "", "time": now, "success": False, "was": True}
+        corrections = [
+            common | {"event": number, "decision_id": id_}
+            for number, id_ in zip(numbers, ids, strict=True)
+        ]
+        self.insert_corrections(connection, corrections)
 
-    def _take_decisions(self, connection: sa.Connection, decisions: Sequence[StoredDecision]) -> list[Event]:
-        """Insert the new ones; returns what is to be said of those whose id has another decision."""
-        query = sa.select(*DECISION.c, *TRACE.c["decision_id", "channels", "samples", "data"]).select_from(WITH_TRACES)
-        stored = self._by_id(connection, query, [each.decision.id for each in decisions])
-        new = [each for each in decisions if each.decision.id not in stored]
-        self.insert(connection, DECISION.c.number, [decision_row(each) for each in new])
+    def _insert_decisions(
+        self, connection: sa.Connection, decisions: Sequence[StoredDecision]
+    ) -> list[Event]:
+        """Insert the decisions that are not stored yet.
+
+        Return a dead letter for each whose id has another decision.
+        """
+        trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
+        query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
+        stored = self._rows_by_id(connection, query, [item.decision.id for item in decisions])
+        new = [item for item in decisions if item.decision.id not in stored]
+        self.insert(connection, DECISION.c.number, [decision_row(item) for item in new])
         if new:
-            connection.execute(sa.insert(TRACE), [{"cell_id": self.cell_id} | trace_row(each) for each in new])
+            rows = [{"cell_id": self.cell_id} | trace_row(item) for item in new]
+            connection.execute(sa.insert(TRACE), rows)
         events = []
-        for each in decisions:
-            if (row := stored.get(each.decision.id)) is not None:
-                given = decision_row(each) | trace_row(each)
-                if other := ", ".join(name for name, value in given.items() if row._mapping[name] != value):
-                    events.append(self._set_aside(f"{_named(each)}, of which the store holds another: {other} differ"))
+        for item in decisions:
+            if (row := stored.get(item.decision.id)) is not None:
+                given = decision_row(item) | trace_row(item)
+                different = [name for name, value in given.items() if row._mapping[name] != value]
+                if different:
+                    text = (
+                        f"{_describe(item)}, of which the store holds another: "
+                        f"{', '.join(different)} differ"
+                    )
+                    events.append(self._dead_letter(text))
         return events
 
     def _new_events(self, connection: sa.Connection, events: Sequence[Event]) -> list[Event]:
+        """Return the events that are not stored yet, by time, kind and text."""
         if not events:
             return []
-        query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text).where(EVENT.c.cell_id == self.cell_id)
-        stored = {tuple(row) for row in connection.execute(query.where(EVENT.c.time.in_([each.time for each in events])))}
-        return [each for each in events if (each.time, each.kind, each.text) not in stored]
+        query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text)
+        times = [event.time for event in events]
+        query = query.where(EVENT.c.cell_id == self.cell_id, EVENT.c.time.in_(times))
+        stored = {tuple(row) for row in connection.execute(query)}
+        return [event for event in events if (event.time, event.kind, event.text) not in stored]
 
-    def _set_aside(self, text: str) -> Event:
+    def _dead_letter(self, text: str) -> Event:
+        """Log a record that cannot be stored, and return the event that tells of it."""
         log.error("dead letter: %s", text)
         return Event(0, self._clock(), "dead letter", as_text(text))
 
 
-def _named(record: Record) -> str:
+def _describe(record: Record) -> str:
+    """Return a record in words, for a dead letter."""
     if isinstance(record, Event):
         return f"an event, {record.text!r}"
     if isinstance(record, StoredDecision):
         return f"a decision, {record.decision.id!r}"
-    said = "success" if record.success else "failure"
-    return f"a label, {said} from {record.source.value}, on {record.decision_id!r}"
+    result = "success" if record.success else "failure"
+    return f"a label, {result} from {record.source.value}, on {record.decision_id!r}"

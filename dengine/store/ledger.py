@@ -1,16 +1,19 @@
-"""The ledger of a cell: every transaction that adds rows, or changes settings, ends with an entry that chains them.
+"""The ledger of a cell: a hash chain by which a changed or missing row of the store is noticed.
 
-A statement that inserts into a table of CHAINED is met on its way to the database: its rows get the number of the entry
-and a sum of their own, whoever sends it. So no writer has to remember the ledger, and none can go around it.
+Every transaction that adds rows or changes settings ends with a ledger entry. The entry has a
+digest over the entry before, over the sums (SHA-256) of the rows that the transaction added, and,
+for each table that an engine reads at its start (`IN_FORCE`), over all its rows so far (`held`).
+By the latter an engine checks what it reads from the newest entry and these rows alone.
 
-An entry also holds, of each table that an engine learns from or answers by, one digest over all its rows so far: what an
-engine reads is held to the ledger by these rows alone, from any of them on, and by the newest entry.
+Rows are chained where a statement is sent to the database: inserts into the tables of CHAINED are
+intercepted (`chain_writes`), and each row is given the number of the entry and its own sum. So no
+writer has to think of the ledger, and none can go around it.
 
-Where the environment names a key's file, the entries of a ledger that is begun are keyed: who has no key can change a
-store, and make its chain anew, but not so that it fits.
+If the environment names a key file, the entries of a new ledger are keyed (HMAC): without the key
+nobody can change a store and compute a chain that fits.
 
-What a row's sum is must never change. So a column without a value is not in it, and columns are taken by name: a later
-schema may add columns that are empty in earlier rows.
+What a row's sum is must never change. Therefore a column without a value is left out of it and
+columns are taken by name: a later schema may add columns that are empty in earlier rows.
 """
 
 import hashlib
@@ -31,19 +34,33 @@ from ..files import read_key
 from .schema import CHAINED, CORRECTION, LABEL, LEDGER, LEDGER_KEY, RESERVED, SETTING, VERSION
 
 KEY_VARIABLE = "DENGINE_LEDGER_KEY"  # of the environment: the file of the key of all ledgers
-IN_FORCE = {LABEL.name: LABEL.c.seq, CORRECTION.name: CORRECTION.c.number, VERSION.name: VERSION.c.retrain}
-START = bytes(32)  # what the first entry of a cell follows
-APART = {"sum", "state"}  # columns that a row's sum leaves out: itself, and a state, which may go: `state_sum` covers it
+# The column by which the rows of each table that an engine reads are numbered.
+IN_FORCE = {
+    LABEL.name: LABEL.c.seq,
+    CORRECTION.name: CORRECTION.c.number,
+    VERSION.name: VERSION.c.retrain,
+}
+START = bytes(32)  # the digest before a cell's first entry
+# Columns that a row's sum leaves out: itself, and a state, which `state_sum` covers: it may be
+# deleted.
+NOT_SUMMED = {"sum", "state"}
 
 
 def row_sum(table: str, row: Mapping[str, Any]) -> bytes:
-    """Return the SHA-256 of a row, 32 bytes: of the table's name, and name, type and bytes of every value.
+    """Return the sum of a row.
 
-    The same on SQLite and PostgreSQL, as written and as read: true is 1 (SQLite has no booleans), NaN is nothing and -0.0
-    is 0.0 (SQLite keeps neither).
+    The SHA-256 of the table's name and every value's name, type and bytes.
+
+    It is the same on SQLite and PostgreSQL, as written and as read: true is 1 (SQLite has no
+    booleans), NaN is left out and -0.0 is 0.0 (SQLite keeps neither).
+
+    Returns
+    -------
+    bytes
+        32 bytes.
     """
     pieces = [table.encode(), b"\n"]
-    for name, begin in _columns(tuple(row)):  # the commonest kinds in line: a thousand rows a second pass here
+    for name, begin in _columns(tuple(row)):  # inline, since a thousand rows a second pass here
         value = row[name]
         kind = type(value)
         if value is None or value != value:
@@ -51,63 +68,97 @@ def row_sum(table: str, row: Mapping[str, Any]) -> bytes:
         if kind is int or kind is bool:
             pieces.append(b"%bi%d;" % (begin, value))
         elif kind is str:
-            data = value.encode("utf-8", "surrogatepass")  # never raises; two texts never share their bytes
+            # never raises; two texts never share their bytes
+            data = value.encode("utf-8", "surrogatepass")
             pieces += (b"%bs%d:" % (begin, len(data)), data)
         elif kind is float:
             pieces += (begin, b"f", _DOUBLE(value + 0.0))
         elif kind is bytes:
             pieces += (b"%bb%d:" % (begin, len(value)), value)
         else:
-            raise TypeError(f"Expected a plain value of column {name!r}, got {kind.__name__}; see `to_row`.")
+            raise TypeError(
+                f"Expected a plain value of column {name!r}, got {kind.__name__}; see `to_row`."
+            )
     return hashlib.sha256(b"".join(pieces)).digest()
 
 
 @lru_cache(256)
 def _columns(names: tuple[str, ...]) -> list[tuple[str, bytes]]:
-    return [(name, name.encode() + b"=") for name in sorted(names) if name not in APART]
+    """Return the columns that a row's sum includes, sorted, each with its name in bytes and "="."""
+    return [(name, name.encode() + b"=") for name in sorted(names) if name not in NOT_SUMMED]
 
 
 _DOUBLE = struct.Struct(">d").pack
 
 
-def is_sound(table: str, row: Mapping[str, Any]) -> bool:
-    """Whether a row, its sum among its columns, is as it was stored."""
+def is_intact(table: str, row: Mapping[str, Any]) -> bool:
+    """Return whether a row, which includes its sum, is as it was stored."""
     return bool(row_sum(table, row) == row["sum"])
 
 
 def state_sum(state: bytes | None) -> bytes | None:
-    """Return the SHA-256 of a version's state as it is stored; None without one."""
+    """Return the SHA-256 of a version's stored state; None without a state."""
     return None if state is None else hashlib.sha256(state).digest()
 
 
 def ledger_key() -> bytes:
-    """The key that the environment names, b"" where it names none; StoreError for a file that holds none."""
+    """Return the key from the file that DENGINE_LEDGER_KEY names, b"" if it names none.
+
+    StoreError for a file without a key.
+    """
     file = os.environ.get(KEY_VARIABLE)
     return read_key(file, StoreError) if file else b""
 
 
-def must_have_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool = False) -> None:
-    """StoreError unless a cell's ledger was begun with this key, or, for b"", without.  begin : note it in a new cell."""
+def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool = False) -> None:
+    """Check that a cell's ledger was begun with this key.
+
+    Parameters
+    ----------
+    connection : sqlalchemy.Connection
+    cell_id : str
+    key : bytes
+        b"" for a ledger without a key.
+    begin : bool, default False
+        If the cell has no ledger yet, record that it is begun with this key.
+
+    Raises
+    ------
+    StoreError
+        If the ledger was begun with another key, or with a key and b"" is given, or the reverse.
+    """
     tag = hmac.new(key, b"dengine ledger", "sha256").hexdigest() if key else None
-    mine = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == LEDGER_KEY)
-    held = connection.execute(sa.select(SETTING.c.value).where(mine)).scalar()
-    if begin and held is None and tag and newest_entry(connection, cell_id) is None:
-        connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": LEDGER_KEY, "value": tag})
-    elif held != tag:
-        begun = "without a key" if held is None else "with a key" if tag is None else "with another key"
-        wanted = f"a ledger of cell {cell_id!r} by the key that {KEY_VARIABLE} names{'' if key else ', none'}"
+    is_tag = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == LEDGER_KEY)
+    stored = connection.execute(sa.select(SETTING.c.value).where(is_tag)).scalar()
+    if begin and stored is None and tag and newest_entry(connection, cell_id) is None:
+        connection.execute(
+            sa.insert(SETTING), {"cell_id": cell_id, "key": LEDGER_KEY, "value": tag}
+        )
+    elif stored != tag:
+        begun = "with another key"
+        if stored is None:
+            begun = "without a key"
+        elif tag is None:
+            begun = "with a key"
+        expected = (
+            f"a ledger of cell {cell_id!r} by the key that {KEY_VARIABLE} "
+            f"names{'' if key else ', none'}"
+        )
         do = "have it name the file of the ledger's own key, or none"
-        raise StoreError(f"Expected {wanted}; it was begun, or made anew, {begun}: {do}.")
+        raise StoreError(f"Expected {expected}; it was begun, or made anew, {begun}: {do}.")
 
 
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
-    """Number, digest and what is held of a cell's newest entry; None where there is none."""
+    """Return a row (number, digest, held) of a cell's newest ledger entry.
+
+    None if there is none.
+    """
     query = sa.select(*LEDGER.c["number", "digest", "held"]).where(LEDGER.c.cell_id == cell_id)
     return connection.execute(query.order_by(LEDGER.c.number.desc()).limit(1)).first()
 
 
 def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
-    """Return the SHA-256 over the sums of rows, by table, in any order."""
+    """Return the SHA-256 over the sums of rows, given by table; their order does not matter."""
     digest = hashlib.sha256()
     for table in sorted(sums):
         ordered = sorted(sums[table])
@@ -116,69 +167,115 @@ def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
 
 
 def entry_digest(previous: bytes, head: Mapping[str, Any], key: bytes = b"") -> bytes:
-    """Return the digest of a ledger entry, 32 bytes: over the one before, and all columns of the entry but its digest.
+    """Return the digest of a ledger entry.
 
-    key : of a keyed ledger: then it is the HMAC-SHA-256 (RFC 2104).
+    Parameters
+    ----------
+    previous : bytes
+        Digest of the entry before; START for the first.
+    head : mapping
+        All columns of the entry but its digest.
+    key : bytes, default b""
+        Key of a keyed ledger.
+
+    Returns
+    -------
+    bytes
+        32 bytes: SHA-256, or HMAC-SHA-256 (RFC 2104) with a key.
     """
-    begin = b"dengine ledger 2\n" + previous + row_sum("ledger", head)
-    return hmac.digest(key, begin, "sha256") if key else hashlib.sha256(begin).digest()
+    message = b"dengine ledger 2\n" + previous + row_sum("ledger", head)
+    return hmac.digest(key, message, "sha256") if key else hashlib.sha256(message).digest()
 
 
-def _onward(chained: str, sums: Iterable[bytes]) -> str:
-    """The chain of a table's rows, with those of another entry."""
+def _extend_chain(chained: str, sums: Iterable[bytes]) -> str:
+    """Return a table's chain, hexadecimal, extended by the sums of the next entry's rows."""
     return hashlib.sha256(chained.encode() + b"".join(sorted(sums))).hexdigest()
 
 
-def _of_settings(settings: Mapping[str, str]) -> str:
-    return _onward("", [json.dumps(settings, sort_keys=True).encode()])
+def _settings_chain(settings: Mapping[str, str]) -> str:
+    """Return the chain value of a cell's settings, hexadecimal."""
+    return _extend_chain("", [json.dumps(settings, sort_keys=True).encode()])
 
 
-def _loaded(held: str) -> dict[str, str]:
-    with suppress(ValueError, TypeError):  # damaged: it fits no rows
+def _parse_chains(held: str) -> dict[str, str]:
+    """Return the chain of each table from an entry's column `held`.
+
+    {} if it is damaged, which then fits no rows.
+    """
+    with suppress(ValueError, TypeError):
         return dict(json.loads(held))
     return {}
 
 
 class LedgerEntry:
-    """The entry that a transaction under way will end with. The cell is locked: two processes may write to it.
+    """The ledger entry that an open write transaction will end with. The cell must be locked.
 
-    key : of a keyed ledger.  settings : whether they change.
+    Parameters
+    ----------
+    connection : sqlalchemy.Connection
+        Of the transaction.
+    cell_id : str
+    key : bytes, default b""
+        Key of a keyed ledger.
+
+    Attributes
+    ----------
+    settings : bool
+        Whether the transaction changes settings; set by `chain_writes`.
     """
 
     def __init__(self, connection: sa.Connection, cell_id: str, key: bytes = b"") -> None:
-        self._connection, self._cell_id, self._key = connection, cell_id, key
+        self._connection = connection
+        self._cell_id = cell_id
+        self._key = key
         last = newest_entry(connection, cell_id)
         self._number: int = 1 if last is None else last.number + 1
         self._previous: bytes = START if last is None else last.digest
-        self._held = {} if last is None else _loaded(last.held)
+        self._chains = {} if last is None else _parse_chains(last.held)
         self._sums: dict[str, list[bytes]] = {}
         self.settings = False
 
-    def take(self, table: str, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Return rows on their way into a table with the number of the entry, and each with its sum."""
-        taken = [{**row, "entry": self._number} for row in rows]
-        for row in taken:
+    def add_rows(self, table: str, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Add rows that are about to be inserted into a table.
+
+        Return them with the entry's number and their sums.
+        """
+        chained = [{**row, "entry": self._number} for row in rows]
+        for row in chained:
             row["sum"] = row_sum(table, row)
-        self._sums.setdefault(table, []).extend(row["sum"] for row in taken)
-        return taken
+        self._sums.setdefault(table, []).extend(row["sum"] for row in chained)
+        return chained
 
     def append(self, clock: Callable[[], float]) -> tuple[int, str] | None:
-        """Write the entry, as the last of the transaction; its number and digest, None where there is nothing to chain.
+        """Insert the entry, as the last step of the transaction.
 
-        clock : the time in seconds that it is stamped with.
+        Parameters
+        ----------
+        clock : callable
+            Returns the entry's time, in seconds.
+
+        Returns
+        -------
+        (int, str) or None
+            Number and hexadecimal digest of the entry; None if nothing was added or changed.
         """
         if not (self._sums or self.settings):
             return None
-        settings = held_settings(self._connection, self._cell_id) if self.settings else None
-        held = {name: _onward(self._held.get(name, ""), self._sums[name]) for name in IN_FORCE if name in self._sums}
-        held |= {} if settings is None else {SETTING.name: _of_settings(settings)}
+        chains = dict(self._chains)
+        for name in IN_FORCE:
+            if name in self._sums:
+                chains[name] = _extend_chain(chains.get(name, ""), self._sums[name])
+        settings = None
+        if self.settings:
+            settings = read_settings(self._connection, self._cell_id)
+            chains[SETTING.name] = _settings_chain(settings)
         head = {
             "cell_id": self._cell_id,
             "number": self._number,
             "time": float(clock()),
             "added": json.dumps({table: len(sums) for table, sums in sorted(self._sums.items())}),
             "rows": rows_digest(self._sums),
-            "held": json.dumps(self._held | held, sort_keys=True),
+            "held": json.dumps(chains, sort_keys=True),
             "settings": None if settings is None else json.dumps(settings, sort_keys=True),
         }
         digest = entry_digest(self._previous, head, self._key)
@@ -186,80 +283,125 @@ class LedgerEntry:
         return self._number, digest.hex()
 
 
-def held_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
-    """Return a cell's settings, without the store's own."""
-    query = sa.select(SETTING.c.key, SETTING.c.value).where(SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED))
+def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
+    """Return a cell's settings, without those that the store itself keeps (`RESERVED`)."""
+    query = sa.select(SETTING.c.key, SETTING.c.value)
+    query = query.where(SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED))
     return {row.key: row.value for row in connection.execute(query)}
 
 
-def settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, str]:
-    """What of a cell's settings is not as the newest entry that changed them has it: by key, in words."""
-    held, chained = held_settings(connection, cell_id), dict[str, str]()
-    newest = sa.select(LEDGER.c.settings).where(LEDGER.c.cell_id == cell_id, LEDGER.c.settings.is_not(None))
-    with suppress(ValueError, TypeError):  # the entry itself was changed: of that the chain tells
-        chained = dict(json.loads(connection.execute(newest.order_by(LEDGER.c.number.desc()).limit(1)).scalar() or "{}"))
-    return {
-        key: "is not chained" if key not in chained else "is missing" if key not in held else "was changed"
-        for key in sorted(held.keys() | chained.keys(), key=str)
-        if held.get(key) != chained.get(key)
-    }
+def find_settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, str]:
+    """Compare a cell's settings with the ledger's newest copy.
+
+    Return by key what is wrong, in words.
+    """
+    stored = read_settings(connection, cell_id)
+    chained: dict[str, str] = {}
+    is_copy = (LEDGER.c.cell_id == cell_id) & LEDGER.c.settings.is_not(None)
+    newest = sa.select(LEDGER.c.settings).where(is_copy).order_by(LEDGER.c.number.desc()).limit(1)
+    with suppress(ValueError, TypeError):  # an entry that was changed is found by the chain
+        chained = dict(json.loads(connection.execute(newest).scalar() or "{}"))
+    faults = {}
+    for key in sorted(stored.keys() | chained.keys(), key=str):
+        if key not in chained:
+            faults[key] = "is not chained"
+        elif key not in stored:
+            faults[key] = "is missing"
+        elif stored[key] != chained[key]:
+            faults[key] = "was changed"
+    return faults
 
 
-def doubt_of(connection: sa.Connection, cell_id: str, key: bytes, first: int) -> str:
-    """What a cell's engine reads that is not as its ledger has it, in words; "" where all is.
+def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, first: int) -> str:
+    """Compare what an engine reads of a cell with the cell's ledger.
 
-    first : number of the oldest label that is read.  Settings, corrections and versions are held to it from the first on.
+    Parameters
+    ----------
+    connection : sqlalchemy.Connection
+    cell_id : str
+    key : bytes
+        Key of the ledger, b"" without one.
+    first : int
+        Number of the oldest label that is checked. Settings, corrections and versions are checked
+        in full.
+
+    Returns
+    -------
+    str
+        The first difference, in words; "" if there is none.
     """
     try:
-        must_have_key(connection, cell_id, key)
+        check_key(connection, cell_id, key)
     except StoreError as error:
         return f"{error}"
-    entries = sa.select(LEDGER).where(LEDGER.c.cell_id == cell_id).order_by(LEDGER.c.number.desc()).limit(2)
-    head, before = [*(dict(row._mapping) for row in connection.execute(entries)), {}, {}][:2]
-    if head and entry_digest(before.get("digest", START), head | {"digest": None}, key) != head["digest"]:
+    query = sa.select(LEDGER).where(LEDGER.c.cell_id == cell_id)
+    rows = connection.execute(query.order_by(LEDGER.c.number.desc()).limit(2))
+    newest, before = [*(dict(row._mapping) for row in rows), {}, {}][:2]
+    previous = before.get("digest", START)
+    if newest and entry_digest(previous, newest | {"digest": None}, key) != newest["digest"]:
         return "the newest entry of the ledger is not as it was written"
-    held = _loaded(head.get("held", ""))
-    if held.get(SETTING.name, _of_settings({})) != _of_settings(held_settings(connection, cell_id)):
+    chains = _parse_chains(newest.get("held", ""))
+    settings = _settings_chain(read_settings(connection, cell_id))
+    if chains.get(SETTING.name, _settings_chain({})) != settings:
         return "the settings are not those of the ledger"
-    newest = head.get("number", 0)
+    last_entry = newest.get("number", 0)
     for name in IN_FORCE:
         begin = first if name == LABEL.name else 1
-        if said := _table_doubt(connection, cell_id, name, begin, newest, held.get(name, "")):
-            return said
+        difference = _find_table_error(
+            connection, cell_id, name, begin, last_entry, chains.get(name, "")
+        )
+        if difference:
+            return difference
     return ""
 
 
-def _table_doubt(connection: sa.Connection, cell_id: str, name: str, first: int, newest: int, chained: str) -> str:
-    """What of a table in force is not as its ledger has it, in words, from row `first` on, or from the first of its entry.
+def _find_table_error(
+    connection: sa.Connection, cell_id: str, name: str, first: int, last_entry: int, chained: str
+) -> str:
+    """Compare a table's rows with the chain over them; return the first difference in words, or "".
 
-    newest : entry up to which rows count; others may write meanwhile.  chained : what it holds of this table.
+    Rows from number `first` on are read, or from the first of its entry, up to those of the entry
+    `last_entry`: others may write meanwhile. `chained` is the chain that `last_entry` has.
     """
     number = IN_FORCE[name]
-    table, mine = number.table, number.table.c.cell_id == cell_id
-    entry = sa.select(table.c.entry).where(mine, number >= first).order_by(number).limit(1).scalar_subquery()
-    earlier = sa.select(table.c.entry, number).where(mine, number < first, table.c.entry < sa.func.coalesce(entry, 2**62))
+    table = number.table
+    selected = table.c.cell_id == cell_id
+    entry = sa.select(table.c.entry).where(selected, number >= first).order_by(number).limit(1)
+    is_earlier = table.c.entry < sa.func.coalesce(entry.scalar_subquery(), 2**62)
+    earlier = sa.select(table.c.entry, number).where(selected, number < first, is_earlier)
     before = connection.execute(earlier.order_by(number.desc()).limit(1)).first()
     chain = ""
     if before is not None:
-        held = sa.select(LEDGER.c.held).where(LEDGER.c.cell_id == cell_id, LEDGER.c.number == before.entry)
-        chain, mine = _loaded(connection.execute(held).scalar() or "").get(name, ""), mine & (number > before[1])
-    mine &= table.c.entry.is_(None) | (table.c.entry <= newest)
-    rows = connection.execute(sa.select(*(c for c in table.c if c.name != "state")).where(mine).order_by(number))
-    for _, some in groupby(rows, lambda row: row.entry):
-        each = [dict(zip(rows.keys(), row, strict=True)) for row in some]
-        if other := [row for row in each if not is_sound(name, row)]:
-            return f"the {name} {other[0][number.name]} is not as it was written"
-        chain = _onward(chain, [row["sum"] for row in each])
+        is_entry = (LEDGER.c.cell_id == cell_id) & (LEDGER.c.number == before.entry)
+        held = connection.execute(sa.select(LEDGER.c.held).where(is_entry)).scalar()
+        chain = _parse_chains(held or "").get(name, "")
+        selected = selected & (number > before[1])
+    selected &= table.c.entry.is_(None) | (table.c.entry <= last_entry)
+    query = sa.select(*(column for column in table.c if column.name != "state"))
+    rows = connection.execute(query.where(selected).order_by(number))
+    for _, group in groupby(rows, lambda row: row.entry):
+        entry_rows = [dict(zip(rows.keys(), row, strict=True)) for row in group]
+        if changed := [row for row in entry_rows if not is_intact(name, row)]:
+            return f"the {name} {changed[0][number.name]} is not as it was written"
+        chain = _extend_chain(chain, [row["sum"] for row in entry_rows])
     return "" if chain == chained else f"the rows of {name} are not those of the ledger"
 
 
 def chain_writes(engine: sa.Engine) -> None:
-    """Let all that is written through an engine, in transactions with an entry, be chained."""
-    sa.event.listen(engine, "before_execute", _meet, retval=True)
+    """Have every statement of an engine pass `_chain_statement`, which chains inserted rows."""
+    sa.event.listen(engine, "before_execute", _chain_statement, retval=True)
 
 
-def _meet(connection: sa.Connection, statement: Any, many: Any, one: Any, options: Any) -> tuple[Any, Any, Any]:
-    """See what is about to be executed: rows for a chained table are taken into the entry of the transaction."""
+def _chain_statement(
+    connection: sa.Connection, statement: Any, many: Any, one: Any, options: Any
+) -> tuple[Any, Any, Any]:
+    """Add rows that are about to be inserted to the transaction's ledger entry.
+
+    Note a change of settings.
+
+    Returns the statement and its parameters, the rows with entry and sum. Raises StoreError for an
+    insert into a chained table whose rows are not beside the statement.
+    """
     entry: LedgerEntry | None = connection.get_execution_options().get("dengine_entry")
     if entry is None or not isinstance(statement, sa.Insert | sa.Update | sa.Delete):
         return statement, many, one
@@ -268,5 +410,8 @@ def _meet(connection: sa.Connection, statement: Any, many: Any, one: Any, option
     if table not in CHAINED or not isinstance(statement, sa.Insert):
         return statement, many, one
     if not (many or one):
-        raise StoreError(f"Expected the rows of {table} beside the statement, got none; execute(insert(table), rows).")
-    return statement, entry.take(table, many or [one]), {}
+        raise StoreError(
+            f"Expected the rows of {table} beside the statement, got none; "
+            "execute(insert(table), rows)."
+        )
+    return statement, entry.add_rows(table, many or [one]), {}

@@ -1,8 +1,8 @@
-"""Opening what a user names as a store: nothing, a file, a URL, or a store as it is.
+"""Opens what a user names as a store: None, a file, a URL, or a store that is open already.
 
-    store = open_store("engine.db")      # SqlStore; `open_store(None)` is one in memory
+    store = open_store("engine.db")      # an SqlStore; open_store(None) is one in memory
 
-The database behind `SqlStore` is imported where it is used, so that importing this module costs numpy and no more.
+SQLAlchemy is imported only when a store is opened, so that importing this module is fast.
 """
 
 from __future__ import annotations
@@ -20,34 +20,60 @@ if TYPE_CHECKING:
 
     StoreLike = str | os.PathLike[str] | SqlStore
 
-UNHURRIED = 10.0  # seconds to wait for a store where no cell waits, as its wait
+UNHURRIED = 10.0  # seconds to wait for a store while no cell runs: the parameter `wait`
 
 
-def open_store(store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None) -> SqlStore:
-    """Return the store that a user named: nothing (memory), a file or URL (database), or a store as it is.
+def open_store(
+    store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None
+) -> SqlStore:
+    """Open the store that a user named.
 
-    A file or URL may say whose rows it means, and what that cell makes: `address`.
-    must_exist : a file or a cell that is not there is a StoreError; by default it is made.
-    wait : as `SqlStore` takes it; `UNHURRIED` where no cell waits.
+    Parameters
+    ----------
+    store : None, str, path or SqlStore
+        None: a store in memory. A file or URL: a database; a `CellAddress` (see `address`) also
+        names the cell and its product. A store is returned as it is.
+    must_exist : bool, default False
+        Raise a StoreError for a file or cell that does not exist, instead of creating it.
+    wait : float or None
+        As `SqlStore` takes it; `UNHURRIED` if no cell waits for it.
+
+    Returns
+    -------
+    SqlStore
+
+    Raises
+    ------
+    StoreError
+        For anything else, and as of `SqlStore`.
     """
     from .peers import must_have_cell  # SQLAlchemy is imported where it is used
     from .sql import SqlStore
 
     if isinstance(store, SqlStore):
         return store
-    named = store is None or isinstance(store, str | os.PathLike)
-    expect(named, "None, a file, a URL or an SqlStore", store, error=StoreError)
+    is_name = store is None or isinstance(store, str | os.PathLike)
+    expect(is_name, "None, a file, a URL or an SqlStore", store, error=StoreError)
     if store is None:
         return SqlStore()
-    cell_id, product = (store.cell_id, store.product) if isinstance(store, CellAddress) else ("cell", None)
+    cell_id = "cell"
+    product = None
+    if isinstance(store, CellAddress):
+        cell_id = store.cell_id
+        product = store.product
     if must_exist:
         must_have_cell(os.fspath(store), cell_id)
     return SqlStore(os.fspath(store), cell_id, product=product, wait=wait)
 
 
 @contextmanager
-def opening(store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None) -> Iterator[SqlStore]:
-    """`open_store`; where what follows fails, a store that was opened here is closed again."""
+def opening(
+    store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None
+) -> Iterator[SqlStore]:
+    """Open a store for the block, as `open_store`; yield it.
+
+    If the block raises, a store that was opened here is closed; otherwise it stays open.
+    """
     opened = open_store(store, must_exist=must_exist, wait=wait)
     try:
         yield opened

@@ -1,8 +1,9 @@
-"""A file that one process owns, read and written at offsets; what Windows does otherwise is met here.
+"""`OwnedFile`, a file that one process locks and reads and writes at offsets.
 
-POSIX locks the file (`flock`) and reads and writes at an offset in one call. Windows locks one byte far behind
-what is ever written, so that others read the rest, and needs the offset set first. Either lock ends with the
-process, whatever ended it, and no child has it.
+The journal is such a file. POSIX locks the file (`flock`) and reads and writes at an offset in one
+call. Windows locks one byte far behind all content, so that others can read the rest, and sets the
+offset first. Either lock ends with the process, however that ends, and a child process does not
+inherit it.
 """
 
 import ctypes
@@ -19,7 +20,7 @@ LOCKED_BYTE = 2**31 - 2  # the last that the C library of Windows can lock
 
 
 def _lock_of_system() -> Callable[[int], object]:
-    """Return what locks a descriptor at once, or raises a BlockingIOError where somebody has it."""
+    """Return this system's function that locks a descriptor, or raises BlockingIOError."""
     exclusive_now = 2 | 4  # LOCK_EX and LOCK_NB, of every system that has flock
     with suppress(ImportError):
         from fcntl import flock
@@ -29,7 +30,8 @@ def _lock_of_system() -> Callable[[int], object]:
         import msvcrt
 
         return _lock_of_windows(msvcrt)
-    flock_of_c = ctypes.CDLL(None, use_errno=True).flock  # of a Python that was built without either
+    # of a Python that was built without either
+    flock_of_c = ctypes.CDLL(None, use_errno=True).flock
 
     def lock(descriptor: int) -> None:
         if flock_of_c(descriptor, exclusive_now):
@@ -39,7 +41,10 @@ def _lock_of_system() -> Callable[[int], object]:
 
 
 def _lock_of_windows(msvcrt: Any) -> Callable[[int], object]:
-    """Return what locks a descriptor by Windows, with a BlockingIOError as `flock` has it; it moves the offset."""
+    """Return the function that locks a descriptor on Windows, and raises as `flock` does.
+
+    Locking moves the descriptor's offset.
+    """
 
     def lock(descriptor: int) -> None:
         os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
@@ -55,7 +60,10 @@ LOCK = _lock_of_system()
 
 
 def open_plain(path: Path, flags: int) -> int:
-    """Open a file, which is made for its owner alone; OSError for a link."""
+    """Open a file and return its descriptor; a new one is readable by its owner alone.
+
+    OSError for a symbolic link.
+    """
     no_follow = getattr(os, "O_NOFOLLOW", 0)
     binary = getattr(os, "O_BINARY", 0)  # or Windows writes \r\n for \n
     if not no_follow and path.is_symlink():
@@ -64,21 +72,21 @@ def open_plain(path: Path, flags: int) -> int:
 
 
 class OwnedFile:
-    """An open file, which is made if need be.
+    """An open file; it is created if need be.
 
     Parameters
     ----------
     path : Path
-        A link is refused.
+        A symbolic link is refused.
     owning : bool, default True
-        Whether to lock it; else it is only read, whoever owns it.
+        Lock the file. False: only read it, whoever owns it.
 
     Raises
     ------
     BlockingIOError
-        Where another process, or another object of this one, owns it.
+        If another process, or another object of this one, owns it.
     OSError
-        What the system says.
+        Whatever else the system reports.
     """
 
     def __init__(self, path: Path, owning: bool = True) -> None:
@@ -88,7 +96,10 @@ class OwnedFile:
         _OPEN.add(self)
 
     def _open_and_lock(self) -> int:
-        """Open and lock the file that is still at its path once the lock is held."""
+        """Open and lock the file, and again if another file is at its path by then.
+
+        Return the descriptor.
+        """
         while True:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._fd = open_plain(self.path, os.O_RDWR | os.O_CREAT)
@@ -99,21 +110,21 @@ class OwnedFile:
             except BaseException:
                 os.close(self._fd)
                 raise
-            os.close(self._fd)  # its owner went, and took the file along, before it was locked: once more
+            os.close(self._fd)  # its owner deleted it before it was locked here: once more
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed."""
+        """Whether the file was closed."""
         return self._fd < 0
 
     @property
     def size(self) -> int:
-        """Bytes that it has."""
+        """Size in bytes."""
         return os.fstat(self._fd).st_size
 
     def in_place(self) -> bool:
-        """Whether it is the file at its path."""
-        if os.name == "nt":  # it lets nobody delete, move or replace a file that is open
+        """Return whether this open file is still the one at its path."""
+        if os.name == "nt":  # there an open file cannot be deleted, moved or replaced
             return True
         try:
             return os.path.samestat(os.fstat(self._fd), self.path.lstat())
@@ -121,7 +132,7 @@ class OwnedFile:
             return False
 
     def read(self, size: int, offset: int) -> bytes:
-        """Return so many bytes, or fewer at the end."""
+        """Return `size` bytes from an offset, or fewer at the end of the file."""
         if hasattr(os, "pread"):
             return os.pread(self._fd, size, offset)
         with self._seeking:
@@ -129,14 +140,14 @@ class OwnedFile:
             return os.read(self._fd, size)
 
     def write(self, content: bytes | bytearray, offset: int) -> None:
-        """Write all of it, or raise an OSError."""
+        """Write all of the content at an offset, or raise an OSError."""
         if hasattr(os, "pwrite"):
             written = os.pwrite(self._fd, content, offset)
         else:
             with self._seeking:
                 os.lseek(self._fd, offset, os.SEEK_SET)
                 written = os.write(self._fd, content)
-        if written < len(content):  # a disk that is full takes a part
+        if written < len(content):  # a full disk takes a part
             raise OSError(f"only {written} of {len(content)} bytes were written")
 
     def sync(self) -> None:
@@ -144,11 +155,14 @@ class OwnedFile:
         getattr(os, "fdatasync", os.fsync)(self._fd)  # not every system has the quicker one
 
     def truncate(self, size: int) -> None:
-        """Cut it off, or extend it."""
+        """Set the size in bytes: cut the file off, or extend it."""
         os.ftruncate(self._fd, size)
 
     def reserve(self, size: int) -> None:
-        """Have the disk keep room for so many bytes, and sync; without room it stays as it is."""
+        """Reserve disk space for `size` bytes in total, and sync.
+
+        Without space the file stays as it is.
+        """
         before = self.size
         try:
             if hasattr(os, "posix_fallocate"):
@@ -160,7 +174,7 @@ class OwnedFile:
         os.fsync(self._fd)
 
     def close(self) -> None:
-        """Close it, which gives it free."""
+        """Close the file, which unlocks it; a second call does nothing."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -170,6 +184,8 @@ _OPEN: weakref.WeakSet[OwnedFile] = weakref.WeakSet()
 
 
 def _close_all() -> None:
+    """Close every open file, in a child process after a fork."""
+    """Close every open file, in a child process after a fork."""
     for file in list(_OPEN):
         file.close()
 

@@ -1,4 +1,4 @@
-"""The cells of a database, and the settings that cells of one product must agree on."""
+"""Lists the cells of a database; checks that cells of one product have matching settings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,15 +11,24 @@ from ..recipe import Recipe
 from .connections import reading
 from .schema import DECISION, LABEL, PRODUCT_KEY, SETTING, VERSION
 
-EMBEDDING = ("reducer", "params", "folds", "window", "novelty")  # of a recipe: what a version's arrays were made by
+# Settings of a recipe on which the arrays of a version depend.
+EMBEDDING = ("reducer", "params", "folds", "window", "novelty")
 
 
 @dataclass(frozen=True, slots=True)
 class CellSummary:
     """One cell of a database.
 
-    version : number of the newest accepted version that it may answer by, its product's or its own; None before the first.
-    last_seen : time of its newest decision or label, in seconds.
+    Attributes
+    ----------
+    cell_id : str
+    product : str or None
+    decisions, labels : int
+        Their numbers.
+    version : int or None
+        Number of the newest accepted version, its product's or its own; None before the first.
+    last_seen : float or None
+        Time of its newest decision or label, in seconds since 1970.
     """
 
     cell_id: str
@@ -30,63 +39,108 @@ class CellSummary:
     last_seen: float | None
 
 
-def must_agree(mine: Mapping[str, str], peer: Mapping[str, str], name: str, product: str) -> None:
-    """SettingError where two cells of a product, by their settings, would embed a trace differently.
+def must_agree(
+    settings: Mapping[str, str], peer_settings: Mapping[str, str], name: str, product: str
+) -> None:
+    """Check that two cells of a product would embed a trace in the same way.
 
-    name : of the peer.  A policy, a radius, a schedule or a budget may differ: a version's arrays do not depend on them.
+    A policy, a radius, a schedule or a budget may differ: a version's arrays do not depend on them.
+
+    Parameters
+    ----------
+    settings, peer_settings : mapping of str to str
+        Of this cell and of the peer, as stored.
+    name : str
+        Of the peer, for the error.
+    product : str
+
+    Raises
+    ------
+    SettingError
+        If a setting of the embedding differs.
     """
-    if "recipe" not in mine or "recipe" not in peer:
+    if "recipe" not in settings or "recipe" not in peer_settings:
         return
-    have, asked = _embedding(peer), _embedding(mine)
-    either = ("trace",) if None in (have["trace"], asked["trace"]) else ()  # the first trace of any cell sets the contract
-    other = [key for key in have if key not in either and have[key] != asked[key]]
-    if other:
-        stored, got = (", ".join(f"{key} {values[key]}" for key in other) for values in (have, asked))
-        do = "cells that share labels share what embeds them: give the same, or name another product"
-        wanted = f"the settings of product {product!r}, as cell {name!r} has them ({stored})"
-        raise SettingError(f"Expected {wanted}, got {got}; {do}.")
+    peer_values = _embedding_settings(peer_settings)
+    values = _embedding_settings(settings)
+    # The first trace of any cell sets the product's trace spec.
+    is_open = None in (peer_values["trace"], values["trace"])
+    different = [
+        key
+        for key, value in peer_values.items()
+        if value != values[key] and not (is_open and key == "trace")
+    ]
+    if different:
+        expected = ", ".join(f"{key} {peer_values[key]}" for key in different)
+        got = ", ".join(f"{key} {values[key]}" for key in different)
+        do = (
+            "cells that share labels share what embeds them: give the same, or name another product"
+        )
+        raise SettingError(
+            f"Expected the settings of product {product!r}, as cell {name!r} has them "
+            f"({expected}), "
+            f"got {got}; {do}."
+        )
 
 
-def _embedding(settings: Mapping[str, str]) -> dict[str, Any]:
+def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
+    """Return the settings on which an embedding depends, by name."""
     recipe = Recipe.from_toml(settings["recipe"])
-    own = {key: getattr(recipe, key) for key in EMBEDDING}
-    return own | {key: settings.get(key) for key in ("seed", "trace", "model", "described")}
+    of_recipe = {key: getattr(recipe, key) for key in EMBEDDING}
+    return of_recipe | {key: settings.get(key) for key in ("seed", "trace", "model", "described")}
 
 
 def must_have_cell(url: str, cell_id: str) -> None:
-    """StoreError for a cell that a database does not hold, and for what is no store."""
+    """Raise a StoreError if a database has no such cell, or is no store."""
     with reading(url) as connection:
         names = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
     if cell_id not in names:
-        held = ", ".join(names)
-        raise StoreError(f"Expected a cell of this store, got {cell_id!r}; it holds {held}. Name one of them: --cell NAME.")
+        cells = ", ".join(names)
+        raise StoreError(
+            f"Expected a cell of this store, got {cell_id!r}; it holds {cells}. Name one of "
+            "them: --cell NAME."
+        )
 
 
 def list_cells(url: str) -> list[CellSummary]:
-    """Every cell of a database, by name. StoreError for what is no store."""
-    accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version)).where(VERSION.c.accepted == sa.true())
+    """Return a summary of every cell of a database, sorted by name.
+
+    StoreError if it is no store.
+    """
+    accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version)).where(
+        VERSION.c.accepted == sa.true()
+    )
     with reading(url) as connection:
         settings = connection.execute(sa.select(*SETTING.c["cell_id", "key", "value"])).all()
-        decisions, labels = (_counts(connection, table) for table in (DECISION, LABEL))
-        versions = {row[0]: row[1] for row in connection.execute(accepted.group_by(VERSION.c.cell_id))}
+        decisions = _count_by_cell(connection, DECISION)
+        labels = _count_by_cell(connection, LABEL)
+        versions = {
+            row[0]: row[1] for row in connection.execute(accepted.group_by(VERSION.c.cell_id))
+        }
     products = {cell_id: value for cell_id, key, value in settings if key == PRODUCT_KEY}
-    shared = dict[str | None, int]()  # by product, its newest version
+    product_versions: dict[str | None, int] = {}  # the newest version, by product
     for name, version in versions.items():
-        shared[products.get(name)] = max(version, shared.get(products.get(name), 0))
-    none = (0, None)
-    return [
-        CellSummary(
+        product = products.get(name)
+        product_versions[product] = max(version, product_versions.get(product, 0))
+    summaries = []
+    for name in sorted({row.cell_id for row in settings}):
+        product = products.get(name)
+        times = [counts[name][1] for counts in (decisions, labels) if name in counts]
+        summary = CellSummary(
             cell_id=name,
-            product=products.get(name),
-            decisions=decisions.get(name, none)[0],
-            labels=labels.get(name, none)[0],
-            version=(shared if name in products else versions).get(products.get(name, name)),
-            last_seen=max((row[name][1] for row in (decisions, labels) if name in row), default=None),
+            product=product,
+            decisions=decisions[name][0] if name in decisions else 0,
+            labels=labels[name][0] if name in labels else 0,
+            version=versions.get(name) if product is None else product_versions.get(product),
+            last_seen=max(times, default=None),
         )
-        for name in sorted({row.cell_id for row in settings})
-    ]
+        summaries.append(summary)
+    return summaries
 
 
-def _counts(connection: sa.Connection, table: sa.Table) -> dict[str, tuple[int, float]]:
-    query = sa.select(table.c.cell_id, sa.func.count(), sa.func.max(table.c.time)).group_by(table.c.cell_id)
+def _count_by_cell(connection: sa.Connection, table: sa.Table) -> dict[str, tuple[int, float]]:
+    """Return, by cell, the number of a table's rows and the time of the newest."""
+    query = sa.select(table.c.cell_id, sa.func.count(), sa.func.max(table.c.time)).group_by(
+        table.c.cell_id
+    )
     return {row[0]: (row[1], row[2]) for row in connection.execute(query)}

@@ -1,4 +1,10 @@
-"""Whose rows a query is about, a cell's own or those of all cells of its product, and what several queries are made of."""
+"""Building blocks of the store's queries.
+
+Which cells' rows are meant, joins, and labels as corrected.
+
+A query is about one cell's rows or about those of all cells of its product (`Scope`). `SqlStore`
+and `Database` compose their statements from these functions and columns.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache, reduce
@@ -9,89 +15,167 @@ import sqlalchemy as sa
 from ..errors import StoreError, expect
 from ..records import ACTIONS, Action, Reason
 from .records import FORGOTTEN
-from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT, PRODUCT_KEY, RESERVED, SETTING, TRACE, VERSION, hold
+from .schema import (
+    CORRECTION,
+    DECISION,
+    EVENT,
+    LABEL,
+    PRODUCT,
+    PRODUCT_KEY,
+    RESERVED,
+    SETTING,
+    TRACE,
+    VERSION,
+    lock,
+)
 
 
 @dataclass(frozen=True)
 class Scope:
-    """A cell, and its product, if it has one.
+    """A cell and its product, if it has one.
 
-    What is learned belongs to the product: labels as traces to train on, and versions. One sequence numbers each over all
-    of the product's cells. What was decided, and what became of it, belongs to the cell.
+    What is learned is shared by a product: labelled traces for training, and model versions. Each
+    is numbered in one sequence over all cells of the product. Decisions and their outcomes belong
+    to the cell alone.
     """
 
     cell_id: str
     product: str | None = None
 
     def shared(self, column: sa.Column[Any]) -> sa.ColumnElement[bool]:
-        """Whether a row belongs to what this cell shares, by the row's cell_id; without a product its own rows."""
-        return column == self.cell_id if self.product is None else column.in_(cells_of(self.product))
+        """Return the condition that a row's cell (`column`) is this one or one of its product."""
+        return (
+            column == self.cell_id if self.product is None else column.in_(cells_of(self.product))
+        )
 
     def cells(self, connection: sa.Connection) -> list[str]:
-        """The cells whose rows it shares, its own first, the others by name."""
-        peers = connection.execute(cells_of(self.product or "").order_by(SETTING.c.cell_id)).scalars()
+        """Return the ids of this cell and then of its product's others, sorted."""
+        peers = connection.execute(
+            cells_of(self.product or "").order_by(SETTING.c.cell_id)
+        ).scalars()
         return [self.cell_id, *(cell for cell in peers if cell != self.cell_id)]
 
     def first_label(self, connection: sa.Connection, window: int) -> int:
-        """Number of a label; the newest `window` labels that train are that one and later ones."""
+        """Return a label number such that the newest `window` training labels are at or after it.
+
+        For a product that is an estimate, 2 * window below the newest: others are not read.
+        """
         if self.product is not None:  # by their numbers, or all would be read to be sorted
             return self.newest(connection, LABEL.c.seq) + 1 - 2 * window
-        train = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
-        query = sa.select(LABEL.c.seq).where(train).order_by(LABEL.c.seq.desc()).limit(1).offset(window - 1)
+        trains = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
+        query = (
+            sa.select(LABEL.c.seq)
+            .where(trains)
+            .order_by(LABEL.c.seq.desc())
+            .limit(1)
+            .offset(window - 1)
+        )
         return connection.execute(query).scalar() or 1
 
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
-        """Number the next row of a table, as nobody else does until the transaction ends: the product is locked."""
+        """Return the number of the next row of a table; it stays free until the transaction ends.
+
+        Where the numbers are the product's, the product is locked for that.
+        """
         if self.product is None or column.table in (DECISION, EVENT):
             return Scope(self.cell_id).newest(connection, column) + 1
-        hold(connection, PRODUCT, self.product)
+        lock(connection, PRODUCT, self.product)
         return self.newest(connection, column) + 1
 
-    def newest(self, connection: sa.Connection, column: sa.Column[Any], *more: sa.ColumnElement[bool]) -> int:
-        """The largest number in a column of what it shares; 0: there is none."""
+    def newest(
+        self, connection: sa.Connection, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
+    ) -> int:
+        """Return the largest number in a column, over the cell or its product.
+
+        0 if there is none.
+        """
         if self.product is not None:
-            return connection.execute(newest_of(self.product, column, *more)).scalar() or 0
-        mine = column.table.c.cell_id == self.cell_id
-        return connection.execute(sa.select(sa.func.max(column)).where(mine, *more)).scalar() or 0
+            return connection.execute(newest_of(self.product, column, *conditions)).scalar() or 0
+        is_own = column.table.c.cell_id == self.cell_id
+        return (
+            connection.execute(sa.select(sa.func.max(column)).where(is_own, *conditions)).scalar()
+            or 0
+        )
 
     def newest_version(self, connection: sa.Connection) -> int:
-        """Number of the newest accepted version; 0 before the first."""
+        """Return the number of the newest accepted version; 0 before the first."""
         return self.newest(connection, VERSION.c.version, VERSION.c.accepted == sa.true())
 
 
 def cells_of(product: str) -> sa.Select[Any]:
-    return sa.select(SETTING.c.cell_id).where(SETTING.c.key == PRODUCT_KEY, SETTING.c.value == product)
+    """Return the query for the ids of a product's cells."""
+    return sa.select(SETTING.c.cell_id).where(
+        SETTING.c.key == PRODUCT_KEY, SETTING.c.value == product
+    )
 
 
-@lru_cache(maxsize=100)  # of a few products and columns: to write the statement takes longer than to answer it
-def newest_of(product: str, column: sa.Column[Any], *more: sa.ColumnElement[bool]) -> sa.Select[Any]:
-    """The largest number in a column over a product's cells: a step down the index for each, of however many rows."""
-    table, peer = column.table, cells_of(product).subquery()
-    order = VERSION.c.retrain if table is VERSION else column  # the index's own order, in which versions increase too
-    query = sa.select(column).where(table.c.cell_id == peer.c.cell_id, *more)
-    each = query.order_by(order.desc()).limit(1).correlate(peer).scalar_subquery()
-    return sa.select(sa.func.max(each)).select_from(peer)
+# of a few products and columns: building the statement takes longer than running it
+@lru_cache(maxsize=100)
+def newest_of(
+    product: str, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
+) -> sa.Select[Any]:
+    """Return the query for the largest number in a column over a product's cells.
+
+    It takes one step down the index for each cell, however many rows there are.
+    """
+    table = column.table
+    peer = cells_of(product).subquery()
+    # By the index's own order, in which the numbers of versions increase too.
+    order = VERSION.c.retrain if table is VERSION else column
+    query = sa.select(column).where(table.c.cell_id == peer.c.cell_id, *conditions)
+    newest = query.order_by(order.desc()).limit(1).correlate(peer).scalar_subquery()
+    return sa.select(sa.func.max(newest)).select_from(peer)
 
 
 def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
-    """The product of a cell; a new cell enters the one that is named.
+    """Return a cell's product; enter a new cell into the product that is named.
 
-    Raises StoreError for a cell of another product, and for one that has worked without: its labels have other numbers.
+    Parameters
+    ----------
+    connection : sqlalchemy.Connection
+        In a write transaction.
+    cell_id : str
+    product : str or None
+        None: as the store says.
+
+    Raises
+    ------
+    StoreError
+        For a cell of another product, and for a cell that has worked without one: its labels are
+        numbered by themselves.
     """
-    mine = SETTING.c.cell_id == cell_id
-    query = sa.select(SETTING.c.value).where(mine, SETTING.c.key == PRODUCT_KEY)
-    held: str | None = connection.execute(query).scalar()
-    if product is None or held == product:
-        return held
-    expect(held is None, f"product {held!r} of cell {cell_id!r}", product, "leave it out, or name another cell", StoreError)
-    named = bool(product.strip()) and product.isprintable()
-    expect(named, "a product's name of printable characters", product, error=StoreError)
-    settings = connection.execute(sa.select(SETTING.c.key).where(mine, SETTING.c.key.not_in(RESERVED))).first()
-    label = connection.execute(sa.select(LABEL.c.seq).where(LABEL.c.cell_id == cell_id).limit(1)).first()
+    is_own = SETTING.c.cell_id == cell_id
+    query = sa.select(SETTING.c.value).where(is_own, SETTING.c.key == PRODUCT_KEY)
+    stored: str | None = connection.execute(query).scalar()
+    if product is None or stored == product:
+        return stored
+    expect(
+        stored is None,
+        f"product {stored!r} of cell {cell_id!r}",
+        product,
+        "leave it out, or name another cell",
+        StoreError,
+    )
+    is_name = bool(product.strip()) and product.isprintable()
+    expect(is_name, "a product's name of printable characters", product, error=StoreError)
+    settings = connection.execute(
+        sa.select(SETTING.c.key).where(is_own, SETTING.c.key.not_in(RESERVED))
+    ).first()
+    label = connection.execute(
+        sa.select(LABEL.c.seq).where(LABEL.c.cell_id == cell_id).limit(1)
+    ).first()
     do = "it has worked without a product: name a new cell, and bring its labels over by an import"
-    expect(settings is None and label is None, f"a new cell for product {product!r}", cell_id, do, StoreError)
-    hold(connection, PRODUCT, product)
-    connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": PRODUCT_KEY, "value": product})
+    expect(
+        settings is None and label is None,
+        f"a new cell for product {product!r}",
+        cell_id,
+        do,
+        StoreError,
+    )
+    lock(connection, PRODUCT, product)
+    connection.execute(
+        sa.insert(SETTING), {"cell_id": cell_id, "key": PRODUCT_KEY, "value": product}
+    )
     return product
 
 
@@ -101,78 +185,135 @@ TRACE_OF_DECISION = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_
 WITH_TRACES = DECISION.outerjoin(TRACE, TRACE_OF_DECISION)
 
 
-def counted(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
-    """A label as it counts, by its newest correction, along `correction_of`: 0, 1 or FORGOTTEN, NULL where there is none.
+def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
+    """Return the column of a label after corrections: 0, 1 or FORGOTTEN; NULL without a label.
 
-    corrected_to : number of the last correction that counts; None: all do.
+    Parameters
+    ----------
+    corrected_to : int or None
+        Number of the last correction that is applied; None: all are.
     """
-    says = sa.func.coalesce(sa.cast(CORRECTION.c.success, sa.Integer), sa.literal_column(str(FORGOTTEN)))
-    query = sa.select(says).where(CORRECTION.c.cell_id == LABEL.c.cell_id, CORRECTION.c.decision_id == LABEL.c.decision_id)
+    value = sa.func.coalesce(
+        sa.cast(CORRECTION.c.success, sa.Integer), sa.literal_column(str(FORGOTTEN))
+    )
+    # Along the index `correction_of`.
+    is_of_label = (CORRECTION.c.cell_id == LABEL.c.cell_id) & (
+        CORRECTION.c.decision_id == LABEL.c.decision_id
+    )
+    query = sa.select(value).where(is_of_label)
     query = query if corrected_to is None else query.where(CORRECTION.c.number <= corrected_to)
     newest = query.order_by(CORRECTION.c.number.desc()).limit(1).correlate(LABEL).scalar_subquery()
     return sa.func.coalesce(newest, sa.cast(LABEL.c.success, sa.Integer))
 
 
 def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
-    """What the model alone would have done, as a position in `ACTIONS`, and `Decision.inclusion_probability`."""
+    """Return two columns.
+
+    `predicted`, as a position in `ACTIONS`, and `Decision.inclusion_probability`.
+    """
     positions = {action.value: position for position, action in enumerate(ACTIONS)}
-    asked = sa.case((DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0)
-    return sa.case(positions, value=DECISION.c.predicted).label("predicted"), asked.label("inclusion_probability")
+    probability = sa.case(
+        (DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0
+    )
+    predicted = sa.case(positions, value=DECISION.c.predicted)
+    return predicted.label("predicted"), probability.label("inclusion_probability")
 
 
-SAID: sa.ColumnElement[int | None] = sa.func.nullif(counted(), FORGOTTEN)  # as it counts now; NULL: none, or forgotten
+# The label after corrections: 0 or 1; NULL if there is none, or it was forgotten.
+SUCCESS: sa.ColumnElement[int | None] = sa.func.nullif(corrected_label(), FORGOTTEN)
 
-
-# Where a label comes from, as it counts now: an accepted part that was confirmed, and is known to be
-# bad, is one of a stop, which came late.
+# Where a label comes from, after corrections: an accepted part that silence confirmed, and that is
+# known to be bad, is one of a stop, which came late.
 _CONFIRMED: sa.ColumnElement[str] = sa.literal_column("'confirmed'")
 _STOP: sa.ColumnElement[str] = sa.literal_column("'stop'")
 _BAD: sa.ColumnElement[int] = sa.literal_column("0")
 SOURCE: sa.ColumnElement[str | None] = sa.case(
-    ((LABEL.c.source == _CONFIRMED) & (counted() == _BAD), _STOP), else_=LABEL.c.source
+    ((LABEL.c.source == _CONFIRMED) & (corrected_label() == _BAD), _STOP), else_=LABEL.c.source
 )
 
 
 def past_query(cell_id: str) -> sa.Select[Any]:
-    """Decisions with their labels, without traces; the columns of `read_decision`."""
+    """Return the query for a cell's decisions with labels, without traces, for `read_decision`."""
     labels = (
-        SAID.label("success"),
+        SUCCESS.label("success"),
         SOURCE.label("source"),
         LABEL.c.seq.label("label_seq"),
         LABEL.c.time.label("label_time"),
     )
-    return sa.select(*DECISION.c, *labels).select_from(WITH_LABELS).where(DECISION.c.cell_id == cell_id)
+    return (
+        sa.select(*DECISION.c, *labels)
+        .select_from(WITH_LABELS)
+        .where(DECISION.c.cell_id == cell_id)
+    )
 
 
 def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[Any]:
-    """The labels that train, without their traces; along the index `label_training`."""
-    label = counted(corrected_to)
+    """Return the query for the labels that train: seq, success, content_hash, decision_id.
+
+    Labels that were forgotten and those of quarantined traces are left out. Corrections up to
+    number `corrected_to` are applied; None: all. It runs along the index `label_training`.
+    """
+    label = corrected_label(corrected_to)
     query = sa.select(LABEL.c.seq, label.label("success"), *LABEL.c["content_hash", "decision_id"])
-    return query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false(), label != FORGOTTEN)
+    return query.where(
+        scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false(), label != FORGOTTEN
+    )
 
 
 def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
-    """Number of a cell's newest decision."""
-    every = DECISION.alias("every")
-    return sa.select(sa.func.max(every.c.number)).where(every.c.cell_id == cell_id).scalar_subquery()
+    """Return the subquery for the number of a cell's newest decision."""
+    decision = DECISION.alias("every")
+    query = sa.select(sa.func.max(decision.c.number)).where(decision.c.cell_id == cell_id)
+    return query.scalar_subquery()
 
 
-def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: str = "") -> sa.Select[Any]:
-    """All decisions counted in stretches of one length, oldest first; the columns of `Stretch`.
+def stretches_query(
+    cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: str = ""
+) -> sa.Select[Any]:
+    """Return the query that counts all decisions of a cell in stretches, oldest first.
 
-    batch : by the beginnings of parts' numbers instead, "5" characters, or up to the last of "-/".  seconds : or of time.
+    Parameters
+    ----------
+    cell_id : str
+    length : int
+        Decisions per stretch.
+    seconds : float, default 0.0
+        Length of a stretch in time instead; 0.0: by number.
+    start : float, default 0.0
+        A time, in seconds since 1970, at which a stretch of `seconds` begins.
+    batch : str, default ""
+        Group decisions by the beginnings of their parts' numbers instead: a number n in digits
+        takes the first n characters, separators such as "-/" take all up to the last of them.
+
+    Returns
+    -------
+    sqlalchemy.Select
+        With the columns of `Stretch`.
     """
     number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
-    columns = (*DECISION.c["cell_id", "id", "time", "action", "reason", "part"], number.label("number"))
+    columns = (
+        *DECISION.c["cell_id", "id", "time", "action", "reason", "part"],
+        number.label("number"),
+    )
     every = sa.select(*columns).where(DECISION.c.cell_id == cell_id).subquery("every")
-    of = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)
+    is_of_decision = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)
     verified, accepted, rejected = (every.c.action == action.value for action in Action)
     novel, outside = (every.c.reason == reason.value for reason in (Reason.NOVEL, Reason.OUTSIDE))
-    which = (verified, novel, accepted, accepted & (SAID == 0), rejected & ~outside, outside)
-    counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
-    query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
+    false_accepted = accepted & (SUCCESS == 0)
+    conditions = (verified, novel, accepted, false_accepted, rejected & ~outside, outside)
+    counts: list[sa.ColumnElement[Any]] = [
+        sa.func.sum(sa.case((condition, 1), else_=0)) for condition in conditions
+    ]
+    query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts])
+    query = query.select_from(every.outerjoin(LABEL, is_of_decision))
     part: Any = every.c.part
-    others = reduce(lambda text, each: sa.func.replace(text, each, ""), batch, part)
-    name = sa.func.substr(part, 1, int(batch)) if batch.isdecimal() else sa.func.rtrim(part, others) if batch else sa.null()
-    timed = sa.func.floor((every.c.time - start) / seconds) if seconds else every.c.number - every.c.number % length
-    return query.add_columns(name).group_by(name if batch else timed).order_by(sa.func.max(every.c.number))
+    name: Any = sa.null()
+    if batch.isdecimal():
+        name = sa.func.substr(part, 1, int(batch))
+    elif batch:  # trim the characters that are no separators off the end
+        others = reduce(lambda text, separator: sa.func.replace(text, separator, ""), batch, part)
+        name = sa.func.rtrim(part, others)
+    by_number = every.c.number - every.c.number % length
+    by_time = sa.func.floor((every.c.time - start) / seconds) if seconds else by_number
+    query = query.add_columns(name).group_by(name if batch else by_time)
+    return query.order_by(sa.func.max(every.c.number))

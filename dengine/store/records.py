@@ -304,12 +304,16 @@ def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
     if decision.lower > 0.0:
         accepts = int(decision.predicted is Action.ACCEPT)
         outcomes.append(
-            OutcomeRecord(0, decision.lower, 1.0, False, False, 0, accepts, decision.inclusion_probability)
+            OutcomeRecord(
+                0, decision.lower, 1.0, False, False, 0, accepts, decision.inclusion_probability
+            )
         )
     if decision.upper < 1.0:
         rejects = 2 * int(decision.predicted is Action.REJECT)
         outcomes.append(
-            OutcomeRecord(0, 0.0, decision.upper, True, False, 0, rejects, decision.inclusion_probability)
+            OutcomeRecord(
+                0, 0.0, decision.upper, True, False, 0, rejects, decision.inclusion_probability
+            )
         )
     return outcomes
 

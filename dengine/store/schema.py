@@ -1,4 +1,8 @@
-"""The tables of a store in a database; their columns are the fields of the records that they hold."""
+"""The tables of a store's database; how they are created, checked and locked.
+
+The columns of a table are the fields of the record that it holds (see records.py). Every row
+belongs to a cell, `cell_id`.
+"""
 
 from enum import StrEnum
 from typing import Any
@@ -11,14 +15,17 @@ from ..records import Decision, RetrainReport
 from .records import OF_DECISION, Correction, Event, NewLabel, StoredDecision, columns
 
 SCHEMA = "1"
-SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell
-PRODUCT_KEY = "product"  # a row of `setting` for every cell that shares what it learns
-LEDGER_KEY = "ledger_key"  # a row of `setting` for every cell whose ledger is keyed: what tells its key from others
-TABLES, PRODUCT, CELL = range(7236482514, 7236482517)  # what is held; the numbers are nobody else's
-RESERVED = (SCHEMA_KEY, PRODUCT_KEY, LEDGER_KEY)  # rows of `setting` that are the store's own
+# Keys of rows of `setting` that the store itself keeps.
+SCHEMA_KEY = "schema_version"  # for every cell
+PRODUCT_KEY = "product"  # for every cell that shares what it learns
+# for every cell whose ledger is keyed: a tag by which the key is recognized
+LEDGER_KEY = "ledger_key"
+RESERVED = (SCHEMA_KEY, PRODUCT_KEY, LEDGER_KEY)
+# kinds of locks; numbers that no other program uses
+TABLES, PRODUCT, CELL = range(7236482514, 7236482517)
 
 METADATA = sa.MetaData()
-KINDS: dict[type, Any] = {
+COLUMN_TYPES: dict[type, Any] = {
     str: sa.String,
     int: sa.BigInteger,
     float: sa.Double,
@@ -30,18 +37,32 @@ KINDS: dict[type, Any] = {
 
 
 def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
-    """Columns of a record's fields, of all or of these; key : the one that is of the primary key."""
-    known = {name: each for name, each in columns(record).items() if not names or name in names}
-    kinds = {name: sa.String if issubclass(kind, StrEnum) else KINDS[kind] for name, (kind, _) in known.items()}
+    """Return the columns for a record's fields, for all or only for `names`.
+
+    `key` is part of the primary key.
+    """
+    selected = {
+        name: field for name, field in columns(record).items() if not names or name in names
+    }
     return [
-        sa.Column(name, kinds[name], nullable=optional, primary_key=name == key, autoincrement=False)
-        for name, (_, optional) in known.items()
+        sa.Column(
+            name,
+            sa.String if issubclass(type_, StrEnum) else COLUMN_TYPES[type_],
+            nullable=optional,
+            primary_key=name == key,
+            autoincrement=False,
+        )
+        for name, (type_, optional) in selected.items()
     ]
 
 
 def _table(name: str, *parts: Any) -> sa.Table:
-    """A table of a cell's rows, each with its entry in the cell's ledger and its SHA-256 (`row_sum`)."""
-    cell, entry = sa.Column("cell_id", sa.String, primary_key=True), sa.Column("entry", sa.BigInteger)
+    """Return a table of a cell's rows.
+
+    Each has the number of its ledger entry and its sum (`row_sum`).
+    """
+    cell = sa.Column("cell_id", sa.String, primary_key=True)
+    entry = sa.Column("entry", sa.BigInteger)
     return sa.Table(name, METADATA, cell, *parts, entry, sa.Column("sum", sa.LargeBinary))
 
 
@@ -56,7 +77,8 @@ DECISION = _table(
     "decision",
     *_columns(Decision, key="id"),
     *_columns(StoredDecision, *OF_DECISION),
-    sa.Column("number", sa.BigInteger, nullable=False),  # 1, 2, ... in each cell, in their order: a clock may be set back
+    # 1, 2, ... in each cell: a clock may be set back
+    sa.Column("number", sa.BigInteger, nullable=False),
     sa.Index("decision_number", "cell_id", "number", unique=True),
     sa.Index("decision_time", "cell_id", "time"),
 )
@@ -65,102 +87,148 @@ TRACE = _table(  # apart from `decision`, so that counting decisions does not re
     sa.Column("decision_id", sa.String, primary_key=True),
     sa.Column("channels", sa.Integer, nullable=False),
     sa.Column("samples", sa.Integer, nullable=False),
-    sa.Column("data", sa.LargeBinary, nullable=False),  # float32, little-endian, (channels, samples)
+    # float32, little-endian, (channels, samples)
+    sa.Column("data", sa.LargeBinary, nullable=False),
 )
 LABEL = _table(
     "label",
     *_columns(NewLabel, key="decision_id"),
     sa.Column("seq", sa.BigInteger, nullable=False),
-    *_columns(StoredDecision, "quarantined"),  # as of `decision`, for the index
+    *_columns(StoredDecision, "quarantined"),  # a copy of the decision's, for the index
     sa.UniqueConstraint("cell_id", "seq", name="label_seq"),
     sa.Index("label_training", "cell_id", "quarantined", "seq"),
 )
 VERSION = _table(  # every retrain, dropped candidates included
     "model_version",
-    sa.Column("retrain", sa.BigInteger, primary_key=True, autoincrement=False),  # 1, 2, ... in each cell, or product
+    # 1, 2, ... in each cell, or product
+    sa.Column("retrain", sa.BigInteger, primary_key=True, autoincrement=False),
     sa.Column("time", sa.Double, nullable=False),
     *_columns(RetrainReport),
     sa.Column("last_seq", sa.BigInteger, nullable=False),
-    sa.Column("state", sa.LargeBinary),  # npz without pickles; NULL where it was thinned out
-    sa.Column("state_sum", sa.LargeBinary),  # SHA-256 of the state, which stays where the state goes
+    sa.Column("state", sa.LargeBinary),  # npz without pickles; NULL if it was deleted
+    # SHA-256 of the state, which stays when the state is deleted
+    sa.Column("state_sum", sa.LargeBinary),
     sa.Index("version_accepted", "cell_id", "accepted", "retrain"),
 )
 EVENT = _table("event", *_columns(Event, key="number"))
-CORRECTION = _table(  # later words on labels; the newest of a decision counts
+CORRECTION = _table(  # the newest of a decision counts
     "correction",
     *_columns(Correction, *(name for name in columns(Correction) if name != "seq"), key="number"),
     sa.Index("correction_of", "cell_id", "decision_id", "number"),
 )
-CHAINED = {table.name: table for table in (DECISION, TRACE, LABEL, VERSION, EVENT, CORRECTION)}  # rows the ledger chains
-ADDED = {LABEL.c.overdue_to}  # columns that came after the first schema
+# Tables whose rows the ledger chains.
+CHAINED = {table.name: table for table in (DECISION, TRACE, LABEL, VERSION, EVENT, CORRECTION)}
+
+ADDED = {LABEL.c.overdue_to}  # columns that were added after the first schema
 LEDGER = sa.Table(  # an entry for every transaction that added rows or changed settings
     "ledger",
     METADATA,
     sa.Column("cell_id", sa.String, primary_key=True),
-    sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),  # 1, 2, ... in each cell
+    # 1, 2, ... in each cell
+    sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
     sa.Column("time", sa.Double, nullable=False),
-    sa.Column("added", sa.Text, nullable=False),  # JSON: how many rows of each table
-    sa.Column("rows", sa.LargeBinary, nullable=False),  # of these rows' sums: `rows_digest`
-    sa.Column("held", sa.Text, nullable=False),  # JSON: the chain of all rows so far of each table that is in force
-    sa.Column("settings", sa.Text),  # JSON: all settings, where they changed
-    sa.Column("digest", sa.LargeBinary, nullable=False),  # over the entry before and this one: `entry_digest`
+    sa.Column("added", sa.Text, nullable=False),  # JSON: number of added rows by table
+    sa.Column("rows", sa.LargeBinary, nullable=False),  # digest of these rows' sums: `rows_digest`
+    # JSON: the chain over all rows so far of each table in IN_FORCE
+    sa.Column("held", sa.Text, nullable=False),
+    sa.Column("settings", sa.Text),  # JSON: all settings, if they changed
+    # over the entry before and this one: `entry_digest`
+    sa.Column("digest", sa.LargeBinary, nullable=False),
 )
 
 
-def hold(connection: sa.Connection, kind: int, name: str = "") -> None:
-    """Hold the tables, then a cell, then a product until the transaction ends, so that numbers are committed in order."""
+def lock(connection: sa.Connection, kind: int, name: str = "") -> None:
+    """Lock the tables (TABLES), or a cell or product by name, until the transaction ends.
+
+    Numbers are then committed in their order. To avoid a deadlock take several locks in this order.
+    """
     if connection.dialect.name == "postgresql":  # SQLite's BEGIN IMMEDIATE did it already
-        lock = sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:name, :kind))")
-        connection.execute(lock, {"name": name, "kind": kind})
+        statement = sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:name, :kind))")
+        connection.execute(statement, {"name": name, "kind": kind})
 
 
 def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
-    """Create the tables in an empty database, or check that they are ours; enter the cell.
+    """Create the tables in an empty database, or check that they are ours.
 
-    name : of the database, for the error.
+    Enter the cell if it is new.
+
+    Parameters
+    ----------
+    connection : sqlalchemy.Connection
+        In a write transaction.
+    cell_id : str
+    name : str
+        Of the database, for the error.
+
+    Raises
+    ------
+    StoreError
+        As of `check_schema`.
     """
-    hold(connection, TABLES)  # two cells may create them at the same moment
-    found = set(sa.inspect(connection).get_table_names())
+    lock(connection, TABLES)  # two cells may create them at the same moment
+    tables = set(sa.inspect(connection).get_table_names())
     # A file belongs to one program; a PostgreSQL database may hold other tables beside ours.
-    if found & set(METADATA.tables) or (found and connection.dialect.name == "sqlite"):
+    if tables & set(METADATA.tables) or (tables and connection.dialect.name == "sqlite"):
         _add_columns(connection)
         check_schema(connection, name)
     else:
         METADATA.create_all(connection)
-    entered = sa.select(SETTING).where(SETTING.c.cell_id == cell_id, SETTING.c.key == SCHEMA_KEY)
-    if connection.execute(entered).first() is None:
-        connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": SCHEMA_KEY, "value": SCHEMA})
+    query = sa.select(SETTING).where(SETTING.c.cell_id == cell_id, SETTING.c.key == SCHEMA_KEY)
+    if connection.execute(query).first() is None:
+        connection.execute(
+            sa.insert(SETTING), {"cell_id": cell_id, "key": SCHEMA_KEY, "value": SCHEMA}
+        )
 
 
 def _add_columns(connection: sa.Connection) -> None:
-    """Add the columns that an earlier dengine did not write; they are empty in its rows, whose sums leave them out."""
+    """Add the columns of ADDED to a store that an earlier dengine made.
+
+    They are NULL in its rows.
+    """
     inspector = sa.inspect(connection)
     for column in ADDED:
         table = column.table.name
-        names = {each["name"] for each in inspector.get_columns(table)} if inspector.has_table(table) else set()
+        names = set()
+        if inspector.has_table(table):
+            names = {info["name"] for info in inspector.get_columns(table)}
         if names >= {"cell_id", "sum"} and column.name not in names:
-            kind = column.type.compile(connection.dialect)
-            connection.execute(sa.text(f'ALTER TABLE "{table}" ADD COLUMN "{column.name}" {kind}'))
+            type_ = column.type.compile(connection.dialect)
+            connection.execute(sa.text(f'ALTER TABLE "{table}" ADD COLUMN "{column.name}" {type_}'))
 
 
 def check_schema(connection: sa.Connection, name: str) -> None:
-    """StoreError for a database that holds no store, or one of another schema, or a store that lacks columns."""
+    """Raise a StoreError unless a database holds a store of this schema with all columns."""
     inspector = sa.inspect(connection)
-    found = {
-        table: {column["name"] for column in inspector.get_columns(table)} if table in METADATA.tables else set()
+    tables = {
+        table: {column["name"] for column in inspector.get_columns(table)}
+        if table in METADATA.tables
+        else set()
         for table in inspector.get_table_names()
     }
-    if found.get(SETTING.name) != set(SETTING.c.keys()):
-        held = f"tables of another program: {', '.join(sorted(found))}" if found else "no tables"
+    if tables.get(SETTING.name) != set(SETTING.c.keys()):
+        description = (
+            f"tables of another program: {', '.join(sorted(tables))}" if tables else "no tables"
+        )
     else:
-        query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()  # the one query over all cells
-        held = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
-    if held != f"schema {SCHEMA}":
+        # the one query over all cells
+        query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()
+        description = "schema " + (
+            ", ".join(sorted(connection.execute(query).scalars())) or "unknown"
+        )
+    if description != f"schema {SCHEMA}":
         do = "open it with the dengine that wrote it, or name a new file or database"
-        if not found:
-            do = "a plain copy of a store that is in use lacks what it holds: make it by `dengine backup`"
-        raise StoreError(f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; {do}.")
+        if not tables:
+            do = (
+                "a plain copy of a store that is in use lacks what it holds: make it by "
+                "`dengine backup`"
+            )
+        raise StoreError(
+            f"Expected a dengine store of schema {SCHEMA}, found {description} in {name}; {do}."
+        )
     for table in METADATA.tables.values():
-        wanted = {column.name for column in table.c if column not in ADDED}
-        if missing := wanted - found.get(table.name, set()):
-            raise StoreError(f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it from a copy.")
+        expected = {column.name for column in table.c if column not in ADDED}
+        if missing := expected - tables.get(table.name, set()):
+            raise StoreError(
+                f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it "
+                "from a copy."
+            )

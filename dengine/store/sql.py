@@ -1,10 +1,11 @@
-"""The store in a database: SQLite in a file, or PostgreSQL by URL for a fleet.
+"""`SqlStore`, an engine's memory in a database: SQLite in a file, or PostgreSQL for a fleet.
 
     store = SqlStore("engine.db", cell_id="cell-7")
     store = SqlStore("postgresql+psycopg://user:password@host/database", cell_id="cell-7")
 
-What a returned call promises, given a disk that keeps what it synced: all that is put is committed. An engine does not put
-what it decides: that goes into a journal first, and from there, by `apply_records`, into the database.
+When a call that writes returns, its rows are committed, and survive a power failure if the disk
+keeps what it synced. The decisions and labels of a running engine do not come in by these calls:
+they go into the journal first, and from there, by `apply_records`, into the database.
 """
 
 import math
@@ -23,17 +24,17 @@ from ..errors import StoreError, expect, instead, listed, shortened
 from ..records import Action, Reason, RetrainReport, Source
 from .connections import Database
 from .journal import Journal, Record, journal_path
-from .ledger import held_settings, is_sound, state_sum
+from .ledger import is_intact, read_settings, state_sum
 from .peers import must_agree
 from .queries import (
     LABEL_OF_DECISION,
-    SAID,
     SOURCE,
+    SUCCESS,
     TRACE_OF_DECISION,
     WITH_LABELS,
     Scope,
     audit_columns,
-    counted,
+    corrected_label,
     n_decisions,
     past_query,
     stretches_query,
@@ -72,32 +73,69 @@ from .records import (
     unpack,
     without_rule,
 )
-from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT, RESERVED, SETTING, TRACE, VERSION, hold
+from .schema import (
+    CORRECTION,
+    DECISION,
+    EVENT,
+    LABEL,
+    PRODUCT,
+    RESERVED,
+    SETTING,
+    TRACE,
+    VERSION,
+    lock,
+)
 from .views import LABELS, DecisionGroup, HistoryFilter, PastLabel, Stretch, Tally
 
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
-WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
-MOST_TRAINED = 40  # versions that wait in memory, some half a megabyte each: a replay of 1,503 parts has fewer
+# of the environment: other seconds for all stores that are given none
+WAIT_VARIABLE = "DENGINE_STORE_WAIT"
+# of a store in memory, about 0.5 MB each; a replay of 1,503 parts has fewer
+MAX_UNWRITTEN_VERSIONS = 40
 
 
 class SqlStore(AbstractContextManager["SqlStore"]):
-    """What an engine needs of its memory, in a database. Everything belongs to one cell.
+    """An engine's memory in a database: settings, decisions, labels, versions, events of one cell.
 
-    url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL. None: SQLite in memory, for replays and trials.
-    cell_id : whose rows these are; several cells share one database without seeing each other.
-    clock : the time in seconds that rows are stamped with.
-    product : what the cell makes. None: as a known cell has it, or it shares nothing. Else labels as traces to train on,
-        and versions, are those of all its cells: `labelled`, `last_version`, `versions`, `retrains`, `corrections`,
-        and the numbers of both. What became of decisions stays the cell's own.
-    wait : seconds that a cell's engine waits for its disk, and for the database, at most. None: as the environment's
-        DENGINE_STORE_WAIT says, or 0.4.
-    keep_versions : newest model versions that keep their states, beside the first and a few older ones (`keeps_state`);
-        None: all keep them. A retrain itself stays listed for ever.
+    Parameters
+    ----------
+    url : str or None
+        A file (SQLite), or an SQLAlchemy URL of SQLite or PostgreSQL. None: SQLite in memory, for
+        replays and trials; such a store has no journal and no owner, stays open after `close`, and
+        is used by one thread at a time.
+    cell_id : str, default "cell"
+        Whose rows these are. Several cells share one database without seeing each other.
+    clock : callable
+        Returns the time, in seconds since 1970, with which rows are stamped.
+    product : str or None
+        What the cell makes. None: as the store says of a known cell; a new one shares nothing.
+        Cells of one product share labelled traces for training, versions and corrections
+        (`labelled`, `last_version`, `versions`, `retrains`, `corrections`) and their numbers.
+        Decisions and their outcomes stay the cell's own.
+    wait : float or None
+        Seconds that an engine waits for the disk and the database at most. None: the environment's
+        DENGINE_STORE_WAIT, or 0.4.
+    keep_versions : int or None
+        Number of newest model versions that keep their states, beside the first and a few older
+        ones (`keeps_state`). None: all. A retrain itself stays listed for ever.
 
-    SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may open one
-    cell: label numbers stay unique and increasing. Engines own their cell (`claim_cell`): a second one is refused.
-    before_use : called before each use of it but `apply_records`, so that it sees what is on its way into it.
-    In memory it has no journal, nobody owns it, `close` leaves it as it is, and one thread at a time may use it.
+    Attributes
+    ----------
+    database : Database
+    before_use : callable
+        Called before every use but `apply_records`, so that waiting records are written first; set
+        by the outbox.
+
+    Raises
+    ------
+    StoreError
+        For a setting that is not valid, and as of `Database`.
+
+    Notes
+    -----
+    SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, no network drive. Two
+    processes may open one cell, and the numbers of labels stay unique and increasing. An engine
+    owns its cell (`claim_cell`): a second engine is refused.
     """
 
     def __init__(
@@ -110,84 +148,133 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         wait: float | None = None,
         keep_versions: int | None = KEEP,
     ) -> None:
-        expect(bool(cell_id), "a cell_id that names the cell", cell_id, "use for example 'cell'", StoreError)
+        expect(
+            bool(cell_id),
+            "a cell_id that names the cell",
+            cell_id,
+            "use for example 'cell'",
+            StoreError,
+        )
         self.cell_id = cell_id
-        whole = keep_versions is None or (type(keep_versions) is int and keep_versions >= 2)
-        expect(whole, "keep_versions of 2 or more, or None for all", keep_versions, f"leave it at {KEEP}", StoreError)
+        is_valid = keep_versions is None or (type(keep_versions) is int and keep_versions >= 2)
+        expect(
+            is_valid,
+            "keep_versions of 2 or more, or None for all",
+            keep_versions,
+            f"leave it at {KEEP}",
+            StoreError,
+        )
         self.keep_versions = keep_versions
         self.wait = None if url is None else _checked_wait(wait)
         self.clock = clock
-        self.before_use: Callable[[], None] = self._write_waiting
-        self._waiting: list[Record] = []  # in memory: taken, and not written yet
-        self._trained: list[tuple[Any, ...]] = []  # in memory: versions, the same
-        self._held: dict[str, bool] = {}  # in memory: all decisions, and whether they have labels
-        self._labels = 0  # in memory: number of the newest one
-        self.database = Database(url if url is None else str(url), cell_id, clock, product, lambda: self.before_use())
-        self._read, self._scope = self.database.read, self.database.scope
+        self.before_use: Callable[[], None] = self._write_memory
+        # Of a store in memory: what was given and is written to the database when it is first read.
+        self._unwritten: list[Record] = []
+        self._unwritten_versions: list[tuple[Any, ...]] = []
+        self._has_label: dict[str, bool] = {}  # of every decision, by id
+        self._newest_label = 0
+        self.database = Database(
+            url if url is None else str(url), cell_id, clock, product, lambda: self.before_use()
+        )
+        self._read = self.database.read
+        self._scope = self.database.scope
         self.product = self._scope.product
         self._journal: Journal | None = None
 
     # Settings
 
     def settings(self) -> dict[str, str]:
-        """What `save_settings` was given; {} for a new store."""
+        """Return the settings that were saved last; {} for a new store."""
         with self.database.reading() as connection:
-            return held_settings(connection, self.cell_id)
+            return read_settings(connection, self.cell_id)
 
     def save_settings(self, settings: Mapping[str, str]) -> None:
-        """Replace the settings by these."""
-        self.database.write(lambda connection: self._settle(connection, settings))
+        """Commit new settings in the place of all present ones.
 
-    def _settle(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
-        """Replace the settings. SettingError where a peer embeds otherwise: the product stays locked until the commit."""
+        SettingError if a peer's contradict them.
+        """
+        self.database.write(lambda connection: self._replace_settings(connection, settings))
+
+    def _replace_settings(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
+        """Replace the settings in a transaction.
+
+        SettingError if a peer of the product would embed traces differently.
+
+        The product stays locked until the commit.
+        """
         for key in sorted(settings.keys() & set(RESERVED)):
-            raise StoreError(f"Expected settings of the engine, got {key!r}, which is the store's; rename it.")
+            raise StoreError(
+                f"Expected settings of the engine, got {key!r}, which is the store's; rename it."
+            )
         if self.product is not None:
-            hold(connection, PRODUCT, self.product)
-            for name, theirs in self._peers_of(connection).items():
-                must_agree(settings, theirs, name, self.product)
-        mine = (SETTING.c.cell_id == self.cell_id) & SETTING.c.key.not_in(RESERVED)
-        connection.execute(sa.delete(SETTING).where(mine))
-        rows = [{"cell_id": self.cell_id, "key": key, "value": value} for key, value in settings.items()]
+            lock(connection, PRODUCT, self.product)
+            for name, peer_settings in self._read_peers(connection).items():
+                must_agree(settings, peer_settings, name, self.product)
+        is_replaced = (SETTING.c.cell_id == self.cell_id) & SETTING.c.key.not_in(RESERVED)
+        connection.execute(sa.delete(SETTING).where(is_replaced))
+        rows = [
+            {"cell_id": self.cell_id, "key": key, "value": value} for key, value in settings.items()
+        ]
         if rows:
             connection.execute(sa.insert(SETTING), rows)
 
     def peers_settings(self) -> dict[str, dict[str, str]]:
         """Return the settings of the product's other cells, by cell."""
         with self.database.reading() as connection:
-            return self._peers_of(connection)
+            return self._read_peers(connection)
 
-    def _peers_of(self, connection: sa.Connection) -> dict[str, dict[str, str]]:
+    def _read_peers(self, connection: sa.Connection) -> dict[str, dict[str, str]]:
+        """Return the settings of the product's other cells, by cell, of those that have some."""
         peers = self._scope.cells(connection)[1:]
-        return {name: held for name in peers if (held := held_settings(connection, name))}
+        return {name: settings for name in peers if (settings := read_settings(connection, name))}
 
     # Decisions
 
     def flush(self) -> None:
-        """Return when all that is on its way into it is there, as far as it comes in time."""
+        """Wait until the outbox's records are in the database, at most its time limit."""
         self.database.check_open()
         self.before_use()
 
     def get_decision(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
-        """Return the decision; None where it is unknown.
+        """Return a decision with its label.
 
-        trace : with it; StoreError where it is not as it was stored.
+        Parameters
+        ----------
+        decision_id : str
+        trace : bool, default True
+            Read its trace, too.
+
+        Returns
+        -------
+        StoredDecision or None
+            None for an unknown id.
+
+        Raises
+        ------
+        StoreError
+            If the trace is not as it was stored.
         """
         query = past_query(self.cell_id).where(DECISION.c.id == decision_id)
-        rows = self._read(query.add_columns(*TRACE.c).outerjoin(TRACE, TRACE_OF_DECISION) if trace else query)
+        rows = self._read(
+            query.add_columns(*TRACE.c).outerjoin(TRACE, TRACE_OF_DECISION) if trace else query
+        )
         if not rows:
             return None
-        if trace and not is_sound(TRACE.name, dict(zip(TRACE.c.keys(), rows[0][-len(TRACE.c) :], strict=True))):
+        if trace and not is_intact(
+            TRACE.name, dict(zip(TRACE.c.keys(), rows[0][-len(TRACE.c) :], strict=True))
+        ):
             where = f"as it was stored in {self.database.name}, its bytes have changed"
             do = "see `dengine verify`, and restore the store from a copy"
             raise StoreError(f"Expected the trace of decision {decision_id!r} {where}; {do}.")
         return read_decision(rows[0])
 
     def decision_ids(self) -> Iterator[Sequence[str]]:
-        """Yield the ids of every decision, in any order and in pieces, so that others have their turns."""
+        """Yield the ids of all decisions, in any order, in chunks of CHUNK."""
         query = sa.select(DECISION.c.id).where(DECISION.c.cell_id == self.cell_id)
         with self.database.reading() as connection:
-            yield from connection.execute(query.execution_options(yield_per=CHUNK)).scalars().partitions()
+            yield from (
+                connection.execute(query.execution_options(yield_per=CHUNK)).scalars().partitions()
+            )
 
     # Training
 
@@ -200,12 +287,24 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         corrected_to: int | None = None,
         cell_only: bool = False,
     ) -> Labelled:
-        """Return the newest `limit` labelled traces, all where it is None, with their labels as they count.
+        """Return labelled traces for training, with corrected labels.
 
-        first, last : sequence numbers between which they lie.
-        corrected_to : number of the last correction that counts, for labels as they stood then; None: all do.
-        cell_only : of this cell alone, where others share its product.
-        A trace that is not as it was stored is left out; an event names its decision.
+        A trace that is not as it was stored is left out, and an event names its decision.
+
+        Parameters
+        ----------
+        limit : int or None
+            Number of newest labels; None: all.
+        first, last : int, optional
+            Numbers of the first and the last label.
+        corrected_to : int or None
+            Number of the last correction that is applied, for labels as they stood then; None: all.
+        cell_only : bool, default False
+            Leave out those of the product's other cells.
+
+        Returns
+        -------
+        Labelled
         """
         scope = Scope(self.cell_id) if cell_only else self._scope
         query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
@@ -213,396 +312,669 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = query if last is None else query.where(LABEL.c.seq <= last)
         with self.database.reading() as connection:
             rows = self._newest(connection, query, limit, last)[::-1]
-            found, damaged = self._with_traces(connection, rows, scope)
-        self._tell_of(damaged, "trace")
-        return found
+            labelled, damaged = self._with_traces(connection, rows, scope)
+        self._note_damage(damaged, "trace")
+        return labelled
 
     def _newest(
         self, connection: sa.Connection, query: sa.Select[Any], limit: int | None, last: int | None
     ) -> Sequence[Any]:
-        """The newest labels, newest first. Of a product: by their numbers, or all would be read to be sorted."""
+        """Run a query for the newest `limit` labels, newest first.
+
+        Of a product by their numbers, or all would be sorted.
+        """
         if self.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)
             newest = newest if last is None else min(newest, last)
             rows = connection.execute(query.where(LABEL.c.seq > newest - 2 * limit)).all()
             if len(rows) == limit or newest <= 2 * limit:
                 return rows
-        return connection.execute(query).all()  # more than every second is quarantined or forgotten
+        return connection.execute(query).all()  # here more than half are quarantined or forgotten
 
     def news_since(self, seq: int, limit: int) -> News:
-        """Return the labels after `seq`, at most `limit`, and the numbers of the newest version and correction."""
-        query = training_query(self._scope).where(LABEL.c.seq > int(seq)).order_by(LABEL.c.seq).limit(limit)
+        """Return the oldest `limit` labels after number `seq`.
+
+        With them come the numbers of the newest accepted version and the newest correction.
+        """
+        query = (
+            training_query(self._scope)
+            .where(LABEL.c.seq > int(seq))
+            .order_by(LABEL.c.seq)
+            .limit(limit)
+        )
         with self.database.reading() as connection:
-            found, damaged = self._with_traces(connection, connection.execute(query).all(), self._scope)
+            labelled, damaged = self._with_traces(
+                connection, connection.execute(query).all(), self._scope
+            )
             version = self._scope.newest_version(connection)
             correction = self._scope.newest(connection, CORRECTION.c.number)
-        self._tell_of(damaged, "trace")
-        return News(found, version, correction)
+        self._note_damage(damaged, "trace")
+        return News(labelled, version, correction)
 
-    def _with_traces(self, connection: sa.Connection, rows: Sequence[Any], scope: Scope) -> tuple[Labelled, list[str]]:
-        """Labels, oldest first, with their traces, read one by one; and the decisions whose traces have changed."""
-        at = {row.seq: i for i, row in enumerate(rows)}  # the forgotten are not among them
-        traces, kept = np.zeros((0, 0, 0), dtype=np.float32), np.zeros(len(rows), dtype=bool)
-        same = (TRACE.c.cell_id == LABEL.c.cell_id) & (TRACE.c.decision_id == LABEL.c.decision_id)
-        query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, same)).order_by(LABEL.c.seq)
+    def _with_traces(
+        self, connection: sa.Connection, rows: Sequence[Any], scope: Scope
+    ) -> tuple[Labelled, list[str]]:
+        """Read the traces of label rows, oldest first, one by one.
+
+        Returns the labelled traces, and the ids of decisions whose traces are not as they were
+        stored; these are left out.
+        """
+        positions = {row.seq: i for i, row in enumerate(rows)}  # the forgotten are not among them
+        traces = np.zeros((0, 0, 0), dtype=np.float32)
+        is_kept = np.zeros(len(rows), dtype=bool)
+        is_of_label = (TRACE.c.cell_id == LABEL.c.cell_id) & (
+            TRACE.c.decision_id == LABEL.c.decision_id
+        )
+        query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, is_of_label))
         query = query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false())
-        query = query.where(LABEL.c.seq.between(*((rows[0].seq, rows[-1].seq) if rows else (1, 0))))
+        first, last = (rows[0].seq, rows[-1].seq) if rows else (1, 0)
+        query = query.where(LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
         names = TRACE.c.keys()
         for *values, seq in connection.execute(query.execution_options(yield_per=CHUNK)):
             row = dict(zip(names, values, strict=True))
-            if seq not in at or not is_sound(TRACE.name, row):
+            if seq not in positions or not is_intact(TRACE.name, row):
                 continue
             shape = row["channels"], row["samples"]
             if not len(traces):
                 traces = np.empty((len(rows), *shape), dtype=np.float32)
             if shape != traces.shape[1:]:
                 shapes = sorted({traces.shape[1:], shape})
-                raise StoreError(f"Expected one shape in a cell's store, found {shapes}; give each kind its own cell_id.")
-            traces[at[seq]], kept[at[seq]] = unpack(row["data"]).reshape(shape), True
+                raise StoreError(
+                    f"Expected one shape in a cell's store, found {shapes}; give each kind its "
+                    "own cell_id."
+                )
+            traces[positions[seq]] = unpack(row["data"]).reshape(shape)
+            is_kept[positions[seq]] = True
         labels = [row.success for row in rows]
         if not all(label in (0, 1) for label in labels):
-            raise StoreError("Expected labels that are True or False, found another: the store is damaged; restore a copy.")
-        found = Labelled(
-            seq=np.array([row.seq for row in rows], dtype=np.int64)[kept],
-            traces=traces if kept.all() else traces[kept[: len(traces)]],
-            labels=np.array(labels, dtype=np.int8)[kept],
-            hashes=np.array([row.content_hash for row in rows], dtype=np.int64)[kept],
+            raise StoreError(
+                "Expected labels that are True or False, found another: the store is damaged; "
+                "restore a copy."
+            )
+        labelled = Labelled(
+            seq=np.array([row.seq for row in rows], dtype=np.int64)[is_kept],
+            traces=traces if is_kept.all() else traces[is_kept[: len(traces)]],
+            labels=np.array(labels, dtype=np.int8)[is_kept],
+            hashes=np.array([row.content_hash for row in rows], dtype=np.int64)[is_kept],
         )
-        return found, [rows[i].decision_id for i in np.flatnonzero(~kept)]
+        return labelled, [rows[i].decision_id for i in np.flatnonzero(~is_kept)]
 
-    def _tell_of(self, damaged: Sequence[str], what: str) -> None:
-        """Damage that was read is an event, once that transaction is over."""
+    def _note_damage(self, damaged: Sequence[str], part: str) -> None:
+        """Record an event that names decisions whose damaged trace or label was left out."""
         if damaged:
-            named = f"decision {listed(damaged)}; see dengine verify"
-            self._note("damaged", f"left out, since the {what} is not as it was stored: {named}")
+            names = f"decision {listed(damaged)}; see dengine verify"
+            self._note("damaged", f"left out, since the {part} is not as it was stored: {names}")
 
-    # What became of decisions
+    # Outcomes
 
-    def outcomes_since(self, seq: int, since_version: int = 0, overdue_to: int = 0) -> list[OutcomeRecord]:
-        """Return what a rule is told of the labels after number `seq`, in their order, of this cell alone.
+    def outcomes_since(
+        self, seq: int, since_version: int = 0, overdue_to: int = 0
+    ) -> list[OutcomeRecord]:
+        """Return the outcomes with which a rule is updated, in the order of the labels.
 
-        It is not told of rejected parts, of which those come back that somebody chose.
-        overdue_to : number of the newest decision whose check is overdue. Overdue checks are inserted where the running
-            engine told the rule of them; every later label stores that position.
-        Only this cell's labels count: evidence from other cells certifies nothing here, and a watch that counts it would
-        notice too late that this cell has changed.
+        Labels of rejected parts are left out: which of them come back is somebody's choice. Only
+        this cell's labels count, since those of other cells are no evidence for this one, and a
+        detector of drift that counts them would notice too late that this cell has changed.
+
+        Parameters
+        ----------
+        seq : int
+            Outcomes of labels after this number.
+        since_version : int, default 0
+            Only of decisions by this version or a later one.
+        overdue_to : int, default 0
+            Number of the newest decision whose check is overdue. Overdue checks are inserted where
+            the running engine updated the rule with them; every later label stores that position.
+
+        Returns
+        -------
+        list of OutcomeRecord
         """
-        label = counted()
+        label = corrected_label()
         novel = DECISION.c.reason == Reason.NOVEL.value
-        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label == 1, novel, LABEL.c.silent, *audit_columns())
+        fields = (
+            LABEL.c.seq,
+            *DECISION.c["lower", "upper"],
+            label == 1,
+            novel,
+            LABEL.c.silent,
+            *audit_columns(),
+        )
         # A label that does not know came right after its decision, as most do.
         known_overdue = sa.func.coalesce(LABEL.c.overdue_to, DECISION.c.number)
-        mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > int(seq))
-        mine &= LABEL.c.source != Source.INSPECTION.value
-        query = sa.select(*of, known_overdue).select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
-        query = query.where(mine, label != FORGOTTEN, DECISION.c.model_version >= since_version)
+        query = sa.select(*fields, known_overdue).select_from(
+            LABEL.join(DECISION, LABEL_OF_DECISION)
+        )
+        query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.quarantined == sa.false())
+        query = query.where(LABEL.c.seq > int(seq), LABEL.c.source != Source.INSPECTION.value)
+        query = query.where(label != FORGOTTEN, DECISION.c.model_version >= since_version)
         rows = self._read(query.order_by(LABEL.c.seq))
-        overdue = deque(each for each in self.pending_decisions(since_version) if each.number <= overdue_to) if overdue_to else deque()
-        told: list[OutcomeRecord] = []
-        for *values, known in rows:
-            while overdue and overdue[0].number <= known:
-                told += overdue_outcomes(overdue.popleft().decision)
-            told.append(OutcomeRecord(*values))
-        return told + [each for owed in overdue for each in overdue_outcomes(owed.decision)]
+        overdue: deque[StoredDecision] = deque()
+        if overdue_to:
+            pending = self.pending_decisions(since_version)
+            overdue.extend(item for item in pending if item.number <= overdue_to)
+        outcomes: list[OutcomeRecord] = []
+        for *values, last_overdue in rows:
+            while overdue and overdue[0].number <= last_overdue:
+                outcomes += overdue_outcomes(overdue.popleft().decision)
+            outcomes.append(OutcomeRecord(*values))
+        for item in overdue:
+            outcomes += overdue_outcomes(item.decision)
+        return outcomes
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
-        """Return the ids of accepted decisions without a label, oldest first, without the quarantined ones."""
-        return [row.id for row in self._read(self._unheard_of(Action.ACCEPT, since_version, DECISION.c.id))]
+        """Return the ids of accepted decisions without a label, oldest first, none quarantined."""
+        return [
+            row.id
+            for row in self._read(self._unlabelled(Action.ACCEPT, since_version, DECISION.c.id))
+        ]
 
     def pending_decisions(self, since_version: int = 0) -> list[StoredDecision]:
-        """Return the decisions whose checks were not reported, oldest first."""
-        return [read_decision(row) for row in self._read(self._unheard_of(Action.VERIFY, since_version, *DECISION.c))]
+        """Return the decisions that asked for a check and have no label, oldest first."""
+        return [
+            read_decision(row)
+            for row in self._read(self._unlabelled(Action.VERIFY, since_version, *DECISION.c))
+        ]
 
     def overdue_to(self, within: int, since_version: int = 0) -> int:
-        """Return the number of the newest decision whose check is overdue, as far as the labels and the decisions tell.
+        """Return the number of the newest decision whose check is overdue, if it has no label.
 
-        within : decisions after which it is.  since_version : the first version since `within` is in force.
+        Parameters
+        ----------
+        within : int
+            Number of later decisions after which a check is overdue.
+        since_version : int, default 0
+            The first version since `within` is in force; before, only the labels tell.
         """
-        newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(DECISION.c.cell_id == self.cell_id)
+        newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(
+            DECISION.c.cell_id == self.cell_id
+        )
         last = self._read(newest.order_by(DECISION.c.number.desc()).limit(1))
-        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(LABEL.c.cell_id == self.cell_id)
-        known = self._read(of_labels)[0][0] or 0
-        counted_since = bool(last) and last[0].model_version >= since_version
-        return max(known, last[0].number - within) if counted_since else known
+        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(
+            LABEL.c.cell_id == self.cell_id
+        )
+        by_labels = self._read(of_labels)[0][0] or 0
+        is_in_force = bool(last) and last[0].model_version >= since_version
+        return max(by_labels, last[0].number - within) if is_in_force else by_labels
 
     def n_decisions(self) -> int:
         """Return the number of the newest decision; 0 before the first."""
         return self._read(sa.select(n_decisions(self.cell_id)))[0][0] or 0
 
-    def _unheard_of(self, action: Action, since_version: int, *columns: Any) -> sa.Select[Any]:
-        query = sa.select(*columns).select_from(WITH_LABELS).where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
-        query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.quarantined == sa.false())
+    def _unlabelled(self, action: Action, since_version: int, *columns: Any) -> sa.Select[Any]:
+        """Return the query for decisions of an action without a label, oldest first."""
+        query = (
+            sa.select(*columns)
+            .select_from(WITH_LABELS)
+            .where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
+        )
+        query = query.where(
+            DECISION.c.cell_id == self.cell_id, DECISION.c.quarantined == sa.false()
+        )
         return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
 
     def silent_total(self, since_version: int = 0) -> int:
-        """Return how many accepted parts went on unheard of: `silent` over all labels but the quarantined ones."""
+        """Return how many accepted parts went on without a report.
+
+        The sum of `silent` over labels, quarantined ones left out.
+        """
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
-        mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
-        return int(self._read(query.where(mine, LABEL.c.model_version >= since_version))[0][0])
+        is_counted = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
+        return int(
+            self._read(query.where(is_counted, LABEL.c.model_version >= since_version))[0][0]
+        )
 
     def status(self) -> dict[str, Any]:
-        """Count decisions and labels, by what they are. Of retrains tells `versions`, of events `events`."""
-        every = self.tally()
-        actions, reasons = every.by("action"), every.by("reason")
+        """Return counts of all decisions and labels.
+
+        Returns
+        -------
+        dict
+            decisions, quarantined, labels, corrected, forgotten: numbers; actions, reasons,
+            sources: numbers by value.
+        """
+        tally = self.tally()
+        actions = tally.by("action")
+        reasons = tally.by("reason")
         sources: Counter[Any] = Counter()
-        for group in every.groups:
+        for group in tally.groups:
             sources[group.source] += group.n if group.success is not None else 0
-        forgotten = every.by("label")["forgotten"]
-        corrected = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct()))
+        forgotten = tally.by("label")["forgotten"]
+        query = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct()))
+        corrected = self._read(query.where(CORRECTION.c.cell_id == self.cell_id))[0][0]
         return {
-            "decisions": every.count(),
+            "decisions": tally.count(),
             "actions": {action.value: actions[action] for action in Action},
             "reasons": {reason.value: reasons[reason] for reason in Reason},
-            "quarantined": every.by("quarantined")[True],
+            "quarantined": tally.by("quarantined")[True],
             "labels": sources.total(),
             "sources": {source.value: sources[source] for source in Source},
-            "corrected": self._read(corrected.where(CORRECTION.c.cell_id == self.cell_id))[0][0] - forgotten,
+            "corrected": corrected - forgotten,
             "forgotten": forgotten,
         }
 
     # Model versions
 
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
-        """Record a retrain; a dropped candidate has no state. Returns the version's number.
+    def put_version(
+        self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
+    ) -> int:
+        """Commit a retrain.
 
-        That is the report's, but where cells share versions and a peer's was stored meanwhile: then the next.
+        Parameters
+        ----------
+        report : RetrainReport
+        last_seq : int
+            Number of the newest label that it knew of.
+        state : mapping of str to array, or None
+            The version's arrays; None for a dropped candidate.
+
+        Returns
+        -------
+        int
+            The version's number. It is the report's, unless a peer of the product stored a version
+            meanwhile: then the next.
         """
-        given = report, last_seq, check_state(report, state), float(self.clock())
+        arguments = report, last_seq, check_state(report, state), float(self.clock())
         if self.wait is None and self.product is None:
-            self._trained.append(given)
-            if len(self._trained) == MOST_TRAINED:
-                self._write_trained()
+            self._unwritten_versions.append(arguments)
+            if len(self._unwritten_versions) == MAX_UNWRITTEN_VERSIONS:
+                self._write_versions()
             return report.version
-        return self._put_trained(*given)
+        return self._commit_version(*arguments)
 
-    def _put_trained(self, *given: Any) -> int:
-        row = self._version_row(*given)
-        return self.database.write(lambda connection: self._add_version(connection, row), settled=False)
+    def _commit_version(self, *arguments: Any) -> int:
+        row = self._version_row(*arguments)
+        return self.database.write(
+            lambda connection: self._insert_version(connection, row), flush_first=False
+        )
 
-    def _write_trained(self) -> None:
-        trained, self._trained = self._trained, []
-        for given in trained:
-            self._put_trained(*given)
+    def _write_versions(self) -> None:
+        unwritten = self._unwritten_versions
+        self._unwritten_versions = []
+        for arguments in unwritten:
+            self._commit_version(*arguments)
 
     def _version_row(
-        self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None, now: float
+        self,
+        report: RetrainReport,
+        last_seq: int,
+        state: Mapping[str, NDArray[Any]] | None,
+        now: float,
     ) -> dict[str, Any]:
+        """Return the row of a version, its arrays packed as npz."""
         arrays = check_state(report, state)
         blob = None if arrays is None else to_npz(arrays)
-        return {"time": now, "last_seq": int(last_seq), "state": blob, "state_sum": state_sum(blob)} | to_row(report)
+        return {
+            "time": now,
+            "last_seq": int(last_seq),
+            "state": blob,
+            "state_sum": state_sum(blob),
+        } | to_row(report)
 
-    def _add_version(self, connection: sa.Connection, row: dict[str, Any]) -> int:
-        """Insert a version, and let go of states that `keeps_state` does not keep; returns its number."""
+    def _insert_version(self, connection: sa.Connection, row: dict[str, Any]) -> int:
+        """Insert a version, and delete the states that `keeps_state` does not keep.
+
+        Return the version's number.
+        """
         number: int = row["version"]
-        if self.product is not None and row["accepted"]:  # a peer's may have come before
-            hold(connection, PRODUCT, self.product)
+        if self.product is not None and row["accepted"]:  # a peer's may have been stored before
+            lock(connection, PRODUCT, self.product)
             number = max(number, self._scope.newest_version(connection) + 1)
         self.database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         if row["accepted"]:
-            held = connection.execute(self._accepted().where(VERSION.c.state.is_not(None))).all()
-            gone = [each.retrain for each in held if not keeps_state(each.version, number, self.keep_versions)]
-            mine = self._scope.shared(VERSION.c.cell_id) & VERSION.c.retrain.in_(gone)
-            if gone:
-                connection.execute(sa.update(VERSION).where(mine).values(state=None))
+            with_state = connection.execute(
+                self._accepted().where(VERSION.c.state.is_not(None))
+            ).all()
+            dropped = [
+                stored.retrain
+                for stored in with_state
+                if not keeps_state(stored.version, number, self.keep_versions)
+            ]
+            if dropped:
+                is_dropped = self._scope.shared(VERSION.c.cell_id) & VERSION.c.retrain.in_(dropped)
+                connection.execute(sa.update(VERSION).where(is_dropped).values(state=None))
         return number
 
     def _accepted(self) -> sa.Select[Any]:
-        """The accepted versions, newest first, and whether each has its state."""
-        query = sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))
+        """Return the query for the accepted versions, newest first.
+
+        Retrain, version, and whether the state is kept.
+        """
+        query = sa.select(
+            *VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept")
+        )
         query = query.where(self._scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true())
         return query.order_by(VERSION.c.retrain.desc())
 
     def last_version(self) -> ModelVersion | None:
-        """Return the newest accepted version; of a damaged one an event tells, and the one before it is returned."""
+        """Return the newest accepted version, None before the first.
+
+        For a damaged one an event is recorded, and the one before it is returned.
+        """
         for i, row in enumerate(self._read(self._accepted())):
             if not row.kept and i > 0:
-                continue  # thinned out, which the newest never is
+                continue  # its state was deleted, which the newest's never is
             try:
-                return self._loaded(row.retrain)
+                return self._load(row.retrain)
             except VersionError as error:
                 self._note("damaged", f"{error} The accepted version before it answers.")
         return None
 
     def load_version(self, version: int) -> ModelVersion:
-        """Return an accepted version by its number. VersionError, naming those that can be loaded, where it cannot."""
-        held = {row.version: row.retrain for row in reversed(self._read(self._accepted())) if row.kept}
-        if version not in held:
-            others = ", ".join(map(str, held)) or "none"
-            raise VersionError(f"Expected a held version, got {version}, which is not kept; load one of these: {others}.")
-        return self._loaded(held[version])
+        """Return an accepted version by its number.
 
-    def _loaded(self, retrain: int) -> ModelVersion:
+        VersionError, which names those that are kept, if it is not kept or damaged.
+        """
+        retrains = {
+            row.version: row.retrain for row in reversed(self._read(self._accepted())) if row.kept
+        }
+        if version not in retrains:
+            others = ", ".join(map(str, retrains)) or "none"
+            raise VersionError(
+                f"Expected a held version, got {version}, which is not kept; load one of "
+                f"these: {others}."
+            )
+        return self._load(retrains[version])
+
+    def _load(self, retrain: int) -> ModelVersion:
+        """Return the version of a retrain, of a peer's without its rule.
+
+        VersionError if its state is missing or damaged.
+        """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
-        mine = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
-        row = self._read(query.where(mine))[0]
-        if row.state is None or (row.state_sum is not None and state_sum(row.state) != row.state_sum):
+        is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
+        row = self._read(query.where(is_retrain))[0]
+        if row.state is None or (
+            row.state_sum is not None and state_sum(row.state) != row.state_sum
+        ):
             where = f"as it was stored in {self.database.name}, its bytes have changed"
-            raise VersionError(f"Expected the state of version {row.version} {where}; restore the store from a copy.")
+            raise VersionError(
+                f"Expected the state of version {row.version} {where}; restore the store from "
+                "a copy."
+            )
         with instead(VersionError, f"Version {row.version} cannot be read", StoreError):
             state = from_npz(row.state, self.database.name)
-        if row.cell_id != self.cell_id:  # what a peer's parts taught its rule says nothing certain of this cell
+        if row.cell_id != self.cell_id:  # a peer's outcomes are no evidence for this cell
             state = without_rule(state) | {"rule_last_seq": np.array(0)}
         return ModelVersion(row.version, row.last_seq, state)
 
     def versions(self, cell_only: bool = False) -> list[StoredVersion]:
-        """Return every retrain, oldest first: its number, time, report, and whether its state is kept.
-
-        cell_only : this cell's alone.
-        """
+        """Return every retrain, oldest first; of the whole product unless `cell_only`."""
         kept = VERSION.c.state.is_not(None).label("kept")
         n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")
-        query = sa.select(*(c for c in VERSION.c if c.name != "state"), VERSION.c.retrain.label("number"), n_bytes, kept)
+        columns = (column for column in VERSION.c if column.name != "state")
+        query = sa.select(*columns, VERSION.c.retrain.label("number"), n_bytes, kept)
         scope = Scope(self.cell_id) if cell_only else self._scope
         rows = self._read(query.where(scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain))
-        return [from_row(StoredVersion, row._mapping, report=from_row(RetrainReport, row._mapping)) for row in rows]
+        return [
+            from_row(StoredVersion, row._mapping, report=from_row(RetrainReport, row._mapping))
+            for row in rows
+        ]
 
     def retrains(self) -> list[RetrainReport]:
-        """Return every retrain, oldest first."""
-        return [each.report for each in self.versions()]
+        """Return the report of every retrain, oldest first."""
+        return [version.report for version in self.versions()]
 
     # Events and corrections
 
-    def put_event(self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = "") -> None:
-        """Commit what happened, in a word and for people to read, to the cell's log.
-
-        data : the same for machines, as JSON has it.  author : who did it; "" for the engine itself.
-        """
-        self.record(Change(kind, text, data, author))
+    def put_event(
+        self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = ""
+    ) -> None:
+        """Commit an event; the parameters are the fields of `Event`."""
+        self.apply_change(Change(kind, text, data, author))
 
     def _note(self, kind: str, text: str) -> None:
-        """Commit an event, unless one of these very words is there."""
-        said = (EVENT.c.cell_id == self.cell_id) & (EVENT.c.kind == as_text(kind)) & (EVENT.c.text == as_text(text))
-        if not self._read(sa.select(EVENT.c.number).where(said).limit(1)):
+        """Commit an event, unless the cell has one with the same kind and text."""
+        query = sa.select(EVENT.c.number).where(EVENT.c.cell_id == self.cell_id)
+        query = query.where(EVENT.c.kind == as_text(kind), EVENT.c.text == as_text(text))
+        if not self._read(query.limit(1)):
             self.put_event(kind, text)
 
     def events(self, limit: int | None = None) -> list[Event]:
-        """Return the newest `limit` events, all where it is None; oldest first."""
-        query = sa.select(EVENT).where(EVENT.c.cell_id == self.cell_id).order_by(EVENT.c.number.desc()).limit(limit)
+        """Return the newest `limit` events, or all, oldest first."""
+        query = (
+            sa.select(EVENT)
+            .where(EVENT.c.cell_id == self.cell_id)
+            .order_by(EVENT.c.number.desc())
+            .limit(limit)
+        )
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
 
     def policy_change_after(self, decision_id: str) -> Event | None:
-        """Return the first change of the policy after a decision, whatever the clock said; None: there was none."""
-        mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.id == decision_id)
-        decided = sa.select(DECISION.c.entry).where(mine).scalar_subquery()  # entries of the ledger are in their order
+        """Return the event of the first change of the policy after a decision.
+
+        The order is the ledger's, whatever the clock said. None if there was no change.
+        """
+        is_decision = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.id == decision_id)
+        decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()
         kinds = EVENT.c.kind.in_((POLICY_CHANGED, SHADOW_CHANGED)) & EVENT.c.data.is_not(None)
-        query = sa.select(EVENT).where(EVENT.c.cell_id == self.cell_id, kinds, EVENT.c.entry > decided)
+        query = sa.select(EVENT).where(
+            EVENT.c.cell_id == self.cell_id, kinds, EVENT.c.entry > decided
+        )
         rows = self._read(query.order_by(EVENT.c.number).limit(1))
         return from_row(Event, rows[0]._mapping) if rows else None
 
-    def record(self, change: Change) -> int:
-        """Commit what a person changed, all or none, together with its event; returns the event's number.
+    def apply_change(self, change: Change) -> int:
+        """Commit a person's change and its event in one transaction; return the event's number.
 
-        Raises ReportError for a decision that is unknown or has no label.
+        Raises
+        ------
+        ReportError
+            For a decision that is unknown or has no label.
+        StoreError
+            If a peer of the product stored a version meanwhile.
         """
-        now, author = float(self.clock()), as_text(change.author)
-        said = Event(0, now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
+        now = float(self.clock())
+        author = as_text(change.author)
+        event = Event(
+            0, now, as_text(change.kind), as_text(change.text), as_data(change.data), author
+        )
         version = None if change.version is None else self._version_row(*change.version, now)
 
-        def add(connection: sa.Connection) -> int:
-            (number,) = self.database.insert(connection, EVENT.c.number, [to_row(said)])
+        def add_rows(connection: sa.Connection) -> int:
+            (number,) = self.database.insert(connection, EVENT.c.number, [to_row(event)])
             if change.decisions:
                 self._correct(connection, change, {"author": author, "event": number, "time": now})
-            if version is not None and (stored := self._add_version(connection, version)) != version["version"]:
-                wanted = f"version {version['version']} to be the next"
-                raise StoreError(f"Expected {wanted}, a peer of the product stored {stored - 1} meanwhile; try it again.")
+            if version is not None:
+                stored = self._insert_version(connection, version)
+                if stored != version["version"]:
+                    expected = f"version {version['version']} to be the next"
+                    raise StoreError(
+                        f"Expected {expected}, a peer of the product stored {stored - 1} "
+                        "meanwhile; try it again."
+                    )
             if change.settings is not None:
-                self._settle(connection, change.settings)
+                self._replace_settings(connection, change.settings)
             return number
 
-        return self.database.write(add)
+        return self.database.write(add_rows)
 
     def _correct(self, connection: sa.Connection, change: Change, event: Mapping[str, Any]) -> None:
-        held = self.database.held(connection, change.decisions)
-        for name in change.decisions:
-            if name not in held:
-                raise unknown_decision(name)
-            if held[name].counted is None:
-                raise nothing_to_correct(name)
-        counts = {0: False, 1: True, FORGOTTEN: None}
-        was = {name: counts[held[name].counted] for name in change.decisions}
-        said = {**event, "success": change.success}
-        self.database.correct(connection, [said | {"decision_id": name, "was": label} for name, label in was.items()])
+        """Insert a correction for each decision of a change.
+
+        `event` has the columns that they share.
+        """
+        stored = self.database.stored_labels(connection, change.decisions)
+        for id_ in change.decisions:
+            if id_ not in stored:
+                raise unknown_decision(id_)
+            if stored[id_].corrected is None:
+                raise nothing_to_correct(id_)
+        labels = {0: False, 1: True, FORGOTTEN: None}
+        common = {**event, "success": change.success}
+        corrections = {id_: labels[stored[id_].corrected] for id_ in change.decisions}
+        rows = [common | {"decision_id": id_, "was": was} for id_, was in corrections.items()]
+        self.database.insert_corrections(connection, rows)
 
     def corrections(self, after: int = 0) -> list[Correction]:
         """Return the corrections after number `after`, oldest first."""
-        same = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (LABEL.c.decision_id == CORRECTION.c.decision_id)
-        query = sa.select(*CORRECTION.c, LABEL.c.seq).select_from(CORRECTION.join(LABEL, same))
-        query = query.where(self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after))
-        return [from_row(Correction, row._mapping) for row in self._read(query.order_by(CORRECTION.c.number))]
+        is_of_label = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (
+            LABEL.c.decision_id == CORRECTION.c.decision_id
+        )
+        query = sa.select(*CORRECTION.c, LABEL.c.seq).select_from(
+            CORRECTION.join(LABEL, is_of_label)
+        )
+        query = query.where(
+            self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after)
+        )
+        return [
+            from_row(Correction, row._mapping)
+            for row in self._read(query.order_by(CORRECTION.c.number))
+        ]
 
-    # Looking back
+    # History
 
     def decisions(
         self, where: HistoryFilter, limit: int, beyond: str | None = None, newest: bool = True
     ) -> list[StoredDecision]:
-        """Return the newest (or oldest) `limit` decisions that are meant, oldest first.
+        """Return the newest `limit` decisions of a selection, or the oldest.
 
-        beyond : only those before (or after) the one of this id: the next page. Their order is that of the decisions,
-        whatever the clock said.
+        In both cases oldest first.
+
+        They are in the order in which they were made, whatever the clock said.
+
+        Parameters
+        ----------
+        where : HistoryFilter
+        limit : int
+        beyond : str or None
+            Id of a decision; only those before it (after it, for the oldest) are returned: the next
+            page.
+        newest : bool, default True
+            False: the oldest.
+
+        Returns
+        -------
+        list of StoredDecision
+            Without their traces.
         """
-        asked = ((column, getattr(where, column.name)) for column in DECISION.c["action", "predicted", "reason", "part"])
-        meant = [column == str(wanted) for column, wanted in asked if wanted is not None]
+        conditions = [
+            column == str(value)
+            for column in DECISION.c["action", "predicted", "reason", "part"]
+            if (value := getattr(where, column.name)) is not None
+        ]
         if where.label is not None:
             label = LABELS[where.label]
-            meant.append(SAID.is_(None) if label is None else SAID.in_([int(label)]))
+            conditions.append(SUCCESS.is_(None) if label is None else SUCCESS.in_([int(label)]))
         if where.since is not None:
-            meant.append(DECISION.c.time >= where.since)
+            conditions.append(DECISION.c.time >= where.since)
         if where.until is not None:
-            meant.append(DECISION.c.time < where.until)
+            conditions.append(DECISION.c.time < where.until)
         number = DECISION.c.number
         if beyond is not None:
-            one = DECISION.alias("beyond")
-            there = sa.select(one.c.number).where(one.c.cell_id == self.cell_id, one.c.id == beyond).scalar_subquery()
-            meant.append(number < there if newest else number > there)
-        query = past_query(self.cell_id).where(*meant).order_by(number.desc() if newest else number)
+            other = DECISION.alias("beyond")
+            is_other = (other.c.cell_id == self.cell_id) & (other.c.id == beyond)
+            limit_number = sa.select(other.c.number).where(is_other).scalar_subquery()
+            conditions.append(number < limit_number if newest else number > limit_number)
+        query = (
+            past_query(self.cell_id)
+            .where(*conditions)
+            .order_by(number.desc() if newest else number)
+        )
         rows = self._read(query.limit(limit))
         return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
     def past_labels(self, after: int, upto: int | None = None) -> list[PastLabel]:
-        """Return the labels after number `after`, up to `upto`, oldest first.
+        """Return the labels after number `after`, up to `upto`, as recorded, oldest first.
 
-        One that is not as it was stored is left out; an event names its decision.
+        One that is not as it was stored is left out, and an event names its decision.
         """
         query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
         query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
-        query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
+        query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.seq > int(after)).order_by(
+            LABEL.c.seq
+        )
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
         names = LABEL.c.keys()
-        damaged = {row.decision_id for row in rows if not is_sound(LABEL.name, dict(zip(names, row, strict=False)))}
-        self._tell_of(sorted(damaged), "label")
+        damaged = {
+            row.decision_id
+            for row in rows
+            if not is_intact(LABEL.name, dict(zip(names, row, strict=False)))
+        }
+        self._note_damage(sorted(damaged), "label")
         rows = [row for row in rows if row.decision_id not in damaged]
         return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
 
-    def tally(self, last: int | None = None, since_version: int = 0, within: int | None = None) -> Tally:
-        """Count the newest `last` decisions, all where it is None; since_version : by versions from that one on.
+    def tally(
+        self, last: int | None = None, since_version: int = 0, within: int | None = None
+    ) -> Tally:
+        """Count decisions by action, reason, label and so on.
 
-        within : decisions after which one that asked for a check, and got none, is overdue; None: none is.
+        Parameters
+        ----------
+        last : int or None
+            Number of newest decisions that are counted; None: all.
+        since_version : int, default 0
+            Only decisions by this version or a later one.
+        within : int or None
+            Number of later decisions after which a check without a label is overdue; None: none is.
+
+        Returns
+        -------
+        Tally
         """
         newest = n_decisions(self.cell_id)
-        aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label("aged")
+        aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
+            "aged"
+        )
         columns = DECISION.c["action", "predicted", "reason", "audit", "quarantined"]
-        kind = (*columns, aged, SAID.label("success"), SOURCE.label("source"), sa.func.count().label("n"))
-        times = sa.func.min(DECISION.c.time), sa.func.max(DECISION.c.time), sa.func.max(LABEL.c.time)
-        query = sa.select(*kind, *times).select_from(WITH_LABELS).group_by(*columns, "aged", SAID, SOURCE)
-        query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version)
+        group = (
+            *columns,
+            aged,
+            SUCCESS.label("success"),
+            SOURCE.label("source"),
+            sa.func.count().label("n"),
+        )
+        times = (
+            sa.func.min(DECISION.c.time),
+            sa.func.max(DECISION.c.time),
+            sa.func.max(LABEL.c.time),
+        )
+        query = (
+            sa.select(*group, *times)
+            .select_from(WITH_LABELS)
+            .group_by(*columns, "aged", SUCCESS, SOURCE)
+        )
+        query = query.where(
+            DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version
+        )
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
-        first, latest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))
+        first, latest, label = (
+            [row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1)
+        )
         groups = tuple(from_row(DecisionGroup, row._mapping) for row in rows)
-        return Tally(groups, min(first, default=None), max(latest, default=None), max(label, default=None))
+        return Tally(
+            groups, min(first, default=None), max(latest, default=None), max(label, default=None)
+        )
 
     def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
-        """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter.
+        """Count decisions in at most `n` stretches of equal length, oldest first.
 
-        by : of time, or of batches, instead: as of `stretches_query`.
+        The newest may be shorter.
+
+        Parameters
+        ----------
+        n : int
+        **by
+            `seconds`, `start` or `batch` of `stretches_query`: stretches of time, or batches.
+
+        Returns
+        -------
+        list of Stretch
         """
-        every = self._read(sa.select(sa.func.count()).where(DECISION.c.cell_id == self.cell_id))[0][0]
-        rows = self._read(stretches_query(self.cell_id, max(1, -(-int(every) // n)), **by))
+        total = self._read(sa.select(sa.func.count()).where(DECISION.c.cell_id == self.cell_id))[0][
+            0
+        ]
+        rows = self._read(stretches_query(self.cell_id, max(1, -(-int(total) // n)), **by))
         return [Stretch(*row) for row in rows]
 
     # The one engine that owns the cell
 
     def claim_cell(self) -> Journal | None:
-        """Claim the cell for one engine; its journal, None where there is none. StoreError where another engine has it."""
+        """Claim the cell for this engine; return its open journal, None for a store in memory.
+
+        Raises StoreError if another engine owns the cell.
+        """
         if self.wait is None:
             return None
         in_file = self.database.url.get_backend_name() == "sqlite"
@@ -619,40 +991,47 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return journal
 
     def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
-        """Commit what a journal holds, all or none; returns the numbers of its labels by their decisions.
+        """Commit records of a journal in one transaction.
 
-        What is there already, and is the same, counts as taken. Another decision of the same id, a label on that, or a
-        second label becomes an event, "dead letter": it is never guessed which one is right.
+        A record that is stored already and is the same counts as taken. Another decision with the
+        same id, a label on that, or a second label becomes an event, "dead letter": which one is
+        right is never guessed. A store in memory writes them when it is next read.
+
+        Returns
+        -------
+        list of (str, int)
+            Decision id and number of each label.
         """
         if self.wait is not None:
             return self.database.apply_records(records)
         numbers: list[tuple[str, int]] = []
-        for each in records:
-            if isinstance(each, StoredDecision) and each.decision.id not in self._held:
-                self._held[each.decision.id] = False
-            elif isinstance(each, NewLabel) and self._held.get(each.decision_id) is False:
-                numbers.append((each.decision_id, self._labels + len(numbers) + 1))  # nobody else gives any
-                self._held[each.decision_id] = True
-            elif not isinstance(each, Event):  # what is there already, or contradicts it
+        for record in records:
+            if isinstance(record, StoredDecision) and record.decision.id not in self._has_label:
+                self._has_label[record.decision.id] = False
+            elif isinstance(record, NewLabel) and self._has_label.get(record.decision_id) is False:
+                numbers.append((record.decision_id, self._newest_label + len(numbers) + 1))
+                self._has_label[record.decision_id] = True
+            elif not isinstance(record, Event):  # it is stored already, or contradicts what is
                 numbers = self.database.apply_records(records)
-                self._held |= dict.fromkeys((name for name, _ in numbers), True)
+                self._has_label |= dict.fromkeys((id_ for id_, _ in numbers), True)
                 break
         else:
-            self._waiting += records
+            self._unwritten += records
         for _, number in numbers:
-            self._labels = max(self._labels, number)
+            self._newest_label = max(self._newest_label, number)
         return numbers
 
-    def _write_waiting(self) -> None:
-        """Write what was taken in memory: a replay, which reads nothing, never does."""
-        self._write_trained()
-        waiting, self._waiting = self._waiting, []
-        for part in chunks(waiting):
+    def _write_memory(self) -> None:
+        """Write what a store in memory was given; a replay, which reads nothing, never does."""
+        self._write_versions()
+        unwritten = self._unwritten
+        self._unwritten = []
+        for part in chunks(unwritten):
             self.database.apply_records(part)
 
     def close(self) -> None:
-        """Disconnect."""
-        if self.wait is not None:  # what is in memory lives as long as its store
+        """Disconnect from the database, and free the cell; a store in memory stays as it is."""
+        if self.wait is not None:
             self.database.close()
         if self._journal is not None:
             self._journal.close()
@@ -662,12 +1041,21 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
 
 def _checked_wait(wait: float | None) -> float:
-    said = os.environ.get(WAIT_VARIABLE) if wait is None else None
-    name = "a wait" if said is None else WAIT_VARIABLE
+    """Return a store's time limit in seconds: the argument, else DENGINE_STORE_WAIT, else 0.4.
+
+    StoreError if not above 0.
+    """
+    text = os.environ.get(WAIT_VARIABLE) if wait is None else None
+    name = "a wait" if text is None else WAIT_VARIABLE
+    seconds = WAIT if wait is None else wait
     try:
-        seconds = float(said) if said else WAIT if wait is None else wait
+        if text:
+            seconds = float(text)
     except ValueError:
         seconds = math.nan
     if not 0.0 < seconds < math.inf:
-        raise StoreError(f"Expected {name} above 0 seconds, got {shortened(said or wait)}; {WAIT} is the default.")
+        raise StoreError(
+            f"Expected {name} above 0 seconds, got {shortened(text or wait)}; {WAIT} is the "
+            "default."
+        )
     return seconds

@@ -46,8 +46,8 @@ def write(store: SqlStore, n: int = 12) -> SqlStore:
     store.put_version(report(2, accepted=False), 6, None)
     store.save_settings({"recipe": "a = 2", "trace": "{}"})
     store.put_event("note", "Prüfung wörtlich")
-    store.record(Change("correct", "no success", {"decisions": ["d6"]}, "kim", ("d6",), False))
-    store.record(Change("forget", "forgotten", {"decisions": ["d7"]}, "kim", ("d7",), None))
+    store.apply_change(Change("correct", "no success", {"decisions": ["d6"]}, "kim", ("d6",), False))
+    store.apply_change(Change("forget", "forgotten", {"decisions": ["d7"]}, "kim", ("d7",), None))
     return store
 
 

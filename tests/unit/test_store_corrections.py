@@ -28,7 +28,7 @@ def fill(store: SqlStore, n: int = 5) -> None:
 
 def correct(store: SqlStore, success: bool | None, *names: str, author: str = "kim") -> int:
     kind = "forget" if success is None else "correct"
-    return store.record(Change(kind, f"{kind} {', '.join(names)}", {"names": list(names)}, author, names, success))
+    return store.apply_change(Change(kind, f"{kind} {', '.join(names)}", {"names": list(names)}, author, names, success))
 
 
 def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: SqlStore) -> None:
@@ -82,14 +82,14 @@ def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is
     put(store, "open")
     store.save_settings({"a": "1"})
     with pytest.raises(ReportError, match=said):
-        store.record(Change("correct", "", decisions=("0", name), success=False, settings={"a": "2"}))
+        store.apply_change(Change("correct", "", decisions=("0", name), success=False, settings={"a": "2"}))
     assert (store.events(), store.corrections(), store.settings()) == ([], [], {"a": "1"})
     assert store.labelled().labels.tolist() == [1, 0]
 
 
 def test_an_event_a_version_and_settings_are_kept_together(store: SqlStore) -> None:
     report = RetrainReport(1, 0.0, 2, 0, True, "rolled back")
-    store.record(Change("rollback", "to 1", version=(report, 7, {"w": np.ones(2)}), settings={"b": "2"}))
+    store.apply_change(Change("rollback", "to 1", version=(report, 7, {"w": np.ones(2)}), settings={"b": "2"}))
     assert (store.retrains(), store.settings(), store.last_version().last_seq) == ([report], {"b": "2"}, 7)
 
 
