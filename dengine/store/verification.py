@@ -281,7 +281,7 @@ class CellCheck:
         return HistoryFault(self.cell_id, table, str(key), what)
 
     def _read_raw(self, table: str) -> Iterator[dict[str, Any]]:
-        """Yield the cell's rows of a table as the database driver returns them, without conversion."""
+        """Yield the cell's rows of a table as the driver returns them, without conversion."""
         # no type is known, none is converted
         query = sa.text(f'SELECT * FROM "{table}" WHERE cell_id = :cell')
         for row in self.connection.execute(
@@ -317,7 +317,9 @@ class CellCheck:
                 self._sums[table] += ROW_SUMS.pack(entry, _bytes(stored), now)
 
     def _check_ledger(self) -> Iterator[HistoryFault]:
-        """Yield a fault for each ledger entry that is missing, or does not fit the entry before and its rows.
+        """Yield a fault for each ledger entry that is missing or does not fit.
+
+        Each must fit the entry before and its own rows.
 
         Fills `digests`.
         """
@@ -359,7 +361,7 @@ class CellCheck:
             yield self._fault(LEDGER.name, f"entry {number}", "is missing")
 
     def _check_settings(self) -> Iterator[HistoryFault]:
-        """Yield a fault for each setting that differs from the ledger's copy, and if the schema's is missing."""
+        """Yield a fault for each setting that differs from the ledger's copy."""
         for key, what in find_settings_faults(self.connection, self.cell_id).items():
             yield self._fault(SETTING.name, key, what)
         is_schema = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
@@ -380,7 +382,15 @@ class CellCheck:
 
 
 def _entry_fault(added: Any, sums: Mapping[str, list[bytes]]) -> str:
-    """Return why an entry does not fit, in words, from its numbers of rows (JSON) and the sums of its rows by table."""
+    """Return in words why a ledger entry does not fit its rows.
+
+    Parameters
+    ----------
+    added : str
+        The entry's column `added`: JSON, number of rows by table.
+    sums : mapping of str to list of bytes
+        Sums of the rows that are there, by table.
+    """
     counts: dict[str, int] = {}
     with suppress(TypeError, ValueError):
         counts = dict(json.loads(added))
