@@ -412,7 +412,6 @@ class ForceLimitsGate(nn.Module):
             has_samples = window.along is not None or bool(((time >= start) & (time <= end)).any())
             has_channels = {window.channel, window.along} <= rows.keys()
             expect(has_samples and has_channels, wanted, str(window))
-        self.watches = len(windows) > 0
         limits = [(window.start, window.end, window.low, window.high) for window in windows]
         channels = [(rows[window.channel], rows[window.along]) for window in windows]
         action = [1 + window.reject for window in windows]
@@ -429,7 +428,7 @@ class ForceLimitsGate(nn.Module):
         Returns 0 if it keeps all limits, 1 if it leaves one and is to be verified, 2 if it leaves
         one that rejects.
         """
-        if not self.watches:
+        if self.limits.size(0) == 0:
             return 0
         start, end, low, high = self.limits.unbind(1)  # (W, 1) each
         values, where = torch.cat([x, self.time])[self.channels].unbind(1)  # (W, T) each

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 FEWEST_PARTS = 20  # that came at least twice; fewer say nothing
 NEIGHBOURS = 30  # of other parts, that say what is usual where a trace lies
 SAMPLE = 3000  # of the newest points: the work does not grow
+FILTER_SIZE = 2**16  # bits, a power of two
 CONFIDENCE = 1.645  # standard errors above the estimate: 95 %, one-sided
 
 
@@ -85,6 +86,7 @@ class RadiusIndex(nn.Module):
     repeats: Tensor
     agreement: Tensor
     total: Tensor
+    part_filter: Tensor
 
     def __init__(self, dim: int, capacity: int = 10_000) -> None:
         super().__init__()
@@ -97,8 +99,9 @@ class RadiusIndex(nn.Module):
         self.register_buffer("repeats", torch.zeros((), dtype=torch.int64))
         self.register_buffer("agreement", torch.ones((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("part_filter", torch.zeros(FILTER_SIZE, dtype=torch.bool))
+        self.filter_mask = FILTER_SIZE - 1
         self.numbers = np.zeros(capacity, dtype=np.int64)
-        self.known: set[int] = set()
 
     def __len__(self) -> int:
         return self.size()
@@ -138,6 +141,7 @@ class RadiusIndex(nn.Module):
         self.parts[slot] = part
         self.first[slot] = slot
         if part != 0:
+            self.part_filter[part & self.filter_mask] = True
             same = self.parts == part
             if int(same.sum().item()) > 1:
                 self.first.masked_fill_(same, int(same.nonzero()[0].item()))
@@ -154,7 +158,8 @@ class RadiusIndex(nn.Module):
         if z.size(0) > 1:
             own = own.index_select(1, self.spaces[:n])  # (d, size): a reference of fold k is met in space k only
         distances = (self.points.narrow(1, 0, n) - own).square_().sum(0)
-        if part != 0:
+        # The filter spares nearly all queries of new parts the comparison with every reference.
+        if part != 0 and bool(self.part_filter[part & self.filter_mask].item()):
             distances.masked_fill_(self.parts[:n] == part, float("inf"))
         return distances
 
@@ -188,7 +193,6 @@ class RadiusIndex(nn.Module):
         """Add one point (d,), as `put`; number : of its label."""
         self.numbers[int(self.total) % self.capacity] = number
         self.put(point, label, space, part)
-        self.known.add(part)
 
     def renumber(self, was: int, number: int) -> None:
         """Give the point of a label another number; one that has left needs none."""
@@ -256,7 +260,8 @@ class RadiusIndex(nn.Module):
         slots[:n] = np.where(parts != 0, first[inverse], slots[:n])
         self.first.copy_(torch.from_numpy(slots))
         self.repeats.fill_(int((slots != np.arange(self.capacity)).sum()))
-        self.known = set(parts.tolist())
+        self.part_filter.zero_()
+        self.part_filter[torch.from_numpy(parts & self.filter_mask)] = True
 
     def count(self, queries: ArrayLike, radius: float) -> Counts:
         """(n_success, n_failure), each (n,): labels around each query (n, d), or (n, K, d) for K spaces.

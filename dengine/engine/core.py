@@ -28,7 +28,7 @@ from ..records import Action, Decision, Reason, RetrainReport, TraceSpec, as_id,
 from ..store.outbox import CLOSE_SECONDS, Outbox
 from ..store.records import StoredDecision
 from ..traces import convert_trace
-from .decide import DecisionMaker, as_part, decided_before, unasked
+from .decide import DecisionMaker, as_part, check_same_trace, verify_decision
 from .feedback import Feedback
 from .fleet import Peers
 from .guard import GuardedModel
@@ -188,7 +188,7 @@ class EngineCore:
                 except StoreError as error:
                     return self._verify_unrecorded(id_, number, error)
                 if earlier is not None:
-                    return decided_before(earlier, trace, self.settings.now.trace)
+                    return check_same_trace(earlier, trace, self.settings.now.trace)
             self.learner.collect()
             stored = self._record(trace, number, timed_out, id_)
             if id_ is not None:
@@ -237,14 +237,14 @@ class EngineCore:
             return self._verify_unrecorded(id_, number, error)
         if stored is None:
             if spec is None or self.store.wait is None:
-                return unasked(id_, number, self.live.version, Reason.LATE)
+                return verify_decision(id_, number, self.live.version, Reason.LATE)
             reason = Reason.NO_STORE if self.outbox.verify_all_reason else Reason.LATE
             x = convert_trace(trace, spec, False)
             item = self._maker.decide(x, number, None, self.live.version, reason, id_)
             stored = self.outbox.record_decision(item)
         with suppress(NotTakenError):
             self.outbox.sync()
-        return decided_before(stored, trace, spec)
+        return check_same_trace(stored, trace, spec)
 
     def _record(
         self,
@@ -290,7 +290,7 @@ class EngineCore:
             decision_id,
             error,
         )
-        return unasked(decision_id, part, self.live.version, Reason.NO_STORE)
+        return verify_decision(decision_id, part, self.live.version, Reason.NO_STORE)
 
     # The contract of traces
 
@@ -307,7 +307,6 @@ class EngineCore:
         except StoreError:  # the cell's own first trace stands
             log.exception("the product's contract of traces cannot be had")
         settings = replace(self.settings.now, trace=spec, inferred=inferred)
-        self._maker.agree_on(spec)
         self.settings.change(settings)
         self.settings.save()
         return spec
@@ -320,7 +319,7 @@ class EngineCore:
         settings = self.settings.now
         has_learned = self.live.version + self.learner.labels.new_labels > 0
         x = convert_trace(trace, settings.trace, settings.inferred and not has_learned)
-        spec = self._maker.first_contract(x, trace) if settings.trace is None else None
+        spec = self._maker.infer_trace_spec(x, trace) if settings.trace is None else None
         if spec is not None:
             if self.set_trace_spec(spec, inferred=True) != spec:  # a peer's trace came first
                 return convert_trace(trace, self.settings.now.trace, False)

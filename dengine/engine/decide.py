@@ -1,4 +1,8 @@
-"""From one trace to a recorded decision: the gate, the model, the audits' coin; and what a report on it means."""
+"""From one trace to a recorded decision: asks the model's decider, adds an id, a version and a time.
+
+`EngineCore` owns one `DecisionMaker`. The helpers below it check what a caller passes: a part's number,
+and an id that was decided before.
+"""
 
 import logging
 import uuid
@@ -11,44 +15,55 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..decision.scripting import script
+from ..decision.decider import DecisionConditions, Verdict, decider_without_model
 from ..errors import TraceConflictError, TraceError, expect
-from ..folds import audited, part_hash
-from ..model.base import EngineModel, Prediction
-from ..records import LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
+from ..folds import part_hash
+from ..model.base import EngineModel
+from ..records import ACTIONS, LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
 from ..store.records import StoredDecision
-from ..traces import TraceGate, convert_trace, infer_trace_spec
+from ..traces import convert_trace, infer_trace_spec
 from .settings import SettingsInForce
 
 log = logging.getLogger("dengine")
 
 
 class DecisionMaker:
-    """Makes decisions on traces of one contract, with ids of its own.
+    """Makes decisions under the settings in force, and gives them ids.
 
-    settings : of the audits' coin, a fixed function of the trace, and of the contract where there is one.
-    clock : of the store, in seconds.
+    Parameters
+    ----------
+    settings : SettingsInForce
+        Read at each decision.
+    clock : callable
+        The store's clock, in seconds.
     """
 
     def __init__(self, settings: SettingsInForce, clock: Callable[[], float]) -> None:
-        self._settings, self._clock = settings, clock
-        if settings.now.trace is not None:
-            self.agree_on(settings.now.trace)
-        self._run, self._count = uuid.uuid4().hex[:12], count(1)
+        self._settings = settings
+        self._clock = clock
+        self._first_conditions: DecisionConditions | None = None
+        self._run = uuid.uuid4().hex[:12]
+        self._count = count(1)
 
-    def agree_on(self, trace: TraceSpec) -> None:
-        """Set the contract that the gate checks."""
-        gate = TraceGate(trace)
-        self._gate, self._limit = (
-            script(gate).forward,
-            gate.limit,
-        )  # once: a scripted module looks its methods up each time
+    def infer_trace_spec(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
+        """Infer the trace contract from a first trace.
 
-    def first_contract(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
-        """The contract that a first trace (C, T) sets; None for a bad one: it is verified, and the contract stays open."""
-        spec, fit = infer_trace_spec(x, trace)
-        self._gate = TraceGate(spec)  # a bad one needs it as well: to say what is bad
-        return spec if fit else None
+        Parameters
+        ----------
+        x : array of float32, shape (C, T)
+            The trace.
+        trace : object
+            The trace as the caller passed it; a DataFrame names the channels.
+
+        Returns
+        -------
+        TraceSpec or None
+            None if the trace is faulty: then it is verified by a contract of its own, and the next
+            trace sets the contract.
+        """
+        spec, is_sound = infer_trace_spec(x, trace)
+        self._first_conditions = DecisionConditions(spec)
+        return spec if is_sound else None
 
     def decide(
         self,
@@ -56,97 +71,143 @@ class DecisionMaker:
         part: str | None,
         model: EngineModel | None,
         version: int,
-        unasked: Reason | None = None,
+        verify_reason: Reason | None = None,
         decision_id: str | None = None,
     ) -> StoredDecision:
-        """(C, T) of a part with this number -> what goes into the store; in any thread.
+        """Decide on one trace; any thread may call it.
 
-        unasked : why the part is verified whatever the model says; None: it is asked, where there is one.
+        Parameters
+        ----------
+        x : array of float32, shape (C, T)
+            The trace; the record holds a copy.
+        part : str or None
+            Number of the part.
+        model : EngineModel or None
+            The model that answers; None before the first training.
+        version : int
+            Its number.
+        verify_reason : Reason, optional
+            Why the part is verified without asking the model.
+        decision_id : str, optional
+            An id of the caller's; None: a new one.
+
+        Returns
+        -------
+        StoredDecision
+            The record for the store. A model that raises, or returns impossible bounds, is logged,
+            and the decision is VERIFY with `Reason.MODEL_ERROR`.
         """
-        number, said = None if part is None else part_hash(part), None
-        windows = self._settings.outside if unasked is None else None
-        if model is not None and unasked is None:
+        part_hash_ = 0 if part is None else part_hash(part)
+        conditions = self._settings.conditions or self._first_conditions
+        assert conditions is not None  # a trace has come
+        if verify_reason is not None:
+            unlimited = replace(conditions, force_limits=())
+            verdict = _verify(x, unlimited, verify_reason)
+        elif model is None:
+            verdict = _verify(x, conditions, Reason.NO_MODEL)
+        else:
             try:
-                fault, content, said = model.look(x, number, self._gate, self._limit)
-                if (
-                    said is not None and not 0.0 <= said.lower <= said.upper <= 1.0
-                ):  # a NaN is refused too
+                verdict = model.decide_one(x, part_hash_, conditions)
+                lower, upper = verdict[5:7]
+                if not 0.0 <= lower <= upper <= 1.0:  # true of NaN as well
                     raise ValueError(
-                        f"Expected bounds 0 <= lower <= upper <= 1, got {said.lower} and {said.upper}."
+                        f"Expected bounds 0 <= lower <= upper <= 1, got {lower} and {upper}."
                     )
-            except (
-                Exception
-            ):  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
+            except Exception:  # no exception inside a model reaches the cell
                 log.exception("the model failed on a trace; the part is verified")
-                said, unasked = None, Reason.MODEL_ERROR
-        if said is None:
-            fault, content = self._gate(torch.from_numpy(x))
-            reason = REASONS[fault] if fault else unasked or Reason.NO_MODEL
-            said = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, None, reason)
-        outside = 0 if fault or windows is None else windows(torch.from_numpy(x))
-        if outside:  # its place is kept, and nothing else of what the model says of it
-            said = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, said.embedding, Reason.OUTSIDE)
-        certain, rate = said.action is not Action.VERIFY, self._settings.audited_share
-        audit = (
-            certain
-            and rate > 0.0
-            and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
-        )
+                verdict = _verify(x, conditions, Reason.MODEL_ERROR)
+        (
+            fault, content, action, predicted, reason,
+            lower, upper, n_success, n_failure, embedding, propensity,
+        ) = verdict  # fmt: skip
         decision = Decision(
             id=decision_id or f"{self._run}-{next(self._count)}",
-            action=Action.REJECT if outside == 2 else Action.VERIFY if audit else said.action,
-            predicted=said.action,
-            lower=said.lower,
-            upper=said.upper,
-            n_success=said.n_success,
-            n_failure=said.n_failure,
-            embedding=said.embedding,
+            action=ACTIONS[action],
+            predicted=ACTIONS[predicted],
+            lower=lower,
+            upper=upper,
+            n_success=n_success,
+            n_failure=n_failure,
+            embedding=None if fault else tuple(map(tuple, embedding.tolist())) or None,
             model_version=version,
-            reason=Reason.AUDIT if audit else said.reason,
-            audit=audit,
-            propensity=rate if certain else float(outside != 2),
+            reason=REASONS[reason],
+            audit=action == 0 and predicted != 0,
+            propensity=propensity,
             part=part,
         )
-        hash_ = content if number is None else number
-        return StoredDecision(
-            decision, x.copy(), hash_, fault != 0, self._clock()
-        )  # the caller may change his own
+        # The caller may change his own array.
+        return StoredDecision(decision, x.copy(), part_hash_ or content, fault != 0, self._clock())
 
     def lost_accept(
         self, x: NDArray[np.float32], part: str | None, version: int, decision_id: str
     ) -> StoredDecision:
-        """The decision behind a system stop whose own row was lost: an accept without a check, on no known evidence."""
-        item, accept = self.decide(x, part, None, version, None, decision_id), Action.ACCEPT
-        rate = self._settings.audited_share
-        made = replace(
-            item.decision, action=accept, predicted=accept, reason=Reason.CERTAIN, propensity=rate
+        """Make the record of a line stop whose decision was lost.
+
+        Returns an accept without a check, with this id, and with no evidence: the bound is (0, 1).
+        """
+        stored = self.decide(x, part, None, version, None, decision_id)
+        decision = replace(
+            stored.decision,
+            action=Action.ACCEPT,
+            predicted=Action.ACCEPT,
+            reason=Reason.CERTAIN,
+            propensity=self._settings.audited_share,
         )
-        return replace(item, decision=made)
+        return replace(stored, decision=decision)
 
 
-def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
-    """The decision that this id has already; TraceError where it was made on another trace."""
+def _verify(x: NDArray[np.float32], conditions: DecisionConditions, reason: Reason) -> Verdict:
+    """Decide without a model: faults and force limits count, else the part is verified."""
+    verdict: Verdict = decider_without_model(conditions, reason)(torch.from_numpy(x))
+    return verdict
+
+
+def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
+    """Return the decision that an id has already.
+
+    Raises
+    ------
+    TraceConflictError
+        If it was made on another trace.
+    """
     x = convert_trace(trace, spec, False)
-    if not np.array_equal(x, known.trace, equal_nan=True):
-        own = f"the trace that decision {known.decision.id!r} was made on"
-        raise TraceConflictError(f"Expected {own}, got another; give it an id of its own.")
-    return known.decision
+    if not np.array_equal(x, stored.trace, equal_nan=True):
+        wanted = f"the trace that decision {stored.decision.id!r} was made on"
+        raise TraceConflictError(f"Expected {wanted}, got another; give it an id of its own.")
+    return stored.decision
 
 
-def unasked(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
-    """A decision on which no model was asked."""
-    verify = Action.VERIFY
+def verify_decision(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
+    """Return a VERIFY decision for which neither model nor trace was looked at."""
     return Decision(
-        decision_id, verify, verify, 0.0, 1.0, 0, 0, None, version, reason, False, 1.0, part
+        id=decision_id,
+        action=Action.VERIFY,
+        predicted=Action.VERIFY,
+        lower=0.0,
+        upper=1.0,
+        n_success=0,
+        n_failure=0,
+        embedding=None,
+        model_version=version,
+        reason=reason,
+        audit=False,
+        propensity=1.0,
+        part=part,
     )
 
 
 def as_part(part: Any) -> str | None:
-    """A part's number as text; TraceError for what is neither a text nor a whole number, or does not fit a line."""
+    """Convert a part's number to text; None stays None.
+
+    Raises
+    ------
+    TraceError
+        If it is neither a text that prints nor a whole number, or too long.
+    """
     if part is None:
         return None
-    whole = isinstance(part, int | np.integer) and not isinstance(part, bool)
-    text = str(part) if whole and abs(int(part)) < 10**LONGEST else part
+    is_whole = isinstance(part, int | np.integer) and not isinstance(part, bool)
+    text = str(part) if is_whole and abs(int(part)) < 10**LONGEST else part
     wanted = f"a part's number, a whole number or a text of 1 to {LONGEST} characters that print"
     expect(is_name(text), wanted, part, "strip what a scanner added, or pass None", TraceError)
     return str(text)

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from .. import __version__
+from ..decision.decider import DecisionConditions
 from ..decision.policy import NO_WINDOWS, Policy
-from ..decision.scripting import script
 from ..errors import ImportRefusedError, SettingError, StoreError, expect, shortened
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
@@ -301,7 +301,7 @@ class SettingsInForce:
     """The settings in force, and the store's copy of them.
 
     now : they themselves.  audited_share : of certain decisions that are verified all the same.
-    outside : what the policy's windows say of a trace, as `ForceLimitsGate`; None where there are none.
+    conditions : what decisions depend on; None before the first sound trace.
     waiting : whether the store lacks them, and `save` is to be called again.
     """
 
@@ -314,11 +314,10 @@ class SettingsInForce:
         """Go on under others."""
         policy, trace = settings.recipe.policy, settings.trace
         self.now, self.audited_share = settings, policy.audited_share
-        self.outside = (
-            script(ForceLimitsGate(policy.limits, trace)).forward
-            if policy.windows and trace is not None
-            else None
-        )
+        self.conditions = None
+        if trace is not None:
+            share = policy.audited_share
+            self.conditions = DecisionConditions(trace, policy.limits, share, settings.seed)
 
     def save(self) -> None:
         """Store them; where the store is away, they wait."""

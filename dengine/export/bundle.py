@@ -28,6 +28,7 @@ import torch
 from .. import __version__
 from ..decision import member_rules
 from ..decision.code import is_code_changed
+from ..decision.decider import DecisionConditions
 from ..decision.intervals import SCALAR_BOUNDS
 from ..decision.members import SAFE_MODES
 from ..decision.policy import RULES
@@ -109,10 +110,10 @@ def prepared(
             f"{model.name} cannot be exported, for it has no module: give it `module()`, which returns the embedding "
             "as an nn.Module (see `Reducer.module`)."
         )
-    size = model.n_spaces, model.index.dim
-    coin = source.audit_rate, source.seed
-    decision = DecisionModule(source.trace, model.predictor, *size, *coin, source.stops_all, source.windows)
-    return source, decision
+    conditions = DecisionConditions(source.trace, source.windows, source.audit_rate, source.seed)
+    shape = (model.n_spaces, model.index.dim)
+    decider = model.decider(conditions)
+    return source, DecisionModule(source.trace, decider, shape, source.stops_all)
 
 
 def describe(source: Exportable) -> dict[str, Any]:

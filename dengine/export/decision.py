@@ -1,193 +1,305 @@
-"""The whole decision as one module that compiles to TorchScript: what an exported file is, and a cell program runs.
+"""The module inside an exported file: a `Decider` that also learns from reported outcomes.
 
-It decides as `DataEngine.decide` does and learns as `DataEngine.report` does, between two retrains.
+It decides as `DataEngine.decide` does, and learns as `DataEngine.report` does between two retrains.
+`bundle.prepare_export` builds it; TorchScript compiles it; `ExportedModel` and the C++ program call the
+methods in `METHODS`.
 """
 
 import torch
 from torch import Tensor, nn
 
-from ..folds import COIN_BITS, MIX, audit_salt
-from ..limits import ForceLimits
-from ..model.neighbours import NOVEL, Predictor
+from ..decision.decider import Decider
 from ..records import FITS, REASONS, Reason, TraceSpec
-from ..traces import ForceLimitsGate, TraceGate, fit_length
+from ..traces import fit_length
 
-One = tuple[int, int, float, float, int, int, Tensor]
+# action, reason, lower, upper, n_success, n_failure, embedding
+DecisionFields = tuple[int, int, float, float, int, int, Tensor]
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
-METHODS = ("forward", "decide", "learn", "stop", "settle", "safe_mode", "restore", "predicted", "drop", "n_references")
-AUDIT, OUTSIDE = REASONS.index(Reason.AUDIT), REASONS.index(Reason.OUTSIDE)
-NOBODY = -1  # waits for a label
+METHODS = (
+    "forward",
+    "decide",
+    "learn",
+    "stop",
+    "settle",
+    "safe_mode",
+    "restore",
+    "predicted",
+    "drop",
+    "n_references",
+)
+NONE_PENDING = -1  # in place of an action: no decision is pending
 
 
 class DecisionModule(nn.Module):
-    """Gate, predictor and audits: raw trace in, action out, as positions in `Action` and `Reason`.
+    """Decides on raw traces, keeps the pending decision, and learns its outcome.
 
-    A labelled trace becomes a reference, bounded, in its own fold's space, the oldest one leaving first whatever its label,
-    and the rule is told. Encoder and novelty stay. With `stops_all` the next `decide` confirms an accepted part.
+    A labelled trace becomes a reference in the space of its fold; the oldest reference leaves first,
+    whatever its label. The rule is updated with each outcome. Encoder and novelty gate stay as they
+    are. All state, the pending decision included, is saved with the module.
 
-    Of the decision that waits for its label: waits, its action or NOBODY; alone, what the model alone would have done; own
-    and content, the hashes of part and trace; novel, lower, upper, place (K, d). silent: accepted parts since the last
-    label of which nothing was heard. All of it is saved with the module.
+    Parameters
+    ----------
+    spec : TraceSpec
+        Shape of the traces, and how other lengths are fitted to it.
+    decider : Decider
+        Eager or compiled; its predictor has `neighbours`, as `model.neighbours.Predictor`.
+    embedding_shape : pair of int
+        (K, d).
+    stops_all : bool, default False
+        Whether the next `decide` confirms an accepted part of which nothing was reported.
+
+    Attributes
+    ----------
+    pending_action : int
+        Action of the decision whose outcome is not yet reported, or `NONE_PENDING`.
+    pending_predicted : int
+        What the model alone would have done.
+    pending_part, pending_content : int
+        Hash of its part (or of its content if the part is unknown), and of its content.
+    pending_novel : bool
+        Whether its trace was novel.
+    pending_lower, pending_upper : float
+        Its bound.
+    pending_embedding : Tensor of float32, shape (K, d)
+    n_silent : int
+        Accepted parts since the last label whose outcome stays unknown.
     """
 
-    place: Tensor
+    pending_embedding: Tensor
 
     def __init__(
-        self, spec: TraceSpec, predictor: Predictor, n_spaces: int, dim: int,
-        audit_rate: float, seed: int, stops_all: bool = False, windows: tuple[ForceLimits, ...] = (),
-    ) -> None:  # fmt: skip
+        self,
+        spec: TraceSpec,
+        decider: Decider,
+        embedding_shape: tuple[int, int],
+        stops_all: bool = False,
+    ) -> None:
         super().__init__()
-        self.predictor, self.limit, self.windows = predictor, TraceGate(spec).limit, ForceLimitsGate(windows, spec)
-        self.channels, self.samples, self.fit = spec.channels, spec.samples, FITS.index(spec.fit)
-        self.n_spaces, self.dim = n_spaces, dim
-        self.audit_below, self.salt, self.audit_rate = int(audit_rate * 2**COIN_BITS), audit_salt(seed), float(audit_rate)
-        self.mix, self.shift, self.mask = MIX, 63 - COIN_BITS, 2**COIN_BITS - 1
+        self.decider = decider
+        self.channels = spec.channels
+        self.samples = spec.samples
+        self.fit = FITS.index(spec.fit)
+        self.n_spaces = embedding_shape[0]
         self.stops_all = stops_all
-        self.audit_reason, self.novel_reason, self.outside_reason, self.nobody = AUDIT, NOVEL, OUTSIDE, NOBODY
-        # Plain attributes: a scripted float that is assigned to an element of a tensor goes through float32.
-        self.waits, self.alone, self.own, self.content, self.silent = NOBODY, 0, 0, 0, 0
-        self.novel, self.lower, self.upper = False, 0.0, 1.0
-        self.register_buffer("place", torch.zeros(n_spaces, dim))
+        self.audit_reason = REASONS.index(Reason.AUDIT)
+        self.novel_reason = REASONS.index(Reason.NOVEL)
+        self.outside_reason = REASONS.index(Reason.OUTSIDE)
+        self.none_pending = NONE_PENDING
+        # Plain attributes: assigned to an element of a tensor, a float would go through float32.
+        self.pending_action = NONE_PENDING
+        self.pending_predicted = 0
+        self.pending_part = 0
+        self.pending_content = 0
+        self.pending_novel = False
+        self.pending_lower = 0.0
+        self.pending_upper = 1.0
+        self.n_silent = 0
+        self.register_buffer("pending_embedding", torch.zeros(embedding_shape))
 
     @torch.jit.export
-    def decide(self, trace: Tensor, part: int = 0) -> One:
-        """One trace, (T,) or (C, T) of any real dtype -> action, reason, lower, upper, n_success, n_failure, (K, d).
+    def decide(self, trace: Tensor, part: int = 0) -> DecisionFields:
+        """Decide on one trace, and make this the pending decision.
 
-        part : the hash of its part's number (`folds.part_hash`); 0 for an unknown one.
+        Before that, a pending accept is settled, see `settle`.
+
+        Parameters
+        ----------
+        trace : Tensor of any real dtype, shape (T,) or (C, T)
+        part : int, default 0
+            Hash of its part's number (`folds.part_hash`); 0 for an unknown part.
+
+        Returns
+        -------
+        action, reason : int
+            Positions in `Action` and `Reason`.
+        lower, upper : float
+        n_success, n_failure : int
+        embedding : Tensor of float32, shape (K, d)
+
+        Raises
+        ------
+        ValueError
+            For another shape.
         """
         x = self.as_trace(trace)
         self.settle()
-        fault, content = self.predictor.gate.check(x, self.limit)
-        one, alone = self.look(x, part, fault, content)
-        action, reason, lower, upper, _, _, z = one
-        self.wait(action if fault == 0 else self.nobody, alone, part, content, reason, lower, upper, z)
-        return one
+        (
+            fault, content, action, predicted, reason, lower, upper, n_success, n_failure, z, _,
+        ) = self.decider(x, part)  # fmt: skip
+        pending = action if fault == 0 else self.none_pending
+        self.set_pending(pending, predicted, part, content, reason, lower, upper, z)
+        return action, reason, lower, upper, n_success, n_failure, z
 
-    def forward(self, trace: Tensor, part: int = 0) -> One:
-        """`decide`, by the name that a plain `torch.jit.load` calls a module by."""
+    def forward(self, trace: Tensor, part: int = 0) -> DecisionFields:
+        """Call `decide`, by the name under which `torch.jit.load` calls a module."""
         return self.decide(trace, part)
 
-    def look(self, x: Tensor, part: int, fault: int, content: int) -> tuple[One, int]:
-        """(C, T) and what the gate says -> the decision, which changes nothing; what the model alone would have done."""
-        if fault != 0:
-            return (0, fault, 0.0, 1.0, 0, 0, torch.full((self.n_spaces, self.dim), float("nan"))), 0
-        outside = self.windows(x)
-        if outside != 0:
-            return (2 * (outside - 1), self.outside_reason, 0.0, 1.0, 0, 0, self.predictor.embed(x)), 0
-        alone, reason, lower, upper, n_success, n_failure, z = self.predictor(x, part if part != 0 else content)
-        action = alone
-        if alone != 0 and self.audit_below > 0 and self.toss(content ^ self.salt) < self.audit_below:
-            action, reason = 0, self.audit_reason
-        return (action, reason, lower, upper, n_success, n_failure, z), alone
-
-    def wait(
-        self, action: int, alone: int, part: int, content: int, reason: int, lower: float, upper: float, z: Tensor
+    def set_pending(
+        self,
+        action: int,
+        predicted: int,
+        part: int,
+        content: int,
+        reason: int,
+        lower: float,
+        upper: float,
+        z: Tensor,
     ) -> None:
-        """Make this the decision that waits for its label."""
-        self.waits, self.alone, self.lower, self.upper = action, alone, lower, upper
-        self.own, self.content, self.novel = part if part != 0 else content, content, reason == self.novel_reason
-        self.place.copy_(z)
+        """Make a decision the pending one; `action` is `NONE_PENDING` for a faulty trace."""
+        self.pending_action = action
+        self.pending_predicted = predicted
+        self.pending_part = part if part != 0 else content
+        self.pending_content = content
+        self.pending_novel = reason == self.novel_reason
+        self.pending_lower = lower
+        self.pending_upper = upper
+        self.pending_embedding.copy_(z)
 
     @torch.jit.export
     def learn(self, trace: Tensor, success: bool, part: int = 0) -> int:
-        """What became of a part; returns how many references there are. A faulty trace is not learned from.
+        """Learn the outcome of a part; a faulty trace is ignored.
 
-        A trace that is not the one decided last is looked at first: its bound must be one from before its label was known.
+        If the trace is not that of the pending decision, it is decided on first, because its bound
+        must be one from before its label was known; the pending decision stays pending.
+
+        Parameters
+        ----------
+        trace, part
+            As of `decide`.
+        success : bool
+            The label.
+
+        Returns
+        -------
+        int
+            Number of references.
         """
         x = self.as_trace(trace)
-        fault, content = self.predictor.gate.check(x, self.limit)
+        fault, content = self.decider.check(x)
         if fault == 0:
             own = part if part != 0 else content
-            if self.waits != self.nobody and self.own == own and self.content == content:
-                self.take(success)
-            else:  # what waits goes on waiting
-                z, alone = self.look(x, part, fault, content)
-                looked = self.looked(z[0], alone)
-                self.count(z[2], z[3], z[1] == self.novel_reason, z[6], own, success, alone, looked)
+            is_pending = self.pending_action != self.none_pending
+            if is_pending and self.pending_part == own and self.pending_content == content:
+                self.learn_pending(success)
+            else:
+                (
+                    _, _, action, predicted, reason, lower, upper, _, _, z, _,
+                ) = self.decider(x, part)  # fmt: skip
+                novel = reason == self.novel_reason
+                self.learn_outcome(lower, upper, novel, z, own, success, action, predicted)
         return self.n_references()
 
     @torch.jit.export
     def stop(self, trace: Tensor, part: int = 0) -> int:
-        """An accepted part was bad and stopped the system."""
+        """Learn that an accepted part was bad and stopped the line; as `learn`."""
         return self.learn(trace, False, part)
 
     @torch.jit.export
     def settle(self) -> bool:
-        """The next trace comes: an accepted part of which nothing was heard went on. Whether that confirmed it."""
-        if self.waits != 1:
+        """Settle a pending accept: the next part comes, and nothing was reported.
+
+        With `stops_all` the part is learned as good, else it counts as silent. Returns whether it was
+        learned. Other pending decisions stay.
+        """
+        if self.pending_action != 1:
             return False
         if self.stops_all:
-            self.take(True)
+            self.learn_pending(True)
             return True
-        self.silent += 1
-        self.waits = self.nobody
+        self.n_silent += 1
+        self.pending_action = self.none_pending
         return False
 
     @torch.jit.export
     def drop(self) -> None:
-        """Nothing will be known of the part that was decided last, and its silence is none: it did not go on."""
-        self.waits = self.nobody
+        """Forget the pending decision: its outcome will not be known, and it was not let go."""
+        self.pending_action = self.none_pending
 
     @torch.jit.export
-    def restore(self, trace: Tensor, part: int, action: int, reason: int, lower: float, upper: float) -> None:
-        """In the place of `decide`: a decision that was made before, as a journal has it, waits for its label again."""
+    def restore(
+        self, trace: Tensor, part: int, action: int, reason: int, lower: float, upper: float
+    ) -> None:
+        """Make a decision that was made before, as a journal has it, the pending one again."""
         x = self.as_trace(trace)
         self.settle()
-        fault, content = self.predictor.gate.check(x, self.limit)
-        waits = action if fault == 0 else self.nobody
-        alone = 0 if reason == self.outside_reason else action
+        fault, content = self.decider.check(x)
+        pending = action if fault == 0 else self.none_pending
+        predicted = 0 if reason == self.outside_reason else action
         if reason == self.audit_reason:
-            alone = self.predictor.neighbours.rule.action(lower, upper)
-        self.wait(waits, alone, part, content, reason, lower, upper, self.predictor.embed(x))
+            predicted = self.decider.predictor.neighbours.rule.action(lower, upper)
+        z = self.decider.predictor.embed(x)
+        self.set_pending(pending, predicted, part, content, reason, lower, upper, z)
 
     @torch.jit.export
     def predicted(self) -> int:
-        """What the model alone would have done with the trace decided last: something else than was done in audits only."""
-        return self.alone
+        """Return what the model alone would have done with the trace decided last.
+
+        It differs from the action in an audit, and where a force limit rejects.
+        """
+        return self.pending_predicted
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Why everything is verified at present: the position in `SAFE_MODES`, 0 where it is not."""
-        return self.predictor.neighbours.rule.safe_mode()
+        """Return why every part is verified at present: a position in `SAFE_MODES`, 0 for no reason."""
+        safe_mode: int = self.decider.predictor.neighbours.rule.safe_mode()
+        return safe_mode
 
     @torch.jit.export
     def n_references(self) -> int:
-        """References held."""
-        return self.predictor.neighbours.references.size()
+        """Return the number of references."""
+        n_references: int = self.decider.predictor.neighbours.references.size()
+        return n_references
 
-    def take(self, success: bool) -> None:
-        """What became of the part that was decided last."""
-        looked = self.looked(self.waits, self.alone)
-        self.count(self.lower, self.upper, self.novel, self.place, self.own, success, self.alone, looked)
-        self.waits = self.nobody
+    def learn_pending(self, success: bool) -> None:
+        """Learn the outcome of the pending decision; then none is pending."""
+        self.learn_outcome(
+            self.pending_lower,
+            self.pending_upper,
+            self.pending_novel,
+            self.pending_embedding,
+            self.pending_part,
+            success,
+            self.pending_action,
+            self.pending_predicted,
+        )
+        self.pending_action = self.none_pending
 
-    def looked(self, action: int, alone: int) -> float:
-        """`Decision.inclusion_probability`."""
-        if action != 0:
-            return 0.0
-        return 1.0 if alone == 0 else self.audit_rate
-
-    def count(
-        self, lower: float, upper: float, novel: bool, z: Tensor, own: int, success: bool, alone: int, looked: float
+    def learn_outcome(
+        self,
+        lower: float,
+        upper: float,
+        novel: bool,
+        z: Tensor,
+        part: int,
+        success: bool,
+        action: int,
+        predicted: int,
     ) -> None:
-        """Tell the rule of a part, and make it a reference."""
-        around, space = self.predictor.neighbours, self.toss(own) % self.n_spaces
-        around.rule.observe(self.silent, novel)
-        around.rule.update(lower, upper, success, alone, looked)
-        around.references.put(z[space], 1.0 if success else 0.0, space, own)
-        self.silent = 0
+        """Update the rule with an outcome, and make the trace with embedding z (K, d) a reference.
+
+        Its outcome was asked for with probability 1 if the model was not certain, with the audit rate
+        if it was audited, and not at all (0) if it went on.
+        """
+        inclusion_probability = 0.0
+        if action == 0:
+            audit_rate = float(self.decider.audit_rate.item())
+            inclusion_probability = 1.0 if predicted == 0 else audit_rate
+        neighbours = self.decider.predictor.neighbours
+        neighbours.rule.observe(self.n_silent, novel)
+        neighbours.rule.update(lower, upper, success, predicted, inclusion_probability)
+        space = self.decider.toss(part) % self.n_spaces
+        neighbours.references.put(z[space], 1.0 if success else 0.0, space, part)
+        self.n_silent = 0
 
     def as_trace(self, trace: Tensor) -> Tensor:
-        """(C, T) float32 of the contract's length; raises for another shape, which is a caller's bug."""
+        """Return the trace as (C, T) float32 with the number of samples of the contract.
+
+        Raises ValueError for another shape.
+        """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
-        length = x.size(-1) == self.samples or (self.fit != 0 and x.numel() > 0)
-        if x.dim() != 2 or x.size(0) != self.channels or not length:
-            raise ValueError(f"Expected one trace of {self.channels} x {self.samples} samples, got shape {trace.size()}.")
+        fits = x.size(-1) == self.samples or (self.fit != 0 and x.numel() > 0)
+        if x.dim() != 2 or x.size(0) != self.channels or not fits:
+            wanted = f"{self.channels} x {self.samples} samples"
+            raise ValueError(f"Expected one trace of {wanted}, got shape {trace.size()}.")
         x = x.to(torch.float32).contiguous()
         return x if x.size(1) == self.samples else fit_length(x, self.samples, self.fit)
-
-    def toss(self, content: int) -> int:
-        """`folds.toss` of one hash: 64-bit integers that wrap around."""
-        h = (content ^ (content >> 32)) * self.mix
-        h = (h ^ (h >> 32)) * self.mix
-        return int((h >> self.shift) & self.mask)

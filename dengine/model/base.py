@@ -14,12 +14,14 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
+from ..decision.decider import Decider, DecisionConditions, Predicted, Verdict
 from ..decision.policy import Policy
 from ..errors import ExportError, SettingError, shortened
 from ..limits import ForceLimits
 from ..recipe import Recipe
-from ..records import Action, Reason, TraceSpec
+from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
 from ..traces import clip_extremes
 
@@ -37,11 +39,6 @@ class Prediction(NamedTuple):
     embedding: Embedding | None
     reason: Reason
 
-
-Gate = Callable[[Any], tuple[int, int]]  # a trace (C, T) -> fault, content hash
-Looked = tuple[
-    int, int, Prediction | None
-]  # fault, content hash, what a model says of a trace without a fault
 
 
 @runtime_checkable
@@ -100,6 +97,8 @@ class EngineModel(ABC):
     user_model: Any
     name: str
     description: str
+    _decider: Decider | None = None
+    _conditions: DecisionConditions | None = None
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
         """Return the recipe with this model's own settings in place of those that have no effect on it."""
@@ -146,17 +145,27 @@ class EngineModel(ABC):
         `hash_` is the hash of its part, whose references have no vote; 0 excludes none.
         """
 
-    def look(self, x: Floats, part: int | None, gate: Gate, limit: float) -> Looked:
-        """Fault and content hash of one trace (C, T), and what it says of it where there is no fault.
+    def decide_one(self, x: Floats, part: int, conditions: DecisionConditions) -> Verdict:
+        """Decide on one trace by `predict_one`, see `Decider.forward`.
 
-        part : the hash of its part's number; None: it goes by its content.  gate : `TraceGate` by the sensor's `limit`.
+        Parameters
+        ----------
+        x : array of float32, shape (channels, samples)
+        part : int
+            Hash of its part's number; 0 for an unknown part.
+        conditions : DecisionConditions
+            The decider is kept and used again while they stay equal.
+
+        Returns
+        -------
+        Verdict
         """
-        fault, content = gate(torch.from_numpy(x))
-        return (
-            fault,
-            content,
-            None if fault else self.predict_one(x, content if part is None else part),
-        )
+        is_same = conditions is self._conditions or conditions == self._conditions
+        if self._decider is None or not is_same:
+            self._decider = Decider(PythonPredictor(self), conditions)
+            self._conditions = conditions
+        verdict: Verdict = self._decider(torch.from_numpy(x), part)
+        return verdict
 
     @abstractmethod
     def add_reference(
@@ -274,6 +283,32 @@ class EngineModel(ABC):
         raise ExportError(
             f"{self.name} is a baseline and stays in Python; only dengine's own model can be exported."
         )
+
+
+class PythonPredictor(nn.Module):
+    """Lets a `Decider` ask a model that has no compiled module.
+
+    Parameters
+    ----------
+    model : EngineModel
+        Its `predict_one` is called.
+    """
+
+    def __init__(self, model: EngineModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, x: Tensor, part: int = 0) -> Predicted:
+        """Return what the model predicts for one trace (C, T), as `Predicted`."""
+        found = self.model.predict_one(x.numpy(), part)
+        action = ACTIONS.index(found.action)
+        reason = REASONS.index(found.reason)
+        counts = (found.n_success, found.n_failure)
+        return action, reason, found.lower, found.upper, *counts, self.embed(x)
+
+    def embed(self, x: Tensor) -> Tensor:
+        """Return an empty embedding, shape (0, 0): the model has none."""
+        return torch.empty(0, 0)
 
 
 def as_engine_model(model: Model) -> EngineModel:

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache, reduce
+from functools import reduce
 from types import FunctionType
 from typing import Any, Self
 
@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.code import is_code_changed
+from ..decision.decider import Decider, DecisionConditions, Predicted, Verdict
 from ..decision.members import SAFE_MODES
 from ..decision.neighbours import RadiusNeighbours
 from ..decision.novelty import NoveltyGate, fit_novelty
@@ -47,8 +48,8 @@ from ..reducers.base import (
     as_reducer,
     space_scale,
 )
-from ..traces import TraceGate, as_labels, as_traces, clip_extremes
-from .base import Embedding, EngineModel, Exportable, Gate, Looked, Prediction
+from ..traces import ForceLimitsGate, as_labels, as_traces, clip_extremes
+from .base import Embedding, EngineModel, Exportable, Prediction
 
 log = logging.getLogger("dengine")
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
@@ -57,29 +58,32 @@ NEAR = 0.12  # of the distance to the tenth neighbour; of parts of their own abo
 SUSPICIOUS = 25  # such traces: up to 15 were counted among 100 to 500 insertions of parts of their own, at any number
 NOVEL = REASONS.index(Reason.NOVEL)
 KINDS = 16  # compiled modules that a process keeps
-Predicted = tuple[int, int, float, float, int, int, Tensor]
 
 
 class Predictor(nn.Module):
-    """The traces' gate, encoder, scale, novelty, references and rule as one module; compiles where the rule does.
+    """Encoder, novelty gate, references and rule as one module; compiles if the rule does.
 
-    gate : of traces without a limit, which comes with each.
-    encoder : (B, C, T) -> (B, K, d).
-    scale : (K,) what each space is divided by.
+    Parameters
+    ----------
+    encoder : nn.Module
+        (B, C, T) -> (B, K, d).
+    scale : Tensor of float32, shape (K,)
+        Each space is divided by its scale.
+    novelty : NoveltyGate
+    neighbours : RadiusNeighbours
     """
 
     scale: Tensor
 
     def __init__(
         self,
-        gate: TraceGate,
         encoder: nn.Module,
         scale: Tensor,
         novelty: NoveltyGate,
         neighbours: RadiusNeighbours,
     ) -> None:
         super().__init__()
-        self.gate, self.encoder = gate, encoder
+        self.encoder = encoder
         self.register_buffer("scale", scale[:, None])
         self.scaled = bool((scale != 1.0).any())
         self.novelty = novelty
@@ -88,31 +92,22 @@ class Predictor(nn.Module):
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:
-        """(C, T) one trace -> (K, d), scaled."""
+        """Return the scaled embedding (K, d) of one trace (C, T)."""
         z: Tensor = self.encoder(x.unsqueeze(0))[0]
         return z / self.scale if self.scaled else z
 
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
-        """(C, T) one trace -> action, reason, lower, upper, n_success, n_failure, scaled embedding (K, d).
+        """Predict one trace (C, T) of float32.
 
-        part : the hash of its part, which has no vote on itself; 0 for an unknown one.
+        `part` is the hash of its part, whose references have no vote; 0 excludes none. Returns
+        positions of action and reason, lower, upper, n_success, n_failure, and the scaled embedding
+        (K, d). A novel trace is verified without counting.
         """
         z = self.embed(x)
-        return (0, self.novel, 0.0, 1.0, 0, 0, z) if self.novelty(x) else self.at(z, part)
-
-    @torch.jit.export
-    def at(self, z: Tensor, part: int) -> Predicted:
-        """What `forward` says of a trace that is not novel, by its scaled embedding (K, d)."""
+        if self.novelty(x):
+            return 0, self.novel, 0.0, 1.0, 0, 0, z
         action, lower, upper, n_success, n_failure = self.neighbours(z, part)
         return action, self.neighbours.reason(action), lower, upper, n_success, n_failure, z
-
-    @torch.jit.export
-    def look(self, x: Tensor, part: int, limit: float) -> tuple[int, int, Predicted]:
-        """Fault and content hash, as of `TraceGate`, and what `forward` says of a trace without a fault: one call."""
-        fault, content = self.gate.check(x, limit)
-        if fault != 0:
-            return fault, content, (0, fault, 0.0, 1.0, 0, 0, x)
-        return fault, content, self.forward(x, part)
 
 
 class InPython(nn.Module):
@@ -133,21 +128,22 @@ _COMPILED: dict[
 ] = {}  # a module of each structure: to script takes 24 ms and more, a copy of one 1 ms
 
 
-def mould_of(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
-    """The compiled module of a predictor's structure, warm."""
+def template_of(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
+    """Return the compiled and warm decider of this structure; compile it if there is none yet.
+
+    It is shared: `compiled` copies it.
+    """
     structure = structure_of(eager)
-    if (mould := _COMPILED.get(structure)) is None:
-        mould = script(eager)
+    if (template := _COMPILED.get(structure)) is None:
+        template = script(eager)
+        x = torch.linspace(0.0, 1.0, math.prod(trace_shape)).view(trace_shape)
         with torch.inference_mode():
             for _ in range(3):  # TorchScript's first calls compile; a cell should not wait for that
-                said = mould.look(
-                    torch.linspace(0.0, 1.0, math.prod(trace_shape)).view(trace_shape), 0, math.inf
-                )[2]
-                mould.at(said[-1], 1)
+                template(x, 0)
         while len(_COMPILED) >= KINDS:
             _COMPILED.pop(next(iter(_COMPILED)), None)
-        _COMPILED[structure] = mould
-    return mould
+        _COMPILED[structure] = template
+    return template
 
 
 def structure_of(eager: nn.Module) -> tuple[Any, ...]:
@@ -164,7 +160,10 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
                 for key, value in vars(module).items()
                 if is_compiled_in(key, value)
             ),
-            *((key, tuple(tensor.shape)) for key, tensor in _tensors_of(module)),
+            *(
+                (key, None if isinstance(module, ForceLimitsGate) else tuple(tensor.shape))
+                for key, tensor in _tensors_of(module)
+            ),
         )
         for name, module in eager.named_modules()
     )
@@ -197,9 +196,9 @@ def _tensors_of(module: nn.Module, recurse: bool = False) -> list[tuple[str, Ten
     return [*module.named_parameters(recurse=recurse), *module.named_buffers(recurse=recurse)]
 
 
-def compiled(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
+def compiled(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
     """A scripted module with another one's tensors, shared, not copied."""
-    module = copy.deepcopy(mould_of(eager, trace_shape))
+    module = copy.deepcopy(template_of(eager, trace_shape))
     for name, tensor in _tensors_of(eager, recurse=True):
         *path, leaf = name.split(".")
         setattr(reduce(getattr, path, module), leaf, tensor)
@@ -237,7 +236,6 @@ class ModelPrediction(EngineModel):
         self.folds, self.name = folds, type(self.reducer).__name__
         self.rule = rule or self.classifier.policy().rule()
         self.spaces: Reducer = as_reducer(clone(self.reducer), folds)
-        self._predictor: Any = None
         self._note = ""
 
     @classmethod
@@ -320,7 +318,7 @@ class ModelPrediction(EngineModel):
         self.gate = (
             fit_novelty(X, self.novelty, hashes) if self.novelty else NoveltyGate(*self.trace_shape)
         )
-        self._predictor = None  # built by `prepare`, or when it is asked
+        self._decider = None  # built by `prepare`, or when it is asked
         return self
 
     def warm_up(self) -> None:
@@ -344,53 +342,67 @@ class ModelPrediction(EngineModel):
                 around = own.neighbours_over(
                     RadiusIndex(blank.dim, own.capacity), self.rule, self.spaces.scores
                 )
-                mould_of(
-                    Predictor(
-                        trace_gate(shape), blank, torch.ones(self.n_spaces), gate, around
-                    ).eval(),
-                    shape,
-                )
+                predictor = Predictor(blank, torch.ones(self.n_spaces), gate, around)
+                conditions = DecisionConditions(TraceSpec(channels=shape[0], samples=shape[1]))
+                decider = Decider(predictor, conditions, (self.n_spaces, blank.dim))
+                template_of(decider.eval(), shape)
             ahead.result()
 
     def prepare(self, previous: EngineModel) -> None:
         """Take over the rule of the previous model, stale or not, and compile the predictor unless that is done."""
         if not isinstance(previous, ModelPrediction):
             return
-        compiled_with_rule = self._predictor is not None and self.rule is previous.rule
+        compiled_with_rule = self._decider is not None and self.rule is previous.rule
         self.rule = previous.rule
         self.rule_is_stale = self.rule_is_stale or previous.rule_is_stale
         if not compiled_with_rule:
-            self._predictor = self._compile()
+            self._conditions = previous._conditions or self._conditions
+            self._decider = self._build_decider()
 
-    def _compile(self) -> Any:
-        own, encoder, gate = self.classifier, self.spaces.module(), trace_gate(self.trace_shape)
-        around = own.neighbours_over(self.index, self.rule, self.spaces.scores)
-        scale, compiles = (
-            torch.from_numpy(self.scale),
-            self.rule.scriptable and _compiles(self.rule),
-        )
-        encoder = encoder if encoder is not None and _compiles(encoder) else None
-        if encoder is not None and compiles:
-            return compiled(
-                Predictor(gate, encoder, scale, self.gate, around).eval(), self.trace_shape
+    def _build_decider(self) -> Decider:
+        """Return a decider for `_conditions`, compiled if encoder and rule can be compiled."""
+        encoder = self.spaces.module()
+        neighbours: Any = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
+        scale = torch.from_numpy(self.scale)
+        channels, samples = self.trace_shape
+        conditions = self._conditions or DecisionConditions(TraceSpec(samples, channels=channels))
+        shape = (self.n_spaces, self.index.dim)
+        rule_compiles = self.rule.scriptable and _compiles(self.rule)
+        if encoder is not None and not _compiles(encoder):
+            encoder = None
+        if encoder is not None and rule_compiles:
+            predictor = Predictor(encoder, scale, self.gate, neighbours)
+            decider: Decider = compiled(
+                Decider(predictor, conditions, shape).eval(), self.trace_shape
             )
+            return decider
         encoder = InPython(self.spaces) if encoder is None else script(encoder)
-        return Predictor(
-            gate, encoder, scale, script(self.gate), script(around) if compiles else around
-        ).eval()
+        neighbours = script(neighbours) if rule_compiles else neighbours
+        predictor = Predictor(encoder, scale, script(self.gate), neighbours)
+        return Decider(predictor, conditions, shape).eval()
 
     @property
     def is_compiled(self) -> bool:  # type: ignore[override]  # asked when there is a predictor
-        return isinstance(self._predictor, torch.jit.ScriptModule)
+        return isinstance(self._decider, torch.jit.ScriptModule)
 
     @property
     def predictor(self) -> Any:
-        """The module that answers, built where it is not yet; ValueError where nothing was fitted."""
-        if self._predictor is None:
+        """The `Predictor` in the decider; ValueError if nothing was fitted."""
+        return self.decider(self._conditions).predictor
+
+    def decider(self, conditions: DecisionConditions | None) -> Decider:
+        """Return the module that decides under these conditions, built if there is none yet.
+
+        None stands for no force limits, no sensor limit and no audits. Raises ValueError if nothing
+        was fitted.
+        """
+        is_same = conditions is self._conditions or conditions == self._conditions
+        if self._decider is None or not is_same:
             if "index" not in vars(self):
                 raise ValueError("Expected a fitted model; call fit(X, y) first.")
-            self._predictor = self._compile()
-        return self._predictor
+            self._conditions = conditions
+            self._decider = self._build_decider()
+        return self._decider
 
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
         """Take in one labelled trace, (T,) or (C, T), as a reference."""
@@ -473,7 +485,7 @@ class ModelPrediction(EngineModel):
         model.classifier = clone(self.classifier).set_params(**settings)
         model.rule = policy.rule()
         model.rule_is_stale = False
-        model._predictor = None
+        model._decider = None
         return model
 
     @property
@@ -483,34 +495,27 @@ class ModelPrediction(EngineModel):
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """The whole prediction on one trace (C, T); the part with this hash, if it is known, has no vote."""
         with torch.inference_mode():
-            return self._prediction(
-                self.predictor(torch.from_numpy(x), hash_ if hash_ in self.index.known else 0)
-            )
-
-    def look(self, x: Floats, part: int | None, gate: Gate, limit: float) -> Looked:
-        predictor, known = self.predictor, self.index.known
-        with torch._C._InferenceMode(
-            True
-        ):  # as `torch.inference_mode`, whose entering costs 3 % of a decision
-            fault, content, said = predictor.look(
-                torch.from_numpy(x), part if part in known else 0, limit
-            )
-            if (
-                part is None and content in known and not fault and said[1] != NOVEL
-            ):  # the same trace is a reference
-                said = predictor.at(said[-1], content)
-        if fault:
-            return fault, content, None
-        return fault, content, self._prediction(said)
-
-    def _prediction(self, said: Predicted) -> Prediction:
-        if self.rule_is_stale:
-            raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
-        action, reason, lower, upper, n_success, n_failure, z = said
+            predicted = self.predictor(torch.from_numpy(x), hash_)
+        self._check_rule()
+        action, reason, lower, upper, n_success, n_failure, z = predicted
         embedding = tuple(map(tuple, z.tolist()))
         return Prediction(
             ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason]
         )
+
+    def decide_one(self, x: Floats, part: int, conditions: DecisionConditions) -> Verdict:
+        decider = self.decider(conditions)
+        # As `torch.inference_mode`, whose entering costs 3 % of a decision.
+        with torch._C._InferenceMode(True):
+            verdict: Verdict = decider.forward(torch.from_numpy(x), part)
+        if verdict[0] == 0:  # a faulty trace does not ask the rule
+            self._check_rule()
+        return verdict
+
+    def _check_rule(self) -> None:
+        """Raise RuntimeError if the rule has missed an outcome."""
+        if self.rule_is_stale:
+            raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
 
     def predict_many(self, X: ArrayLike) -> list[Prediction]:
         """The prediction on each trace of (n, T) or (n, C, T)."""
@@ -535,7 +540,7 @@ class ModelPrediction(EngineModel):
     def successor(self) -> "ModelPrediction":
         """A model to train next, warm from this one; all but the rule is its own, so this one goes on answering."""
         new = copy.copy(self)
-        new.spaces, new._predictor, new._note = copy.deepcopy(self.spaces), None, ""
+        new.spaces, new._decider, new._note = copy.deepcopy(self.spaces), None, ""
         return new
 
     def defect(self) -> str:
@@ -584,7 +589,7 @@ class ModelPrediction(EngineModel):
         for module, prefix in ((self.rule, "rule."), (self.gate, "novelty.")):
             if arrays := arrays_with_prefix(state, prefix):
                 restore(module, arrays)
-        self._predictor = None
+        self._decider = None
         return self
 
     def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
@@ -602,13 +607,8 @@ class ModelPrediction(EngineModel):
 
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.
-        return self.__dict__ | {"_predictor": None}
+        return self.__dict__ | {"_decider": None}
 
-
-@lru_cache(KINDS)
-def trace_gate(trace_shape: tuple[int, ...]) -> TraceGate:
-    """The gate of traces (C, T), which nothing changes: one for all versions."""
-    return TraceGate(TraceSpec(channels=trace_shape[0], samples=trace_shape[1]))
 
 
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:

@@ -7,9 +7,11 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.neighbors import NeighborhoodComponentsAnalysis
 
-from dengine import DataEngine, Dataset, ModelPrediction, WilsonRadiusClassifier
+from dengine import DataEngine, Dataset, ModelPrediction, TraceSpec, WilsonRadiusClassifier
+from dengine.decision.decider import DecisionConditions, trace_gate
 from dengine.folds import content_fold, content_hash
 from dengine.model import neighbours
+from dengine.records import ACTIONS, REASONS
 
 
 def classifier(**changes) -> WilsonRadiusClassifier:
@@ -20,17 +22,23 @@ def lda(folds: int = 2) -> ModelPrediction:
     return ModelPrediction(LinearDiscriminantAnalysis(), classifier(), folds)
 
 
-def test_one_call_says_what_gate_and_prediction_say_one_after_the_other(make_data) -> None:
+def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(make_data) -> None:
     data = make_data(120, samples=40)
     model = ModelPrediction("conv", WilsonRadiusClassifier(radius=0.05), 5).fit(data.X, data.y)
+    conditions = DecisionConditions(TraceSpec(40))
     queries = [*data.X[100:, None], *make_data(20, samples=40, seed=9).X[:, None], np.ones((1, 40), np.float32)]
     for x in queries:
-        gate = neighbours.trace_gate(x.shape)
-        fault, content = gate(torch.from_numpy(x))
-        for part in (None, 7):
-            *seen, said = model.look(x, part, gate, float("inf"))
-            assert seen == [fault, content]
-            assert said == (None if fault else model.predict_one(x, part or content))  # without a vote on itself
+        found = trace_gate(*x.shape)(torch.from_numpy(x))
+        for part in (0, 7):
+            fault, content, action, predicted, reason, lower, upper, n_success, n_failure, z, propensity = model.decide_one(
+                x, part, conditions
+            )
+            assert (fault, content) == found
+            if not fault:  # without a vote on itself
+                embedding = tuple(map(tuple, z.tolist()))
+                said = (ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
+                assert model.predict_one(x, part or content) == said
+            assert (action, propensity) == (predicted, 0.0 if action else 1.0)
 
 
 @pytest.mark.parametrize("folds", [2, 3])

@@ -1,0 +1,202 @@
+"""The decision on one trace, in one module: faults, force limits, prediction, audit.
+
+    >>> decider = Decider(predictor, DecisionConditions(TraceSpec(1000), audit_rate=0.02), (5, 2))
+    >>> fault, content, action, *_ = decider(torch.from_numpy(x), part=0)
+
+The engine asks a `Decider` and adds an id, a model version and a time; the exported file contains
+one. Both therefore decide alike. TorchScript compiles it if it can compile the predictor; a predictor
+that is plain Python is asked through the same lines.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..folds import COIN_BITS, MIX, audit_salt
+from ..limits import ForceLimits
+from ..records import REASONS, Reason, TraceSpec
+from ..traces import ForceLimitsGate, TraceGate
+
+# fault, content hash, action, predicted action, reason, lower, upper, n_success, n_failure,
+# embedding, propensity; see `Decider.forward`.
+Verdict = tuple[int, int, int, int, int, float, float, int, int, Tensor, float]
+# action, reason, lower, upper, n_success, n_failure, embedding; what a predictor returns.
+Predicted = tuple[int, int, float, float, int, int, Tensor]
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionConditions:
+    """What a decision depends on besides the trace and the model.
+
+    Attributes
+    ----------
+    trace : TraceSpec
+        Shape and rate of the traces; its `limit` is the sensor's range.
+    force_limits : tuple of ForceLimits
+        The operator's limits.
+    audit_rate : float
+        Probability with which a certain decision is verified all the same.
+    seed : int
+        Seed of the audit coin, which is a fixed function of seed and trace.
+    """
+
+    trace: TraceSpec
+    force_limits: tuple[ForceLimits, ...] = ()
+    audit_rate: float = 0.0
+    seed: int = 0
+
+
+class Decider(nn.Module):
+    """Decides on one trace: is it faulty, within the operator's limits, certain, audited?
+
+    Parameters
+    ----------
+    predictor : nn.Module
+        `forward(x, part)` returns what the model predicts, as `Predicted`; `embed(x)` returns the
+        embedding alone.
+    conditions : DecisionConditions
+        Copied into buffers, so that one compiled module serves all conditions.
+    embedding_shape : pair of int
+        (K, d) of the embedding; (0, 0) for a predictor without one.
+    """
+
+    sensor_limit: Tensor
+    audit_rate: Tensor
+    audit_salt: Tensor
+
+    def __init__(
+        self,
+        predictor: nn.Module,
+        conditions: DecisionConditions,
+        embedding_shape: tuple[int, int] = (0, 0),
+    ) -> None:
+        super().__init__()
+        spec = conditions.trace
+        self.predictor: Any = predictor
+        self.gate = trace_gate(spec.channels, spec.samples)
+        self.limits = ForceLimitsGate(conditions.force_limits, spec)
+        self.n_spaces, self.dim = embedding_shape
+        self.audit_reason = REASONS.index(Reason.AUDIT)
+        self.outside_reason = REASONS.index(Reason.OUTSIDE)
+        self.coin_range = float(2**COIN_BITS)
+        self.mix = MIX
+        self.shift = 63 - COIN_BITS
+        self.mask = 2**COIN_BITS - 1
+        limit = float("inf") if spec.limit is None else float(spec.limit)
+        self.register_buffer("sensor_limit", torch.tensor(limit, dtype=torch.float64))
+        rate = torch.tensor(float(conditions.audit_rate), dtype=torch.float64)
+        self.register_buffer("audit_rate", rate)
+        self.register_buffer("audit_salt", torch.tensor(audit_salt(conditions.seed)))
+
+    def forward(self, x: Tensor, part: int = 0) -> Verdict:
+        """Decide on one trace.
+
+        Parameters
+        ----------
+        x : Tensor of float32, shape (C, T)
+            The trace.
+        part : int, default 0
+            Hash of its part's number, 0 if unknown: then the content hash stands for the part. The
+            part's own references do not count.
+
+        Returns
+        -------
+        fault : int
+            Position in `Reason` of what is wrong with the trace, 0 if nothing. A faulty trace is
+            verified and its embedding is NaN.
+        content : int
+            Content hash of the trace (`folds.content_hash`).
+        action, predicted : int
+            Positions in `Action`: what to do, and what the model alone would do. They differ in an
+            audit, and where a force limit rejects.
+        reason : int
+            Position in `Reason`.
+        lower, upper : float
+            Bound on the success probability; (0, 1) without a prediction.
+        n_success, n_failure : int
+            Labels within the radius.
+        embedding : Tensor of float32, shape (K, d)
+        propensity : float
+            Probability, fixed beforehand, that this part is verified: the audit rate if the model is
+            certain, 0 if a force limit rejects, otherwise 1.
+        """
+        fault, content = self.check(x)
+        if fault != 0:
+            nothing = torch.full((self.n_spaces, self.dim), float("nan"))
+            return fault, content, 0, 0, fault, 0.0, 1.0, 0, 0, nothing, 1.0
+        outside = self.limits(x)  # 0 within, 1 verify, 2 reject
+        if outside != 0:
+            z = self.predictor.embed(x)
+            action = 2 * (outside - 1)
+            propensity = float(2 - outside)
+            return 0, content, action, 0, self.outside_reason, 0.0, 1.0, 0, 0, z, propensity
+        own = part if part != 0 else content
+        predicted, reason, lower, upper, n_success, n_failure, z = self.predictor(x, own)
+        action = predicted
+        propensity = 1.0
+        if predicted != 0:
+            propensity = float(self.audit_rate.item())
+            if propensity > 0.0 and self.is_audited(content, propensity):
+                action = 0
+                reason = self.audit_reason
+        return (
+            0, content, action, predicted, reason,
+            lower, upper, n_success, n_failure, z, propensity,
+        )  # fmt: skip
+
+    @torch.jit.export
+    def check(self, x: Tensor) -> tuple[int, int]:
+        """Return fault and content hash of a trace (C, T), as of `forward`."""
+        return self.gate.check(x, float(self.sensor_limit.item()))
+
+    def is_audited(self, content: int, rate: float) -> bool:
+        """Return whether the audit coin of this content hash falls, as `folds.audited` has it."""
+        return self.toss(content ^ int(self.audit_salt.item())) < int(rate * self.coin_range)
+
+    @torch.jit.export
+    def toss(self, value: int) -> int:
+        """Return `folds.toss` of one hash, an integer below 2**30.
+
+        The arithmetic is on tensors because int64 wraps around there, compiled or not.
+        """
+        h = torch.tensor(value)
+        h = (h ^ (h >> 32)) * self.mix
+        h = (h ^ (h >> 32)) * self.mix
+        return int(((h >> self.shift) & self.mask).item())
+
+
+class VerifyAll(nn.Module):
+    """A predictor for the time without a model: every part is verified, for one reason.
+
+    Parameters
+    ----------
+    reason : Reason
+        Why.
+    """
+
+    def __init__(self, reason: Reason) -> None:
+        super().__init__()
+        self.reason = REASONS.index(reason)
+
+    def forward(self, x: Tensor, part: int = 0) -> Predicted:
+        """Return VERIFY with the bound (0, 1), no labels and an empty embedding."""
+        return 0, self.reason, 0.0, 1.0, 0, 0, self.embed(x)
+
+    def embed(self, x: Tensor) -> Tensor:
+        """Return an empty embedding, shape (0, 0)."""
+        return torch.empty(0, 0)
+
+
+@lru_cache(16)
+def decider_without_model(conditions: DecisionConditions, reason: Reason) -> Decider:
+    """Return a decider that verifies every part for `reason`, except where a force limit rejects."""
+    return Decider(VerifyAll(reason), conditions)
+
+
+@lru_cache(16)
+def trace_gate(channels: int, samples: int) -> TraceGate:
+    """Return the gate of traces of this shape; it has no state, so all deciders share it."""
+    return TraceGate(TraceSpec(channels=channels, samples=samples))
