@@ -40,7 +40,6 @@ class Prediction(NamedTuple):
     reason: Reason
 
 
-
 @runtime_checkable
 class Model(Protocol):
     """What a baseline method must give, and no more. X is (n, C, T) float32, y (n,) of 1 = success and 0 = failure."""

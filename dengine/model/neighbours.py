@@ -610,7 +610,6 @@ class ModelPrediction(EngineModel):
         return self.__dict__ | {"_decider": None}
 
 
-
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     """How many of the newest traces (n, C, T) nearly repeat one of another part; parts (n,) hashes.
 
