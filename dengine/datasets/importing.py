@@ -22,7 +22,7 @@ from ..decision.policy import Policy
 from ..engine.decide import as_part
 from ..engine.engine import DataEngine, core_of
 from ..errors import StoreError, TraceError
-from ..folds import content_hash, own_hash
+from ..folds import content_hash, trace_hash
 from ..recipe import Recipe
 from ..records import REASONS, Action, Decision, Reason, TraceSpec, as_success, source_of, stored_trace_spec
 from ..store.opening import UNHURRIED, opening
@@ -148,7 +148,7 @@ def import_parts(
                 propensity = 1.0 if decision.predicted is Action.VERIFY else policy.audited_share
                 reason = REASONS[fault] if fault else decision.reason  # a bad one is kept, but never given to training
                 new = replace(decision, reason=reason, propensity=propensity)
-                known = StoredDecision(new, trace.copy(), own_hash(hash_, decision.part), bool(fault), store.clock())
+                known = StoredDecision(new, trace.copy(), trace_hash(hash_, decision.part), bool(fault), store.clock())
                 made[decision.id] = known
             if counts_silence and decision.action is Action.ACCEPT:  # one held without a label was counted as silent
                 silent += (label is None) - (held is not None)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datasets import Dataset, Fault
-from ..folds import content_hash, own_hash
+from ..folds import content_hash, trace_hash
 from ..model.neighbours import NEWEST, near_repeats
 from ..traces import LARGEST, as_traces
 
@@ -87,7 +87,7 @@ def survey(data: Dataset) -> Survey:
     too_large = finite & ~constant & (np.abs(X).max(axis=(1, 2)) > LARGEST)
     usable, hashes = finite & ~constant & ~too_large, content_hash(X)
     parts: list[str | None] = [None] * len(data) if data.part is None else data.part.tolist()
-    own = np.array([own_hash(*each) for each in zip(hashes.tolist(), parts, strict=True)], dtype=np.int64)
+    own = np.array([trace_hash(*each) for each in zip(hashes.tolist(), parts, strict=True)], dtype=np.int64)
     first: dict[int, int] = {}  # the label of each content's first trace
     labels = zip(hashes[usable].tolist(), data.y[usable].tolist(), strict=True)
     again = [(first.setdefault(content, label), label) for content, label in labels]

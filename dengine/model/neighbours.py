@@ -283,7 +283,7 @@ class ModelPrediction(EngineModel):
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
         """Train the reducer afresh, and make every trace a reference.
 
-        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.own_hash` of each, or None: of
+        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.trace_hash` of each, or None: of
         their content. Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
         """
         X, y = as_traces(X), as_labels(y)

@@ -15,7 +15,7 @@ from sklearn.decomposition import PCA
 from dengine import Action, DataEngine, Dataset, Reason, ReplayCell, Source, TraceError, TraceSpec
 from dengine.engine.engine import core_of
 from dengine.errors import ReportError, SettingError, StoreError
-from dengine.folds import audited, content_hash
+from dengine.folds import COIN_BITS, audit_salt, content_hash, toss
 from dengine.store import SqlStore
 from tests.support.driving import RECIPE, Counting, evidence, make
 from tests.support.driving import drive as play
@@ -155,7 +155,8 @@ def test_an_audit_verifies_what_was_certain_by_a_coin_of_trace_and_seed_alone(da
     certain = np.array([c.decision.predicted is not Action.VERIFY for c in cycles])
     audits = np.array([c.decision.audit for c in cycles])
     assert audits.any()
-    np.testing.assert_array_equal(audits, audited(content_hash(data.X), 0.3, 5) & certain)
+    coin = toss(content_hash(data.X), audit_salt(5)) < int(0.3 * 2**COIN_BITS)
+    np.testing.assert_array_equal(audits, coin & certain)
 
 
 FAULTS = [

@@ -9,8 +9,10 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from dengine import TraceSpec
+from dengine.decision.decider import DecisionConditions, Decider, VerifyAll
 from dengine.decision.scripting import script
-from dengine.folds import audited, content_fold, content_hash, fold_of, toss
+from dengine.folds import content_fold, content_hash, fold_of, toss
+from dengine.records import Reason
 from dengine.traces import TraceGate
 
 any_float32 = st.floats(width=32, allow_nan=True, allow_infinity=True)
@@ -19,6 +21,12 @@ traces = hnp.arrays(np.float32, hnp.array_shapes(min_dims=2, max_dims=2, min_sid
 
 def noise(n: int, samples: int = 50, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(0, 10, (n, samples)).astype(np.float32)
+
+
+def audited(hashes: np.ndarray, rate: float, seed: int) -> np.ndarray:
+    """What the decider's coin says of each hash."""
+    decider = Decider(VerifyAll(Reason.NO_MODEL), DecisionConditions(TraceSpec(20), seed=seed))
+    return np.array([decider.is_audited(int(h), rate) for h in hashes])
 
 
 def golden_traces() -> dict[str, np.ndarray]:
@@ -95,3 +103,10 @@ def test_engines_of_different_seeds_audit_different_traces() -> None:
     one, other = audited(h, 0.5, seed=1), audited(h, 0.5, seed=2)
     assert stats.binomtest(int((one == other).sum()), len(h), 0.5).pvalue > 1e-4
     np.testing.assert_array_equal(one, audited(h, 0.5, seed=1))
+
+
+def test_the_decider_tosses_as_numpy_does_compiled_or_not() -> None:
+    decider = Decider(VerifyAll(Reason.NO_MODEL), DecisionConditions(TraceSpec(20)))
+    scripted = script(decider)
+    hashes = content_hash(noise(200, 20))
+    assert [decider.toss(int(h)) for h in hashes] == [scripted.toss(int(h)) for h in hashes] == toss(hashes).tolist()
