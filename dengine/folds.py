@@ -1,11 +1,11 @@
-"""Permanent hashes of traces and parts: they deal folds and audits, and recognise a part that returns.
+"""Permanent hashes of traces and parts, which deal folds and audits and recognise parts.
 
-A label may be counted for a query only in an embedding that never saw that label, so every trace has a
-fold for life. The fold must not depend on ids, order or time: it comes from the number of the part if
-that is given, else from the content of the trace, so that a controller that knows only the samples
-computes the same. The content hash also tosses the audit coin. The arithmetic is on 64-bit integers
-that wrap around, the same in NumPy, TorchScript and C++. `traces.TraceGate` computes the content hash
-and `decision.decider.Decider` tosses the coin in TorchScript.
+A label may be counted for a query only in an embedding that never saw that label, so every trace
+has a fold for life. The fold must not depend on ids, order or time: it comes from the number of the
+part if that is given, else from the content of the trace, so that a controller that knows only the
+samples computes the same. The content hash also tosses the audit coin. The arithmetic is on 64-bit
+integers that wrap around, the same in NumPy, TorchScript and C++. `traces.TraceGate` computes the
+content hash and `decision.decider.Decider` tosses the coin in TorchScript.
 """
 
 import numpy as np

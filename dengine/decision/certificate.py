@@ -1,28 +1,35 @@
-"""What became of the parts that went on without a check: an upper bound on how many were bad, however often one looks.
+"""The certificate: an anytime-valid upper bound on how many unchecked parts were decided wrongly.
 
-    >>> failure_bound(1203, 24, alpha=0.05)     # 1,203 parts, 24 of them bad: 2 % were seen, 3.5 % is the bound
+    >>> failure_bound(1203, 24, alpha=0.05)     # 1,203 parts, 24 of them bad: 2 % were seen
     0.0349...
 
-With probability 1 - alpha the bound is, at all moments together (anytime-valid), at or above the mean of the failure
-probabilities that the parts so far really had. These may differ and drift; the model may be retrained, and its rule may
-learn from every outcome. Assumed: an audit's coin falls with the stated probability whatever the part is. An audit whose
-outcome is owed for too long (`Policy.label_within`) counts as bad until it is reported, so that none that is lost makes the
-bound smaller; a younger one is left out as yet. It speaks of parts past, not of those to come.
+With probability 1 - alpha the bound is, at all moments together, at or above the mean of the
+failure probabilities that the parts so far really had. These may differ and drift, the model may be
+retrained, and its rule may learn from every outcome. The one assumption is that an audit coin falls
+with the stated probability whatever the part is. An audit that is overdue (`Policy.label_within`)
+counts as bad until it is reported, so that a lost one cannot make the bound smaller; a younger one
+is left out. The bound is about parts so far, not about those to come. `Policy.certificate` computes
+it for the engine.
 
-The evidence is an e-process, the capital of a bettor. He starts with 1 and bets the same b on every part, that it will be
-good. With x = 1 for a bad part that was looked at, else 0,
+*Proof.* The evidence is an e-process, the capital of a bettor. It starts at 1, and the same share b
+is bet on every part, that it will be good. With x = 1 for a bad part whose outcome is known, else
+0,
 
-    capital(theta) = product of (1 - b)^x / (1 - b q theta),   q the propensity, theta the tolerance.
+    capital(theta) = product of (1 - b)^x / (1 - b q theta),   q the propensity, theta the
+    tolerance.
 
-In place of theta put each part's own failure probability p_i, whatever it is and however it depends on the past: x has the
-mean q p_i, so the product M is a martingale that begins at 1, and by Ville's inequality M ever reaches 1 / alpha with
-probability alpha at most. The logarithm is concave, so capital(mean of p_1 ... p_n) <= M, at every n at once: no
-stationarity, one may look after every part, and the running mean may move. For that b must not depend on theta; as a stake
-it is l = b q / (1 - b q theta) on 1 + l (theta - x / q), inverse probability weighting. The capital grows with theta, so
-what is not refuted is an interval. Nobody knows the best b beforehand (1 - odds(q p) / odds(q theta), where all parts have
-one p), so the capital is a mixture, weighted by the bets: large ones matter while n is small.
+Put each part's own failure probability p_i in the place of theta, whatever it is and however it
+depends on the past. Then x has the mean q p_i, so the product M is a martingale that begins at 1,
+and by Ville's inequality M ever reaches 1 / alpha with probability at most alpha. The logarithm is
+concave, so capital(mean of p_1 ... p_n) <= M at every n at once. Neither stationarity nor a fixed n
+is needed, but b must not depend on theta. As a stake, b is l = b q / (1 - b q theta) on 1 + l
+(theta - x / q), inverse probability weighting. The capital grows with theta, so the values that are
+not refuted are an interval. The best b is not known beforehand (it is 1 - odds(q p) / odds(q theta)
+where all parts have one p), so the capital is a mixture of bets, weighted by the bets: large ones
+matter while n is small.
 
-Sources: Ville (1939); Waudby-Smith and Ramdas (2024), JRSS B 86(1); mixtures over bets: Robbins (1970), AMS 41(5).
+References: Ville (1939); Waudby-Smith and Ramdas (2024), JRSS B 86(1); mixtures over bets: Robbins
+(1970), Annals of Mathematical Statistics 41(5).
 """
 
 import math
@@ -30,65 +37,132 @@ from dataclasses import dataclass, replace
 
 from ..errors import expect, percent
 
-BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # for any rate; never 1, by which one bad part would lose all for ever
+BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # never 1: after one bad part its capital would stay 0
 
 
 def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) -> float:
-    """Log capital of a mixture of constant bets that the mean failure probability of n parts is below `tolerance`.
+    """Return the log capital of the bet that the mean failure probability is below the tolerance.
 
-    n : parts, looked at or not.  n_bad : those of them that were looked at and were bad.  tolerance : in [0, 1].
-    propensity : in (0, 1], with which each part was looked at. Where it changed, the smallest: that is on the safe side.
+    Parameters
+    ----------
+    n : int
+        Number of parts, of known outcome or not.
+    n_bad : int
+        Parts among them that are known to be bad.
+    tolerance : float
+        From 0 to 1.
+    propensity : float, default 1.0
+        Probability, above 0, with which the outcome of each part was asked for. If it changed, the
+        smallest value is on the safe side.
+
+    Returns
+    -------
+    float
+        log(1 / alpha) or more refutes, at error level alpha, that the mean is at the tolerance or
+        above.
     """
     rate = propensity * tolerance
     logs = [n_bad * math.log1p(-bet) - n * math.log1p(-bet * rate) for bet in BETS]
-    top = max(logs)
-    capital = sum(bet * math.exp(log - top) for bet, log in zip(BETS, logs, strict=True))
-    return top + math.log(capital / sum(BETS))
+    largest = max(logs)
+    capital = sum(bet * math.exp(log - largest) for bet, log in zip(BETS, logs, strict=True))
+    return largest + math.log(capital / sum(BETS))
 
 
 def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> float:
-    """Upper bound on the mean failure probability of n parts, valid at all moments together with probability 1 - alpha.
+    """Bound the mean failure probability of n parts from above.
 
-    n, n_bad, propensity : as in `log_evidence`; propensity 1 where every outcome is known, 0 where nobody looks.
-    Returns the largest theta that the evidence does not refute, sup{theta: log_evidence < log(1 / alpha)}, by bisection;
-    never less than n_bad / (n propensity). 1 where nothing is known.
+    The bound holds at all moments together with probability 1 - alpha.
+
+    Parameters
+    ----------
+    n, n_bad : int
+        As of `log_evidence`.
+    alpha : float
+        Error level, between 0 and 1.
+    propensity : float, default 1.0
+        As of `log_evidence`; 1 if every outcome is known, 0 if none is.
+
+    Returns
+    -------
+    float
+        The largest tolerance that the evidence does not refute, found by bisection. It is never
+        less than n_bad / (n propensity), and 1 if nothing is known.
+
+    Raises
+    ------
+    SettingError
+        For an alpha or a propensity out of range.
+    ValueError
+        If n_bad is not between 0 and n.
     """
     expect(0.0 < alpha < 1.0, "0 < alpha < 1", alpha, "0.05 asks for 95 % confidence")
-    expect(0.0 <= propensity <= 1.0, "0 <= propensity <= 1", propensity, "0.02 looks at one part in fifty")
+    do = "0.02 looks at one part in fifty"
+    expect(0.0 <= propensity <= 1.0, "0 <= propensity <= 1", propensity, do)
     if not 0 <= n_bad <= n:
-        raise ValueError(f"Expected 0 <= n_bad <= n, got n_bad = {n_bad} of n = {n}; count each part once.")
+        got = f"n_bad = {n_bad} of n = {n}"
+        raise ValueError(f"Expected 0 <= n_bad <= n, got {got}; count each part once.")
     enough = math.log(1.0 / alpha)
     if propensity == 0.0 or log_evidence(n, n_bad, 1.0, propensity) < enough:
         return 1.0
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     for _ in range(50):
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if log_evidence(n, n_bad, middle, propensity) >= enough else (middle, high)
+        if log_evidence(n, n_bad, middle, propensity) >= enough:
+            high = middle
+        else:
+            low = middle
     return high  # the refuted end: rounding widens
 
 
 def cusum(share: float, parts: float) -> tuple[int, int]:
-    """(step, limit) of the detector that notices twice a share of wrong parts soonest, with few false alarms.
+    """Design the CUSUM detector that notices a doubled share of wrong parts soonest.
 
-    A wrong part adds `step` to a sum, a right one takes 1 from it, and it begins anew at 0 wherever it falls below (Page,
-    1954, Biometrika 41; that this is soonest: Moustakides, 1986, Annals of Statistics 14). At `limit` it alarms: after
-    `parts` on average or later, wherever each part is wrong with probability `share`, below 0.5, or less given the past.
+    A wrong part adds `step` to a sum, a right one takes 1 from it, and the sum restarts at 0 where
+    it would fall below. It alarms at `limit`.
+
+    Parameters
+    ----------
+    share : float
+        Probability, below 0.5, with which a part may be wrong.
+    parts : float
+        Mean number of parts to a false alarm, at least, while each part is wrong with probability
+        `share` or less given the past.
+
+    Returns
+    -------
+    step, limit : int
+
+    References
+    ----------
+    Page (1954), Biometrika 41; that it is the soonest: Moustakides (1986), Annals of Statistics 14.
     """
-    twice = min(2.0 * share, 0.99)
-    step = max(1, round(math.log(twice / share) / math.log((1.0 - share) / (1.0 - twice))))
-    limit, least = 1, 1
+    doubled = min(2.0 * share, 0.99)
+    odds = math.log((1.0 - share) / (1.0 - doubled))
+    step = max(1, round(math.log(doubled / share) / odds))
+    too_low = 1
+    limit = 1
     while _run_length(share, step, limit) < parts:
-        least, limit = limit, 2 * limit
-    while limit - least > 1:
-        middle = (least + limit) // 2
-        least, limit = (middle, limit) if _run_length(share, step, middle) < parts else (least, middle)
+        too_low = limit
+        limit = 2 * limit
+    while limit - too_low > 1:
+        middle = (too_low + limit) // 2
+        if _run_length(share, step, middle) < parts:
+            too_low = middle
+        else:
+            limit = middle
     return step, limit
 
 
 def _run_length(share: float, step: int, limit: int) -> float:
-    """Mean number of parts until the alarm, from a sum of 0: exact (Brook and Evans, 1972, Biometrika 59)."""
-    # From the sum s it is a[s] + b[s] t, where t is that from the largest sum: downwards, and at 0 the equation for t.
-    a, b = [0.0] * (limit + step), [0.0] * (limit + step)  # 0 at and beyond the limit
+    """Return the mean number of parts until a CUSUM that starts at 0 reaches its limit.
+
+    It is exact (Brook and Evans, 1972, Biometrika 59).
+    """
+    # The mean from the sum s is a[s] + b[s] t, where t is the mean from the largest sum; it is
+    # computed downwards, and the equation at 0 gives t. At and beyond the limit both are 0.
+    a = [0.0] * (limit + step)
+    b = [0.0] * (limit + step)
     b[limit - 1] = 1.0
     for s in range(limit - 1, 0, -1):
         a[s - 1] = (a[s] - 1.0 - share * a[s + step]) / (1.0 - share)
@@ -99,16 +173,26 @@ def _run_length(share: float, step: int, limit: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Outcomes:
-    """How many parts the model was certain of since the policy's settings last changed, and what became of them.
+    """Counts of the parts that the model was certain of, and of their outcomes.
 
-    accepted, rejected : let go without a check.
-    false_accepts, confirmed : of the accepted, known to be bad, and to be good.
-    audited_accepts, audited_accepts_bad : checked though the model would have accepted, and the bad ones of them.
-    false_rejects : of the rejected, those that somebody looked at and found good.
-    audited_rejects, audited_rejects_good : checked though the model would have rejected, and the good ones of them.
-    forgotten_accepts, forgotten_audited_accepts, forgotten_audited_rejects : those whose label was forgotten, which are in
-        none of the counts of labels above.
-    overdue_audited_accepts, overdue_audited_rejects : audits that were not reported in time, in none of the counts above.
+    They begin with the last change of the policy's settings.
+
+    Attributes
+    ----------
+    accepted, rejected : int
+        Decided without a check.
+    false_accepts, confirmed : int
+        Accepted parts known to be bad, and known to be good.
+    audited_accepts, audited_accepts_bad : int
+        Parts that were checked although the model would have accepted; the bad ones of these.
+    audited_rejects, audited_rejects_good : int
+        Parts that were checked although the model would have rejected; the good ones of these.
+    forgotten_accepts, forgotten_audited_accepts, forgotten_audited_rejects : int
+        Parts whose label was forgotten; they are in none of the counts of labels above.
+    overdue_audited_accepts, overdue_audited_rejects : int
+        Audits that were not reported in time; they are in none of the counts above.
+    false_rejects : int
+        Rejected parts that somebody inspected and found good.
     """
 
     accepted: int = 0
@@ -128,17 +212,30 @@ class Outcomes:
 
 
 @dataclass(frozen=True, slots=True)
-class Bounded:
-    """A group of parts and the bound on how many of them were decided wrongly, on average.
+class OutcomeBound:
+    """A group of parts, and the bound on the mean probability that they were decided wrongly.
 
-    n : parts the claim is about.  n_looked_at : those whose outcome is known.  n_bad : those known to be decided wrongly.
-    propensity : probability with which each was looked at; 0 where nobody looked, so that nothing is known.
-    alpha : what this bound may spend, the certificate's or a share of it.  upper : the bound, 1 where nothing is known.
-    shadowed : none of them was decided without a check, each was audited: the shadow mode.
+    Attributes
+    ----------
+    n : int
+        Number of parts that the claim is about.
+    n_with_outcome : int
+        Parts among them whose outcome is known.
+    n_bad : int
+        Parts that are known to be decided wrongly.
+    propensity : float
+        Probability with which the outcome of each was asked for; 0 if none was, so that nothing is
+        known.
+    alpha : float
+        Error level of this bound: the certificate's, or a share of it.
+    upper : float
+        The bound; 1 if nothing is known.
+    shadowed : bool
+        Whether each of them was audited, as in shadow mode.
     """
 
     n: int
-    n_looked_at: int
+    n_with_outcome: int
     n_bad: int
     propensity: float
     alpha: float
@@ -148,24 +245,33 @@ class Bounded:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What can be said, at level 1 - alpha and at any moment, of the parts that the model decided alone.
+    """The claims about parts that were decided without a check, at confidence 1 - alpha.
 
-    accepted : the bound on the mean probability that an accepted part was bad.  rejected : that a rejected one was good.
-    tolerance : what is allowed of the accepted, by default 1 - lower_bound. Each bound holds at 1 - alpha by itself.
-    prices : of a check, an escape and a false reject where they are what decides, see `Policy`; else None.
+    Attributes
+    ----------
+    alpha : float
+        Error level. Each of the two bounds holds at 1 - alpha by itself.
+    tolerance : float
+        Share of accepted parts that may be bad; 1 - lower_bound unless prices decide.
+    accepted : OutcomeBound
+        On the mean probability that an accepted part was bad.
+    rejected : OutcomeBound
+        On the mean probability that a rejected part was good.
+    prices : three floats or None
+        Of a check, an escape and a false reject, if these decide; see `Policy`.
     """
 
     alpha: float
     tolerance: float
-    accepted: Bounded
-    rejected: Bounded
+    accepted: OutcomeBound
+    rejected: OutcomeBound
     prices: tuple[float, float, float] | None = None
 
     @property
     def saved(self) -> float | None:
-        """At least so much, in the unit of the prices, was saved by not checking what is accepted, less what bad ones cost.
+        """Lower bound on what was saved by not checking accepted parts, in the unit of the prices.
 
-        Expected, as the bound is: n check - escape n upper, for all moments together. None where nothing is priced.
+        It is n check - escape n upper, an expectation as the bound is. None without prices.
         """
         if self.prices is None:
             return None
@@ -179,53 +285,94 @@ class Certificate:
 
     @property
     def sentence(self) -> str:
-        """What a plant manager may rely on about accepted parts, in one sentence."""
-        unknown = "silence is no success: set audit_rate, or stops='all' where every bad part stops the system"
-        said = self._sentence(self.accepted, "that went on without a check", "accept", "bad", unknown)
+        """The claim about accepted parts as one sentence, with what was saved."""
+        unknown = (
+            "silence is no success: set audit_rate, or stops='all' where every bad part stops the "
+            "system"
+        )
+        which = "that went on without a check"
+        claim = self._claim(self.accepted, which, "accept", "bad", unknown)
         if self.saved is None or self.accepted.upper >= 1.0:
-            return said
-        known = f"at least {math.floor(self.saved):,}" if self.saved > 0.0 else "nothing for certain"
-        return f"{said} By the prices not checking them saved {known}."
+            return claim
+        saved = "nothing for certain"
+        if self.saved > 0.0:
+            saved = f"at least {math.floor(self.saved):,}"
+        return f"{claim} By the prices not checking them saved {saved}."
 
     @property
     def sentence_on_rejects(self) -> str:
-        """The same about rejected parts."""
+        """The claim about rejected parts as one sentence."""
         unknown = "nobody looks at what is rejected: set audit_rate"
-        return self._sentence(self.rejected, "rejected without a check", "reject", "good", unknown)
+        return self._claim(self.rejected, "rejected without a check", "reject", "good", unknown)
 
-    def _sentence(self, bounded: Bounded, which: str, verb: str, wrong: str, unknown: str) -> str:
-        parts = f"{bounded.n:,} part{'s' if bounded.n != 1 else ''}"
+    def _claim(self, group: OutcomeBound, which: str, verb: str, wrong: str, unknown: str) -> str:
+        """Return the claim about a group of parts as one sentence.
+
+        `which` describes the parts, `verb` is what the model does with them, `wrong` what they were
+        if that was wrong, `unknown` the reason where no outcome is known.
+        """
+        parts = f"{group.n:,} part{'s' if group.n != 1 else ''}"
         but = " beyond the known stops" if verb == "accept" else ""
-        if bounded.n == 0:
+        if group.n == 0:
             return f"Nothing can be said yet: no part was one {which}."
-        if bounded.propensity == 0.0:
+        if group.propensity == 0.0:
             return f"Of {parts} {which} nothing can be said{but}, for {unknown}."
-        if bounded.propensity < 1.0:
-            which = f"that the model would {verb}, of which {bounded.n_looked_at:,} were audited"
-        if bounded.shadowed:
+        if group.shadowed:
             which = f"that the model would {verb}, each of which was checked"
-        if bounded.upper >= 1.0:
+        elif group.propensity < 1.0:
+            audited = f"{group.n_with_outcome:,} were audited"
+            which = f"that the model would {verb}, of which {audited}"
+        if group.upper >= 1.0:
             return f"Of {parts} {which}, nothing can be said yet: too few were looked at."
-        # A sentence must not promise more than the bound: rounded up.
-        digits = 1 if bounded.upper >= 0.01 else 2 if bounded.upper >= 0.001 else 4
-        upper = f"{math.ceil(bounded.upper * 10.0 ** (digits + 2)) / 10.0**digits:g} %"
+        confidence = percent(1.0 - self.alpha, ".6g")
         return (
-            f"Of {parts} {which}, at most {upper} were {wrong} on average, with {percent(1.0 - self.alpha, '.6g')} "
-            f"confidence, however often one looks; the tolerance is {percent(self.tolerance, '.6g')}."
+            f"Of {parts} {which}, at most {_round_up(group.upper)} were {wrong} on average, with "
+            f"{confidence} confidence, however often one looks; the tolerance is "
+            f"{percent(self.tolerance, '.6g')}."
         )
 
 
-def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audit_rate: float) -> Certificate:
-    """The certificate of what became of all certain decisions so far; `Policy.certificate` is the engine's way to it.
+def _round_up(bound: float) -> str:
+    """Return a bound in per cent, rounded up: a sentence must not promise more than the bound."""
+    digits = 4
+    if bound >= 0.01:
+        digits = 1
+    elif bound >= 0.001:
+        digits = 2
+    return f"{math.ceil(bound * 10.0 ** (digits + 2)) / 10.0**digits:g} %"
 
-    stops : as in `Policy`; under "all" leave the newest part out while its outcome is open.
-    audit_rate : probability with which a certain decision is verified all the same; where it changed, the smallest.
 
-    Under "some" the bound comes from audits and is about all parts the model would have accepted, let go or audited. It
-    never lies below the share known to be bad. A cell that confirmed or stopped every accepted part knows as much as under
-    "all". Where both are possible they share alpha: whoever sees now the one and now the other is wrong with probability
-    alpha at most. Rejected parts are known by audits; what is found good of them without being asked for is a share that
-    the bound never lies below. A label that was forgotten, or is overdue, counts as a wrong
+def certify(
+    outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audit_rate: float
+) -> Certificate:
+    """Compute the certificate from the outcomes of all certain decisions so far.
+
+    Parameters
+    ----------
+    outcomes : Outcomes
+        Under "all" without accepted parts whose outcome is still open.
+    alpha : float
+        Error level.
+    tolerance : float
+        Share of accepted parts that may be bad, between 0 and 1.
+    stops : {"all", "some"}
+        As in `Policy`.
+    audit_rate : float
+        Probability with which a certain decision is verified all the same; if it changed, the
+        smallest value.
+
+    Returns
+    -------
+    Certificate
+
+    Notes
+    -----
+    Under "all", or if every accepted part was confirmed or stopped the line, all outcomes are
+    known. Otherwise the bound comes from audits and is about all parts that the model would have
+    accepted, let go or audited; it is never below the share known to be bad. Where both are
+    possible they share alpha, so that whoever sees now the one and now the other is wrong with
+    probability alpha at most. Rejected parts are known by audits; the share that was found good
+    without being asked for is a floor of that bound. A forgotten or overdue label counts as a wrong
     decision.
     """
     expect(stops in ("all", "some"), "stops among all, some", stops)
@@ -240,22 +387,32 @@ def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audi
         audited_rejects=outcomes.audited_rejects + lost_rejects,
         audited_rejects_good=outcomes.audited_rejects_good + lost_rejects,
     )
-    share = 1.0 if stops == "all" or audit_rate == 0.0 else 0.1  # of alpha: audits see less and need more
+    # Share of alpha for known outcomes: audits see less and need more.
+    share = 1.0 if stops == "all" or audit_rate == 0.0 else 0.1
     if stops == "all" or 0 < o.accepted == o.false_accepts + o.confirmed:
-        accepted = _bounded(o.accepted, o.accepted, o.false_accepts, 1.0, share * alpha)
+        accepted = _bound_outcomes(o.accepted, o.accepted, o.false_accepts, 1.0, share * alpha)
     elif audit_rate == 0.0:
-        accepted = _bounded(o.accepted, 0, 0, 0.0, alpha)
+        accepted = _bound_outcomes(o.accepted, 0, 0, 0.0, alpha)
     else:
-        n, n_bad = o.accepted + o.audited_accepts, o.audited_accepts_bad
-        accepted = _bounded(n, o.audited_accepts, n_bad, audit_rate, (1.0 - share) * alpha)
+        n = o.accepted + o.audited_accepts
+        n_bad = o.audited_accepts_bad
+        audit_alpha = (1.0 - share) * alpha
+        accepted = _bound_outcomes(n, o.audited_accepts, n_bad, audit_rate, audit_alpha)
         upper = max(accepted.upper, (n_bad + o.false_accepts) / max(1, n))
-        accepted = replace(accepted, upper=upper, shadowed=audit_rate == 1.0 and o.accepted == 0)
-    n, n_good = o.rejected + o.audited_rejects, o.audited_rejects_good
-    rejected = _bounded(n, o.audited_rejects, n_good, audit_rate, alpha)
-    rejected = replace(rejected, upper=max(rejected.upper, (n_good + o.false_rejects) / max(1, n)))
-    rejected = replace(rejected, shadowed=audit_rate == 1.0 and o.rejected == 0)
+        shadowed = audit_rate == 1.0 and o.accepted == 0
+        accepted = replace(accepted, upper=upper, shadowed=shadowed)
+    n = o.rejected + o.audited_rejects
+    n_good = o.audited_rejects_good
+    rejected = _bound_outcomes(n, o.audited_rejects, n_good, audit_rate, alpha)
+    upper = max(rejected.upper, (n_good + o.false_rejects) / max(1, n))
+    shadowed = audit_rate == 1.0 and o.rejected == 0
+    rejected = replace(rejected, upper=upper, shadowed=shadowed)
     return Certificate(alpha, tolerance, accepted, rejected)
 
 
-def _bounded(n: int, n_looked_at: int, n_bad: int, propensity: float, alpha: float) -> Bounded:
-    return Bounded(n, n_looked_at, n_bad, propensity, alpha, failure_bound(n, n_bad, alpha, propensity))
+def _bound_outcomes(
+    n: int, n_with_outcome: int, n_bad: int, propensity: float, alpha: float
+) -> OutcomeBound:
+    """Return the group of these counts with its `failure_bound`."""
+    upper = failure_bound(n, n_bad, alpha, propensity)
+    return OutcomeBound(n, n_with_outcome, n_bad, propensity, alpha, upper)

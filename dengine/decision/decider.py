@@ -4,8 +4,8 @@
     >>> fault, content, action, *_ = decider(torch.from_numpy(x), part=0)
 
 The engine asks a `Decider` and adds an id, a model version and a time; the exported file contains
-one. Both therefore decide alike. TorchScript compiles it if it can compile the predictor; a predictor
-that is plain Python is asked through the same lines.
+one. Both therefore decide alike. TorchScript compiles it if it can compile the predictor; a
+predictor that is plain Python is asked through the same lines.
 """
 
 from dataclasses import dataclass
@@ -120,8 +120,8 @@ class Decider(nn.Module):
             Labels within the radius.
         embedding : Tensor of float32, shape (K, d)
         propensity : float
-            Probability, fixed beforehand, that this part is verified: the audit rate if the model is
-            certain, 0 if a force limit rejects, otherwise 1.
+            Probability, fixed beforehand, that this part is verified: the audit rate if the model
+            is certain, 0 if a force limit rejects, otherwise 1.
         """
         fault, content = self.check(x)
         if fault != 0:
@@ -192,7 +192,7 @@ class VerifyAll(nn.Module):
 
 @lru_cache(16)
 def decider_without_model(conditions: DecisionConditions, reason: Reason) -> Decider:
-    """Return a decider that verifies every part for `reason`, except where a force limit rejects."""
+    """Return a decider that verifies every part for `reason`; a force limit may still reject."""
     return Decider(VerifyAll(reason), conditions)
 
 

@@ -4,16 +4,16 @@
     >>> wilson_interval(96, 4, alpha=0.05)  # the paper's "Wilson Formula results" (b), first row
     (0.901..., 0.984...)
 
-The public functions take integer arrays and return `(lower, upper)` with
-`0 <= lower <= n_success / n <= upper <= 1`. Each interval is two-sided at error level alpha: z is the
-1 - alpha / 2 quantile of the normal distribution, and each tail holds alpha / 2. Where nothing was
-counted, the interval is (0, 1). `INTERVALS` lists them by name.
+The public functions take integer arrays and return `(lower, upper)` with `0 <= lower <= n_success /
+n <= upper <= 1`. Each interval is two-sided at error level alpha: z is the 1 - alpha / 2 quantile
+of the normal distribution, and each tail holds alpha / 2. Where nothing was counted, the interval
+is (0, 1). `INTERVALS` lists them by name.
 
-The Wilson and the Wald formula stand here twice, and nowhere else. `wilson_limits` and `wald_limits`
-are written for NumPy arrays and for PyTorch tensors alike (they are given the library as `xp`): the
-public functions and the ONNX export share them. `wilson_bound` and `wald_bound` take two integers:
-TorchScript compiles only functions with fixed scalar types, and a tensor operation for each of the
-dozen steps would slow down every decision.
+The Wilson and the Wald formula stand here twice, and nowhere else. `wilson_limits` and
+`wald_limits` are written for NumPy arrays and for PyTorch tensors alike (they are given the library
+as `xp`): the public functions and the ONNX export share them. `wilson_bound` and `wald_bound` take
+two integers: TorchScript compiles only functions with fixed scalar types, and a tensor operation
+for each of the dozen steps would slow down every decision.
 """
 
 import math
@@ -247,7 +247,7 @@ ARRAY_LIMITS = {"wilson": wilson_limits, "binomial": wald_limits}  # of the same
 def scalar_interval(
     interval: str, alpha: float, n_success: int, n_failure: int, z: float
 ) -> tuple[float, float]:
-    """Evaluate any interval of `INTERVALS` on two integers, in Python; TorchScript cannot compile it.
+    """Evaluate any interval of `INTERVALS` on two integers; TorchScript cannot compile it.
 
     It has the parameters of a `ScalarBound` behind `interval` and `alpha`; z is not used.
     Returns lower and upper as floats.

@@ -1,7 +1,7 @@
 """The rules that learn from outcomes: watched, pooled and priced.
 
-All three decide by `members.MemberEvidence`, which opens and closes levels of the score. `policy.RULES`
-says which one belongs to which guarantee.
+All three decide by `members.MemberEvidence`, which opens and closes levels of the score.
+`policy.RULES` says which one belongs to which guarantee.
 """
 
 import torch
@@ -105,7 +105,7 @@ class PooledRule(MemberRule):
 
 
 class PricedRule(MemberRule):
-    """Accept what is expected to cost less than its check while the account allows; reject likewise.
+    """Accept what should cost less than its check while the account allows; reject likewise.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""The evidence that a learning decision rule keeps: outcomes of its members, levels, drift detectors.
+"""The evidence that a learning rule keeps: outcomes of members, levels and drift detectors.
 
-`MemberEvidence` is a module with one buffer for each quantity. `member_rules` builds the pooled, the
-priced and the watched rule on it; TorchScript compiles it into the exported file, where it goes on
-learning.
+`MemberEvidence` is a module with one buffer for each quantity. `member_rules` builds the pooled,
+the priced and the watched rule on it; TorchScript compiles it into the exported file, where it goes
+on learning.
 
 *Members* are the parts whose score reached the target level when they were decided, accepted or
 checked. The score for accepting is the lower bound, the score for rejecting 1 - upper bound. Each
@@ -10,16 +10,16 @@ side has candidate *levels* of the score, the strictest first; the rule accepts 
 whose score reaches the threshold of that side, which is one of the levels, or out of reach.
 
 *The bet.* A bettor who stakes the same share on every member, against the claim "the mean failure
-probability is above the tolerance", has a capital of 1 / alpha or more with a probability of at most
-alpha while that claim is true. So the pooled rule opens a level while the capital is at least
+probability is above the tolerance", has a capital of 1 / alpha or more with a probability of at
+most alpha while that claim is true. So the pooled rule opens a level while the capital is at least
 1 / alpha. Statement, assumptions, proof and references: docs/explanation/pooled_proof.md.
 
 *The account.* The priced rule counts what accepting all members would have cost beyond checking
 them, in units of one false accept, and opens a level while the balance is at least -1.
 
 *Safe mode.* A mean over all members reacts late to drift. So CUSUM detectors (`certificate.cusum`)
-watch the accepted parts, the rejected parts, and the share of novel traces. After an alarm every part
-is verified until the members decided since the alarm show again that the tolerance is kept.
+watch the accepted parts, the rejected parts, and the share of novel traces. After an alarm every
+part is verified until the members decided since the alarm show again that the tolerance is kept.
 """
 
 import math
@@ -87,8 +87,8 @@ def weighted_sum(counts: list[int], weights: list[float]) -> float:
 class MemberEvidence(nn.Module):
     """Outcomes of members and levels, drift detectors, and the threshold of each side.
 
-    Side 0 accepts, side 1 rejects. Counts are held apart for *checked* parts (outcome asked for with
-    certainty) and *audited* parts (asked for with the probability `inclusion_probability`).
+    Side 0 accepts, side 1 rejects. Counts are held apart for *checked* parts (outcome asked for
+    with certainty) and *audited* parts (asked for with the probability `inclusion_probability`).
 
     Parameters
     ----------
@@ -112,7 +112,8 @@ class MemberEvidence(nn.Module):
     member_counts_since_alarm : Tensor of int64, shape (2, 2, 2)
         The same since the last alarm.
     level_counts_since_alarm : Tensor of int64, shape (2, L, 2, 2)
-        [side, level, checked or audited, parts or wrong parts]: parts whose score reached the level.
+        [side, level, checked or audited, parts or wrong parts]: parts whose score reached the
+        level.
     level_totals : Tensor of int64, shape (2, L)
         Parts that ever reached each level.
     recent_errors : Tensor of int64, shape (2, L, N_RECENT)
@@ -120,7 +121,8 @@ class MemberEvidence(nn.Module):
     detector_sums : Tensor of float64, shape (3,)
         CUSUM of accepted parts, of rejected parts, and of novel traces.
     thresholds : Tensor of float64, shape (2,)
-        Score that a part must reach to be accepted, and to be rejected; `CLOSED` if nothing may pass.
+        Score that a part must reach to be accepted, and to be rejected; `CLOSED` if nothing may
+        pass.
     target_level : Tensor of int64, shape (2,)
         For each side the position of the level whose parts are members.
     safe_mode : Tensor of int64, shape ()
@@ -243,8 +245,8 @@ class MemberEvidence(nn.Module):
     ) -> None:
         """Count one part of known outcome on one side, then choose the threshold of that side.
 
-        The detector takes every part that reaches the threshold; levels and members take a part only
-        if its outcome was asked for (`inclusion_probability` > 0) or all outcomes are known.
+        The detector takes every part that reaches the threshold; levels and members take a part
+        only if its outcome was asked for (`inclusion_probability` > 0) or all outcomes are known.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
@@ -274,9 +276,11 @@ class MemberEvidence(nn.Module):
         self.choose_threshold(side)
 
     def step_detector(self, detector: int, step: float, times: int) -> None:
-        """Add `step` to a CUSUM `times` times, restarting at 0 below 0; start the safe mode at its limit.
+        """Add `step` to a CUSUM several times; start the safe mode if it reaches its limit.
 
-        With several steps `step` is negative, so that none but the last can start from 0.
+        The sum restarts at 0 where it would fall below.
+
+        With more than one step, `step` is negative, so that none but the last can start from 0.
         """
         if times <= 0:
             return

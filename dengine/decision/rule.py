@@ -4,9 +4,9 @@
     >>> rule(40, 0)                      # 40 successes, no failure: (1, 0.93..., 1.0), accept
 
 `DecisionRule` is the paper's rule and the base class of all others. It is an `nn.Module` that
-compiles to TorchScript, so the engine, the scikit-learn classifier and the exported file run the same
-lines. `member_rules` holds the rules that learn from outcomes. `Policy.rule` makes the one that a
-policy asks for.
+compiles to TorchScript, so the engine, the scikit-learn classifier and the exported file run the
+same lines. `member_rules` holds the rules that learn from outcomes. `Policy.rule` makes the one
+that a policy asks for.
 """
 
 from functools import partial
@@ -42,9 +42,9 @@ class DecisionRule(nn.Module):
     """The paper's rule: accept where lower >= LB, reject where upper <= 1 - LB.
 
     A rule that learns from outcomes is a subclass. It overrides `update` and `action`, perhaps
-    `observe`, and keeps what it learned in buffers of fixed shape: a store keeps these with each model
-    version. If its `update` raises, the engine verifies every part until the store is opened again,
-    and then updates a fresh rule with all outcomes.
+    `observe`, and keeps what it learned in buffers of fixed shape: a store keeps these with each
+    model version. If its `update` raises, the engine verifies every part until the store is opened
+    again, and then updates a fresh rule with all outcomes.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class DecisionRule(nn.Module):
         self.extra_arguments: tuple[Any, ...] = ()
 
     def forward(self, n_success: int, n_failure: int) -> tuple[int, float, float]:
-        """Return action (0 verify, 1 accept, 2 reject), lower and upper for the counts of labels."""
+        """Return action (0 verify, 1 accept, 2 reject), lower and upper for label counts."""
         lower, upper = self.bound(n_success, n_failure, self.z)
         return self.action(lower, upper), lower, upper
 
@@ -137,7 +137,7 @@ class DecisionRule(nn.Module):
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Return why every part is verified at present: a position in `SAFE_MODES`, 0 for no reason."""
+        """Return why every part is verified at present, as a position in `SAFE_MODES`."""
         return 0
 
     @torch.jit.unused
@@ -155,6 +155,6 @@ class DecisionRule(nn.Module):
 
     @torch.jit.unused
     def learns(self) -> bool:
-        """Return whether the rule can learn: it has a buffer, or overrides `update` or `observe`."""
+        """Return whether the rule can learn: it has buffers, or its own `update` or `observe`."""
         methods = (type(self).update, type(self).observe)
         return bool(self.state_dict()) or methods != (DecisionRule.update, DecisionRule.observe)

@@ -1,7 +1,7 @@
-"""From one trace to a recorded decision: asks the model's decider, adds an id, a version and a time.
+"""From a trace to a recorded decision: the model's decider, an id, a version, a time.
 
-`EngineCore` owns one `DecisionMaker`. The helpers below it check what a caller passes: a part's number,
-and an id that was decided before.
+`EngineCore` owns one `DecisionMaker`. The helpers below it check what a caller passes: a part's
+number, and an id that was decided before.
 """
 
 import logging

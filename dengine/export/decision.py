@@ -1,8 +1,8 @@
 """The module inside an exported file: a `Decider` that also learns from reported outcomes.
 
 It decides as `DataEngine.decide` does, and learns as `DataEngine.report` does between two retrains.
-`bundle.prepare_export` builds it; TorchScript compiles it; `ExportedModel` and the C++ program call the
-methods in `METHODS`.
+`bundle.prepare_export` builds it; TorchScript compiles it; `ExportedModel` and the C++ program call
+the methods in `METHODS`.
 """
 
 import torch
@@ -33,9 +33,9 @@ NONE_PENDING = -1  # in place of an action: no decision is pending
 class DecisionModule(nn.Module):
     """Decides on raw traces, keeps the pending decision, and learns its outcome.
 
-    A labelled trace becomes a reference in the space of its fold; the oldest reference leaves first,
-    whatever its label. The rule is updated with each outcome. Encoder and novelty gate stay as they
-    are. All state, the pending decision included, is saved with the module.
+    A labelled trace becomes a reference in the space of its fold; the oldest reference leaves
+    first, whatever its label. The rule is updated with each outcome. Encoder and novelty gate stay
+    as they are. All state, the pending decision included, is saved with the module.
 
     Parameters
     ----------
@@ -198,8 +198,8 @@ class DecisionModule(nn.Module):
     def settle(self) -> bool:
         """Settle a pending accept: the next part comes, and nothing was reported.
 
-        With `stops_all` the part is learned as good, else it counts as silent. Returns whether it was
-        learned. Other pending decisions stay.
+        With `stops_all` the part is learned as good, else it counts as silent. Returns whether it
+        was learned. Other pending decisions stay.
         """
         if self.pending_action != 1:
             return False
@@ -240,7 +240,7 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Return why every part is verified at present: a position in `SAFE_MODES`, 0 for no reason."""
+        """Return why every part is verified at present, as a position in `SAFE_MODES`."""
         safe_mode: int = self.decider.predictor.neighbours.rule.safe_mode()
         return safe_mode
 
@@ -277,8 +277,8 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Update the rule with an outcome, and make the trace with embedding z (K, d) a reference.
 
-        Its outcome was asked for with probability 1 if the model was not certain, with the audit rate
-        if it was audited, and not at all (0) if it went on.
+        Its outcome was asked for with probability 1 if the model was not certain, with the audit
+        rate if it was audited, and not at all (0) if it went on.
         """
         inclusion_probability = 0.0
         if action == 0:

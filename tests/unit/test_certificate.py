@@ -104,7 +104,7 @@ def test_the_mean_capital_is_one_at_the_tolerance_and_less_above_it(n: int, q: f
 )
 def test_what_is_known_of_accepted_parts(stops: str, audit_rate: float, seen: dict[str, int], known) -> None:
     found = certificate(stops, audit_rate, **seen).accepted
-    assert (found.n, found.n_looked_at, found.n_bad, found.propensity) == known
+    assert (found.n, found.n_with_outcome, found.n_bad, found.propensity) == known
     assert found.upper == failure_bound(found.n, found.n_bad, found.alpha, found.propensity)
 
 
@@ -121,7 +121,7 @@ def test_by_prices_it_says_what_was_saved_at_least_and_nothing_where_that_is_not
 
 def test_one_sentence_says_what_was_kept_or_what_audits_tell_which_alone_know_of_rejected_parts() -> None:
     found = certificate("all", 0.1, rejected=3600, audited_rejects=400, audited_rejects_good=2).rejected
-    assert (found.n, found.n_looked_at, found.n_bad, certificate("all", rejected=9).rejected.upper) == (4000, 400, 2, 1.0)
+    assert (found.n, found.n_with_outcome, found.n_bad, certificate("all", rejected=9).rejected.upper) == (4000, 400, 2, 1.0)
     end = " were bad on average, with 95 % confidence, however often one looks; the tolerance is 5 %."
     kept = certificate("all", accepted=1203, false_accepts=24)
     assert kept.kept
