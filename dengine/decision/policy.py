@@ -116,8 +116,8 @@ class Policy:
         if claims_members and self.stops == "some" and self.audited_share == 0.0:
             raise SettingError(
                 f"Expected audits, or stops='all', beside the {self.guarantee} guarantee, which "
-                "can claim nothing of parts that nobody hears of; set audit_rate=0.1, or stops='all' "
-                "where every bad accepted part stops the system."
+                "can claim nothing of parts that nobody hears of; set audit_rate=0.1, or "
+                "stops='all' where every bad accepted part stops the system."
             )
 
     def _checked_windows(self) -> tuple[ForceLimits, ...]:

@@ -165,7 +165,8 @@ class Corrections:
             )
         self._make_ready()
         # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.
-        asked = policy.guarantee in SORTING_GUARANTEES and policy.inclusion_probability != now.recipe.policy.inclusion_probability
+        before = now.recipe.policy.inclusion_probability
+        asked = policy.guarantee in SORTING_GUARANTEES and policy.inclusion_probability != before
         anew = not own and (asked or any(name in new for name in SCORING))
         since = 0 if live.answering is None else live.next_version
         evidence = (
