@@ -67,15 +67,15 @@ def history(store: str, events: bool, **asked: Any) -> None:
     is what they say of the success rate, v the model's version, and label what the part turned out to be. `dengine explain`
     says more of one.
     """
-    from ..history.status import beside
     from ..history.status import history as read
+    from ..history.status import read_retrains_and_events
     from ..representation import to_jsonable
     from ..store.opening import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
         found = list(read(opened, **asked))
         since = asked["since"] if asked["since"] is not None or not found else found[0].time
-        others = beside(opened, since, asked["until"]) if events else {}
+        others = read_retrains_and_events(opened, since, asked["until"]) if events else {}
     record = {"store": store, "decisions": [to_jsonable(past) | {"label": past.label} for past in found]} | others
     tell(record, _table(merge(*others.values(), found, key=lambda each: each.time)))
 
@@ -171,7 +171,7 @@ def _rows(found: Explanation) -> Iterator[tuple[str, str]]:
     yield "decided", f"{when(past.time)}, by " + (f"version {version}" if version else "no model")
     if past.decision.part is not None:
         yield "part", past.decision.part
-    yield from (("" if i else "why", sentence) for i, sentence in enumerate(found.said))
+    yield from (("" if i else "why", sentence) for i, sentence in enumerate(found.sentences))
     yield from (("" if i else "found again", note) for i, note in enumerate(found.notes))
     if band is None:
         yield "envelope", "too few successes of this shape are known yet"

@@ -12,7 +12,7 @@ from .options import verb
 from .output import certificate_record, duration, facts, heading, listed, rows_of, tell, when, written
 
 if TYPE_CHECKING:
-    from ..history.status import Judged, Span, Status
+    from ..history.status import ErrorEstimate, Span, Status
 
 WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
 # Parts of the shadow mode are no audits, though they have their reason.
@@ -87,17 +87,17 @@ def _of_span(name: str, span: "Span") -> str:
         return when(value)
     if name == "bad_accepts" and not span.accepted:
         return "none was accepted"
-    if name == "would_accept" and value.known and span.bad_accepts.by == value.by:
+    if name == "would_accept" and value.n_known and span.bad_accepts.basis == value.basis:
         return "as bad accepts, below"  # the same parts
     stops = span.false_accepts if name == "bad_accepts" else 0
     return _held(value, stops) if hasattr(value, "verdict") else written(name, value)
 
 
-def _held(said: "Judged", stops: int) -> str:
+def _held(said: "ErrorEstimate", stops: int) -> str:
     """An interval of the share of wrong ones, held against what is tolerated; first the stops that no share tells."""
-    first = f"{stops:,} stop{'s' * (stops > 1)}; " if stops and said.by != "every outcome" else ""
-    if not said.known and said.verdict == "open":
+    first = f"{stops:,} stop{'s' * (stops > 1)}; " if stops and said.basis != "every outcome" else ""
+    if not said.n_known and said.verdict == "open":
         return first + ("else unknown" if stops else "none is known")
     between = f"{100 * said.lower:.1f} to {percent(said.upper)}"
-    by = f"{said.wrong:,} of {said.known:,} by {said.by}: " if said.known else ""
+    by = f"{said.n_wrong:,} of {said.n_known:,} by {said.basis}: " if said.n_known else ""
     return f"{first}{by}{between}, {WORDS[said.verdict]} {percent(said.tolerance, 'g')}"

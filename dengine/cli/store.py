@@ -71,10 +71,10 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
     wrong is put right by `dengine correct`.
     """
     from ..engine.corrections import Changed
-    from ..history.explain import of_part
+    from ..history.explain import find_decision_id
 
     def change(engine: DataEngine) -> Changed:
-        id_ = of_part(engine.store, part)
+        id_ = find_decision_id(engine.store, part)
         if (known := engine.find(id_)) is not None and known.success is LABELS[label]:
             return Changed("report", f"Decision {id_} was {label} already; nothing changed.", None, engine.version)
         engine.report(id_, LABELS[label])
@@ -94,9 +94,12 @@ def correct(store: str, part: str, label: str, author: str, allow_import: bool) 
     The part is named as for `dengine report`; from now on its decision counts so. The label as it was reported stays
     in the store, and so does what was decided; the correction is a later row. A forgotten label counts again by it.
     """
-    from ..history.explain import of_part
+    from ..history.explain import find_decision_id
 
-    _changed(store, author, allow_import, lambda engine: engine.correct(of_part(engine.store, part), LABELS[label], author))
+    def correct(engine: DataEngine) -> Changed:
+        return engine.correct(find_decision_id(engine.store, part), LABELS[label], author)
+
+    _changed(store, author, allow_import, correct)
 
 
 @verb("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")

@@ -394,7 +394,7 @@ def _draw_bound(axes: Axes, bound: Bound | None) -> None:
         axes.plot([bound.n_success / n], [0.0], "o", color=BLACK, label=f"{bound.n_success} of {n}")
     text = f"bound: {bound.lower:.3f} to {bound.upper:.3f}"
     axes.plot([bound.lower, bound.upper], [0.0, 0.0], color=BLACK, linewidth=3.0, alpha=0.7, label=text)
-    for at, colour, name in ((bound.accept_at, GOOD, "accept from"), (bound.reject_at, BAD, "reject up to")):
+    for at, colour, name in ((bound.accept_threshold, GOOD, "accept from"), (bound.reject_threshold, BAD, "reject up to")):
         if at is not None:
             axes.axvline(at, color=colour, linestyle=":", linewidth=1.5, label=f"{name} {at:.3g}")
     finish(axes, legend=2)

@@ -1,1 +1,1 @@
-"""What a store tells of the past: how the cell is doing, what was decided, and why."""
+"""The past of an engine, read from its store: its status, its decisions, and why they were made."""

@@ -1,10 +1,12 @@
-"""Why a decision came out as it did: its evidence as it was recorded, and what can be found again around it.
+"""Explains why a decision came out as it did, from what its store keeps.
 
-    for sentence in explain(store, "0123456789ab-412").said: ...
+    for sentence in explain(store, "0123456789ab-412").sentences: ...
 
-What was recorded (counts, bound, action, reason) is shown as it is. Neighbours, the novelty score and the levels of a
-guarantee are found again, without a reducer, by the version that answered, where the store keeps it. A store keeps each
-version's references, each trace's place, and the time of each label.
+Counts, bounds, action and reason are shown as they were recorded. The neighbours, the novelty
+scores and the thresholds of a guarantee were not recorded: they are computed again from the version
+that decided, if the store keeps its state. That needs no reducer, since the store has each
+version's references, the embedding of each trace, and the time of each label. `DataEngine.explain`,
+`dengine explain` and the web page use this.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -32,7 +34,14 @@ from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, Source, TraceSpec, stored_trace_spec
 from ..representation import to_html
-from ..store.records import SAFE_MODE_BEGAN, ModelVersion, OutcomeRecord, StoredDecision, VersionError, unknown_decision
+from ..store.records import (
+    SAFE_MODE_BEGAN,
+    ModelVersion,
+    OutcomeRecord,
+    StoredDecision,
+    VersionError,
+    unknown_decision,
+)
 from ..store.rule_progress import read_rule_progress
 from ..store.views import HistoryFilter, PastLabel
 from ..traces import LARGEST, ForceLimitsGate
@@ -40,66 +49,114 @@ from ..traces import LARGEST, ForceLimitsGate
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
-STRIDE = 100_000  # labels after a version at most that are read: a cell that never retrains again
-Levels = tuple[float, float]  # accepted where lower >= the first, rejected where 1 - upper >= the second
+MAX_LABELS = 100_000  # read after a version at most, for a cell that never retrains again
+# accepted where lower >= the first, rejected where 1 - upper >= the second
+Thresholds = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Answering:
-    """A version as it stood at a moment.
+class PastVersion:
+    """A model version as it was at a moment in the past.
 
-    index : its references.  behind : the label of each, in the order of its places; None where it is not known.
-    levels : that a bound had to reach, None where that is not kept.  last_seq : the newest label that it could know.
-    novelty : of the trace that it found novel, None for any other.
+    Attributes
+    ----------
+    index : RadiusIndex
+        Its references.
+    labels : list of PastLabel or None
+        The label of each reference, in the order of the index; None if it is unknown.
+    thresholds : (float, float) or None
+        That a decision's bounds had to reach; None if they are not kept.
+    last_seq : int
+        Number of the newest label that it could know.
+    novelty : Novelty or None
+        Of the trace that it found novel; None for any other.
     """
 
     index: RadiusIndex
-    behind: list[PastLabel | None]
-    levels: Levels | None
+    labels: list[PastLabel | None]
+    thresholds: Thresholds | None
     last_seq: int
     novelty: Novelty | None
 
 
-def as_it_stood(store: SqlStore, version: int, recipe: Recipe, then: StoredDecision | None) -> Answering | None:
-    """A version as it stood when a decision was made, or as it stands now; None where the store does not keep it."""
+def load_past_version(
+    store: SqlStore, version: int, recipe: Recipe, item: StoredDecision | None
+) -> PastVersion | None:
+    """Load a model version as it was when a decision was made.
+
+    Parameters
+    ----------
+    store : SqlStore
+    version : int
+    recipe : Recipe
+        Of that moment.
+    item : StoredDecision or None
+        The decision, with its trace; None: the version as it is now.
+
+    Returns
+    -------
+    PastVersion or None
+        None if the store does not keep the version's references.
+    """
     try:
         stored = store.load_version(version)
     except VersionError:
         return None
-    if "points" not in stored.state:  # a baseline keeps nothing
+    if "points" not in stored.state:  # a baseline keeps no references
         return None
-    reports = ((each.report, each.last_seq) for each in store.versions(cell_only=True))
-    retrains = [last_seq for report, last_seq in reports if report.accepted and report.version > version]
-    upto = min([*retrains[:1], stored.last_seq + STRIDE])
-    later = store.past_labels(stored.last_seq, upto)
-    if then is not None:
-        later = [label for label in later if _known_at(label, then, recipe.policy.stops == "all")]
+    later_retrains = [
+        retrain.last_seq
+        for retrain in store.versions(cell_only=True)
+        if retrain.report.accepted and retrain.report.version > version
+    ]
+    last = min([*later_retrains[:1], stored.last_seq + MAX_LABELS])
+    later = store.past_labels(stored.last_seq, last)
+    if item is not None:
+        stops_all = recipe.policy.stops == "all"
+        later = [label for label in later if _was_known(label, item, stops_all)]
     before = store.past_labels(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
-    known = {label.seq: label for label in (*before, *later) if not label.quarantined}
-    last = max(known, default=stored.last_seq)
-    index = _index(stored, [label for label in later if label.model_version == version], recipe)
-    behind = [known.get(number) for number in index.held("numbers").tolist()]
-    return Answering(index, behind, _levels(stored, later, recipe.policy), last, _novelty(stored, then))
+    by_number = {label.seq: label for label in (*before, *later) if not label.quarantined}
+    added = [label for label in later if label.model_version == version]
+    index = _restore_index(stored, added, recipe)
+    return PastVersion(
+        index=index,
+        labels=[by_number.get(number) for number in index.held("numbers").tolist()],
+        thresholds=_restore_thresholds(stored, later, recipe.policy),
+        last_seq=max(by_number, default=stored.last_seq),
+        novelty=_score_novelty(stored, item),
+    )
 
 
-def _known_at(label: PastLabel, then: StoredDecision, stops_all: bool) -> bool:
-    """Whether an engine knew of a label when it made a decision: silence confirms a part before it is stored."""
-    by_silence = stops_all and label.source is Source.CONFIRMED
-    return label.decided < then.time if by_silence else label.time <= then.time and label.decision_id != then.decision.id
+def _was_known(label: PastLabel, item: StoredDecision, stops_all: bool) -> bool:
+    """Return whether the engine knew a label when it made a decision.
+
+    Under `stops="all"` silence confirms a part before its label is stored.
+    """
+    if stops_all and label.source is Source.CONFIRMED:
+        return label.decided < item.time
+    return label.time <= item.time and label.decision_id != item.decision.id
 
 
-def _index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
-    n, total, spaces = stored.state["points"].shape[1], int(stored.state["total"]), len(stored.state["scale"])
-    index = RadiusIndex.from_state(stored.state, n if total > n else max(n, recipe.window))
+def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
+    """Return the index of a stored version's references, with those that were added later."""
+    n = stored.state["points"].shape[1]
+    spaces = len(stored.state["scale"])
+    is_full = int(stored.state["total"]) > n
+    index = RadiusIndex.from_state(stored.state, n if is_full else max(n, recipe.window))
     for label in added:
         if label.point is not None:
             fold = int(fold_of(np.array([label.content_hash], dtype=np.int64), spaces)[0])
-            index.keep(torch.from_numpy(label.point), float(label.success), fold, label.content_hash, label.seq)
+            point = torch.from_numpy(label.point)
+            index.keep(point, float(label.success), fold, label.content_hash, label.seq)
     return index
 
 
-def _novelty(stored: ModelVersion, then: StoredDecision | None) -> Novelty | None:
-    if then is None or then.decision.reason is not Reason.NOVEL:
+def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty | None:
+    """Return the novelty scores of a decision that was novel, by its version's gate.
+
+    None for any other.
+    """
+    if item is None or item.decision.reason is not Reason.NOVEL:
         return None
     gate = NoveltyGate(*(int(n) for n in stored.state["trace_shape"]))
     gate.asleep = False
@@ -108,67 +165,108 @@ def _novelty(stored: ModelVersion, then: StoredDecision | None) -> Novelty | Non
     except StoreError:  # the gate of another version of dengine
         return None
     with torch.inference_mode():
-        return Novelty(*gate.scores(torch.from_numpy(then.trace)).tolist())
+        return Novelty(*gate.scores(torch.from_numpy(item.trace)).tolist())
 
 
-def _restored(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
-    """The rule as a version has it; None where it is another one than the policy's, or had missed something."""
+def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
+    """Return the rule in a version's state.
+
+    None if it is not the policy's rule, or was stale when stored.
+    """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
-        return None  # nothing is imported because a store says so; an engine that runs here has imported it
+        # nothing is imported because a store names it; a running engine has imported it
+        return None
     rule = policy.rule()
     try:
         restore(rule, arrays_with_prefix(stored.state, "rule."))
-    except StoreError:  # the rule was another one, handed in with its model, or had missed something
+    except StoreError:
         return None
     return rule
 
 
-def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Levels | None:
-    if (policy.guarantee, policy.stops) == ("local", "some") and not arrays_with_prefix(stored.state, "rule."):
+def _restore_thresholds(
+    stored: ModelVersion, later: list[PastLabel], policy: Policy
+) -> Thresholds | None:
+    """Return the thresholds of a version's rule after it was updated with later labels.
+
+    None if they are not kept.
+    """
+    has_state = bool(arrays_with_prefix(stored.state, "rule."))
+    if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
         return policy.lower_bound, policy.lower_bound  # the paper's rule learns nothing
-    if (rule := _restored(stored, policy)) is None or not isinstance(rule, MemberRule):
+    rule = _restore_rule(stored, policy)
+    if not isinstance(rule, MemberRule):
         return None
-    for label in told:
+    for label in later:
         if not label.quarantined and label.source is not Source.INSPECTION:
             _update(rule, label)
     return float(rule.evidence.thresholds[0]), float(rule.evidence.thresholds[1])
 
 
-def rule_now(store: SqlStore, policy: Policy) -> DecisionRule | None:
-    """The rule as it stands now; None before the first version, and where it is not kept."""
-    stored, settings = store.last_version(), store.settings()
-    if stored is None or (rule := _restored(stored, policy)) is None:
+def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
+    """Return the decision rule as it is now, updated with all stored outcomes.
+
+    Parameters
+    ----------
+    store : SqlStore
+    policy : Policy
+
+    Returns
+    -------
+    DecisionRule or None
+        None before the first version, and if the rule's state is not kept.
+    """
+    stored = store.last_version()
+    settings = store.settings()
+    if stored is None or (rule := _restore_rule(stored, policy)) is None:
         return None
-    since, began_in, policy_since = (int(settings.get(name, 0)) for name in ("told_since", "began_in", "policy_since"))
-    past = read_rule_progress(store, stored, since, policy.label_within, policy_since)
-    if not past.last_seq:  # as an engine that is opened
+    since = int(settings.get("told_since", 0))
+    began_in = int(settings.get("began_in", 0))
+    policy_since = int(settings.get("policy_since", 0))
+    progress = read_rule_progress(store, stored, since, policy.label_within, policy_since)
+    if not progress.last_seq:  # rebuilt from all outcomes, as when an engine is opened
         rule = rule.clone()
         rule.start_in_safe_mode(began_in)
-    for evidence in store.outcomes_since(past.last_seq, since, past.overdue_to):
-        _update(rule, evidence)
+    for outcome in store.outcomes_since(progress.last_seq, since, progress.overdue_to):
+        _update(rule, outcome)
     return rule
 
 
 def _update(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
-    """Update a rule with what became of a part."""
+    """Update a rule with the outcome of one part."""
     rule.observe(outcome.silent, outcome.novel)
-    rule.update(outcome.lower, outcome.upper, outcome.success, outcome.predicted, outcome.inclusion_probability)
+    rule.update(
+        outcome.lower,
+        outcome.upper,
+        outcome.success,
+        outcome.predicted,
+        outcome.inclusion_probability,
+    )
 
 
-# The envelope: a picture for people, not a test. One sample in twenty of an ordinary success lies outside, by its making.
+# The envelope is a picture for people and no test: one sample in twenty of an ordinary success lies
+# outside, by construction.
 
-CENTRAL = 0.95  # of the successes, at each sample, that the band holds
-FEWEST = 20  # successes: the band of fewer is what the outermost of them happen to be
-NARROWEST = 0.05  # of a channel's median width: where all successes agree, the noise of a sensor is no excess of a hundred
-SUCCESSES = 1000  # newest labelled traces that it is made of
+CENTRAL = 0.95  # share of the successes that the band contains at each sample
+MIN_SUCCESSES = 20  # the band of fewer would be their outermost values
+MIN_WIDTH = 0.05  # of a channel's median width: where all successes agree, noise is no large excess
+MAX_SUCCESSES = 1000  # newest labelled traces of which the band is made
 
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """A piece of one channel that lies outside on one side.
+    """A piece of one channel of a trace that lies outside the envelope, on one side.
 
-    from_s, to_s : times in seconds of its first and its last sample.  above : whether it lies above the band.
-    widths : the largest distance from the band, in widths that the band has there.
+    Attributes
+    ----------
+    channel : int
+        From 0.
+    from_s, to_s : float
+        Times of its first and last sample, in seconds.
+    above : bool
+        Whether it lies above the band.
+    widths : float
+        Largest distance from the band, in widths of the band there.
     """
 
     channel: int
@@ -180,12 +278,22 @@ class Excess:
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """The band of the known successes, and where one trace leaves it.
+    """The band in which known successes lie, and where one trace leaves it.
 
-    n : successes.  low, median, high : (C, T), the band's edges and its middle, in the trace's unit.
-    outside : share of the trace's samples that lie outside.  usual : below which that share lies for 95 % of the successes.
-    not_finite : samples of the trace that are NaN or infinite, and lie nowhere.
-    excesses : where it leaves the band, the farthest first.
+    Attributes
+    ----------
+    n : int
+        Number of successes.
+    low, median, high : array of float32, shape (C, T)
+        The band's lower edge, middle and upper edge, in the trace's unit.
+    outside : float
+        Share of the trace's samples that lie outside.
+    usual : float
+        95 % of the successes have a smaller share outside.
+    not_finite : int
+        Samples of the trace that are NaN or infinite; they count neither way.
+    excesses : tuple of Excess
+        Where the trace leaves the band, the largest first.
     """
 
     n: int
@@ -198,49 +306,73 @@ class Envelope:
     excesses: tuple[Excess, ...]
 
 
-def envelope_of(successes: NDArray[np.float32], trace: NDArray[np.float32], rate_hz: float) -> Envelope | None:
-    """The band of successes (n, C, T) and where a trace (C, T) leaves it; None: they are too few, or of another shape."""
-    if len(successes) < FEWEST or successes.shape[1:] != trace.shape:
+def envelope_of(
+    successes: NDArray[np.float32], trace: NDArray[np.float32], rate_hz: float
+) -> Envelope | None:
+    """Compute the envelope of successes, and where a trace leaves it.
+
+    Parameters
+    ----------
+    successes : array of float32, shape (n, C, T)
+    trace : array of float32, shape (C, T)
+    rate_hz : float
+        Sampling rate.
+
+    Returns
+    -------
+    Envelope or None
+        None for fewer than 20 successes, or another shape.
+    """
+    if len(successes) < MIN_SUCCESSES or successes.shape[1:] != trace.shape:
         return None
     tail = (1.0 - CENTRAL) / 2.0
     low, median, high = np.quantile(successes, (tail, 0.5, 1.0 - tail), axis=0).astype(np.float32)
     finite = np.isfinite(trace)
     width = (high - low).astype(np.float64)
-    width = np.maximum(width, NARROWEST * np.median(width, axis=1, keepdims=True) + 1e-9)
+    width = np.maximum(width, MIN_WIDTH * np.median(width, axis=1, keepdims=True) + 1e-9)
     x = np.where(finite, trace, low).astype(np.float64)
-    beyond = np.where(x > high, (x - high) / width, np.where(x < low, (x - low) / width, 0.0))  # (C, T) in widths
+    below = np.where(x < low, (x - low) / width, 0.0)
+    excess = np.where(x > high, (x - high) / width, below)  # (C, T), in widths
     return Envelope(
         n=len(successes),
         low=low,
         median=median,
         high=high,
-        outside=float((beyond != 0.0).sum() / max(1, finite.sum())),
+        outside=float((excess != 0.0).sum() / max(1, finite.sum())),
         usual=float(np.quantile(((successes < low) | (successes > high)).mean(axis=(1, 2)), 0.95)),
         not_finite=int((~finite).sum()),
-        excesses=tuple(sorted(_excesses(beyond, rate_hz), key=lambda each: -each.widths)),
+        excesses=tuple(sorted(_find_excesses(excess, rate_hz), key=lambda piece: -piece.widths)),
     )
 
 
-def _excesses(beyond: NDArray[np.float64], rate_hz: float) -> Iterator[Excess]:
-    for channel, row in enumerate(beyond):
+def _find_excesses(excess: NDArray[np.float64], rate_hz: float) -> Iterator[Excess]:
+    """Yield the pieces in which the signed excess (C, T) has one sign, channel by channel."""
+    for channel, row in enumerate(excess):
         side = np.sign(row)
-        edges = np.flatnonzero(np.diff(side, prepend=0.0, append=0.0))  # where a piece of one side begins or ends
+        # where a piece begins or ends
+        edges = np.flatnonzero(np.diff(side, prepend=0.0, append=0.0))
         for first, end in pairwise(edges.tolist()):
             if side[first]:
-                widest = float(np.abs(row[first:end]).max())
-                yield Excess(channel, first / rate_hz, (end - 1) / rate_hz, bool(side[first] > 0), widest)
+                widths = float(np.abs(row[first:end]).max())
+                above = bool(side[first] > 0)
+                yield Excess(channel, first / rate_hz, (end - 1) / rate_hz, above, widths)
 
 
 # The evidence of one decision
 
-MOST = 20_000  # more labels in a ball than that are not thought of
+MAX_NEEDED = 20_000  # more labels within the radius than that are not considered
 BOUNDED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
 DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "verified"}
 
 
 @dataclass(frozen=True, slots=True)
 class Novelty:
-    """Squared distance to the nearest reference over its limit, in level, texture, distortion, gaps: above 1 is novel."""
+    """How novel a trace was, in four respects.
+
+    Squared distance to the nearest reference over its limit.
+
+    Above 1 is novel.
+    """
 
     level: float
     texture: float
@@ -254,203 +386,348 @@ class Novelty:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """A bound, and what it was held against.
+    """The bounds of a decision and the thresholds that they had to reach.
 
-    n_success, n_failure, lower, upper : as recorded.
-    accept_at, reject_at : accepted where lower >= accept_at, rejected where upper <= reject_at; None where nothing was
-        let pass on that side, or where it is not known.
-    level : what set these two, in words.
-    successes_needed, failures_needed : more labels of this kind, and none of the other, that would have been accepted, or
-        rejected; 0 where it was; None where no number would do.
+    Attributes
+    ----------
+    n_success, n_failure : int
+        Labels within the radius, as recorded.
+    lower, upper : float
+        Bounds of the success rate, as recorded.
+    accept_threshold : float or None
+        Accepted where lower >= accept_threshold. None if nothing could be accepted, or unknown.
+    reject_threshold : float or None
+        Rejected where upper <= reject_threshold. None if nothing could be rejected, or unknown.
+    origin : str
+        Where the thresholds come from, in words.
+    successes_needed : int or None
+        So many more successes within the radius, and no failure, would have made it accepted; 0 if
+        it reached the threshold, None if no number would do.
+    failures_needed : int or None
+        The same of failures, for a reject.
     """
 
     n_success: int
     n_failure: int
     lower: float
     upper: float
-    accept_at: float | None
-    reject_at: float | None
-    level: str
+    accept_threshold: float | None
+    reject_threshold: float | None
+    origin: str
     successes_needed: int | None
     failures_needed: int | None
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What a decision is explained by: its engine's settings, and what is known of that moment.
+    """What a decision is explained by: the engine's settings and state at that moment.
 
-    recipe : with the policy of that moment.
-    spec : the traces' contract.  model : what a model that was handed in is called.
-    levels : that a bound had to reach, None where that is not kept.  novelty : as in `Explanation`.
-    safe_mode : why everything was verified, "" where it was not.
+    Attributes
+    ----------
+    recipe : Recipe
+        With the policy of that moment.
+    spec : TraceSpec
+    model : str or None
+        Name of a model that was handed in.
+    seed : int
+        Of the engine.
+    thresholds : (float, float) or None
+        As in `PastVersion`; None if they are not kept.
+    novelty : Novelty or None
+        As in `Explanation`.
+    safe_mode : str
+        Why everything was verified; "" outside safe mode.
     """
 
     recipe: Recipe
     spec: TraceSpec
     model: str | None = None
     seed: int = 0
-    levels: Levels | None = None
+    thresholds: Thresholds | None = None
     novelty: Novelty | None = None
     safe_mode: str = ""
 
     @property
     def baseline(self) -> str:
-        """The name of a model that counts and decides by its own, "" where the recipe says how."""
-        return self.model if self.model is not None and self.levels is None else ""
+        """Name of a model that counts and decides by its own method; "" if the recipe says how."""
+        return self.model if self.model is not None and self.thresholds is None else ""
 
 
-def bound_of(made: Decision, found: Circumstances) -> Bound | None:
-    """How a decision's bound came out; None where none was asked for: of bad and novel traces, and before any model."""
-    if made.reason not in BOUNDED or _was_lost(made):
+def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
+    """Return a decision's bounds with their thresholds and what more evidence it would have needed.
+
+    Returns None if no bound was computed: for faulty and novel traces, and before the first model.
+    """
+    if decision.reason not in BOUNDED or _was_lost(decision):
         return None
-    accept_at, reject_at, level = _thresholds(found)
-    needed = [_needed(found.recipe.policy, made, at, success) for at, success in ((accept_at, 1), (reject_at, 0))]
-    return Bound(made.n_success, made.n_failure, made.lower, made.upper, accept_at, reject_at, level, *needed)
+    policy = circumstances.recipe.policy
+    accept_threshold, reject_threshold, origin = _find_thresholds(circumstances)
+    return Bound(
+        n_success=decision.n_success,
+        n_failure=decision.n_failure,
+        lower=decision.lower,
+        upper=decision.upper,
+        accept_threshold=accept_threshold,
+        reject_threshold=reject_threshold,
+        origin=origin,
+        successes_needed=_count_needed(policy, decision, accept_threshold, 1),
+        failures_needed=_count_needed(policy, decision, reject_threshold, 0),
+    )
 
 
-def _was_lost(made: Decision) -> bool:
-    """Whether the row was made from a stop whose decision was lost: an accept on no evidence."""
-    return (made.reason, made.action, made.lower, made.upper) == (Reason.CERTAIN, Action.ACCEPT, 0.0, 1.0)
+def _was_lost(decision: Decision) -> bool:
+    """Return whether a decision was lost and recorded again from a line stop.
+
+    An accept without evidence.
+    """
+    fields = (decision.reason, decision.action, decision.lower, decision.upper)
+    return fields == (Reason.CERTAIN, Action.ACCEPT, 0.0, 1.0)
 
 
-def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
-    policy = found.recipe.policy
-    if found.baseline or policy.guarantee not in RULES:
-        return None, None, f"{found.baseline or policy.guarantee} decides by its own rule"
-    if policy.guarantee == "local" and not found.safe_mode:
-        return policy.lower_bound, 1.0 - policy.lower_bound, "LB, of the ball around the part"
-    if found.levels is None:
-        return None, None, "the levels that held then are not kept"
-    accept_at, reject_at = found.levels
-    held = "the lowest level that held then" if policy.guarantee in SORTING_GUARANTEES else "what held in safe mode"
-    return accept_at if accept_at < CLOSED else None, 1.0 - reject_at if reject_at < CLOSED else None, held
+def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float | None, str]:
+    """Return accept threshold (of lower), reject threshold (of upper), and their origin in words.
+
+    A threshold is None if it is unknown, or if nothing could pass on that side.
+    """
+    policy = circumstances.recipe.policy
+    if circumstances.baseline or policy.guarantee not in RULES:
+        return None, None, f"{circumstances.baseline or policy.guarantee} decides by its own rule"
+    if policy.guarantee == "local" and not circumstances.safe_mode:
+        return policy.lower_bound, 1.0 - policy.lower_bound, "LB, of the neighbourhood of the part"
+    if circumstances.thresholds is None:
+        return None, None, "the thresholds of that time are not kept"
+    accept_score, reject_score = circumstances.thresholds
+    sorts = policy.guarantee in SORTING_GUARANTEES
+    origin = "the lowest level that held then" if sorts else "what held in safe mode"
+    accept_threshold = accept_score if accept_score < CLOSED else None
+    reject_threshold = 1.0 - reject_score if reject_score < CLOSED else None
+    return accept_threshold, reject_threshold, origin
 
 
-def is_score(policy: Policy, made: Decision) -> bool:
-    """Whether a decision was sorted by its heads' score, and not by an interval."""
-    return policy.guarantee in SORTING_GUARANTEES and made.lower == made.upper
+def is_score(policy: Policy, decision: Decision) -> bool:
+    """Return whether a decision's `lower` and `upper` are one score of the heads, no interval."""
+    return policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper
 
 
-def _needed(policy: Policy, made: Decision, threshold: float | None, success: int) -> int | None:
+def _count_needed(
+    policy: Policy, decision: Decision, threshold: float | None, success: int
+) -> int | None:
+    """Return how many more labels of one kind (1 or 0) would have reached a threshold.
+
+    None if no number would.
+    """
     if threshold is None:
         return None
-    more = np.arange(MOST + 1)
-    if is_score(policy, made):  # no count changes it
-        return 0 if (made.lower >= threshold if success else made.upper <= threshold) else None
-    counts = made.n_success + success * more, made.n_failure + (1 - success) * more
-    lower, upper = policy.bound(*counts)
+    if is_score(policy, decision):  # it does not depend on counts
+        is_reached = decision.lower >= threshold if success else decision.upper <= threshold
+        return 0 if is_reached else None
+    more = np.arange(MAX_NEEDED + 1)
+    n_success = decision.n_success + success * more
+    n_failure = decision.n_failure + (1 - success) * more
+    lower, upper = policy.bound(n_success, n_failure)
     enough = np.flatnonzero(lower >= threshold if success else upper <= threshold)
     return int(enough[0]) if len(enough) else None
 
 
-def _verdict(past: StoredDecision, bound: Bound | None, found: Circumstances) -> Iterator[str]:
-    made = past.decision
-    lost = ": the row was made from a stop whose decision was lost; on what evidence is not known."
-    yield DID[made.action].capitalize() + (lost if _was_lost(made) else WHY[made.reason](made, past.trace, found))
+def _explain_in_words(
+    item: StoredDecision, bound: Bound | None, circumstances: Circumstances
+) -> Iterator[str]:
+    """Yield the sentences that explain a decision: its reason, its bounds, its outcome."""
+    decision = item.decision
+    reason = (
+        ": the row was made from a stop whose decision was lost; on what evidence is not known."
+    )
+    if not _was_lost(decision):
+        reason = WHY[decision.reason](decision, item.trace, circumstances)
+    yield DID[decision.action].capitalize() + reason
     if bound is not None:
-        yield from _bound_sentences(made, bound, found)
-    source = "" if past.source is None else f" ({past.source.value})"
-    known = past.success is not None
-    yield f"The part turned out {past.label}{source}." if known else "Nothing was reported of the part."
+        yield from _bound_sentences(decision, bound, circumstances)
+    if item.success is None:
+        yield "Nothing was reported of the part."
+    else:
+        source = "" if item.source is None else f" ({item.source.value})"
+        yield f"The part turned out {item.label}{source}."
 
 
-def _audit(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    (coin,) = toss(content_hash(trace[None]), audit_salt(found.seed)).tolist()
-    coin_fell = f"The audits' coin fell on {coin / 2**COIN_BITS:.4f}, below the audit rate {made.propensity:g}"
-    alone = f" as an audit: the model alone would have {DID[made.predicted]} it"
+def _explain_audit(
+    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
+) -> str:
+    """Return the reason in words for an audit, with the value of its coin."""
+    (coin,) = toss(content_hash(trace[None]), audit_salt(circumstances.seed)).tolist()
+    alone = f" as an audit: the model alone would have {DID[decision.predicted]} it"
+    coin_fell = (
+        f"The audits' coin fell on {coin / 2**COIN_BITS:.4f}, below the audit rate "
+        f"{decision.propensity:g}"
+    )
     return f"{alone}. {coin_fell}; it is a function of the trace and the seed."
 
 
-def _saturated(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    spec = found.spec
-    touching = np.argwhere(np.abs(trace) >= spec.limit) if spec.limit is not None else np.zeros((0, 2))
+def _explain_saturated(
+    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
+) -> str:
+    """Return the reason in words for a saturated trace, with the first sample at the limit."""
+    spec = circumstances.spec
+    touching: NDArray[Any] = np.zeros((0, 2))
+    if spec.limit is not None:
+        touching = np.argwhere(np.abs(trace) >= spec.limit)
     if not len(touching):
         return ": the trace touched the sensor's range."
     channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
     first = f"first after {sample / spec.rate_hz:.3f} s (channel {channel + 1})"
-    return f": {len(touching)} samples touch the sensor's range of {spec.limit:g} {spec.units[channel]}, {first}."
+    return (
+        f": {len(touching)} samples touch the sensor's range of {spec.limit:g} "
+        f"{spec.units[channel]}, {first}."
+    )
 
 
-def _not_finite(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
+def _explain_not_finite(
+    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
+) -> str:
+    """Return the reason in words for a trace with NaN or infinity, with their number."""
     n = int((~np.isfinite(trace)).sum())
-    return f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded too far is."
+    return (
+        f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded "
+        "too far is."
+    )
 
 
-def _outside(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    x, windows = torch.from_numpy(trace), found.recipe.policy.windows
-    left = [str(each) for each in windows if ForceLimitsGate([each], found.spec)(x)]
-    return f": it leaves an operator's window, {' and '.join(left) or 'which is not known'}, whatever the model says."
+def _explain_outside(
+    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
+) -> str:
+    """Return the reason in words for a trace outside an operator's limits, with their names."""
+    x = torch.from_numpy(trace)
+    windows = circumstances.recipe.policy.windows
+    left = [str(limits) for limits in windows if ForceLimitsGate([limits], circumstances.spec)(x)]
+    return (
+        f": it leaves an operator's window, {' and '.join(left) or 'which is not known'}, "
+        "whatever the model says."
+    )
 
 
+# For each reason the rest of the sentence that begins with what was done.
 WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]] = {
     Reason.CERTAIN: lambda *_: ": the bound meets the policy.",
     Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
     Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was.",
-    Reason.AUDIT: _audit,
-    Reason.NOT_FINITE: _not_finite,
-    Reason.CONSTANT: lambda made, trace, found: (
-        f": every sample is {trace.flat[0]:g} {found.spec.units[0]}: a dead sensor."
+    Reason.AUDIT: _explain_audit,
+    Reason.NOT_FINITE: _explain_not_finite,
+    Reason.CONSTANT: lambda decision, trace, circumstances: (
+        f": every sample is {trace.flat[0]:g} {circumstances.spec.units[0]}: a dead sensor."
     ),
-    Reason.SATURATED: _saturated,
-    Reason.TOO_LARGE: lambda made, trace, found: (
-        f": a sample of {np.abs(trace).max():g} {found.spec.units[np.abs(trace).max(axis=1).argmax()]}; beyond "
+    Reason.SATURATED: _explain_saturated,
+    Reason.TOO_LARGE: lambda decision, trace, circumstances: (
+        f": a sample of {np.abs(trace).max():g} "
+        f"{circumstances.spec.units[np.abs(trace).max(axis=1).argmax()]}; beyond "
         f"{LARGEST:g} nothing can be computed from it."
     ),
     Reason.MODEL_ERROR: lambda *_: ": the model raised an error, which the log of that time tells.",
-    Reason.NOVEL: lambda made, trace, found: (
-        f": unlike all that was learned from{'' if found.novelty is None else f': {found.novelty}'}. "
+    Reason.NOVEL: lambda decision, trace, circumstances: (
+        ": unlike all that was learned "
+        f"from{'' if circumstances.novelty is None else f': {circumstances.novelty}'}. "
         "What its neighbours say does not count then."
     ),
-    Reason.SAFE_MODE: lambda made, trace, found: (
-        f" in safe mode, in which every part is: {found.safe_mode or 'its reason is not kept'}."
+    Reason.SAFE_MODE: lambda decision, trace, circumstances: (
+        " in safe mode, in which every part is: "
+        f"{circumstances.safe_mode or 'its reason is not kept'}."
     ),
     Reason.NO_STORE: lambda *_: (
-        ": the cell's disk did not take it then, or could not say whether its id was new, so the model was not asked."
+        ": the cell's disk did not take it then, or could not say whether its id was new, so "
+        "the model was not asked."
     ),
-    Reason.LATE: lambda *_: ": whoever asked could wait no longer, and verified, so the model was not asked.",
-    Reason.OUTSIDE: _outside,
+    Reason.LATE: lambda *_: (
+        ": whoever asked could wait no longer, and verified, so the model was not asked."
+    ),
+    Reason.OUTSIDE: _explain_outside,
 }
 
 
-def _bound_sentences(made: Decision, bound: Bound, found: Circumstances) -> Iterator[str]:
-    n, reach = made.n_success + made.n_failure, f"{made.lower:.3f} to {made.upper:.3f}"
-    if found.baseline:
-        yield f"{found.baseline} gives {made.n_success} successes, {made.n_failure} failures, bound {reach}."
+def _bound_sentences(
+    decision: Decision, bound: Bound, circumstances: Circumstances
+) -> Iterator[str]:
+    """Yield the sentences on a decision's evidence, its bounds, and what it would have needed."""
+    n = decision.n_success + decision.n_failure
+    interval = f"{decision.lower:.3f} to {decision.upper:.3f}"
+    if circumstances.baseline:
+        counts = f"{decision.n_success} successes, {decision.n_failure} failures"
+        yield f"{circumstances.baseline} gives {counts}, bound {interval}."
         return
-    ball, policy = f"within the radius {found.recipe.radius:g}", found.recipe.policy
-    counted = f"{made.n_success} of {n} labels {ball} are successes" if n else f"No label {ball}"
-    name = policy.interval.replace("_", "-").capitalize()
-    if is_score(policy, made):
-        yield f"{counted}; the heads give it {made.lower:.3f}, the mean of what each says of its success."
+    policy = circumstances.recipe.policy
+    within = f"within the radius {circumstances.recipe.radius:g}"
+    counts = (
+        f"{decision.n_success} of {n} labels {within} are successes" if n else f"No label {within}"
+    )
+    if is_score(policy, decision):
+        yield (
+            f"{counts}; the heads give it {decision.lower:.3f}, the mean of what each says "
+            "of its success."
+        )
     else:
+        name = policy.interval.replace("_", "-").capitalize()
         error_level = interval_error_level(policy.alpha, policy.guarantee)
-        yield f"{counted}; {name} at alpha {error_level:g} bounds the success rate by {reach}."
-    if bound.accept_at is None and bound.reject_at is None:
-        why = found.safe_mode or ("" if found.levels is None else "no level of evidence held yet")
-        yield f"Nothing could pass, whatever the bound: {why}." if why else f"What it had to reach: {bound.level}."
+        yield f"{counts}; {name} at alpha {error_level:g} bounds the success rate by {interval}."
+    if bound.accept_threshold is None and bound.reject_threshold is None:
+        why = circumstances.safe_mode
+        if not why and circumstances.thresholds is not None:
+            why = "no level of evidence held yet"
+        yield (
+            f"Nothing could pass, whatever the bound: {why}."
+            if why
+            else f"What it had to reach: {bound.origin}."
+        )
         return
-    good, bad = (MOST + 1 if n is None else n for n in (bound.successes_needed, bound.failures_needed))
-    # Of what is uncertain the nearer of the two is told.
-    if made.predicted is Action.ACCEPT or (made.predicted is Action.VERIFY and good <= bad):
-        must = f"lower must be at least {{:.4g}} ({bound.level}); it is {made.lower:.3f}"
-        yield _side("accept", must, bound.accept_at, bound.successes_needed, ("success", "successes", "failure"))
+    # An uncertain decision is explained by the action that it was nearer to.
+    successes = MAX_NEEDED + 1 if bound.successes_needed is None else bound.successes_needed
+    failures = MAX_NEEDED + 1 if bound.failures_needed is None else bound.failures_needed
+    is_uncertain = decision.predicted is Action.VERIFY
+    if decision.predicted is Action.ACCEPT or (is_uncertain and successes <= failures):
+        condition = f"lower must be at least {{:.4g}} ({bound.origin}); it is {decision.lower:.3f}"
+        kinds = ("success", "successes", "failure")
+        yield _needed_sentence(
+            "accept", condition, bound.accept_threshold, bound.successes_needed, kinds
+        )
     else:
-        must = f"upper must be at most {{:.4g}} ({bound.level}); it is {made.upper:.3f}"
-        yield _side("reject", must, bound.reject_at, bound.failures_needed, ("failure", "failures", "success"))
+        condition = f"upper must be at most {{:.4g}} ({bound.origin}); it is {decision.upper:.3f}"
+        kinds = ("failure", "failures", "success")
+        yield _needed_sentence(
+            "reject", condition, bound.reject_threshold, bound.failures_needed, kinds
+        )
 
 
-def _side(action: str, must: str, threshold: float | None, needed: int | None, kinds: tuple[str, str, str]) -> str:
-    """What one action would have needed; kinds : one label of it, many, and one of the other."""
+def _needed_sentence(
+    action: str,
+    condition: str,
+    threshold: float | None,
+    needed: int | None,
+    kinds: tuple[str, str, str],
+) -> str:
+    """Return the sentence on what one action would have needed.
+
+    `kinds` is the word for one label of the kind that is needed, for several, and for one of the
+    other kind.
+    """
     if threshold is None:
         return f"To {action}: no level held, so nothing could be {action}ed."
-    one, many, other = kinds
-    more = "no number of labels" if needed is None else f"{needed} more {one if needed == 1 else many} and no {other}"
-    return f"To {action}, {must.format(threshold)}" + (", enough." if needed == 0 else f": {more} would do.")
+    if needed == 0:
+        return f"To {action}, {condition.format(threshold)}, enough."
+    one, several, other = kinds
+    more = "no number of labels"
+    if needed is not None:
+        more = f"{needed} more {one if needed == 1 else several} and no {other}"
+    return f"To {action}, {condition.format(threshold)}: {more} would do."
 
 
 @dataclass(frozen=True)
-class Ball:
-    """What lies around a trace: (n,) distances to the references, infinite to those of its own part; a ball's votes."""
+class Neighbourhood:
+    """The references around a trace.
+
+    Attributes
+    ----------
+    distances : array of float64, shape (n,)
+        To every reference; infinite to those of the trace's own part.
+    radius : float
+    n_success, n_failure : int
+        Labels within the radius, counted again.
+    """
 
     distances: NDArray[np.float64]
     radius: float
@@ -462,9 +739,22 @@ class Ball:
 class Neighbour:
     """A reference near the trace.
 
-    decision_id, part : of the trace behind it, None where that is not known any more.  success : its label.
-    source : of that label.  distance : in the unit of the scaled embedding.  space : the fold that it lives in.
-    inside : whether it lies in the ball.  trace : (C, T), None where it is not known any more.
+    Attributes
+    ----------
+    decision_id, part : str or None
+        Of the decision behind it; None if unknown.
+    success : bool
+        Its label.
+    source : Source or None
+        Of the label.
+    distance : float
+        In units of the scaled embedding.
+    space : int
+        The fold in whose embedding it lies.
+    inside : bool
+        Whether it lies within the radius.
+    trace : array of float32, shape (C, T), or None
+        None if unknown.
     """
 
     decision_id: str | None
@@ -481,20 +771,34 @@ class Neighbour:
 class Explanation:
     """A decision and its evidence.
 
-    decision : as it was recorded.  trace : (C, T), as `spec` says.  label : what became of it is in `decision`.
-    said : why, in sentences.  notes : what was found again.
-    bound : how the bound came out, and what others it would have needed; None where no bound was asked for.
-    novelty : how unlike all references a novel trace is; None for any other, and where that is not known any more.
-    neighbours : the nearest references of the version that answered, nearest first; none where it is not kept.
-    radius : of the ball, None where none was drawn.
-    envelope : the band of the known successes; None while there are too few.
-    policy : that was in force when it was made.
+    Attributes
+    ----------
+    decision : StoredDecision
+        As recorded, with its label.
+    trace : array of float32, shape (C, T)
+    spec : TraceSpec
+    sentences : tuple of str
+        Why the decision came out as it did.
+    notes : tuple of str
+        On what was computed again.
+    bound : Bound or None
+        The bounds and thresholds; None if no bound was computed.
+    novelty : Novelty or None
+        How novel a novel trace is; None for any other, and if that is not kept.
+    neighbours : tuple of Neighbour
+        The nearest references of the version that decided, nearest first; empty if it is not kept.
+    radius : float or None
+        None if there is no neighbourhood.
+    envelope : Envelope or None
+        The band of the known successes; None while there are too few.
+    policy : Policy
+        That was in force when the decision was made.
     """
 
     decision: StoredDecision
     trace: NDArray[np.float32] = field(metadata={"apart": True})
     spec: TraceSpec
-    said: tuple[str, ...]
+    sentences: tuple[str, ...]
     notes: tuple[str, ...]
     bound: Bound | None
     novelty: Novelty | None
@@ -504,137 +808,227 @@ class Explanation:
     policy: Policy
 
     def __repr__(self) -> str:
-        made = self.decision.decision
-        return f"<Explanation of {made.id}: {made.action.value}, {made.reason.value}, {len(self.neighbours)} neighbours>"
+        decision = self.decision.decision
+        result = f"{decision.action.value}, {decision.reason.value}"
+        return f"<Explanation of {decision.id}: {result}, {len(self.neighbours)} neighbours>"
 
     _repr_html_ = to_html
 
 
-def of_part(store: SqlStore, part: str) -> str:
-    """The id of the one decision of a part, without earlier rejects of it; or the id itself, where no part has it.
+def find_decision_id(store: SqlStore, part: str) -> str:
+    """Return the id of the decision on a part.
 
-    UnknownDecisionError where there is none, ReportConflictError where there are several.
+    Parameters
+    ----------
+    store : SqlStore
+    part : str
+        The part's number; or a decision's id, which is returned if no part has this number.
+
+    Returns
+    -------
+    str
+        Earlier rejects of the part do not count, if it was decided on again.
+
+    Raises
+    ------
+    UnknownDecisionError
+        If there is none.
+    ReportConflictError
+        If there are several.
     """
-    known = store.decisions(HistoryFilter(part=part), 20)
-    found = [each for each in known if each.decision.action is not Action.REJECT] or known  # it was put in again
-    found = found or [each for each in [store.get_decision(part, trace=False)] if each is not None]
-    if not found:
+    decisions = store.decisions(HistoryFilter(part=part), 20)
+    not_rejected = [item for item in decisions if item.decision.action is not Action.REJECT]
+    matches = not_rejected or decisions
+    if not matches and (item := store.get_decision(part, trace=False)) is not None:
+        matches = [item]
+    if not matches:
         got = f"{shortened(part)}, which is unknown; `dengine history STORE` lists them"
-        raise UnknownDecisionError(f"Expected the number of a part that was decided on, or a decision's id, got {got}.")
-    if len(found) > 1:
-        ids = ", ".join(each.decision.id for each in reversed(found))
-        raise ReportConflictError(f"Expected one decision of that part, there are {len(found)}; name its id: {ids}.")
-    return found[0].decision.id
+        raise UnknownDecisionError(
+            f"Expected the number of a part that was decided on, or a decision's id, got {got}."
+        )
+    if len(matches) > 1:
+        ids = ", ".join(item.decision.id for item in reversed(matches))
+        raise ReportConflictError(
+            f"Expected one decision of that part, there are {len(matches)}; name its id: {ids}."
+        )
+    return matches[0].decision.id
 
 
 def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanation:
-    """Explain one decision, by what its store keeps.
+    """Explain one decision from what its store keeps.
 
-    decision_id : its id, or its part's number as `of_part` takes it.
-    neighbours : how many of the nearest references to show.
-    Raises ReportError for what the store does not hold, StoreError for a store that no engine has used.
+    Parameters
+    ----------
+    store : SqlStore
+    decision_id : str
+        Its id, or its part's number as `find_decision_id` takes it.
+    neighbours : int, default 10
+        Number of nearest references.
+
+    Returns
+    -------
+    Explanation
+
+    Raises
+    ------
+    ReportError
+        For a decision that the store does not hold.
+    StoreError
+        For a store that no engine has used.
     """
-    known = store.settings()
-    if "recipe" not in known:
-        raise StoreError("Expected a store that an engine has used, this one is empty; make a DataEngine with it.")
-    past = store.get_decision(decision_id) or store.get_decision(of_part(store, decision_id))
-    if past is None:
-        raise unknown_decision(decision_id)
-    made, trace, recipe = past.decision, past.trace, Recipe.from_store(known)
-    changed = store.policy_change_after(decision_id)
-    if changed is not None and changed.data is not None:  # the policy that was in force then
-        recipe = replace(recipe, policy=Policy.from_values(changed.data["old"]))
-    channels, samples = trace.shape
-    answering = as_it_stood(store, made.model_version, recipe, past) if made.model_version else None
-    found = Circumstances(
-        recipe=recipe,
-        spec=stored_trace_spec(known) or TraceSpec(samples=samples, channels=channels),
-        model=known.get("model"),
-        seed=int(known.get("seed", "0")),
-        levels=None if answering is None else answering.levels,
-        novelty=None if answering is None else answering.novelty,
-        safe_mode=_safe_mode(store, past),
+    settings = store.settings()
+    if "recipe" not in settings:
+        raise StoreError(
+            "Expected a store that an engine has used, this one is empty; make a DataEngine "
+            "with it."
+        )
+    item = store.get_decision(decision_id) or store.get_decision(
+        find_decision_id(store, decision_id)
     )
-    around, bound = _around(past, answering, recipe), bound_of(made, found)
+    if item is None:
+        raise unknown_decision(decision_id)
+    decision = item.decision
+    recipe = Recipe.from_store(settings)
+    change = store.policy_change_after(decision_id)
+    if change is not None and change.data is not None:  # the policy that was in force then
+        recipe = replace(recipe, policy=Policy.from_values(change.data["old"]))
+    channels, samples = item.trace.shape
+    version = None
+    if decision.model_version:
+        version = load_past_version(store, decision.model_version, recipe, item)
+    circumstances = Circumstances(
+        recipe=recipe,
+        spec=stored_trace_spec(settings) or TraceSpec(samples=samples, channels=channels),
+        model=settings.get("model"),
+        seed=int(settings.get("seed", "0")),
+        thresholds=None if version is None else version.thresholds,
+        novelty=None if version is None else version.novelty,
+        safe_mode=_find_safe_mode(store, item),
+    )
+    neighbourhood = _find_neighbourhood(item, version, recipe)
+    bound = bound_of(decision, circumstances)
     return Explanation(
-        decision=past,
-        trace=trace,
-        spec=found.spec,
-        said=tuple(_verdict(past, bound, found)),
-        notes=tuple(_notes(past, around, bound, found)),
+        decision=item,
+        trace=item.trace,
+        spec=circumstances.spec,
+        sentences=tuple(_explain_in_words(item, bound, circumstances)),
+        notes=tuple(_notes(item, neighbourhood, bound, circumstances)),
         bound=bound,
-        novelty=found.novelty,
-        neighbours=tuple(_nearest(store, around, answering, neighbours)),
-        radius=None if around is None else around.radius,
-        envelope=_envelope(store, past, answering, found.spec),
+        novelty=circumstances.novelty,
+        neighbours=tuple(_nearest(store, neighbourhood, version, neighbours)),
+        radius=None if neighbourhood is None else neighbourhood.radius,
+        envelope=_find_envelope(store, item, version, circumstances.spec),
         policy=recipe.policy,
     )
 
 
-def _safe_mode(store: SqlStore, past: StoredDecision) -> str:
-    if past.decision.reason is not Reason.SAFE_MODE:
+def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
+    """Return why safe mode had begun when a decision was made in it; "" for any other decision."""
+    if item.decision.reason is not Reason.SAFE_MODE:
         return ""
-    began = (each.text for each in reversed(store.events()) if each.kind == SAFE_MODE_BEGAN and each.time <= past.time)
+    began = (
+        event.text
+        for event in reversed(store.events())
+        if event.kind == SAFE_MODE_BEGAN and event.time <= item.time
+    )
     return next(began, "")
 
 
-def _around(past: StoredDecision, answering: Answering | None, recipe: Recipe) -> Ball | None:
-    """The ball that decided; None where nothing placed the trace, or the version is not kept."""
-    placed = past.decision.embedding  # (K, d)
-    if answering is None or placed is None:
+def _find_neighbourhood(
+    item: StoredDecision, version: PastVersion | None, recipe: Recipe
+) -> Neighbourhood | None:
+    """Return the neighbourhood of a decision's trace.
+
+    None if it was not embedded, or the version is not kept.
+    """
+    embedding = item.decision.embedding  # (K, d)
+    if version is None or embedding is None:
         return None
-    squared = answering.index.squared_distances(torch.tensor(placed, dtype=torch.float32), past.content_hash)
-    counts = answering.index.count_near(squared, recipe.radius)
-    return Ball(np.sqrt(squared.double().numpy()), recipe.radius, *counts)
+    query = torch.tensor(embedding, dtype=torch.float32)
+    squared = version.index.squared_distances(query, item.content_hash)
+    counts = version.index.count_near(squared, recipe.radius)
+    return Neighbourhood(np.sqrt(squared.double().numpy()), recipe.radius, *counts)
 
 
-def _nearest(store: SqlStore, ball: Ball | None, answering: Answering | None, most: int) -> Iterator[Neighbour]:
-    if ball is None or answering is None:
+def _nearest(
+    store: SqlStore, neighbourhood: Neighbourhood | None, version: PastVersion | None, n: int
+) -> Iterator[Neighbour]:
+    """Yield the `n` nearest references of other parts with their traces, nearest first."""
+    if neighbourhood is None or version is None:
         return
-    index = answering.index
-    for slot in np.argsort(ball.distances, kind="stable")[:most]:
-        if not np.isfinite(ball.distances[slot]):
+    index = version.index
+    distances = neighbourhood.distances
+    for slot in np.argsort(distances, kind="stable")[:n]:
+        if not np.isfinite(distances[slot]):
             return
-        label = answering.behind[slot]
-        id_, source = (None, None) if label is None else (label.decision_id, label.source)
-        stored = None if id_ is None else store.get_decision(id_)
+        label = version.labels[slot]
+        decision_id = None if label is None else label.decision_id
+        stored = None if decision_id is None else store.get_decision(decision_id)
         yield Neighbour(
-            decision_id=id_,
+            decision_id=decision_id,
             part=None if stored is None else stored.decision.part,
             success=bool(index.held("labels")[slot]),
-            source=source,
-            distance=float(ball.distances[slot]),
+            source=None if label is None else label.source,
+            distance=float(distances[slot]),
             space=int(index.held("spaces")[slot]),
-            inside=bool(ball.distances[slot] <= ball.radius),
+            inside=bool(distances[slot] <= neighbourhood.radius),
             trace=None if stored is None else stored.trace,
         )
 
 
-def _envelope(store: SqlStore, past: StoredDecision, answering: Answering | None, spec: TraceSpec) -> Envelope | None:
-    """The band of the successes that were known then; where those were too few, of those known now."""
-    for upto in (None if answering is None else answering.last_seq, None):
-        labelled = store.labelled(SUCCESSES, last=upto)
-        others = (labelled.labels == 1) & (labelled.hashes != past.content_hash)
-        if (band := envelope_of(labelled.traces[others], past.trace, spec.rate_hz)) is not None:
-            return band
+def _find_envelope(
+    store: SqlStore, item: StoredDecision, version: PastVersion | None, spec: TraceSpec
+) -> Envelope | None:
+    """Return the envelope of the successes known when a decision was made.
+
+    If these were too few, those known now are taken; None if these are too few, too.
+    """
+    for last in (None if version is None else version.last_seq, None):
+        labelled = store.labelled(MAX_SUCCESSES, last=last)
+        is_other_success = (labelled.labels == 1) & (labelled.hashes != item.content_hash)
+        envelope = envelope_of(labelled.traces[is_other_success], item.trace, spec.rate_hz)
+        if envelope is not None:
+            return envelope
     return None
 
 
-def _notes(past: StoredDecision, around: Ball | None, bound: Bound | None, found: Circumstances) -> Iterator[str]:
-    made, policy = past.decision, found.recipe.policy
-    if past.quarantined:
-        yield "The trace is quarantined: it was not embedded, is never trained on, and has no neighbours."
-    elif around is None:
-        gone = f"version {made.model_version}, which answered, is not kept any more"
-        yield f"No neighbours are shown: {'nothing placed the trace' if made.embedding is None else gone}."
+def _notes(
+    item: StoredDecision,
+    neighbourhood: Neighbourhood | None,
+    bound: Bound | None,
+    circumstances: Circumstances,
+) -> Iterator[str]:
+    """Yield sentences on what was computed again, and where it differs from what was recorded."""
+    decision = item.decision
+    policy = circumstances.recipe.policy
+    if item.quarantined:
+        yield (
+            "The trace is quarantined: it was not embedded, is never trained on, and has no "
+            "neighbours."
+        )
+    elif neighbourhood is None:
+        why = f"version {decision.model_version}, which answered, is not kept any more"
+        if decision.embedding is None:
+            why = "nothing placed the trace"
+        yield f"No neighbours are shown: {why}."
     else:
-        recorded, again = (made.n_success, made.n_failure), (around.n_success, around.n_failure)
-        yield f"Neighbours: the references of version {made.model_version}, which answered, as they stood then."
-        if made.reason not in (Reason.NOVEL, Reason.OUTSIDE) and again != recorded:
-            held = f"{again[0]} successes and {again[1]} failures; recorded were {recorded[0]} and {recorded[1]}"
+        recorded = (decision.n_success, decision.n_failure)
+        again = (neighbourhood.n_success, neighbourhood.n_failure)
+        yield (
+            f"Neighbours: the references of version {decision.model_version}, which "
+            "answered, as they stood then."
+        )
+        if decision.reason not in (Reason.NOVEL, Reason.OUTSIDE) and again != recorded:
+            counts = (
+                f"{again[0]} successes and {again[1]} failures; recorded were "
+                f"{recorded[0]} and {recorded[1]}"
+            )
             why = "a label was corrected since, or came while this part was being decided on"
-            yield f"Counted again, the ball holds {held}: {why}."
-    if bound is not None and found.model is None and not is_score(policy, made):
-        given = policy.bound(made.n_success, made.n_failure)
-        if not np.allclose(given, (made.lower, made.upper), atol=1e-6):
-            yield "By the store's present settings these counts give another bound; the recorded one is shown."
+            yield f"Counted again, the neighbourhood holds {counts}: {why}."
+    if bound is not None and circumstances.model is None and not is_score(policy, decision):
+        interval = policy.bound(decision.n_success, decision.n_failure)
+        if not np.allclose(interval, (decision.lower, decision.upper), atol=1e-6):
+            yield (
+                "By the store's present settings these counts give another bound; the "
+                "recorded one is shown."
+            )

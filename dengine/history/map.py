@@ -1,4 +1,4 @@
-"""Where the known and the newest parts lie for the model that answers, for a picture."""
+"""The map of the parts for the web page: where known and newest parts lie in the embedding."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,21 +10,30 @@ from ..recipe import Recipe
 from ..records import Action
 from ..reducers import has_own_unit
 from ..store.views import HistoryFilter
-from .explain import as_it_stood
+from .explain import load_past_version
 
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
-KNOWN, NEWEST = 250, 10  # parts of a map: the newest known ones, and the newest of all
-NAMED = 1000  # newest decisions whose parts' numbers are looked up
+N_KNOWN = 250  # newest labelled parts on the map
+N_NEWEST = 10  # newest parts on the map, labelled or not
+N_NAMED = 1000  # newest decisions whose parts' numbers are read
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
     """A part on the map.
 
-    id, part : of its decision.  x, y : its place, the first two dimensions of the embedding, the mean over the spaces.
-    success : its label, None while there is none.  action : what was decided, of a newest part; None of a known one.
+    Attributes
+    ----------
+    id, part
+        Of its decision.
+    x, y : float
+        The first two dimensions of its embedding; of a newest part the mean over the spaces.
+    success : bool or None
+        Its label; None without one.
+    action : Action or None
+        The decision on a newest part; None for a known one.
     """
 
     id: str
@@ -37,11 +46,19 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class PartMap:
-    """The known parts and the newest.
+    """The known and the newest parts.
 
-    version : of the model.  marks : oldest first, the known ones before the newest; none before the first model, and
-        for a model that keeps no references.
-    radius : of the ball around the newest, None where there is none.  probability : whether x is one.
+    Attributes
+    ----------
+    version : int
+        Of the model.
+    marks : tuple of Mark
+        Oldest first, the known parts before the newest; empty before the first model, and for a
+        model that keeps no references.
+    radius : float or None
+        Around the newest parts; None if there are none.
+    probability : bool
+        Whether x is a probability.
     """
 
     version: int
@@ -51,32 +68,48 @@ class PartMap:
 
 
 def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
-    """Read the map of a version."""
-    recent = [past.decision for past in store.decisions(HistoryFilter(), NAMED)]
-    newest = list(_newest(store, [made.id for made in recent[-NEWEST:] if made.model_version == version]))
-    shown, parts = {mark.id for mark in newest}, {made.id: made.part for made in recent}
-    known = [mark for mark in _known(store, recipe, version, parts) if mark.id not in shown] if version else []
-    return PartMap(version, (*known, *newest), recipe.radius if newest else None, has_own_unit(recipe.reducer))
+    """Read the map of the parts for a model version; 0: before the first, an empty map."""
+    recent = [item.decision for item in store.decisions(HistoryFilter(), N_NAMED)]
+    ids = [decision.id for decision in recent[-N_NEWEST:] if decision.model_version == version]
+    newest = list(_newest_marks(store, ids))
+    newest_ids = {mark.id for mark in newest}
+    parts = {decision.id: decision.part for decision in recent}
+    known = _known_marks(store, recipe, version, parts) if version else []
+    known = [mark for mark in known if mark.id not in newest_ids]
+    radius = recipe.radius if newest else None
+    return PartMap(version, (*known, *newest), radius, has_own_unit(recipe.reducer))
 
 
-def _newest(store: "SqlStore", ids: list[str]) -> Iterator[Mark]:
-    for past in filter(None, map(store.get_decision, ids)):
-        made = past.decision
-        if made.embedding is not None:
-            yield Mark(made.id, made.part, *_plane(np.mean(made.embedding, axis=0)), past.success, made.action)
+def _newest_marks(store: "SqlStore", ids: list[str]) -> Iterator[Mark]:
+    """Yield the marks of decisions that were embedded, in the order of their ids."""
+    for item in filter(None, map(store.get_decision, ids)):
+        decision = item.decision
+        if decision.embedding is not None:
+            x, y = _first_two(np.mean(decision.embedding, axis=0))
+            yield Mark(decision.id, decision.part, x, y, item.success, decision.action)
 
 
-def _known(store: "SqlStore", recipe: Recipe, version: int, parts: dict[str, str | None]) -> list[Mark]:
-    """The newest parts behind a version's references, oldest first."""
-    answering = as_it_stood(store, version, recipe, None)
-    if answering is None:
+def _known_marks(
+    store: "SqlStore", recipe: Recipe, version: int, parts: dict[str, str | None]
+) -> list[Mark]:
+    """Return the marks of the newest parts among a version's references, oldest first.
+
+    `parts` has the parts' numbers by decision id.
+    """
+    past = load_past_version(store, version, recipe, None)
+    if past is None:
         return []
-    points, labels = answering.index.held("points"), answering.index.held("labels")
-    behind = [(label.seq, slot, label.decision_id) for slot, label in enumerate(answering.behind) if label]
-    newest = sorted(behind)[-KNOWN:]
-    return [Mark(id_, parts.get(id_), *_plane(points[slot]), bool(labels[slot]), None) for _, slot, id_ in newest]
+    points = past.index.held("points")
+    labels = past.index.held("labels")
+    references = [
+        (label.seq, slot, label.decision_id) for slot, label in enumerate(past.labels) if label
+    ]
+    return [
+        Mark(id_, parts.get(id_), *_first_two(points[slot]), bool(labels[slot]), None)
+        for _, slot, id_ in sorted(references)[-N_KNOWN:]
+    ]
 
 
-def _plane(point: np.ndarray) -> tuple[float, float]:
-    """The first two dimensions, (d,) -> x, y; 0 where a reducer has but one."""
+def _first_two(point: np.ndarray) -> tuple[float, float]:
+    """Return the first two dimensions of a point (d,); 0.0 for a second that it does not have."""
     return float(point[0]), float(point[1]) if len(point) > 1 else 0.0

@@ -1,8 +1,10 @@
-"""How an engine is doing, and the decisions of its past, read from its store; no trace is read.
+"""The status of an engine and the history of its decisions, read from its store without traces.
 
-found = status(store)
-found.newest.verified_share, found.ever.bad_accepts.upper, found.alarm
-for past in history(store, last=50, action="accept", label="bad"): ...
+    report = status(store)
+    report.newest.verified_share, report.ever.bad_accepts.upper, report.alarm
+    for item in history(store, last=50, action="accept", label="bad"): ...
+
+`DataEngine.status` and `history`, the command line, the web page and the servers show them.
 """
 
 from __future__ import annotations
@@ -20,7 +22,14 @@ from ..errors import StoreError, expect
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceSpec, stored_trace_spec
 from ..representation import to_html
-from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Outcomes, StoredDecision, StoredVersion
+from ..store.records import (
+    SAFE_MODE_BEGAN,
+    SAFE_MODE_ENDED,
+    Event,
+    Outcomes,
+    StoredDecision,
+    StoredVersion,
+)
 from ..store.views import HistoryFilter, Stretch, Tally
 
 if TYPE_CHECKING:
@@ -28,26 +37,40 @@ if TYPE_CHECKING:
 
     from ..store.sql import SqlStore
 
-PAGE, MOST = 500, 10**9  # decisions read at a time, and that can be asked for
-NEWEST = 500  # decisions that are looked at apart
-FAILING = 3  # retrains in a row that were dropped: the first may come before there are enough labels
-EVENTS = 5  # newest ones that a status shows
+PAGE_SIZE = 500  # decisions read at a time
+MAX_LAST = 10**9  # decisions that can be asked for
+NEWEST = 500  # decisions that `Status.newest` counts
+MAX_DROPPED = 3  # dropped retrains in a row that are an alarm: the first may lack labels
+N_EVENTS = 5  # newest events that a status shows
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """Parts that the model was certain of, and how many of them it was wrong about, as far as that is known.
+class ErrorEstimate:
+    """The share of parts about which the model was certain and wrong, as far as it is known.
 
-    n : parts.  known : those of them that the claim rests on.  wrong : of these.
-    by : what tells: "every outcome", "audits", "checks", as of the shadow mode, or "" where nothing does.
-    lower, upper : Wilson interval of the share of wrong ones, at one look; 0 and 1 where nothing is known.
-    tolerance : 1 - LB.  verdict : kept, broken or open, as far as the interval goes.
+    Attributes
+    ----------
+    n : int
+        Parts about which the model was certain.
+    n_known : int
+        Those of them whose outcomes the estimate rests on.
+    n_wrong : int
+        Those of these about which it was wrong.
+    basis : str
+        Where the outcomes come from: "every outcome", "audits", "checks" (in shadow mode), or "" if
+        none is known.
+    lower, upper : float
+        Wilson interval of the share of wrong ones, for a single look; 0 and 1 if nothing is known.
+    tolerance : float
+        1 - LB.
+    verdict : {"kept", "broken", "open"}
+        Whether the interval is below the tolerance, above it, or contains it.
     """
 
     n: int
-    known: int
-    wrong: int
-    by: str
+    n_known: int
+    n_wrong: int
+    basis: str
     lower: float
     upper: float
     tolerance: float
@@ -56,18 +79,37 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Consecutive decisions, and what happened meanwhile.
+    """Counts over consecutive decisions and the retrains meanwhile.
 
-    first, last : times of the oldest and the newest; None where there is none.
-    outside : left an operator's window, and were verified or rejected without the model.
-    verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
-    accepted, rejected : by the model, without a check.  false_accepts : of the accepted, those known to be bad.
-    false_rejects : of the rejected, those that were looked at and found good.
-    bad_accepts : parts that it let pass, and would have but for an audit, by the policy's alpha; of
-        no part where none passed, as in the shadow mode.
-    would_accept, would_reject : by audits alone, in the shadow mode every part; at 95 %, whatever the policy's alpha.
-    unlabelled : verified, of which no result was reported.
-    retrains : all.  dropped : reasons of those that were dropped, with how often.
+    Attributes
+    ----------
+    decisions : int
+    first, last : float or None
+        Times of the oldest and the newest decision, in seconds since 1970; None without decisions.
+    verified : int
+        Decided VERIFY.
+    audits, novel, safe_mode, errors, quarantined : int
+        Verified for these reasons.
+    outside : int
+        Outside an operator's limits, and verified or rejected without the model.
+    accepted, rejected : int
+        By the model, without a check.
+    false_accepts : int
+        Accepted parts that are known to be bad.
+    false_rejects : int
+        Rejected parts that somebody inspected and found good.
+    would_accept, would_reject : ErrorEstimate
+        By audits alone (in shadow mode every part), at 95 %, whatever the policy's alpha.
+    bad_accepts : ErrorEstimate
+        Of the parts that the model accepted, and would have accepted but for an audit, at the
+        policy's alpha; of no part if none was accepted, as in shadow mode.
+    unlabelled : int
+        Verified parts whose result was not reported.
+    retrains : int
+    dropped : dict of str to int
+        Reasons of dropped retrains, and how often each.
+    verified_share, novel_share : float or None
+        Shares of the decisions; None without decisions.
     """
 
     decisions: int
@@ -84,9 +126,9 @@ class Span:
     rejected: int
     false_accepts: int
     false_rejects: int
-    would_accept: Judged
-    would_reject: Judged
-    bad_accepts: Judged
+    would_accept: ErrorEstimate
+    would_reject: ErrorEstimate
+    bad_accepts: ErrorEstimate
     unlabelled: int
     retrains: int
     dropped: dict[str, int]
@@ -96,7 +138,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """How far each detector of the safe mode is on its way to an alarm, from 0 to 1."""
+    """How close each detector of drift is to an alarm, which begins safe mode: from 0 to 1."""
 
     accepts: float
     rejects: float
@@ -105,18 +147,53 @@ class Watch:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Status:
-    """How an engine is doing; times in seconds since 1970.
+    """The status of an engine. Times are in seconds since 1970.
 
-    model : what a model that was handed in is called; None: the recipe describes it.
-    version : of the model that answers; 0 before the first retrain.
-    safe_mode : why everything is verified, "" where it is not.  safe_mode_time : when it began or ended, None: never.
-    new_labels : since the newest retrain, of `recipe.retrain_every` that set one off.
-    newest, ever : the newest `last` decisions, and all.
-    unreported : accepted parts whose fate was never reported; of verified ones `ever.unlabelled` tells.
-    sources : labels by their source.  corrected, forgotten : labels that were put right.
-    events : the newest, oldest first.  watch : None where nothing is watched, or it was not asked for.
-    store_fault, retraining : of a running engine, which alone knows, as of
-    store_lag : the age in seconds of the oldest record that the store has not taken from the journal.
+    Attributes
+    ----------
+    cell : str
+    product : str or None
+    settings : dict of str to str
+        As stored.
+    recipe : Recipe
+    trace : TraceSpec or None
+        None before the first trace.
+    model : str or None
+        Name of a model that was handed in; None: the recipe describes the model.
+    version : int
+        Of the model that answers; 0 before the first retrain.
+    shadow : bool
+        Whether every part is verified and the model only observes.
+    safe_mode : str
+        Why everything is verified; "" outside safe mode.
+    safe_mode_time : float or None
+        When safe mode last began or ended; None: never.
+    new_labels : int
+        Labels since the newest retrain; `recipe.retrain_every` of them start the next.
+    last : int
+        Number of decisions that `newest` counts at most.
+    newest, ever : Span
+        The newest decisions, and all decisions.
+    unreported : int
+        Accepted parts whose outcome was never reported; see `ever.unlabelled` for verified ones.
+    actions, reasons, sources : dict of str to int
+        Decisions by action and by reason, labels by source.
+    labels, corrected, forgotten : int
+        Labels that count; labels that were corrected or forgotten.
+    certificate : Certificate
+    retrains : tuple of StoredVersion
+        Of this cell, oldest first.
+    events : tuple of Event
+        The newest, oldest first.
+    watch : Watch or None
+        None if nothing is watched, or it was not asked for.
+    store_fault : str
+        Of a running engine: what is wrong with the store; "" if nothing is.
+    retraining : bool
+        Of a running engine: whether a retrain is under way.
+    store_lag : float
+        Of a running engine: age in seconds of the oldest record that is in the journal and not yet
+        in the store.
     """
 
     cell: str
@@ -151,42 +228,67 @@ class Status:
     _repr_html_ = to_html
 
     def __repr__(self) -> str:
-        n = self.ever
-        at = f"{self.cell}: version {self.version}, {n.decisions} decision{'' if n.decisions == 1 else 's'}"
-        return f"<Status of {at}, {n.verified} verified, {n.accepted} accepted, {n.false_accepts} known bad, {n.rejected} rejected>"
+        counts = self.ever
+        name = (
+            f"{self.cell}: version {self.version}, {counts.decisions} "
+            f"decision{'' if counts.decisions == 1 else 's'}"
+        )
+        return (
+            f"<Status of {name}, {counts.verified} verified, {counts.accepted} accepted, "
+            f"{counts.false_accepts} known bad, {counts.rejected} rejected>"
+        )
 
     @property
     def alarm(self) -> str:
-        """What somebody should look at, the worst first; "" where there is nothing."""
-        accepts = self.newest.bad_accepts
-        errors = self.newest.errors
-        false_rejects = self.newest.false_rejects
-        rejects = _judged(self.newest.rejected, false_rejects, self.recipe.policy.tolerances[1])
-        found_good = (
-            f"{false_rejects} of the {rejects.n} newest rejected parts were good: more than {rejects.tolerance:.1%}."
-        )
-        would_accept = self.newest.would_accept
+        """What somebody should look at, the most urgent only, as a sentence.
+
+        "" if there is nothing.
+        """
+        newest = self.newest
+        accepts = newest.bad_accepts
+        would_accept = newest.would_accept
+        tolerance = self.recipe.policy.tolerances[1]
+        rejects = _estimate_error(newest.rejected, newest.false_rejects, tolerance)
         reports = [retrain.report for retrain in self.retrains]
-        newest_accepted = max((i for i, report in enumerate(reports, 1) if report.accepted), default=0)
-        failing = retrain_fault([report.reason for report in reports[newest_accepted:]], self.version)
-        broken = f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."
-        would_break = f"It would break the tolerance of {would_accept.tolerance:.1%}."
+        newest_accepted = max(
+            (i for i, report in enumerate(reports, 1) if report.accepted), default=0
+        )
+        failing = retrain_fault(
+            [report.reason for report in reports[newest_accepted:]], self.version
+        )
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
-            (accepts.verdict == "broken", broken),
-            (false_rejects and rejects.verdict == "broken", found_good),
+            (
+                accepts.verdict == "broken",
+                f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} "
+                "allows.",
+            ),
+            (
+                newest.false_rejects and rejects.verdict == "broken",
+                f"{newest.false_rejects} of the {rejects.n} newest rejected parts were good: "
+                f"more than {rejects.tolerance:.1%}.",
+            ),
             (failing, failing),
-            (self.shadow and would_accept.verdict == "broken", would_break),
-            (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
-            (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
-            (errors, f"The model failed on {errors} of the newest decisions."),
+            (
+                self.shadow and would_accept.verdict == "broken",
+                f"It would break the tolerance of {would_accept.tolerance:.1%}.",
+            ),
+            (
+                2 * newest.novel > newest.decisions,
+                f"{newest.novel} of the newest traces are novel.",
+            ),
+            (
+                2 * newest.outside > newest.decisions,
+                f"{newest.outside} of the newest parts leave a window.",
+            ),
+            (newest.errors, f"The model failed on {newest.errors} of the newest decisions."),
         )
-        return next((text for wrong, text in alarms if wrong), "")
+        return next((text for is_raised, text in alarms if is_raised), "")
 
 
 def retrain_fault(dropped: Sequence[str], version: int) -> str:
-    """Return what somebody should look at where retrains are dropped again and again, else "".
+    """Return an alarm in words if retrains are dropped again and again, else "".
 
     Parameters
     ----------
@@ -194,8 +296,12 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
         Reasons of the retrains that were dropped since the last one that was accepted.
     version : int
         Of the model that answers; 0 before the first.
+
+    Returns
+    -------
+    str
     """
-    if len(dropped) < FAILING:
+    if len(dropped) < MAX_DROPPED:
         return ""
     last = f"the last was {dropped[-1].rstrip('.')}."
     if not version:
@@ -204,18 +310,43 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
 
 
 def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:
-    """How the engine of a store is doing; last : the newest so many decisions are looked at apart.
+    """Read the status of an engine from its store.
 
-    watching : read how far the safe mode's detectors are, too, which takes the newest version's arrays.
-    StoreError for a store that no engine has used.
+    Parameters
+    ----------
+    store : SqlStore
+    last : int, default 500
+        Number of newest decisions that `Status.newest` counts.
+    watching : bool, default False
+        Read `Status.watch`, too, for which the newest version's arrays are read.
+
+    Returns
+    -------
+    Status
+
+    Raises
+    ------
+    StoreError
+        For a store that no engine has used.
     """
     settings = store.settings()
     if "recipe" not in settings:
-        raise StoreError(f"Expected a store that an engine has used, cell {store.cell_id!r} of this one is empty.")
-    recipe, counts, retrains = Recipe.from_store(settings), store.status(), store.versions(cell_only=True)
-    every, policy, events = store.tally(), recipe.policy, store.events()
+        raise StoreError(
+            f"Expected a store that an engine has used, cell {store.cell_id!r} of this one is "
+            "empty."
+        )
+    recipe = Recipe.from_store(settings)
+    policy = recipe.policy
+    counts = store.status()
+    tally = store.tally()
+    outcomes = tally.outcomes
+    events = store.events()
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
-    outcomes, since = every.outcomes, int(settings.get("policy_since", 0))
+    retrains = store.versions(cell_only=True)
+    last_seq = retrains[-1].last_seq if retrains else 0
+    accepted = [report.version for report in store.retrains() if report.accepted]
+    since = int(settings.get("policy_since", 0))
+    certified = store.tally(since_version=since, within=policy.label_within).outcomes
     return Status(
         cell=store.cell_id,
         product=store.product,
@@ -223,19 +354,19 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         recipe=recipe,
         trace=stored_trace_spec(settings),
         model=settings.get("model"),
-        version=next((each.version for each in reversed(store.retrains()) if each.accepted), 0),
+        version=accepted[-1] if accepted else 0,
         shadow=policy.shadow,
         safe_mode=mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else "",
         safe_mode_time=None if mode is None else mode.time,
-        new_labels=sum(not each.quarantined for each in store.past_labels(retrains[-1].last_seq if retrains else 0)),
+        new_labels=sum(not label.quarantined for label in store.past_labels(last_seq)),
         last=last,
-        newest=_span(store.tally(last), retrains, policy),
-        ever=_span(every, retrains, policy),
+        newest=_count_span(store.tally(last), retrains, policy),
+        ever=_count_span(tally, retrains, policy),
         unreported=outcomes.accepted - outcomes.false_accepts - outcomes.confirmed,
-        certificate=policy.certificate(store.tally(since_version=since, within=policy.label_within).outcomes),
+        certificate=policy.certificate(certified),
         retrains=tuple(retrains),
-        events=tuple(events[-EVENTS:]),
-        watch=watch(store, recipe) if watching else None,
+        events=tuple(events[-N_EVENTS:]),
+        watch=read_watch(store, recipe) if watching else None,
         **{name: counts[name] for name in COUNTED},
     )
 
@@ -244,13 +375,18 @@ MODES = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
 COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten")
 
 
-def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
-    outcomes, first, n, reasons = tally.outcomes, tally.first, tally.count(), tally.by("reason")
-    here = [each.report for each in retrains if first is not None and each.time >= first]
+def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
+    """Return the counts over a tally's decisions, and over the retrains since the first."""
+    outcomes = tally.outcomes
+    first = tally.first
+    n = tally.count()
+    reasons = tally.by("reason")
+    reports = [
+        retrain.report for retrain in retrains if first is not None and retrain.time >= first
+    ]
     verified = tally.by("action")[Action.VERIFY]
-    by = "audits" if policy.audit_rate else "checks"
-    accepts = (outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0])
-    rejects = (outcomes.audited_rejects, outcomes.audited_rejects_good, policy.tolerances[1])
+    basis = "audits" if policy.audit_rate else "checks"
+    accept_tolerance, reject_tolerance = policy.tolerances
     return Span(
         decisions=n,
         first=first,
@@ -266,67 +402,132 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         rejected=outcomes.rejected,
         false_accepts=outcomes.false_accepts,
         false_rejects=outcomes.false_rejects,
-        would_accept=_judged(*accepts, by=by),
-        would_reject=_judged(*rejects, by=by),
+        would_accept=_estimate_error(
+            outcomes.audited_accepts, outcomes.audited_accepts_bad, accept_tolerance, basis=basis
+        ),
+        would_reject=_estimate_error(
+            outcomes.audited_rejects, outcomes.audited_rejects_good, reject_tolerance, basis=basis
+        ),
         bad_accepts=bad_accepts(outcomes, policy),
-        unlabelled=tally.count(lambda group: group.action is Action.VERIFY and group.success is None),
-        retrains=len(here),
-        dropped=dict(Counter(report.reason for report in here if not report.accepted)),
+        unlabelled=tally.count(
+            lambda group: group.action is Action.VERIFY and group.success is None
+        ),
+        retrains=len(reports),
+        dropped=dict(Counter(report.reason for report in reports if not report.accepted)),
         verified_share=verified / n if n else None,
         novel_share=reasons[Reason.NOVEL] / n if n else None,
     )
 
 
-def _judged(known: int, wrong: int, most: float, alpha: float = 0.05, n: int | None = None, by: str = "audits") -> Judged:
-    low, high = wilson_interval(known - wrong, wrong, alpha)
-    lower, upper = 1.0 - high, 1.0 - low
-    by = by if known else ""
-    return Judged(known if n is None else n, known, wrong, by, lower, upper, most, _verdict(lower, upper, most))
+def _estimate_error(
+    n_known: int,
+    n_wrong: int,
+    tolerance: float,
+    alpha: float = 0.05,
+    n: int | None = None,
+    basis: str = "audits",
+) -> ErrorEstimate:
+    """Return the estimate for `n_wrong` wrong ones of `n_known` parts.
+
+    `n` parts in all, by default `n_known`.
+    """
+    low, high = wilson_interval(n_known - n_wrong, n_wrong, alpha)
+    lower = 1.0 - high
+    upper = 1.0 - low
+    return ErrorEstimate(
+        n=n_known if n is None else n,
+        n_known=n_known,
+        n_wrong=n_wrong,
+        basis=basis if n_known else "",
+        lower=lower,
+        upper=upper,
+        tolerance=tolerance,
+        verdict=_verdict(lower, upper, tolerance),
+    )
 
 
 def _verdict(lower: float, upper: float, tolerance: float) -> str:
-    return "kept" if upper <= tolerance else "broken" if lower > tolerance else "open"
+    """Return "kept", "broken" or "open".
 
-
-def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
-    """How many of the parts that the model let pass were bad: by every outcome where all are known, else by audits.
-
-    Under `stops="all"` a part whose silence is not over is left out. Audits speak for all: their coin knows no outcome.
-    Stops are known beside them: the lower end is at least that of the stops if all others were good, the upper their share.
-    Where no part passed nothing is said of what did: `would_accept` counts those of the shadow mode.
+    The interval is below the tolerance, above it, or contains it.
     """
+    if upper <= tolerance:
+        return "kept"
+    return "broken" if lower > tolerance else "open"
+
+
+def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
+    """Estimate how many of the accepted parts were bad.
+
+    If every outcome is known it is by these, else by audits, whose coin knows no outcome, so that
+    they speak for all. Under `stops="all"` a part whose outcome is still open is left out. Line
+    stops count besides the audits: the lower end is at least the one that follows if all other
+    parts were good, and the upper end at least their share.
+
+    Parameters
+    ----------
+    outcomes : Outcomes
+    policy : Policy
+
+    Returns
+    -------
+    ErrorEstimate
+        Of no part if none was accepted: those of shadow mode are in `Span.would_accept`.
+    """
+    tolerance = policy.tolerances[0]
     if not outcomes.accepted:
-        return _judged(0, 0, policy.tolerances[0], policy.alpha)
-    n, heard = outcomes.accepted + outcomes.audited_accepts, outcomes.false_accepts + outcomes.confirmed
-    if heard and (policy.stops == "all" or outcomes.accepted == heard):
-        return _judged(heard, outcomes.false_accepts, policy.tolerances[0], policy.alpha, n, "every outcome")
-    said = _judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0], policy.alpha, n)
-    quiet = outcomes.accepted - outcomes.false_accepts
-    lower = max(said.lower, 1.0 - wilson_interval(quiet, outcomes.false_accepts, policy.alpha)[1])
-    upper = max(said.upper, outcomes.false_accepts / max(1, outcomes.accepted))
-    return replace(said, lower=lower, upper=upper, verdict=_verdict(lower, upper, said.tolerance))
+        return _estimate_error(0, 0, tolerance, policy.alpha)
+    n = outcomes.accepted + outcomes.audited_accepts
+    reported = outcomes.false_accepts + outcomes.confirmed
+    if reported and (policy.stops == "all" or outcomes.accepted == reported):
+        return _estimate_error(
+            reported, outcomes.false_accepts, tolerance, policy.alpha, n, "every outcome"
+        )
+    audited = _estimate_error(
+        outcomes.audited_accepts, outcomes.audited_accepts_bad, tolerance, policy.alpha, n
+    )
+    others = outcomes.accepted - outcomes.false_accepts
+    by_stops = 1.0 - wilson_interval(others, outcomes.false_accepts, policy.alpha)[1]
+    lower = max(audited.lower, by_stops)
+    upper = max(audited.upper, outcomes.false_accepts / max(1, outcomes.accepted))
+    return replace(audited, lower=lower, upper=upper, verdict=_verdict(lower, upper, tolerance))
 
 
-def watch(store: SqlStore, recipe: Recipe) -> Watch | None:
-    """What the rule that answers knows of drift; None where it watches nothing, or that is not kept."""
+def read_watch(store: SqlStore, recipe: Recipe) -> Watch | None:
+    """Return how close the detectors of drift are to an alarm.
+
+    None if the rule has none, or its state is not kept.
+    """
     from ..decision.member_rules import MemberRule  # torch
-    from .explain import rule_now
+    from .explain import load_rule
 
     if recipe.policy.guarantee == "local" and recipe.policy.stops != "all":
         return None
-    rule = rule_now(store, recipe.policy)
+    rule = load_rule(store, recipe.policy)
     if not isinstance(rule, MemberRule):
         return None
-    limits, mode = rule.evidence.alarm_limits, rule.safe_mode()
-    sums = [0.0 if mode == 3 else each for each in rule.evidence.detector_sums.tolist()]
-    return Watch(*(max(0.0, each / limit) for each, limit in zip(sums, limits, strict=True)))
+    limits = rule.evidence.alarm_limits
+    mode = rule.safe_mode()
+    sums = [0.0 if mode == 3 else total for total in rule.evidence.detector_sums.tolist()]
+    return Watch(*(max(0.0, total / limit) for total, limit in zip(sums, limits, strict=True)))
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """What a picture of a store is drawn from: consecutive decisions, retrains and events; last : looked at apart.
+    """The course of a store over time, from which its picture is drawn.
 
-    modes : the events that began or ended the safe mode, oldest first.
+    Attributes
+    ----------
+    stretches : list of Stretch
+        Counts over consecutive decisions, oldest first.
+    retrains : list of StoredVersion
+        Of this cell.
+    modes : list of Event
+        Those that began or ended safe mode, oldest first.
+    tolerance : float
+        1 - LB for accepted parts.
+    last : int
+        Number of newest decisions that are marked.
     """
 
     stretches: list[Stretch]
@@ -336,56 +537,143 @@ class Course:
     last: int
 
 
-STRETCHES = 120  # of a picture
-FEWEST = 20  # decisions of a stretch: a share of fewer jumps
+MAX_STRETCHES = 120  # of a picture
+MIN_STRETCH = 20  # decisions of a stretch: a share of fewer jumps
 
 
-def course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
-    """Read what a picture is drawn from; by : as of `SqlStore.stretches`, of which the newest are drawn."""
+def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
+    """Read the course of a store.
+
+    Parameters
+    ----------
+    store : SqlStore
+    recipe : Recipe
+    last : int
+        Number of newest decisions that are marked.
+    **by
+        `seconds`, `start` or `batch`, as of `SqlStore.stretches`. The newest 120 stretches are
+        returned.
+
+    Returns
+    -------
+    Course
+    """
     modes = [event for event in store.events() if event.kind in MODES]
-    stretches = store.stretches(max(1, min(STRETCHES, store.tally().count() // FEWEST)), **by)[-STRETCHES:]
-    return Course(stretches, store.versions(cell_only=True), modes, recipe.policy.tolerances[0], last)
+    n = max(1, min(MAX_STRETCHES, store.tally().count() // MIN_STRETCH))
+    stretches = store.stretches(n, **by)[-MAX_STRETCHES:]
+    retrains = store.versions(cell_only=True)
+    return Course(stretches, retrains, modes, recipe.policy.tolerances[0], last)
 
 
 def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
-    """The decisions of a store, newest last, one after the other as they are read.
+    """Iterate over the decisions of a store, oldest first, without their traces.
 
-    last : the newest so many of those that are meant; None: all.  where : which are meant, as `HistoryFilter` takes it.
-    Raises SettingError for a value that is none of these.
+    Parameters
+    ----------
+    store : SqlStore
+    last : int or None
+        Number of newest decisions of the selection; None: all, read as the iteration goes on.
+    **where
+        The selection: fields of `HistoryFilter`.
+
+    Returns
+    -------
+    iterator of StoredDecision
+
+    Raises
+    ------
+    SettingError
+        For a value that a field cannot have.
     """
-    whole = last is None or 1 <= last < MOST
-    expect(whole, f"last to be 1 or more, below {MOST:,}", last, "leave it out for all decisions")
-    meant = HistoryFilter(**where)
+    is_valid = last is None or 1 <= last < MAX_LAST
+    expect(
+        is_valid,
+        f"last to be 1 or more, below {MAX_LAST:,}",
+        last,
+        "leave it out for all decisions",
+    )
+    selection = HistoryFilter(**where)
     if last is None:
-        return paged(store, meant, newest=False)
-    return iter([*islice(paged(store, meant, min(PAGE, last)), last)][::-1])
+        return iterate_decisions(store, selection, newest_first=False)
+    newest = islice(iterate_decisions(store, selection, min(PAGE_SIZE, last)), last)
+    return iter(list(newest)[::-1])
 
 
-def paged(
-    store: SqlStore, where: HistoryFilter, page: int = PAGE, beyond: str | None = None, newest: bool = True
+def iterate_decisions(
+    store: SqlStore,
+    where: HistoryFilter,
+    page_size: int = PAGE_SIZE,
+    start_after: str | None = None,
+    newest_first: bool = True,
 ) -> Iterator[StoredDecision]:
-    """The decisions that are meant, newest (or oldest) first, so many read at a time; beyond : the one of this id."""
-    while found := store.decisions(where, page, beyond, newest):
-        found = found[::-1] if newest else found
-        yield from found
-        beyond = found[-1].decision.id
+    """Iterate over the decisions of a selection, reading a page of the store at a time.
+
+    Parameters
+    ----------
+    store : SqlStore
+    where : HistoryFilter
+    page_size : int, default 500
+        Decisions read at a time.
+    start_after : str or None
+        Id of a decision: the iteration starts with the one after it in its direction.
+    newest_first : bool, default True
+        False: oldest first.
+
+    Yields
+    ------
+    StoredDecision
+        Without its trace.
+    """
+    while page := store.decisions(where, page_size, start_after, newest_first):
+        yield from reversed(page) if newest_first else page
+        start_after = (page[0] if newest_first else page[-1]).decision.id
 
 
 def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
-    """A row a decision, by its id: what was decided, when, as a datetime in UTC, on what evidence, and the label."""
+    """Return decisions as a DataFrame.
+
+    Parameters
+    ----------
+    decisions : iterable of StoredDecision
+
+    Returns
+    -------
+    pandas.DataFrame
+        A row for each, by its id: the fields of `Decision` but for the embedding, `time` in UTC,
+        and `label`, "good", "bad" or None.
+    """
     import pandas as pd
 
-    found = list(decisions)
-    names = [each.name for each in fields(Decision) if each.name != "embedding"]
-    rows = pd.DataFrame([[getattr(each.decision, name) for name in names] for each in found], columns=names)
-    rows.insert(1, "time", pd.to_datetime([each.time for each in found], unit="s", utc=True))
-    return rows.assign(label=[each.label if each.success is not None else None for each in found]).set_index("id")
+    items = list(decisions)
+    names = [field.name for field in fields(Decision) if field.name != "embedding"]
+    values = [[getattr(item.decision, name) for name in names] for item in items]
+    frame = pd.DataFrame(values, columns=names)
+    frame.insert(1, "time", pd.to_datetime([item.time for item in items], unit="s", utc=True))
+    labels = [item.label if item.success is not None else None for item in items]
+    return frame.assign(label=labels).set_index("id")
 
 
-def beside(
+def read_retrains_and_events(
     store: SqlStore, since: float | None = None, until: float | None = None
 ) -> dict[str, list[StoredVersion | Event]]:
-    """What happened beside the decisions, retrains and events, oldest first, between two times in seconds; None: any."""
-    first, end = since or float("-inf"), float("inf") if until is None else until
-    past: dict[str, list[Any]] = {"retrains": store.versions(cell_only=True), "events": store.events()}
-    return {name: [each for each in happened if first <= each.time < end] for name, happened in past.items()}
+    """Return "retrains" and "events" of a cell between two times, oldest first.
+
+    Parameters
+    ----------
+    store : SqlStore
+    since, until : float or None
+        Seconds since 1970; `since` is included, `until` is not. None: no limit.
+
+    Returns
+    -------
+    dict of str to list
+    """
+    first = since or float("-inf")
+    end = float("inf") if until is None else until
+    past: dict[str, list[Any]] = {
+        "retrains": store.versions(cell_only=True),
+        "events": store.events(),
+    }
+    return {
+        name: [item for item in items if first <= item.time < end] for name, items in past.items()
+    }

@@ -32,9 +32,9 @@ from ..decision.policy import Policy
 from ..engine.corrections import Changed
 from ..engine.engine import DataEngine, core_of
 from ..errors import expect
-from ..history.explain import explain, of_part
+from ..history.explain import explain, find_decision_id
 from ..history.map import part_map
-from ..history.status import NEWEST, course, paged
+from ..history.status import NEWEST, iterate_decisions, read_course
 from ..model.base import Exportable
 from ..records import Action, is_name
 from ..store.records import StoredDecision, unknown_decision
@@ -132,7 +132,7 @@ class HttpApi:
     async def _of(self, id_: str, part: str) -> str:
         if bool(id_) == bool(part):
             raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")
-        return id_ or await self.service.look(lambda store: of_part(store, part))
+        return id_ or await self.service.look(lambda store: find_decision_id(store, part))
 
     async def correct(self, success: bool, id_: str = "", part: str = "", author: str = "") -> Json:
         """Put a label right, from the next decision on; what was reported stays on record.
@@ -241,7 +241,7 @@ class HttpApi:
         expect(whole, f"hours of 0, or of {SHORTEST} or more, a second", hours)
         recipe, by = self.service.engine.recipe, {"seconds": 3600.0 * hours, "start": 3600.0 * start, "batch": batch}
         by = by if hours or batch else {}
-        return answer("Course", await self.service.look(lambda store: course(store, recipe, AMONG, **by)))
+        return answer("Course", await self.service.look(lambda store: read_course(store, recipe, AMONG, **by)))
 
     async def embedding(self) -> Json:
         """Where the known and the newest parts lie for the model that answers."""
@@ -317,7 +317,8 @@ def _name(author: str) -> str:
 def _newest(store: SqlStore, where: HistoryFilter, limit: int, before: str | None, waiting: bool) -> list[StoredDecision]:
     """Newest first. A forgotten label is none that is waited for."""
     where = replace(where, action=Action.VERIFY, label="none") if waiting else where
-    return list(islice((past for past in paged(store, where, limit, before) if not waiting or past.source is None), limit))
+    decisions = iterate_decisions(store, where, limit, before)
+    return list(islice((past for past in decisions if not waiting or past.source is None), limit))
 
 
 def _explained(store: SqlStore, id_: str) -> Json:

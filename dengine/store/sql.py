@@ -825,7 +825,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     # History
 
     def decisions(
-        self, where: HistoryFilter, limit: int, beyond: str | None = None, newest: bool = True
+        self, where: HistoryFilter, limit: int, start_after: str | None = None, newest: bool = True
     ) -> list[StoredDecision]:
         """Return the newest `limit` decisions of a selection, or the oldest.
 
@@ -837,7 +837,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         ----------
         where : HistoryFilter
         limit : int
-        beyond : str or None
+        start_after : str or None
             Id of a decision; only those before it (after it, for the oldest) are returned: the next
             page.
         newest : bool, default True
@@ -861,9 +861,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         if where.until is not None:
             conditions.append(DECISION.c.time < where.until)
         number = DECISION.c.number
-        if beyond is not None:
-            other = DECISION.alias("beyond")
-            is_other = (other.c.cell_id == self.cell_id) & (other.c.id == beyond)
+        if start_after is not None:
+            other = DECISION.alias("other")
+            is_other = (other.c.cell_id == self.cell_id) & (other.c.id == start_after)
             limit_number = sa.select(other.c.number).where(is_other).scalar_subquery()
             conditions.append(number < limit_number if newest else number > limit_number)
         query = (

@@ -110,7 +110,7 @@ def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
         accepted = [each["label"] for each in some if each["action"] == "accept"]
         bad, good = accepted.count("bad"), accepted.count("good")
         lower, upper = wilson_interval(good, bad, 0.2)
-        assert (span["bad_accepts"]["known"], span["bad_accepts"]["wrong"]) == (good + bad, bad)
+        assert (span["bad_accepts"]["n_known"], span["bad_accepts"]["n_wrong"]) == (good + bad, bad)
         assert (span["bad_accepts"]["lower"], span["bad_accepts"]["upper"]) == pytest.approx((1 - upper, 1 - lower))
     assert newest["quarantined"] == ever["quarantined"] == 1
     assert newest["retrains"] < ever["retrains"] == len(found["retrains"])
@@ -146,12 +146,12 @@ def test_known_escapes_stand_first_in_status_which_never_says_that_none_is_known
 def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
     some, every = Policy(alpha=0.1, lower_bound=0.9), Policy(alpha=0.1, lower_bound=0.9, stops="all")
     silent = Outcomes(50, 3, 0, 0, 0, 0, 0, 0)
-    assert (bad_accepts(silent, some).by, bad_accepts(silent, some).upper) == ("", 1.0)
+    assert (bad_accepts(silent, some).basis, bad_accepts(silent, some).upper) == ("", 1.0)
     confirmed = Outcomes(50, 3, 47, 0, 0, 0, 0, 0)
     assert bad_accepts(confirmed, some) == bad_accepts(confirmed, every)
-    assert (bad_accepts(confirmed, every).known, bad_accepts(confirmed, every).wrong) == (50, 3)
+    assert (bad_accepts(confirmed, every).n_known, bad_accepts(confirmed, every).n_wrong) == (50, 3)
     audited = Outcomes(50, 3, 0, 40, 0, 0, 0, 0)
-    assert (bad_accepts(audited, some).by, bad_accepts(audited, some).known) == ("audits", 40)
+    assert (bad_accepts(audited, some).basis, bad_accepts(audited, some).n_known) == ("audits", 40)
     assert bad_accepts(audited, some).verdict == "kept"
     assert bad_accepts(Outcomes(50, 6, 0, 40, 0, 0, 0, 0), some).verdict == "open"  # as many as 6 of 50 are known to be bad
     assert bad_accepts(Outcomes(50, 20, 0, 40, 0, 0, 0, 0), some).verdict == "broken"
@@ -183,7 +183,7 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     n, words = len(certain), said("status", store, "--check-seconds", "60")
     assert f"It would have decided {n} of the {told['ever']['verified']} parts that were verified: {60 * n} s of" in words
     assert "shadow yes" in said("status", store)
-    assert told["ever"]["bad_accepts"]["known"] == 0  # nothing was accepted, so none of it is known to be bad
+    assert told["ever"]["bad_accepts"]["n_known"] == 0  # nothing was accepted, so none of it is known to be bad
     words = said("status", store)
     assert f"certain but checked {n} {n}" in words
     assert words.count("bad accepts none was accepted none was accepted") == 1
@@ -199,8 +199,9 @@ def test_each_figure_has_one_interval_prices_have_names_and_dates_are_iso(stream
     words = said("status", store)
     ever = document("status", store)["ever"]
     assert ever["accepted"] > 0
-    assert ever["would_accept"]["known"] == ever["bad_accepts"]["known"] > 0
-    assert words.count(f"{ever['bad_accepts']['wrong']} of {ever['bad_accepts']['known']} by audits") == 2  # newest, ever
+    assert ever["would_accept"]["n_known"] == ever["bad_accepts"]["n_known"] > 0
+    bad = ever["bad_accepts"]
+    assert words.count(f"{bad['n_wrong']} of {bad['n_known']} by audits") == 2  # newest, ever
     assert "prices check 5, escape 120, false reject 47.5" in words
     listed = succeed("history", store, "--last", 3, "--events")
     assert len(re.findall(r"(?m)^20\d\d-\d\d-\d\d \d\d:\d\d:\d\d ", listed)) >= 3

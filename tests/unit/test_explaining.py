@@ -37,7 +37,7 @@ def played(store: SqlStore | Path | None, data: Dataset, recipe: Recipe, **optio
 
 
 def said_of(found: Explanation) -> str:
-    return " ".join((*found.said, *found.notes))
+    return " ".join((*found.sentences, *found.notes))
 
 
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in RECIPES if name not in ("local", "pooled")]  # 10 s each
@@ -92,8 +92,8 @@ def test_of_a_version_that_is_not_kept_the_record_is_shown_and_no_neighbours(mak
     assert "version 1, which answered, is not kept any more" in said_of(again)
     assert again.decision == first.decision
     assert (again.bound.n_success, again.bound.lower) == (first.bound.n_success, first.bound.lower)  # as recorded
-    assert (again.bound.accept_at, again.bound.reject_at) == (None, None)
-    assert "the levels that held then are not kept" in said_of(again)
+    assert (again.bound.accept_threshold, again.bound.reject_threshold) == (None, None)
+    assert "the thresholds of that time are not kept" in said_of(again)
 
 
 def test_the_bound_says_how_many_more_labels_would_have_done(make_data: Callable[..., Dataset]) -> None:
@@ -229,8 +229,8 @@ def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_mad
     with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
         assert [engine.explain(id_).policy for id_ in ids] == policies
         first = engine.explain(ids[0])
-        assert first.bound.accept_at == 0.9
+        assert first.bound.accept_threshold == 0.9
         assert first.bound.successes_needed == 0
         assert "lower must be at least 0.9 (" in said_of(first)
         assert "present settings" not in said_of(first)
-        assert engine.explain(ids[1]).bound.accept_at == 0.95
+        assert engine.explain(ids[1]).bound.accept_threshold == 0.95

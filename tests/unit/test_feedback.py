@@ -456,7 +456,7 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
         assert {found[0].id} == {
             past.decision.id for past in engine.history(label="good") if past.source is Source.INSPECTION
         }
-        assert "turned out good (inspection)" in " ".join(engine.explain(found[0].id).said)
+        assert "turned out good (inspection)" in " ".join(engine.explain(found[0].id).sentences)
         with pytest.raises(ReportError, match="success from inspection was reported first"):
             engine.report(found[0].id, False)
         assert "failure" in engine.correct(found[0].id, False, "kim").text

@@ -10,7 +10,7 @@ import pytest
 
 import dengine.history
 from dengine import SqlStore
-from dengine.history.status import beside, history
+from dengine.history.status import history, read_retrains_and_events
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store.records import StoredDecision
 from dengine.store.views import HistoryFilter, Stretch
@@ -62,7 +62,7 @@ def everything(store: SqlStore) -> list[StoredDecision]:
 def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(store: SqlStore, monkeypatch) -> None:
     whole = everything(store)
     assert [past.decision.id for past in whole] == [f"d{i:03d}" for i in range(N)]
-    monkeypatch.setattr(dengine.history.status, "PAGE", 7)
+    monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 7)
     assert everything(store) == whole
     for last in (1, 7, 8, 59, 60, 1000):
         assert list(history(store, last=last)) == whole[-last:]
@@ -74,7 +74,7 @@ def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch: pytest.Mo
     times, ids = [5.0, 9.0, 2.0, 2.0, 1.0, 7.0], ["d5", "d1", "d4", "d0", "d3", "d2"]
     for now[0], id_ in zip(times, ids, strict=True):
         put_decision(store, Decision(id_, Action.ACCEPT, Action.ACCEPT, *kind), np.ones(5))
-    monkeypatch.setattr(dengine.history.status, "PAGE", 2)
+    monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 2)
     for found in (history(store), history(store, last=6)):
         assert [(past.decision.id, past.time) for past in found] == list(zip(ids, times, strict=True))
     assert [past.decision.id for past in history(store, last=2, since=2.0)] == ["d0", "d2"]
@@ -83,7 +83,7 @@ def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch: pytest.Mo
 
 
 def test_a_filter_takes_what_it_says_and_the_newest_of_that(store: SqlStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dengine.history.status, "PAGE", 4)
+    monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 4)
     whole = everything(store)
     middle = whole[N // 2].time
     for asked, takes in (
@@ -170,11 +170,11 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: SqlS
 
 def test_retrains_and_events_are_those_of_the_time_that_is_asked_for(store: SqlStore) -> None:
     whole = everything(store)
-    every = beside(store)
+    every = read_retrains_and_events(store)
     assert (len(every["retrains"]), [each.text[:5] for each in every["events"]]) == (6, ["too m", "fresh"])
-    late = beside(store, since=whole[-1].time)
+    late = read_retrains_and_events(store, since=whole[-1].time)
     assert [len(each) for each in late.values()] == [1, 2]
-    assert beside(store, until=whole[0].time)["retrains"] == []
+    assert read_retrains_and_events(store, until=whole[0].time)["retrains"] == []
 
 
 def test_a_page_is_read_along_the_index_and_no_trace_is(tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
         status = engine.status()
         assert (status.newest.outside, status.newest.rejected, status.actions["reject"]) == (2, 0, 1)
         assert (status.certificate.rejected.n, status.certificate.accepted.n) == (0, 0)
-        assert "leaves an operator's window, 0:0.1::" in engine.explain(made.id).said[0]
+        assert "leaves an operator's window, 0:0.1::" in engine.explain(made.id).sentences[0]
         assert engine.status(last=3).alarm == "2 of the newest parts leave a window."
     with pytest.raises(SettingError, match=r"\(windows 0:0\.1::.*:reject\), got windows 0:0\.2:0:;"):
         DataEngine.open_or_create(tmp_path / "cell.db", recipe=recipe(windows=["0:0.2:0:"]))

@@ -210,15 +210,15 @@ export function courseChart(course) {
 export function boundChart(bound) {
   const zones = [];
   const marks = [];
-  if (bound.reject_at !== null) {
-    zones.push([0, bound.reject_at, "reject"]);
-    marks.push(["✕ ≤", bound.reject_at]);
+  if (bound.reject_threshold !== null) {
+    zones.push([0, bound.reject_threshold, "reject"]);
+    marks.push(["✕ ≤", bound.reject_threshold]);
   }
-  if (bound.accept_at !== null) {
-    zones.push([bound.accept_at, 1, "accept"]);
-    marks.push(["✓ ≥", bound.accept_at]);
+  if (bound.accept_threshold !== null) {
+    zones.push([bound.accept_threshold, 1, "accept"]);
+    marks.push(["✓ ≥", bound.accept_threshold]);
   }
-  const said = `The success rate lies between ${percent(bound.lower, 1)} and ${percent(bound.upper, 1)}. Accepted from ${percent(bound.accept_at, 1)} on, rejected up to ${percent(bound.reject_at, 1)}.`;
+  const said = `The success rate lies between ${percent(bound.lower, 1)} and ${percent(bound.upper, 1)}. Accepted from ${percent(bound.accept_threshold, 1)} on, rejected up to ${percent(bound.reject_threshold, 1)}.`;
   return interval(1, bound.lower, bound.upper, zones, marks, said);
 }
 

@@ -16,8 +16,8 @@ const CAME = { good: "It was good.", bad: "It was bad.", none: "No result report
 const VERDICT = { kept: "Tolerance kept", open: "Not decided yet", broken: "Tolerance broken" };
 const MODES = { decides: "Decides", learns: "Learning", shadow: "Verifying all", safe: "Safe mode" };
 const BY = {
-  "every outcome": (bad) => `Every outcome is known: ${number(bad.wrong)} of ${number(bad.known)} were bad.`,
-  audits: (bad) => `By audits, ${number(bad.wrong)} of ${number(bad.known)} bad, and by the known system stops.`,
+  "every outcome": (bad) => `Every outcome is known: ${number(bad.n_wrong)} of ${number(bad.n_known)} were bad.`,
+  audits: (bad) => `By audits, ${number(bad.n_wrong)} of ${number(bad.n_known)} bad, and by the known system stops.`,
   "": (bad, stops) => bad.n === 0 ? "No part was accepted without a check." : `${stops ? "Only the system stops are known" : "Nothing is known"} so far; audits would bound it.`,
 };
 
@@ -74,7 +74,7 @@ function badAccepts(doing) {
   return el("section", { class: "card tile wide", id: "bad", "data-part": true }, el("h2", {}, "Bad accepted parts"),
     knownBad(doing.ever), verdict(bad, VERDICT[bad.verdict]), judgedChart(bad),
     el("p", {}, `${percent(bad.lower, 1)} to ${percent(bad.upper, 1)}, tolerance ${percent(bad.tolerance, 1)}`),
-    small(BY[bad.by](bad, doing.ever.false_accepts)));
+    small(BY[bad.basis](bad, doing.ever.false_accepts)));
 }
 
 function wouldHave(doing) {
@@ -82,7 +82,7 @@ function wouldHave(doing) {
   const certain = accepts.n + rejects.n;
   return el("section", { class: "card tile wide", id: "would", "data-part": true }, el("h2", {}, "It would have decided"),
     big(`${number(certain)} of ${number(checked)} verified parts`),
-    el("p", {}, `${number(accepts.n)} accepted, ${number(accepts.wrong)} of them bad; ${number(rejects.n)} rejected, ${number(rejects.wrong)} of them good; ${duration(certain * doing.check_seconds)} saved.`),
+    el("p", {}, `${number(accepts.n)} accepted, ${number(accepts.n_wrong)} of them bad; ${number(rejects.n)} rejected, ${number(rejects.n_wrong)} of them good; ${duration(certain * doing.check_seconds)} saved.`),
     judgedChart(accepts), small(`Bad among those it would have accepted: ${percent(accepts.lower, 1)} to ${percent(accepts.upper, 1)}; ${VERDICT[accepts.verdict].toLowerCase()} (${percent(accepts.tolerance, 1)}).`));
 }
 
@@ -107,7 +107,7 @@ function neighbours(found) {
 }
 
 const why = (found) => [
-  el("ul", { class: "why" }, found.said.map((sentence) => el("li", {}, sentence))),
+  el("ul", { class: "why" }, found.sentences.map((sentence) => el("li", {}, sentence))),
   found.notes.length > 0 && el("details", { id: "notes" }, el("summary", {}, "More that the engine says of it"), found.notes.map((each) => el("p", {}, each))),
 ];
 
