@@ -96,10 +96,10 @@ def correct(store: str, part: str, label: str, author: str, allow_import: bool) 
     """
     from ..history.explain import find_decision_id
 
-    def correct(engine: DataEngine) -> Changed:
+    def change(engine: DataEngine) -> Changed:
         return engine.correct(find_decision_id(engine.store, part), LABELS[label], author)
 
-    _changed(store, author, allow_import, correct)
+    _changed(store, author, allow_import, change)
 
 
 @verb("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")

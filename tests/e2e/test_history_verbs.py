@@ -91,7 +91,7 @@ def test_an_explanations_document_is_its_record(store: Path) -> None:
     assert found["bound"]["n_success"] == found["decision"]["n_success"]
     widths = [each["widths"] for each in found["envelope"]["excesses"]]
     assert widths == sorted(widths, reverse=True)
-    assert found["said"][0].endswith("the bound meets the policy.")
+    assert found["sentences"][0].endswith("the bound meets the policy.")
     newest = document("history", store, "--last", 1)["decisions"][0]
     assert document("explain", store, "last")["decision"] | {"label": newest["label"]} == newest
 
@@ -175,7 +175,7 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
         wrong = true.count(action is Action.REJECT)
         span = told["ever"][name]
         lower, upper = wilson_interval(len(true) - wrong, wrong, 0.05)  # whatever the policy's alpha
-        assert (span["n"], span["wrong"]) == (len(true), wrong)
+        assert (span["n"], span["n_wrong"]) == (len(true), wrong)
         assert (span["lower"], span["upper"]) == pytest.approx((1 - upper, 1 - lower))
     accept, certified = told["ever"]["would_accept"], told["certificate"]
     assert (accept["n"] > 50, accept["verdict"], certified["accepted"]["shadowed"]) == (True, "kept", True)
