@@ -1,7 +1,8 @@
-"""Who may ask, and how much: tokens, the names by which the server is called, sizes, times and rates.
+"""Access control of the HTTP server: tokens, host names, and limits on size, time and rate.
 
-Whoever is on this machine may ask without a token, but for web pages of others: a browser carries their requests here too.
-They are known by the name that they call the server by (`Host`), and by what the browser says of where they come from.
+A server that only this machine can reach needs no token. But a browser on this machine may also
+send requests for web pages of other sites. `Guard` recognises these by the host name that they use
+and by the headers `Origin` and `Sec-Fetch-Site`, and refuses them.
 """
 
 import asyncio
@@ -28,19 +29,24 @@ from ..errors import SettingError, instead
 from .api import Refusal, problem
 
 log = logging.getLogger("dengine")
-SHORTEST = 16  # characters of a token
-CLIENTS = 4096  # whose rate is remembered
-LET_IN = "dengine.let_in"  # in the scope of a request of somebody who may ask, for `connections.Places`
-LOOKS = "GET", "HEAD", "OPTIONS"  # methods that change nothing
-RPC = "/RPC2"  # below which a robot that cannot send headers may have its token
+MIN_TOKEN_LENGTH = 16  # characters
+MAX_CLIENTS = 4096  # whose rate is remembered
+LET_IN = "dengine.let_in"  # key in the scope of an authorized request, read by `Connection`
+SAFE_METHODS = "GET", "HEAD", "OPTIONS"  # they change nothing
+RPC = "/RPC2"  # a robot that cannot send headers may append its token to this path
 
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """What `Authorization: Bearer` has to say, or Basic as its password.
+    """A secret that authorizes requests, as a bearer token or as the password of HTTP Basic.
 
-    operates : reports, corrects, and changes the policy; else its owner only looks.
-    name : the author of what is asked for by it; "": a machine's, or of whoever says his name.
+    Attributes
+    ----------
+    secret : str
+    operates : bool
+        Whether its owner may report, correct and change the policy. False: only read.
+    name : str
+        Recorded as the author of changes. "": a program's token; the request may name an author.
     """
 
     secret: str = field(default="", repr=False)
@@ -50,12 +56,20 @@ class Token:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Who may ask, and how much.
+    """What the server allows.
 
-    tokens : one of which a request has to show; none: it need not.
-    hosts : names by which the server is called, beside localhost; an address of numbers is always taken.
-    largest : bytes of a request's body.  body_seconds : in which it has to come.
-    rate : requests a second of one client, on average, twice as many at once; 0: as many as it likes.
+    Attributes
+    ----------
+    tokens : tuple of Token
+        A request must have one of them. Empty: no token is needed.
+    hosts : tuple of str
+        Names by which the server may be called, beside localhost. IP addresses are always allowed.
+    largest : int
+        Most bytes of a request's body.
+    body_seconds : float
+        Seconds within which the body must arrive.
+    rate : float
+        Mean requests per second of one client, with bursts of twice as many. 0: no limit.
     """
 
     tokens: tuple[Token, ...] = ()
@@ -64,74 +78,110 @@ class Access:
     body_seconds: float = 5.0
     rate: float = 500.0
 
-    def shown(self, said: str) -> Token | None:
-        """The token that this is; None where it is none. Each is compared, in the same time whatever was said."""
-        same = [hmac.compare_digest(each.secret.encode(), said.encode("utf-8", "surrogatepass")) for each in self.tokens]
-        return next(compress(self.tokens, same), None)
+    def find_token(self, secret: str) -> Token | None:
+        """Return the token with this secret, or None. All tokens are compared, in constant time."""
+        given = secret.encode("utf-8", "surrogatepass")
+        is_same = [hmac.compare_digest(token.secret.encode(), given) for token in self.tokens]
+        return next(compress(self.tokens, is_same), None)
 
 
-ANYBODY = Token()  # where no token is asked for
-SHOWN = ContextVar("SHOWN", default=ANYBODY)  # by the request that is being answered, in a task of its own
+ANYBODY = Token()  # of requests to a server that needs no token
+CURRENT_TOKEN = ContextVar("CURRENT_TOKEN", default=ANYBODY)  # of the request being answered
 
 
-class Rates:
-    """A token bucket for each client; those that were not seen for longest are forgotten first."""
+class RateLimiter:
+    """Limits the rate of each client by a token bucket.
+
+    Parameters
+    ----------
+    rate : float
+        Events per second; 0: no limit.
+    burst : float
+        Events that a client may have at once.
+    """
 
     def __init__(self, rate: float, burst: float) -> None:
-        self.rate, self.burst = rate, burst
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()  # tokens, and when they were counted
+        self.rate = rate
+        self.burst = burst
+        # By client: the events left, and the time of that count. Oldest first.
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
-    def take(self, client: str) -> bool:
-        """Take one token; False where there is none."""
+    def allow(self, client: str) -> bool:
+        """Count one event of a client; return False if that exceeds its rate."""
         now = time.monotonic()
-        tokens, since = self._buckets.pop(client, (self.burst, now))
-        tokens = min(self.burst, tokens + (now - since) * self.rate)
-        taken = self.rate <= 0.0 or tokens >= 1.0
-        self._buckets[client] = (tokens - taken, now)
-        if len(self._buckets) > CLIENTS:
+        left, counted_at = self._buckets.pop(client, (self.burst, now))
+        left = min(self.burst, left + (now - counted_at) * self.rate)
+        is_allowed = self.rate <= 0.0 or left >= 1.0
+        self._buckets[client] = (left - is_allowed, now)
+        if len(self._buckets) > MAX_CLIENTS:
             self._buckets.popitem(last=False)
-        return taken
+        return is_allowed
 
 
 def read_tokens(file: Path) -> tuple[Token, ...]:
-    """The tokens in a file that nobody but its owner may read, one a line; SettingError where it has none, or others may.
+    """Read tokens from a file that only its owner may read.
 
-    A line is a token; or that, `viewer` or `operator`, and the name of who has it.
+    Each line is a secret, optionally followed by `viewer` or `operator` and the owner's name.
+
+    Raises
+    ------
+    SettingError
+        If the file cannot be read, others may read it, or a line is not of this form.
     """
-    with instead(SettingError, f"Cannot read the token's file {file}", OSError), file.open("rb") as opened:
-        mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(1 << 16)
-    # systemd, from 254 on, hands a credential to the service's user by an ACL, which shows as a right of the group.
+    with (
+        instead(SettingError, f"Cannot read the token file {file}", OSError),
+        file.open("rb") as opened,
+    ):
+        mode = stat.S_IMODE(os.fstat(opened.fileno()).st_mode)
+        text = opened.read(1 << 16)
+    # From version 254 on, systemd gives a credential to the service's user by an ACL, which shows
+    # as a permission of the group.
     credentials = os.environ.get("CREDENTIALS_DIRECTORY", "")
-    has_owners = hasattr(os, "getuid")  # the bits of Windows say nothing of who may read
-    if has_owners and mode & (0o037 if credentials and file.absolute().parent == Path(credentials) else 0o077):
-        raise SettingError(f"Expected {file} to be its owner's alone, others may use it ({mode:o}): chmod 600 {file}")
+    is_credential = bool(credentials) and file.absolute().parent == Path(credentials)
+    has_owners = hasattr(os, "getuid")  # on Windows the mode does not say who may read
+    if has_owners and mode & (0o037 if is_credential else 0o077):
+        raise SettingError(
+            f"Expected a token file that only its owner may use, {file} has mode {mode:o}; "
+            f"run: chmod 600 {file}"
+        )
     lines = [line.split() for line in text.decode("utf-8", "replace").splitlines() if line.strip()]
     tokens = tuple(Token(line[0], line[1:2] != ["viewer"], " ".join(line[2:])) for line in lines)
-    secrets = {each.secret for each in tokens if each.secret.isascii() and each.secret.isprintable()}
-    if not tokens or len(secrets) < len(tokens) or min(map(len, secrets)) < SHORTEST:
-        wanted = f"tokens of at least {SHORTEST} characters of ASCII in {file}, each once, one a line"
-        raise SettingError(f"Expected {wanted}; make one: (umask 077; openssl rand -hex 24 > {file})")
+    secrets = {
+        token.secret for token in tokens if token.secret.isascii() and token.secret.isprintable()
+    }
+    if not tokens or len(secrets) < len(tokens) or min(map(len, secrets)) < MIN_TOKEN_LENGTH:
+        raise SettingError(
+            f"Expected tokens of at least {MIN_TOKEN_LENGTH} ASCII characters in {file}, one per "
+            f"line and each once; make one: (umask 077; openssl rand -hex 24 > {file})"
+        )
     if any(line[1:2] not in ([], ["viewer"], ["operator"]) for line in lines):
-        raise SettingError(f"Expected viewer or operator behind each token of {file}, then a name; or the token alone.")
+        raise SettingError(
+            f"Expected viewer or operator, and then a name, after each token of {file}; "
+            "or the token alone."
+        )
     return tokens
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server that listens there."""
+    """Return whether only this machine can reach a server that listens at `host`."""
     try:
         return ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return host == "localhost"
 
 
-def in_url(host: str) -> str:
-    """A host as an address has it, before its port."""
+def host_in_url(host: str) -> str:
+    """Return a host as it is written in a URL: an IPv6 address in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 @lru_cache(64)
-def is_called(host: str | None, names: tuple[str, ...]) -> bool:
-    """Whether a request calls the server by a name that is its own: a page that had its own name point here does not."""
+def is_own_host(host: str | None, names: tuple[str, ...]) -> bool:
+    """Return whether a request's `Host` header names this server.
+
+    It must be localhost, an IP address, or one of `names`. A web page whose own name was made to
+    resolve to this machine (DNS rebinding) sends another name.
+    """
     if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
         return False
     try:
@@ -139,33 +189,43 @@ def is_called(host: str | None, names: tuple[str, ...]) -> bool:
         name = parts.hostname
         if name is None or parts.port == 0:
             return False
-        if name != "localhost" and name not in {each.lower() for each in names}:
+        if name != "localhost" and name not in {own_name.lower() for own_name in names}:
             ip_address(name)
     except ValueError:  # no port, or no address
         return False
     return True
 
 
-def said_token(scope: Scope, authorization: str) -> str:
-    """What a request says for the token: as a bearer's, as the password that a browser asks for, or behind /RPC2/.
+def take_token(scope: Scope, authorization: str) -> str:
+    """Return the secret that a request carries, or "".
 
-    What stands there is nobody's business from here on: the scope is of /RPC2 afterwards.
+    It is a bearer token, the password of HTTP Basic, or the rest of a path /RPC2/SECRET. Such a
+    path is changed to /RPC2 in `scope`, so that the secret is not logged later.
+
+    Parameters
+    ----------
+    scope : Scope
+        ASGI scope of the request.
+    authorization : str
+        Value of the header `Authorization`.
     """
     if scope["path"].startswith(f"{RPC}/"):
-        said = str(scope["path"]).removeprefix(f"{RPC}/")
+        secret = str(scope["path"]).removeprefix(f"{RPC}/")
         scope.update(path=RPC, raw_path=RPC.encode("ascii"))
-        return said
-    kind, _, said = authorization.partition(" ")
-    if kind.lower() != "basic":
-        return said.strip() if kind.lower() == "bearer" else ""
+        return secret
+    scheme, _, value = authorization.partition(" ")
+    if scheme.lower() == "bearer":
+        return value.strip()
+    if scheme.lower() != "basic":
+        return ""
     try:
-        return base64.b64decode(said.strip(), validate=True).decode("utf-8").partition(":")[2]
-    except ValueError:  # binascii's and UnicodeDecodeError are such
+        return base64.b64decode(value.strip(), validate=True).decode("utf-8").partition(":")[2]
+    except ValueError:  # also binascii.Error and UnicodeDecodeError
         return ""
 
 
-CLOSE = {"Connection": "close"}  # what was not read is not to be taken for the next request
-HEADERS = [  # of every answer
+CLOSE = {"Connection": "close"}  # bytes of the body that were not read are no next request
+HEADERS = [  # of every response
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
     (b"referrer-policy", b"same-origin"),
@@ -181,97 +241,123 @@ HEADERS = [  # of every answer
 
 
 class Guard:
-    """ASGI middleware: names, tokens, rates and sizes; and the headers that every answer has."""
+    """ASGI middleware that refuses requests which `Access` does not allow.
+
+    It also adds the security headers to every response.
+    """
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self.app = app
         self.access = access
-        self.rates = Rates(access.rate, max(1.0, 2.0 * access.rate))
-        self.lines = Rates(0.1, 3)  # of the log, on a client's wrong tokens
+        self.requests = RateLimiter(access.rate, max(1.0, 2.0 * access.rate))
+        self.log_lines = RateLimiter(0.1, 3)  # about wrong tokens of a client
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request in, or answer it; the application has no websockets, and uvicorn is told to speak none."""
+        """Pass an allowed request on to the application, or answer it with the refusal."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
         try:
-            self._look(scope)
+            self._check(scope)
         except Refusal as refusal:
-            answer = problem(refusal.status, refusal.detail, CLOSE | refusal.headers)
-            if refusal.status == HTTPStatus.UNAUTHORIZED:  # a line of its own: Chromium looks at the first name of each
-                answer.headers.append("WWW-Authenticate", 'Bearer realm="dengine"')
-            await answer(scope, receive, _with_headers(send))
+            response = problem(refusal.status, refusal.detail, CLOSE | refusal.headers)
+            if refusal.status == HTTPStatus.UNAUTHORIZED:
+                # A header of its own: Chromium reads only the first scheme of each.
+                response.headers.append("WWW-Authenticate", 'Bearer realm="dengine"')
+            await response(scope, receive, _with_headers(send))
         else:
             await self.app(scope, _limited(receive, self.access), _with_headers(send))
 
-    def _look(self, scope: Scope) -> None:
-        headers, access = Headers(scope=scope), self.access
-        host, client = headers.get("host"), (scope.get("client") or ("", 0))[0]
-        if not is_called(host, access.hosts):
-            names = "its address, localhost, or a name that it was given (dengine serve --allow-host NAME)"
-            raise Refusal(HTTPStatus.MISDIRECTED_REQUEST, f"Expected the server to be called by {names}.")
-        said = said_token(scope, headers.get("authorization", ""))
-        known = access.shown(said) if access.tokens else ANYBODY
-        # Who uses it up without the token keeps out nobody who has it.
-        if not self.rates.take(client if known else f"{client}, without"):
-            most = f"Expected at most {access.rate:g} requests a second of one client."
-            raise Refusal(HTTPStatus.TOO_MANY_REQUESTS, most)
-        if known is not None:
-            scope[LET_IN] = True
-            SHOWN.set(known)
-            if not known.operates and scope["method"] not in LOOKS:
-                raise Refusal(HTTPStatus.FORBIDDEN, "Expected an operator's token, got a viewer's, who only looks.")
-        elif scope["path"] != "/healthz":
-            if (said or "authorization" in headers) and self.lines.take(client):
-                log.warning("a wrong token came from %s", client)
-            how = "Authorization: Bearer TOKEN, or any user name with it as the password"
-            ask = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
-            raise Refusal(HTTPStatus.UNAUTHORIZED, f"Expected the server's token: {how}.", ask)
-        # What a browser says of a request has to be that it is of one of this server's own pages, or of no page at all.
-        origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
-        own = origin is None or origin.partition("://")[2].lower() == str(host).lower()
-        if scope["method"] not in LOOKS and not (own and site in ("same-origin", "none")):
-            raise Refusal(HTTPStatus.FORBIDDEN, "Expected a request of this server's own pages, got one of another site.")
+    def _check(self, scope: Scope) -> None:
+        """Raise Refusal for a request that is not allowed; else note its token for the handlers."""
+        headers = Headers(scope=scope)
+        host = headers.get("host")
+        if not is_own_host(host, self.access.hosts):
+            names = "its IP address, localhost, or a name given by dengine serve --allow-host NAME"
+            raise Refusal(
+                HTTPStatus.MISDIRECTED_REQUEST, f"Expected the server to be called by {names}."
+            )
+        self._check_token(scope, headers)
+        # Browsers say from which site a request comes. It must be this one, or no page at all.
+        origin = headers.get("origin")
+        is_same_origin = origin is None or origin.partition("://")[2].lower() == str(host).lower()
+        is_same_site = headers.get("sec-fetch-site", "none") in ("same-origin", "none")
+        if scope["method"] not in SAFE_METHODS and not (is_same_origin and is_same_site):
+            raise Refusal(
+                HTTPStatus.FORBIDDEN,
+                "Expected a request of this server's own pages, got one of another site.",
+            )
         length = headers.get("content-length", "0")
         if not (length.isascii() and length.isdecimal()):
             raise Refusal(HTTPStatus.BAD_REQUEST, "Expected Content-Length to be a whole number.")
-        if len(length) > 18 or int(length) > access.largest:
-            raise _too_large(access.largest)
+        if len(length) > 18 or int(length) > self.access.largest:
+            raise _too_large(self.access.largest)
+
+    def _check_token(self, scope: Scope, headers: Headers) -> None:
+        """Raise Refusal for a wrong token, a viewer's token on a change, or too many requests."""
+        client = (scope.get("client") or ("", 0))[0]
+        secret = take_token(scope, headers.get("authorization", ""))
+        token = self.access.find_token(secret) if self.access.tokens else ANYBODY
+        # Requests without a token are counted apart, so that they block nobody who has one.
+        if not self.requests.allow(client if token else f"{client}, without"):
+            limit = f"Expected at most {self.access.rate:g} requests per second from one client."
+            raise Refusal(HTTPStatus.TOO_MANY_REQUESTS, limit)
+        if token is not None:
+            scope[LET_IN] = True
+            CURRENT_TOKEN.set(token)
+            if not token.operates and scope["method"] not in SAFE_METHODS:
+                raise Refusal(
+                    HTTPStatus.FORBIDDEN, "Expected an operator's token, got a viewer's token."
+                )
+        elif scope["path"] != "/healthz":
+            if (secret or "authorization" in headers) and self.log_lines.allow(client):
+                log.warning("a wrong token came from %s", client)
+            how = "Authorization: Bearer TOKEN, or any user name with it as the password"
+            challenge = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
+            raise Refusal(
+                HTTPStatus.UNAUTHORIZED, f"Expected the server's token: {how}.", challenge
+            )
 
 
 def _limited(receive: Receive, access: Access) -> Receive:
-    """What receives a request's body, which has to be of a size and to come in time; else Refusal."""
-    left, more = access.largest, True
-    until = asyncio.get_running_loop().time() + access.body_seconds
+    """Return `receive`, which then raises Refusal for a body that is too large or too late."""
+    bytes_left = access.largest
+    is_incomplete = True
+    deadline = asyncio.get_running_loop().time() + access.body_seconds
 
-    async def receiving() -> Message:
-        nonlocal left, more
-        if not more:  # what follows is the word that the client has gone, which may take as long as it likes
+    async def receive_body() -> Message:
+        nonlocal bytes_left, is_incomplete
+        if not is_incomplete:  # the next message says that the client disconnected, at any time
             return await receive()
         try:
-            async with asyncio.timeout_at(until):
+            async with asyncio.timeout_at(deadline):
                 message = await receive()
         except TimeoutError:
             text = f"Expected the request's body within {access.body_seconds:g} s."
             raise Refusal(HTTPStatus.REQUEST_TIMEOUT, text, CLOSE) from None
-        more = bool(message.get("more_body", False))
-        left -= len(message.get("body", b""))
-        if left < 0:
+        is_incomplete = bool(message.get("more_body", False))
+        bytes_left -= len(message.get("body", b""))
+        if bytes_left < 0:
             raise _too_large(access.largest)
         return message
 
-    return receiving
+    return receive_body
 
 
 def _too_large(largest: int) -> Refusal:
-    text = f"Expected a request of at most {largest} bytes (dengine serve --largest), got a larger one."
+    text = (
+        f"Expected a request of at most {largest} bytes (dengine serve --largest), "
+        "got a larger one."
+    )
     return Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text, CLOSE)
 
 
 def _with_headers(send: Send) -> Send:
-    async def sending(message: Message) -> None:
+    """Return `send` so that every response gets the security headers."""
+
+    async def send_with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":
             message["headers"] = [*message.get("headers", ()), *HEADERS]
         await send(message)
 
-    return sending
+    return send_with_headers

@@ -1,143 +1,186 @@
-"""Connections with limits that uvicorn does not set: places, in all and for each address, and a time for a request's head.
+"""Limits on connections that uvicorn does not set: their number, and the time of a request's head.
 
-Whoever shows the token is not kept out by those who do not: where there is no place, the oldest connection over which
-nobody was let in gives way. What ends a connection is answered before: 503 where there is no place, 408 to a head that
-takes too long (of a body's time `auth.Guard` takes care), 400 to what is no HTTP, to too long a head, and to half a head of
-which no more comes.
+If all places are taken, a new connection replaces the oldest one that is idle and was never
+authorized, so that clients without a token cannot keep out one that has it. A connection is closed
+only after a response: 503 if there is no place, 408 if a request's head takes too long (the time
+of the body is limited by `auth.Guard`), 400 if the request is not HTTP, its head is too long, or
+the client stops in the middle of it.
 """
 
 import asyncio
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # both have the names that are used here
+if TYPE_CHECKING:  # both implementations have the names that are used here
     from uvicorn.protocols.http.h11_impl import H11Protocol as AutoHTTPProtocol
-else:  # that of httptools, where it is installed: a tenth of a millisecond a request less
+else:  # uses httptools if it is installed, which saves 0.1 ms per request
     from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
 from .api import problem
 from .auth import LET_IN
 
-LARGEST_HEAD = 1 << 16  # bytes
-HEAD_SECONDS = 10.0  # from a connection, or from the first byte after an answer, to the end of the request's head
-FEWEST = 8  # places of one address, where half of all are fewer
+MAX_HEAD_BYTES = 1 << 16
+HEAD_SECONDS = 10.0  # from connecting, or the first byte after a response, to the end of the head
+MIN_PER_ADDRESS = 8  # places that one IP address may have, even if that is more than half
 
 
-class Places:
-    """The connections that a server has.  `uvicorn.Config(http=Places(100).connection)` keeps to them."""
+class ConnectionPool:
+    """The open connections of a server, limited in number; half of them for one IP address.
 
-    def __init__(self, connections: int, head_seconds: float = HEAD_SECONDS) -> None:
-        self.most, self.of_address, self.head_seconds = connections, max(FEWEST, connections // 2), head_seconds
-        self.taken: list[Connection] = []  # oldest first
+    Use it as ``uvicorn.Config(app, http=ConnectionPool(100).new_connection)``.
 
-    def take(self, new: "Connection") -> bool:
-        """Whether there is a place for a connection; where there is none, one over which nobody was let in gives way."""
-        same = [each for each in self.taken if each.address == new.address]
-        if len(same) >= self.of_address or len(self.taken) >= self.most:
-            among = same if len(same) >= self.of_address else self.taken
-            if (idle := next((each for each in among if not (each.let_in or each.asked)), None)) is None:
+    Parameters
+    ----------
+    size : int
+        Most open connections.
+    head_seconds : float, default 10
+        Seconds within which the head of a request must arrive.
+    """
+
+    def __init__(self, size: int, head_seconds: float = HEAD_SECONDS) -> None:
+        self.size = size
+        self.per_address = max(MIN_PER_ADDRESS, size // 2)
+        self.head_seconds = head_seconds
+        self.open: list[Connection] = []  # oldest first
+
+    def add(self, connection: "Connection") -> bool:
+        """Add a connection; return False if there is no place for it.
+
+        If all places are taken, the oldest connection that is idle and was never authorized is
+        closed to make room.
+        """
+        same_address = [other for other in self.open if other.address == connection.address]
+        is_address_full = len(same_address) >= self.per_address
+        if is_address_full or len(self.open) >= self.size:
+            candidates = same_address if is_address_full else self.open
+            idle = [
+                other for other in candidates if not (other.was_authorized or other.is_answering)
+            ]
+            if not idle:
                 return False
-            self.taken.remove(idle)
-            idle.refuse()
-        self.taken.append(new)
+            self.open.remove(idle[0])
+            idle[0].refuse()
+        self.open.append(connection)
         return True
 
-    def connection(self, **options: Any) -> "Connection":
-        """A protocol for one connection, made as uvicorn makes its own."""
+    def new_connection(self, **options: Any) -> "Connection":
+        """Return a protocol for one connection, with the options that uvicorn passes."""
         return Connection(self, **options)
 
 
 class Connection(AutoHTTPProtocol):
-    """One connection: uvicorn's own protocol, by its public names, within the limits."""
+    """One connection: uvicorn's own protocol with the limits of this module."""
 
-    def __init__(self, places: Places, **options: Any) -> None:
+    def __init__(self, pool: ConnectionPool, **options: Any) -> None:
         super().__init__(**options)
-        self._places, self.address, self._has_place, self._was_let_in = places, "", False, False
+        self._pool = pool
+        self.address = ""
+        self._has_place = False
+        self._was_authorized = False
         self._timer: asyncio.TimerHandle | None = None
-        self._begun = self._ended = False  # a head; all that the client sends
-        self._head = 0  # bytes of it so far
+        self._head_began = False
+        self._client_finished = False  # sends no more
+        self._head_bytes = 0  # received so far
 
     @property
-    def asked(self) -> bool:
-        """Whether a request is being answered."""
+    def is_answering(self) -> bool:
+        """Return whether a request is being answered."""
         return self.cycle is not None and not self.cycle.response_complete
 
     @property
-    def let_in(self) -> bool:
-        """Whether a request that came over it was one of somebody who may ask."""
-        self._was_let_in = self._was_let_in or (self.cycle is not None and LET_IN in self.cycle.scope)
-        return self._was_let_in
+    def was_authorized(self) -> bool:
+        """Return whether a request on this connection was authorized by `auth.Guard`."""
+        if self.cycle is not None and LET_IN in self.cycle.scope:
+            self._was_authorized = True
+        return self._was_authorized
 
     def refuse(self) -> None:
-        """Say that there are too many, and close."""
-        full = "Expected fewer connections at once (dengine serve --connections); verify the part, and try again."
-        self._end(HTTPStatus.SERVICE_UNAVAILABLE, full)
+        """Respond that there are too many connections, and close."""
+        self._respond_and_close(
+            HTTPStatus.SERVICE_UNAVAILABLE,
+            "Expected fewer connections at once (dengine serve --connections); "
+            "verify the part, and try again.",
+        )
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as of uvicorn's
-        """Take a connection, or say that there are too many."""
+        """Take a place in the pool, or refuse the connection."""
         self.transport = transport
         self.address = str((transport.get_extra_info("peername") or ("",))[0])
-        self._has_place = self._places.take(self)
+        self._has_place = self._pool.add(self)
         if not self._has_place:
             self.refuse()
             return
         super().connection_made(transport)
-        self._wait()
+        self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._stop_waiting()
+        """Give the place in the pool back."""
+        self._stop_timer()
         if self._has_place:
-            if self in self._places.taken:  # else it gave way
-                self._places.taken.remove(self)
+            if self in self._pool.open:  # else it was closed to make room
+                self._pool.open.remove(self)
             super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes; those of a head have to become one in time."""
+        """Pass bytes on to uvicorn, and limit the size and the time of a request's head."""
         if not self._has_place or self.transport.is_closing():
             return
-        self._begun, self._head = self._begun or not self.asked, self._head + len(data)
+        self._head_began = self._head_began or not self.is_answering
+        self._head_bytes += len(data)
         super().data_received(data)
-        if self.asked:
-            self._begun, self._head = False, 0
-            self._stop_waiting()
-        elif self._head > LARGEST_HEAD:
-            self._end(HTTPStatus.BAD_REQUEST, f"Expected the request's head to be at most {LARGEST_HEAD} bytes.")
+        if self.is_answering:
+            self._head_began = False
+            self._head_bytes = 0
+            self._stop_timer()
+        elif self._head_bytes > MAX_HEAD_BYTES:
+            self._respond_and_close(
+                HTTPStatus.BAD_REQUEST,
+                f"Expected the request's head to be at most {MAX_HEAD_BYTES} bytes.",
+            )
         else:
-            self._wait()
+            self._start_timer()
 
-    def eof_received(self) -> bool:  # type: ignore[override]  # asyncio's may say that the connection stays open
-        """The client sends no more: what it asked is answered, half a head is refused."""
-        self._ended = True
-        if self._begun:
-            self._end(HTTPStatus.BAD_REQUEST, "Expected the whole of the request.")
-        return self.asked
+    def eof_received(self) -> bool:  # type: ignore[override]  # asyncio allows a bool
+        """Note that the client sends no more; return whether a request is still being answered.
+
+        Half a head is refused.
+        """
+        self._client_finished = True
+        if self._head_began:
+            self._respond_and_close(HTTPStatus.BAD_REQUEST, "Expected the whole of the request.")
+        return self.is_answering
 
     def on_response_complete(self) -> None:
+        """Close the connection after the last response if the client sends no more."""
         super().on_response_complete()
-        self._was_let_in = self.let_in
-        if self._ended and not self.asked:
+        self._was_authorized = self.was_authorized
+        if self._client_finished and not self.is_answering:
             self.transport.close()
 
     def send_400_response(self, msg: str) -> None:
-        self._end(HTTPStatus.BAD_REQUEST, "Expected a request as HTTP/1.1 has it.")
+        """Respond to bytes that are not HTTP."""
+        self._respond_and_close(HTTPStatus.BAD_REQUEST, "Expected an HTTP/1.1 request.")
 
-    def _end(self, status: HTTPStatus, detail: str) -> None:
-        """Answer outside of HTTP's course, and close."""
+    def _respond_and_close(self, status: HTTPStatus, detail: str) -> None:
+        """Write a response that uvicorn knows nothing of, and close the connection."""
         if self.transport.is_closing():
             return
-        answer = problem(status, detail, {"connection": "close"})
-        head = b"".join(name + b": " + value + b"\r\n" for name, value in answer.raw_headers)
-        first = f"HTTP/1.1 {status.value} {status.phrase}\r\n".encode("ascii")
-        self.transport.write(first + head + b"\r\n" + bytes(answer.body))
+        response = problem(status, detail, {"connection": "close"})
+        head = b"".join(name + b": " + value + b"\r\n" for name, value in response.raw_headers)
+        status_line = f"HTTP/1.1 {status.value} {status.phrase}\r\n".encode("ascii")
+        self.transport.write(status_line + head + b"\r\n" + bytes(response.body))
         self.transport.close()
 
-    def _wait(self) -> None:
+    def _start_timer(self) -> None:
+        """Close the connection with 408 after the pool's `head_seconds`, unless a timer runs."""
         if self._timer is None:
-            seconds = self._places.head_seconds
-            late = HTTPStatus.REQUEST_TIMEOUT, f"Expected the request's head within {seconds:g} s."
-            self._timer = self.loop.call_later(seconds, self._end, *late)
+            seconds = self._pool.head_seconds
+            detail = f"Expected the request's head within {seconds:g} s."
+            self._timer = self.loop.call_later(
+                seconds, self._respond_and_close, HTTPStatus.REQUEST_TIMEOUT, detail
+            )
 
-    def _stop_waiting(self) -> None:
+    def _stop_timer(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -41,7 +41,7 @@ from ..store.records import StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from . import api
 from .api import Json, Operation, Refusal, answer, fields_of
-from .auth import SHOWN, Access, Guard
+from .auth import CURRENT_TOKEN, Access, Guard
 from .metrics import Metrics
 from .robot_calls import Recorder
 from .service import CellService
@@ -126,7 +126,7 @@ class HttpApi:
             that was looked at afterwards it is an inspection.
         author : who says so, for the event log, where the token has no name; a robot leaves it out.
         """
-        by = _name(author) if author or SHOWN.get().name else ""
+        by = _name(author) if author or CURRENT_TOKEN.get().name else ""
         return answer("Told", await self.service.report(await self._of(id_, part), success, by))
 
     async def _of(self, id_: str, part: str) -> str:
@@ -268,7 +268,7 @@ class HttpApi:
 
     async def me(self) -> Json:
         """Whose token was shown, and what it may."""
-        return answer("Me", SHOWN.get())
+        return answer("Me", CURRENT_TOKEN.get())
 
     async def metrics(self) -> Response:
         """What Prometheus reads."""
@@ -306,7 +306,7 @@ class HttpApi:
 
 def _name(author: str) -> str:
     """An author's name for the event log, the token's where it has one; Refusal for none, and for another than that."""
-    owner, name = SHOWN.get().name, " ".join(author.split())
+    owner, name = CURRENT_TOKEN.get().name, " ".join(author.split())
     if owner and name not in ("", owner):
         raise Refusal(422, f"Expected author to be {owner}, whose token it is, or to be left out.")
     if not is_name(owner or name):

@@ -30,7 +30,7 @@ from asyncua.ua.attribute_ids import AttributeIds
 from asyncua.ua.status_codes import StatusCodes
 
 from ..errors import DengineError, SettingError, as_options
-from .auth import in_url, is_loopback
+from .auth import host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
 from .service import CellService
 
@@ -135,7 +135,7 @@ async def opcua_server(
     server.set_identity_tokens([ua.AnonymousIdentityToken if tokens is None else ua.UserNameIdentityToken])
     await server.init()
     server.allow_remote_admin(False)
-    server.set_endpoint(f"opc.tcp://{in_url(host)}:{port}/dengine")
+    server.set_endpoint(f"opc.tcp://{host_in_url(host)}:{port}/dengine")
     server.set_server_name("dengine")
     await server.set_application_uri("urn:dengine:server")
     policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt if secure else ua.SecurityPolicyType.NoSecurity

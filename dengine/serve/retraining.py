@@ -1,8 +1,10 @@
-"""The process in which a served engine retrains: another one, so that no decision waits for Python's lock.
+"""`RetrainingProcess`, an executor with one process, in which a served engine retrains.
 
-torch sends each tensor through shared memory of its own: a hundred of them hold Python's lock for tens of milliseconds, in
-which nothing is answered. Here a call and its result go as plain bytes, pickled in the executor's own thread; arrays, the
-most of it, through a file in memory, which is written and read without the lock.
+In a process of its own a retrain never holds the lock of the interpreter that answers decisions.
+Calls and results are pickled in the executor's thread, and their arrays are passed through a file
+in memory (`memfd_create`), which is written and read without that lock. `torch.multiprocessing`
+would pass each tensor through shared memory of its own, which holds the lock for tens of
+milliseconds.
 """
 
 from __future__ import annotations
@@ -26,41 +28,52 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-# The last is Ctrl-Break of Windows.
-ENDING = [each for each in signal.Signals if each.name in ("SIGINT", "SIGTERM", "SIGBREAK")]
+# Signals that ask a process to end; SIGBREAK is Ctrl-Break on Windows.
+END_SIGNALS = [
+    number for number in signal.Signals if number.name in ("SIGINT", "SIGTERM", "SIGBREAK")
+]
 log = logging.getLogger("dengine")
-NICE = 10  # decisions first, where cores are scarce
-DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of linux/prctl.h
+NICENESS = 10  # decisions go first if cores are scarce
+PR_SET_PDEATHSIG = 1  # linux/prctl.h: send a signal when the parent ends
 T = TypeVar("T")
 
 
 class RetrainingProcess(ProcessPoolExecutor):
-    """An executor of one process, started anew and not forked: this one has threads, and a fork would have their locks.
+    """A `ProcessPoolExecutor` with one spawned process that imports torch at once.
 
-    It ends with the thread that made it, also when that one's process is killed, and imports what a retrain needs at once.
+    The process ends with the thread that created it, even if that thread's process is killed. It
+    is spawned, since a forked process would inherit locks that other threads hold.
     """
 
     def __init__(self) -> None:
         super().__init__(1, multiprocessing.get_context("spawn"), _end_with_parent)
-        others = set(multiprocessing.active_children())
+        other_processes = set(multiprocessing.active_children())
         with _signals_blocked():
-            self.submit(_warm_up).add_done_callback(partial(_tell_ready, time.monotonic()))
-        (self._process,) = set(multiprocessing.active_children()) - others
+            self.submit(_warm_up).add_done_callback(partial(_log_start, time.monotonic()))
+        (self._process,) = set(multiprocessing.active_children()) - other_processes
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Call a function there, after what was submitted before; BrokenExecutor where the process has ended."""
-        return super().submit(_call, _Plain((fn, args, kwargs)))  # type: ignore[arg-type]  # it arrives as what it holds
+        """Call a function in the process, after earlier calls.
+
+        Raises BrokenExecutor if the process has ended.
+        """
+        call = _SharedPickle((fn, args, kwargs))
+        return super().submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the process, whatever it is at: a retrain that was worth waiting for, its engine has waited for."""
+        """Kill the process, also during a retrain; an engine waits for its retrain before this."""
         self._process.kill()
         super().shutdown(wait, cancel_futures=cancel_futures)
 
 
 @contextmanager
 def _signals_blocked() -> Iterator[None]:
-    """What is started meanwhile never hears the signals to the whole group: its parent ends it in time."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows: `_end_with_parent` ignores them there
+    """Block SIGINT and SIGTERM, so that a process started inside inherits the block.
+
+    Ctrl-C signals all processes of a terminal. The retraining process must outlive the signal,
+    since the server ends it in order.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows `_end_with_parent` ignores them
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
@@ -70,63 +83,76 @@ def _signals_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-class _Plain:
-    """Arrives on the other side as what it holds, as long as it lives here."""
+class _SharedPickle:
+    """Pickles a value with its arrays in a file in memory; unpickling gives the value itself.
 
-    def __init__(self, what: Any) -> None:
-        self._what = what
+    The file exists as long as this object, which must live until the other process has read it.
+    """
+
+    def __init__(self, value: Any) -> None:
+        self._value = value
 
     def __reduce__(self) -> tuple[Any, ...]:
         if not hasattr(os, "memfd_create"):
-            return pickle.loads, (pickle.dumps(self._what, 5),)
+            return pickle.loads, (pickle.dumps(self._value, 5),)
         arrays: list[pickle.PickleBuffer] = []
-        pickled = pickle.dumps(self._what, 5, buffer_callback=arrays.append)
+        pickled = pickle.dumps(self._value, 5, buffer_callback=arrays.append)
         descriptor = os.memfd_create("dengine")
         weakref.finalize(self, os.close, descriptor)
         with open(descriptor, "wb", closefd=False) as file:
-            sizes = [file.write(each.raw()) for each in arrays]
-        return _arrived, (pickled, f"/proc/{os.getpid()}/fd/{descriptor}", sizes)
+            sizes = [file.write(array.raw()) for array in arrays]
+        return _unpickle, (pickled, f"/proc/{os.getpid()}/fd/{descriptor}", sizes)
 
 
-def _arrived(pickled: bytes, path: str, sizes: list[int]) -> Any:
+def _unpickle(pickled: bytes, path: str, sizes: list[int]) -> Any:
+    """Return the value of a `_SharedPickle`, reading arrays of these sizes in bytes from a file."""
     arrays = [np.empty(size, np.uint8) for size in sizes]
     with Path(path).open("rb") as file:
-        if [file.readinto(each.data) for each in arrays] != sizes:
+        if [file.readinto(array.data) for array in arrays] != sizes:
             raise EOFError("Expected all arrays of a retrain, got fewer bytes.")
     return pickle.loads(pickled, buffers=arrays)
 
 
-_SENT: list[_Plain] = []  # the newest result: it lives until the next, and is read long before
+_NEWEST_RESULT: list[_SharedPickle] = []  # is kept until the next call, long after it was read
 
 
-def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _Plain:
+def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _SharedPickle:
+    """Call a function with its arguments, in the retraining process."""
     fn, args, kwargs = call
-    _SENT[:] = [_Plain(fn(*args, **kwargs))]
-    return _SENT[0]
+    _NEWEST_RESULT[:] = [_SharedPickle(fn(*args, **kwargs))]
+    return _NEWEST_RESULT[0]
 
 
 def _end_with_parent() -> None:
-    """In that process, first of all: have it end when its parent does, be it at work in C++."""
+    """Prepare the retraining process: end it with its parent, and let decisions go first.
+
+    It runs first in the new process. The process ends with its parent even during a call into C++;
+    it leaves one core to decisions and lowers its priority.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned
-    for number in () if hasattr(signal, "pthread_sigmask") else ENDING:
-        signal.signal(number, signal.SIG_IGN)
+    if not hasattr(signal, "pthread_sigmask"):  # Windows, where `_signals_blocked` blocks nothing
+        for number in END_SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
     if hasattr(os, "sched_setaffinity"):  # Linux
-        ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
-        if os.getppid() != parent.pid:  # it was killed before that
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent.pid:  # the parent ended before that
             os._exit(1)
         cores = sorted(os.sched_getaffinity(0))
-        if len(cores) > 1:  # one is left to decisions alone, not the same one by every server of a machine
+        if len(cores) > 1:  # servers on the same machine leave out different cores
             os.sched_setaffinity(0, {*cores} - {cores[parent.pid % len(cores)]})
     else:
         threading.Thread(target=lambda: (wait([parent.sentinel]), os._exit(1)), daemon=True).start()
     if hasattr(os, "nice"):
-        os.nice(NICE)
+        os.nice(NICENESS)
 
 
-def _tell_ready(began: float, started: Future[None]) -> None:
+def _log_start(began: float, started: Future[None]) -> None:
+    """Log how long the process took to start, since the monotonic time `began`."""
     if not started.cancelled() and started.exception() is None:
-        log.info("ready to retrain, in a process of its own, after %.1f s", time.monotonic() - began)
+        log.info(
+            "ready to retrain, in a process of its own, after %.1f s", time.monotonic() - began
+        )
 
 
 def _warm_up() -> None:

@@ -20,10 +20,10 @@ import uvicorn
 
 from ..engine.engine import DataEngine, frozen_objects
 from ..errors import SettingError, instead, without_password
-from .auth import Access, in_url, is_loopback, read_tokens
-from .connections import Places
+from .auth import Access, host_in_url, is_loopback, read_tokens
+from .connections import ConnectionPool
 from .http import Beside, create_app
-from .retraining import ENDING, RetrainingProcess
+from .retraining import END_SIGNALS, RetrainingProcess
 from .robot_calls import Recorder
 from .service import DEADLINE, CellService
 
@@ -108,7 +108,7 @@ def serve(
                 beside = [*beside, partial(spoken, cert=opcua_cert or cert, key=opcua_key or key)]
             app = create_app(service, access, beside=beside, recorder=recording, **interfaces)
             config = uvicorn.Config(app, **uvicorn_options(connections) | tls)
-            address = f"http{'s' if cert else ''}://{in_url(host)}:{listening.getsockname()[1]}"
+            address = f"http{'s' if cert else ''}://{host_in_url(host)}:{listening.getsockname()[1]}"
             line = f"{service.engine.store.cell_id} is served at {address}{'' if tokens else ', to this machine alone'}."
             server = CellServer(config, service, lambda: say(line))
             try:
@@ -123,7 +123,7 @@ def serve(
 
 def uvicorn_options(connections: int = 100) -> dict[str, Any]:
     """What uvicorn is told, whose loop is uvloop where that is installed; what it would log is answered, or told here."""
-    limits = {"http": Places(connections).connection, "timeout_keep_alive": KEEP_ALIVE, "timeout_graceful_shutdown": GRACE}
+    limits = {"http": ConnectionPool(connections).new_connection, "timeout_keep_alive": KEEP_ALIVE, "timeout_graceful_shutdown": GRACE}
     plain = {"loop": "auto", "ws": "none", "lifespan": "on", "server_header": False, "proxy_headers": False}
     return limits | plain | {"log_config": None, "log_level": "critical", "access_log": False}
 
@@ -152,7 +152,7 @@ class CellServer(uvicorn.Server):
             self._service.end_listening()
             self.handle_exit(number, frame)
 
-        before = {number: signal.signal(number, end) for number in ENDING}
+        before = {number: signal.signal(number, end) for number in END_SIGNALS}
         try:
             yield
         finally:
