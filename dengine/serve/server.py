@@ -123,7 +123,11 @@ def serve(
 
 def uvicorn_options(connections: int = 100) -> dict[str, Any]:
     """What uvicorn is told, whose loop is uvloop where that is installed; what it would log is answered, or told here."""
-    limits = {"http": ConnectionPool(connections).new_connection, "timeout_keep_alive": KEEP_ALIVE, "timeout_graceful_shutdown": GRACE}
+    limits = {
+        "http": ConnectionPool(connections).new_connection,
+        "timeout_keep_alive": KEEP_ALIVE,
+        "timeout_graceful_shutdown": GRACE,
+    }
     plain = {"loop": "auto", "ws": "none", "lifespan": "on", "server_header": False, "proxy_headers": False}
     return limits | plain | {"log_config": None, "log_level": "critical", "access_log": False}
 
