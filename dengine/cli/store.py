@@ -206,7 +206,7 @@ def _lines(report: HistoryReport) -> list[str]:
             lines.append(WAITING.format(cell.cell_id, cell.waiting))
     for fault in report.faults[:SHOWN]:
         where = " ".join(word for word in (fault.cell_id and f"cell {fault.cell_id}:", fault.table, fault.key) if word)
-        lines.append(f"{where} {fault.what}.")
+        lines.append(f"{where} {fault.problem}.")
     if len(report.faults) > SHOWN:
         lines.append(f"And {len(report.faults) - SHOWN} more; --json shows all.")
     if report.ok:

@@ -842,9 +842,9 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     if not matches and (item := store.get_decision(part, trace=False)) is not None:
         matches = [item]
     if not matches:
-        got = f"{shortened(part)}, which is unknown; `dengine history STORE` lists them"
+        actual = f"{shortened(part)}, which is unknown; `dengine history STORE` lists them"
         raise UnknownDecisionError(
-            f"Expected the number of a part that was decided on, or a decision's id, got {got}."
+            f"Expected the number of a part that was decided on, or a decision's id, got {actual}."
         )
     if len(matches) > 1:
         ids = ", ".join(item.decision.id for item in reversed(matches))

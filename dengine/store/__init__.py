@@ -1,4 +1,4 @@
-"""Where an engine remembers: a database: a file, a server, or one in memory."""
+"""The memory of an engine in a database: a file, a server, or in memory; with a local journal."""
 
 import lazy_loader
 

@@ -129,8 +129,8 @@ def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
 
 def _unusable_url(url: str, reason: str) -> StoreError:
     """Return the error for a URL that cannot be used; it names the part behind the password."""
-    got = f"{url.split('@')[-1]!r}: {reason}. For PostgreSQL: pip install 'dengine[postgres]'"
-    return StoreError(f"Expected a file or a database URL that can be used here, got {got}.")
+    actual = f"{url.split('@')[-1]!r}: {reason}. For PostgreSQL: pip install 'dengine[postgres]'"
+    return StoreError(f"Expected a file or a database URL that can be used here, got {actual}.")
 
 
 class CopyConnection(sqlite3.Connection):

@@ -443,9 +443,9 @@ def _parse_header(header: bytes) -> tuple[int, tuple[int, str] | None, str]:
 
 def forked_error(pid: int, name: str) -> StoreError:
     """Return the error for a forked process that uses what its parent opened."""
-    got = f"its fork {os.getpid()}"
+    actual = f"its fork {os.getpid()}"
     do = "open it after the fork, in the process that uses it"
-    return StoreError(f"Expected the process that opened {name}, {pid}, got {got}; {do}.")
+    return StoreError(f"Expected the process that opened {name}, {pid}, got {actual}; {do}.")
 
 
 def describe_process() -> str:

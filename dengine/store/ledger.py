@@ -2,7 +2,7 @@
 
 Every transaction that adds rows or changes settings ends with a ledger entry. The entry has a
 digest over the entry before, over the sums (SHA-256) of the rows that the transaction added, and,
-for each table that an engine reads at its start (`IN_FORCE`), over all its rows so far (`held`).
+for each table that an engine reads at its start (`IN_FORCE`), over all its rows so far (`chains`).
 By the latter an engine checks what it reads from the newest entry and these rows alone.
 
 Rows are chained where a statement is sent to the database: inserts into the tables of CHAINED are
@@ -149,11 +149,11 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
 
 
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
-    """Return a row (number, digest, held) of a cell's newest ledger entry.
+    """Return a row (number, digest, chains) of a cell's newest ledger entry.
 
     None if there is none.
     """
-    query = sa.select(*LEDGER.c["number", "digest", "held"]).where(LEDGER.c.cell_id == cell_id)
+    query = sa.select(*LEDGER.c["number", "digest", "chains"]).where(LEDGER.c.cell_id == cell_id)
     return connection.execute(query.order_by(LEDGER.c.number.desc()).limit(1)).first()
 
 
@@ -197,13 +197,13 @@ def _settings_chain(settings: Mapping[str, str]) -> str:
     return _extend_chain("", [json.dumps(settings, sort_keys=True).encode()])
 
 
-def _parse_chains(held: str) -> dict[str, str]:
-    """Return the chain of each table from an entry's column `held`.
+def _parse_chains(text: str) -> dict[str, str]:
+    """Return the chain of each table from an entry's column `chains`.
 
     {} if it is damaged, which then fits no rows.
     """
     with suppress(ValueError, TypeError):
-        return dict(json.loads(held))
+        return dict(json.loads(text))
     return {}
 
 
@@ -231,7 +231,7 @@ class LedgerEntry:
         last = newest_entry(connection, cell_id)
         self._number: int = 1 if last is None else last.number + 1
         self._previous: bytes = START if last is None else last.digest
-        self._chains = {} if last is None else _parse_chains(last.held)
+        self._chains = {} if last is None else _parse_chains(last.chains)
         self._sums: dict[str, list[bytes]] = {}
         self.settings = False
 
@@ -275,7 +275,7 @@ class LedgerEntry:
             "time": float(clock()),
             "added": json.dumps({table: len(sums) for table, sums in sorted(self._sums.items())}),
             "rows": rows_digest(self._sums),
-            "held": json.dumps(chains, sort_keys=True),
+            "chains": json.dumps(chains, sort_keys=True),
             "settings": None if settings is None else json.dumps(settings, sort_keys=True),
         }
         digest = entry_digest(self._previous, head, self._key)
@@ -340,7 +340,7 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
     previous = before.get("digest", START)
     if newest and entry_digest(previous, newest | {"digest": None}, key) != newest["digest"]:
         return "the newest entry of the ledger is not as it was written"
-    chains = _parse_chains(newest.get("held", ""))
+    chains = _parse_chains(newest.get("chains", ""))
     settings = _settings_chain(read_settings(connection, cell_id))
     if chains.get(SETTING.name, _settings_chain({})) != settings:
         return "the settings are not those of the ledger"
@@ -373,8 +373,8 @@ def _find_table_error(
     chain = ""
     if before is not None:
         is_entry = (LEDGER.c.cell_id == cell_id) & (LEDGER.c.number == before.entry)
-        held = connection.execute(sa.select(LEDGER.c.held).where(is_entry)).scalar()
-        chain = _parse_chains(held or "").get(name, "")
+        text = connection.execute(sa.select(LEDGER.c.chains).where(is_entry)).scalar()
+        chain = _parse_chains(text or "").get(name, "")
         selected = selected & (number > before[1])
     selected &= table.c.entry.is_(None) | (table.c.entry <= last_entry)
     query = sa.select(*(column for column in table.c if column.name != "state"))
@@ -393,25 +393,25 @@ def chain_writes(engine: sa.Engine) -> None:
 
 
 def _chain_statement(
-    connection: sa.Connection, statement: Any, many: Any, one: Any, options: Any
+    connection: sa.Connection, statement: Any, many: Any, single: Any, options: Any
 ) -> tuple[Any, Any, Any]:
     """Add rows that are about to be inserted to the transaction's ledger entry.
 
-    Note a change of settings.
-
-    Returns the statement and its parameters, the rows with entry and sum. Raises StoreError for an
-    insert into a chained table whose rows are not beside the statement.
+    SQLAlchemy calls it before it executes a statement, with its rows as `many` or as a `single`
+    one. It returns the statement and its parameters; inserted rows then have the entry's number and
+    a sum. If settings are written, that is noted in the entry. Raises StoreError for an insert into
+    a chained table whose rows are not beside the statement.
     """
     entry: LedgerEntry | None = connection.get_execution_options().get("dengine_entry")
     if entry is None or not isinstance(statement, sa.Insert | sa.Update | sa.Delete):
-        return statement, many, one
+        return statement, many, single
     table = statement.table.name if isinstance(statement.table, sa.Table) else ""
     entry.settings |= table == SETTING.name
     if table not in CHAINED or not isinstance(statement, sa.Insert):
-        return statement, many, one
-    if not (many or one):
+        return statement, many, single
+    if not (many or single):
         raise StoreError(
             f"Expected the rows of {table} beside the statement, got none; "
             "execute(insert(table), rows)."
         )
-    return statement, entry.add_rows(table, many or [one]), {}
+    return statement, entry.add_rows(table, many or [single]), {}

@@ -47,6 +47,7 @@ def _lock_of_windows(msvcrt: Any) -> Callable[[int], object]:
     """
 
     def lock(descriptor: int) -> None:
+        """Lock one byte of the file; BlockingIOError if it is locked."""
         os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
         try:
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)

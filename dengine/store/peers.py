@@ -72,14 +72,14 @@ def must_agree(
     ]
     if different:
         expected = ", ".join(f"{key} {peer_values[key]}" for key in different)
-        got = ", ".join(f"{key} {values[key]}" for key in different)
+        actual = ", ".join(f"{key} {values[key]}" for key in different)
         do = (
             "cells that share labels share what embeds them: give the same, or name another product"
         )
         raise SettingError(
             f"Expected the settings of product {product!r}, as cell {name!r} has them "
             f"({expected}), "
-            f"got {got}; {do}."
+            f"got {actual}; {do}."
         )
 
 

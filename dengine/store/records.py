@@ -58,9 +58,9 @@ def _when(record: Any) -> datetime:
 
 def unknown_decision(decision_id: str) -> ReportError:
     """Return the error for a report on a decision that the store does not hold."""
-    got = f"{shortened(decision_id)}, which this cell's store does not hold"
+    actual = f"{shortened(decision_id)}, which this cell's store does not hold"
     do = "report the `Decision.id` that `decide` returned, to the same store and cell_id"
-    return UnknownDecisionError(f"Expected the id of a stored decision, got {got}; {do}.")
+    return UnknownDecisionError(f"Expected the id of a stored decision, got {actual}; {do}.")
 
 
 def already_reported(
@@ -85,9 +85,9 @@ def already_reported(
 
 def nothing_to_correct(decision_id: str) -> ReportError:
     """Return the error for a correction of a decision that has no label."""
-    got = f"{decision_id!r}, of which nothing was reported yet"
+    actual = f"{decision_id!r}, of which nothing was reported yet"
     return ReportError(
-        f"Expected a decision with a label, got {got}; there is nothing to correct: report its "
+        f"Expected a decision with a label, got {actual}; there is nothing to correct: report its "
         "label."
     )
 

@@ -130,7 +130,7 @@ LEDGER = sa.Table(  # an entry for every transaction that added rows or changed 
     sa.Column("added", sa.Text, nullable=False),  # JSON: number of added rows by table
     sa.Column("rows", sa.LargeBinary, nullable=False),  # digest of these rows' sums: `rows_digest`
     # JSON: the chain over all rows so far of each table in IN_FORCE
-    sa.Column("held", sa.Text, nullable=False),
+    sa.Column("chains", sa.Text, nullable=False),
     sa.Column("settings", sa.Text),  # JSON: all settings, if they changed
     # over the entry before and this one: `entry_digest`
     sa.Column("digest", sa.LargeBinary, nullable=False),

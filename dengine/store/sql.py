@@ -583,12 +583,14 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return self._commit_version(*arguments)
 
     def _commit_version(self, *arguments: Any) -> int:
+        """Commit a version, the arguments of `_version_row`; return its number."""
         row = self._version_row(*arguments)
         return self.database.write(
             lambda connection: self._insert_version(connection, row), flush_first=False
         )
 
     def _write_versions(self) -> None:
+        """Write the versions that a store in memory was given."""
         unwritten = self._unwritten_versions
         self._unwritten_versions = []
         for arguments in unwritten:
@@ -772,6 +774,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         version = None if change.version is None else self._version_row(*change.version, now)
 
         def add_rows(connection: sa.Connection) -> int:
+            """Insert the event and everything that it changes; return the event's number."""
             (number,) = self.database.insert(connection, EVENT.c.number, [to_row(event)])
             if change.decisions:
                 self._correct(connection, change, {"author": author, "event": number, "time": now})

@@ -61,14 +61,14 @@ class HistoryFault:
     table : str
     key : str
         Which row of the table, as far as is known.
-    what : str
+    problem : str
         In words, to follow the key.
     """
 
     cell_id: str
     table: str
     key: str
-    what: str
+    problem: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,19 +171,19 @@ def verify_history(
                 for number, digest in journal_entries[check.cell_id]
                 if digest not in check.digests
             ]
-            what = (
+            problem = (
                 "is not there, though the cell's journal knows it: the history was cut off, "
                 "or put back from a copy"
             )
             faults += [
-                HistoryFault(check.cell_id, LEDGER.name, f"entry {number}", what)
+                HistoryFault(check.cell_id, LEDGER.name, f"entry {number}", problem)
                 for number in missing
             ]
     if expected and not any(
         digest.startswith(expected) for check in checks for digest in check.digests
     ):
-        what = "is in no entry: the history was cut off before it, or made anew"
-        faults.append(HistoryFault(cell_id or "", LEDGER.name, f"digest {expected}", what))
+        problem = "is in no entry: the history was cut off before it, or made anew"
+        faults.append(HistoryFault(cell_id or "", LEDGER.name, f"digest {expected}", problem))
     cells = [
         CellHistory(
             cell_id=check.cell_id,
@@ -277,8 +277,8 @@ class CellCheck:
             self._is_unreadable = True
             yield self._fault(table, "", f"cannot be read to its end: {error.orig}")
 
-    def _fault(self, table: str, key: object, what: str) -> HistoryFault:
-        return HistoryFault(self.cell_id, table, str(key), what)
+    def _fault(self, table: str, key: object, problem: str) -> HistoryFault:
+        return HistoryFault(self.cell_id, table, str(key), problem)
 
     def _read_raw(self, table: str) -> Iterator[dict[str, Any]]:
         """Yield the cell's rows of a table as the driver returns them, without conversion."""
@@ -362,8 +362,8 @@ class CellCheck:
 
     def _check_settings(self) -> Iterator[HistoryFault]:
         """Yield a fault for each setting that differs from the ledger's copy."""
-        for key, what in find_settings_faults(self.connection, self.cell_id).items():
-            yield self._fault(SETTING.name, key, what)
+        for key, problem in find_settings_faults(self.connection, self.cell_id).items():
+            yield self._fault(SETTING.name, key, problem)
         is_schema = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
         if self.connection.execute(sa.select(SETTING.c.key).where(is_schema)).first() is None:
             yield self._fault(

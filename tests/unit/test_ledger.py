@@ -247,7 +247,7 @@ def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere
         cut_off(file)
     assert verify_history(str(file)).ok
     (fault,) = verify_history(str(file), expect=kept).faults
-    assert (fault.table, "cut off" in fault.what) == ("ledger", True)
+    assert (fault.table, "cut off" in fault.problem) == ("ledger", True)
     with pytest.raises(StoreError, match="64 hexadecimal digits"):
         verify_history(str(file), expect="newest")
 
