@@ -34,14 +34,14 @@ def a_service(file: Path | None = None, recipe: Recipe = RECIPE, deadline: float
 
 @contextmanager
 def served(app: Any, port: int = 0, connections: int = 100, **limits: Any) -> Iterator[int]:
-    """An application in a thread of this process, as `dengine serve` has it; gives its port.  limits : of `Places`."""
+    """An application in a thread of this process, as `dengine serve` has it; gives its port.  limits : of `ConnectionPool`."""
     import uvicorn
 
-    from dengine.serve.connections import Places
+    from dengine.serve.connections import ConnectionPool
     from dengine.serve.server import bound, uvicorn_options
 
-    places = {"http": Places(connections, **limits).connection, "timeout_graceful_shutdown": 1}
-    server = uvicorn.Server(uvicorn.Config(app, **uvicorn_options() | places))
+    options = {"http": ConnectionPool(connections, **limits).new_connection, "timeout_graceful_shutdown": 1}
+    server = uvicorn.Server(uvicorn.Config(app, **uvicorn_options() | options))
     with bound("127.0.0.1", port) as listening:
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()
