@@ -1,4 +1,7 @@
-"""The radius-neighbour classifier with a confidence bound, as a scikit-learn estimator over embeddings."""
+"""The radius-neighbour classifier with a confidence bound: a scikit-learn estimator.
+
+`ModelPrediction` takes one for its settings; on its own it works over any embedding.
+"""
 
 from typing import Any, Self
 
@@ -16,16 +19,26 @@ from .references import Counts, RadiusIndex
 from .rule import DecisionRule
 
 
-class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
-    """Counts labels around a query and bounds its success probability.
+# scikit-learn ships no types
+class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+    """Classifier that counts labels within a radius and bounds the success probability.
 
-    radius : of the ball around a query, in the units of the embedding, surface included.
-    alpha, lower_bound, interval : as in `Policy`.
-    capacity : references held at most; the oldest leave first, blind to labels.
+    The larger of two classes is the success (1 of 0 and 1). `predict` never abstains, and without
+    neighbours the probability is 0.5; only `decide` abstains.
 
-    The larger of two classes is the success (1 of 0 and 1). `predict` never abstains, an empty ball has probability 0.5;
-    only `decide` does. Source: the paper's sections "Radius Neighbors Classifier" and "Confidence Prediction"; with a
-    uniform kernel it is the Wilson score kernel density classifier of Iversen et al. (2025).
+    Parameters
+    ----------
+    radius : float, default 0.3
+        Radius around a query, in units of the embedding, surface included.
+    alpha, lower_bound, interval
+        As of `Policy`.
+    capacity : int, default 10000
+        Largest number of references; the oldest leave first, whatever their label.
+
+    References
+    ----------
+    The paper's sections "Radius Neighbors Classifier" and "Confidence Prediction". With a uniform
+    kernel it is the Wilson score kernel density classifier of Iversen et al. (2025).
     """
 
     def __init__(
@@ -43,82 +56,154 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         self.capacity = capacity
 
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
-        """Forget everything, then hold embeddings Z (n, d) with labels y (n,) of at most two classes."""
+        """Replace all references.
+
+        Parameters
+        ----------
+        Z : array, shape (n, d)
+            Embeddings.
+        y : array, shape (n,)
+            Labels of at most two classes.
+
+        Returns
+        -------
+        self
+        """
         Z, y = validate_data(self, Z, y)
         self.classes_ = classes_of(y)
-        self._start(np.asarray(Z).shape[1])
+        self._create_index(np.asarray(Z).shape[1])
         return self._add(Z, y)
 
     def partial_fit(self, Z: ArrayLike, y: ArrayLike, classes: ArrayLike | None = None) -> Self:
-        """Add embeddings Z (n, d) with labels y (n,) to what is held. `classes` names both, on the first call."""
-        first = "index_" not in vars(self)
-        Z, y = validate_data(self, Z, y, reset=first)
-        if first:
+        """Add references.
+
+        Parameters
+        ----------
+        Z : array, shape (n, d)
+        y : array, shape (n,)
+        classes : array, optional
+            Both classes, for the first call; None: those in `y`.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            For a label of another class.
+        """
+        is_first = "index_" not in vars(self)
+        Z, y = validate_data(self, Z, y, reset=is_first)
+        if is_first:
             self.classes_ = classes_of(y if classes is None else classes)
-            self._start(np.asarray(Z).shape[1])
+            self._create_index(np.asarray(Z).shape[1])
         unknown = np.setdiff1d(np.asarray(y), self.classes_)
         if len(unknown):
-            raise ValueError(f"Expected labels among {self.classes_}, got {unknown}; name all classes on the first call.")
+            do = "name all classes on the first call"
+            raise ValueError(f"Expected labels among {self.classes_}, got {unknown}; {do}.")
         return self._add(Z, y)
 
     def count(self, Z: ArrayLike) -> Counts:
-        """(n_success, n_failure), each (n,) int64: labels in the ball that decides for each row of Z (n, d)."""
-        n_success, n_failure = self._ask(Z)[:, 3:].astype(np.int64).T
+        """Count the labels within the radius.
+
+        Parameters
+        ----------
+        Z : array, shape (n, d)
+
+        Returns
+        -------
+        n_success, n_failure : array of int64, shape (n,)
+        """
+        n_success, n_failure = self._decisions(Z)[:, 3:].astype(np.int64).T
         return n_success, n_failure
 
     def predict_interval(self, Z: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(lower, upper), each (n,): the bound on the success probability around each row of Z (n, d)."""
-        lower, upper = self._ask(Z)[:, 1:3].T
+        """Bound the success probability of each row of Z (n, d).
+
+        Returns
+        -------
+        lower, upper : array of float64, shape (n,)
+        """
+        lower, upper = self._decisions(Z)[:, 1:3].T
         return lower, upper
 
     def decide(self, Z: ArrayLike) -> NDArray[Any]:
-        """(n,) array of `Action`; an empty ball always verifies."""
-        return np.array([ACTIONS[int(a)] for a in self._ask(Z)[:, 0]], dtype=object)
+        """Return an `Action` for each row of Z (n, d), shape (n,); VERIFY without neighbours."""
+        positions = self._decisions(Z)[:, 0]
+        return np.array([ACTIONS[int(position)] for position in positions], dtype=object)
 
     def predict_proba(self, Z: ArrayLike) -> NDArray[np.float64]:
-        """(n, 2) observed rates of failure and success in the ball; 0.5 where it is empty. (n, 1) ones for one class."""
+        """Return the observed rates of failure and success within the radius.
+
+        Parameters
+        ----------
+        Z : array, shape (n, d)
+
+        Returns
+        -------
+        array of float64, shape (n, 2)
+            0.5 without neighbours. Ones of shape (n, 1) if only one class was seen.
+        """
         n_success, n_failure = self.count(Z)
+        n = n_success + n_failure
         if len(self.classes_) == 1:
             return np.ones((len(n_success), 1))
-        rate = np.where(n_success + n_failure > 0, n_success / np.maximum(n_success + n_failure, 1), 0.5)
+        rate = np.where(n > 0, n_success / np.maximum(n, 1), 0.5)
         return np.stack([1.0 - rate, rate], axis=1)
 
     def predict(self, Z: ArrayLike) -> NDArray[Any]:
-        """(n,) the more frequent class in the ball; never abstains."""
+        """Return the more frequent class within the radius for each row of Z (n, d), shape (n,)."""
         rates = self.predict_proba(Z)
         return np.asarray(self.classes_[rates.argmax(axis=1)])
 
     def policy(self) -> Policy:
-        """The user's numbers among the settings; SettingError where one of all is out of range."""
+        """Return the policy of these settings; SettingError if one of them is out of range."""
         check_radius(self.radius)
         return Policy(self.alpha, self.lower_bound, self.interval)
 
     def neighbours_over(
         self, index: RadiusIndex, rule: DecisionRule | None = None, scored: bool = False
     ) -> RadiusNeighbours:
-        """What decides over the points of `index`, by these settings; `rule` in place of the policy's own.
+        """Make the module that decides over the points of an index by these settings.
 
-        scored : whether the first axis is a probability of success, which a rule that only sorts takes for its score.
+        Parameters
+        ----------
+        index : RadiusIndex
+        rule : DecisionRule, optional
+            None: the policy's own.
+        scored : bool, default False
+            Whether the first axis is a probability of success. A rule that only sorts takes it for
+            its score.
+
+        Returns
+        -------
+        RadiusNeighbours
         """
         rule = rule or self.policy().rule()
         return RadiusNeighbours(index, rule, self.radius, scored and rule.sorts)
 
-    def _start(self, dim: int) -> None:
+    def _create_index(self, dim: int) -> None:
+        """Set `index_` and `neighbours_` to empty ones for points of `dim` dimensions."""
         self.index_ = RadiusIndex(dim, self.capacity)
         self.neighbours_ = self.neighbours_over(self.index_)
 
     def _add(self, Z: Any, y: Any) -> Self:
+        """Add embeddings with labels to the index; returns self."""
         success = np.asarray(y) == self.classes_[-1]
         if len(self.classes_) == 1 and self.classes_[0] in (0, False, -1):
             success = ~success  # a lone class of zeros is all failures
         self.index_.add(Z, success)
         return self
 
-    def _ask(self, Z: ArrayLike) -> NDArray[np.float64]:
+    def _decisions(self, Z: ArrayLike) -> NDArray[np.float64]:
+        """Return action, lower, upper, n_success and n_failure of each row of Z, shape (n, 5)."""
         check_is_fitted(self)
-        Z = torch.from_numpy(np.array(validate_data(self, Z, reset=False), dtype=np.float32))
+        valid = validate_data(self, Z, reset=False)
+        embeddings = torch.from_numpy(np.array(valid, dtype=np.float32))
         with torch.inference_mode():
-            return np.array([self.neighbours_(z[None, :]) for z in Z], dtype=np.float64).reshape(-1, 5)
+            rows = [self.neighbours_(z[None, :]) for z in embeddings]
+        return np.array(rows, dtype=np.float64).reshape(-1, 5)
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
@@ -127,10 +212,17 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
 
 def classes_of(y: ArrayLike) -> NDArray[Any]:
-    """The classes among labels, two at most; ValueError in scikit-learn's words for more, and for continuous labels."""
+    """Return the classes among labels, two at most.
+
+    Raises
+    ------
+    ValueError
+        In scikit-learn's words, for more classes and for continuous labels.
+    """
     check_classification_targets(y)
     classes = np.unique(np.asarray(y))
     if len(classes) > 2:
-        said = "Only binary classification is supported. The type of the target is multiclass"
-        raise ValueError(f"{said}: expected two classes, 1 = success and 0 = failure, got {len(classes)}.")
+        problem = "Only binary classification is supported. The type of the target is multiclass"
+        wanted = "expected two classes, 1 = success and 0 = failure"
+        raise ValueError(f"{problem}: {wanted}, got {len(classes)}.")
     return classes

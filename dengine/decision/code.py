@@ -1,8 +1,9 @@
-"""Whether a user's code is still what TorchScript compiled: torch compiles each class once in a process.
+"""Detects code that was changed after TorchScript compiled it: torch compiles each class once.
 
-A notebook cell that is run again defines another class, which is compiled. But where a method, a
+A notebook cell that is run again defines another class, which is compiled. But if a method, a
 helper's method, a function or a constant of a module is replaced, the class stays the same, and
-torch answers with the code of before.
+torch answers with the code of before. `scripting.script` remembers what it compiled; the model then
+answers in Python, and the export refuses.
 """
 
 import sys
@@ -13,70 +14,94 @@ from weakref import WeakKeyDictionary
 
 from torch import nn
 
-LIBRARIES = {*sys.stdlib_module_names, "dengine", "numpy", "scipy", "sklearn", "torch"} - {"__main__"}
+LIBRARIES = {*sys.stdlib_module_names, "dengine", "numpy", "scipy", "sklearn", "torch"} - {
+    "__main__"
+}
 PLAIN = bool, int, float, complex, str, bytes, tuple, list, dict, set, frozenset, type(None)
+IGNORED_MEMBERS = ("__dict__", "__weakref__", "__module__", "__doc__", "__annotations__")
 
-_COMPILED: WeakKeyDictionary[Any, str] = WeakKeyDictionary()  # what classes and functions referred to, compiled
+# Classes and functions that were compiled, and a text of all the code that they refer to.
+_COMPILED: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 
 
 def remember_code(module: nn.Module) -> None:
-    """Note the code of a module, and of all in it, as compiled."""
+    """Note the present code of a module, and of all modules in it, as compiled."""
     for unit in _user_code(module):
-        _COMPILED.setdefault(unit, _code_of(unit))
+        _COMPILED.setdefault(unit, _code_text(unit))
 
 
 def is_code_changed(module: nn.Module) -> bool:
-    """Return whether the code of a module, or of one in it, is another than was compiled in this process."""
-    return any(unit in _COMPILED and _COMPILED[unit] != _code_of(unit) for unit in _user_code(module))
+    """Return whether a module, or one in it, has other code than was compiled in this process."""
+    return any(
+        unit in _COMPILED and _COMPILED[unit] != _code_text(unit) for unit in _user_code(module)
+    )
 
 
 def _user_code(module: nn.Module) -> Iterator[Any]:
-    """The user's classes and functions that a module is made of."""
-    for part in module.modules():
-        for unit in (type(part), *(value for value in vars(part).values() if isinstance(value, FunctionType))):
+    """Yield the classes and functions of a module that are not a library's."""
+    for submodule in module.modules():
+        functions = [value for value in vars(submodule).values() if isinstance(value, FunctionType)]
+        for unit in (type(submodule), *functions):
             if not _is_of_library(unit):
                 yield unit
 
 
 def _is_of_library(value: Any) -> bool:
-    name = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
+    """Return whether a module, class or function belongs to `LIBRARIES`."""
+    attribute = "__name__" if isinstance(value, ModuleType) else "__module__"
+    name = getattr(value, attribute, None)
     return str(name).partition(".")[0] in LIBRARIES
 
 
-def _code_of(unit: Any) -> str:
-    return repr(_described(unit, set(), set()))
+def _code_text(unit: Any) -> str:
+    """Return a text that changes whenever code or constants that the unit refers to change."""
+    return repr(_describe(unit, set(), set()))
 
 
-def _described(value: Any, names: set[str], seen: set[int]) -> Any:
-    """All code that a value refers to, and the constants in it; names : that the code which refers to it mentions."""
+def _describe(value: Any, names: set[str], seen: set[int]) -> Any:
+    """Return all code that a value refers to, and the constants in it, as nested tuples and lists.
+
+    `names` are those that the referring code mentions: of a module only these count. `seen` holds
+    the ids of values that were described already, and grows.
+    """
     if isinstance(value, staticmethod | classmethod):
-        return _described(value.__func__, names, seen)
+        return _describe(value.__func__, names, seen)
     if isinstance(value, property):
-        return _described(value.fget, names, seen)
+        return _describe(value.fget, names, seen)
     if isinstance(value, PLAIN):
         return repr(value)
-    if not isinstance(value, FunctionType | type | ModuleType) or _is_of_library(value) or id(value) in seen:
+    is_code = isinstance(value, FunctionType | type | ModuleType)
+    if not is_code or _is_of_library(value) or id(value) in seen:
         return getattr(value, "__qualname__", type(value).__qualname__)
     seen.add(id(value))
     if isinstance(value, ModuleType):
-        return [(name, _described(vars(value)[name], names, seen)) for name in sorted(names & vars(value).keys())]
+        mentioned = sorted(names & vars(value).keys())
+        return [(name, _describe(vars(value)[name], names, seen)) for name in mentioned]
     if isinstance(value, type):
-        classes = [each for each in value.__mro__ if not _is_of_library(each)]
-        members = [(name, member) for each in classes for name, member in sorted(vars(each).items())]
+        classes = [base for base in value.__mro__ if not _is_of_library(base)]
+        members = [pair for base in classes for pair in sorted(vars(base).items())]
         return [
-            (name, _described(member, names, seen))
+            (name, _describe(member, names, seen))
             for name, member in members
-            if name not in ("__dict__", "__weakref__", "__module__", "__doc__", "__annotations__")
+            if name not in IGNORED_MEMBERS
         ]
-    mentioned = set(_names(value.__code__))
-    known = {name: value.__globals__[name] for name in mentioned & value.__globals__.keys()}
-    for name, cell in zip(value.__code__.co_freevars, value.__closure__ or (), strict=True):
-        known[name] = cell.cell_contents
-    referred = [(name, _described(known[name], mentioned, seen)) for name in sorted(known)]
-    return _instructions(value.__code__), repr(value.__defaults__), referred
+    return _describe_function(value, seen)
+
+
+def _describe_function(function: FunctionType, seen: set[int]) -> Any:
+    """Return instructions, defaults, and a description of all that a function refers to."""
+    mentioned = set(_names(function.__code__))
+    namespace = function.__globals__
+    values = {name: namespace[name] for name in mentioned & namespace.keys()}
+    cells = function.__closure__ or ()
+    for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
+        values[name] = cell.cell_contents
+    referred = [(name, _describe(values[name], mentioned, seen)) for name in sorted(values)]
+    return _instructions(function.__code__), repr(function.__defaults__), referred
 
 
 def _names(code: CodeType) -> Iterator[str]:
+    """Yield the names that code mentions, nested functions included."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -84,5 +109,9 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _instructions(code: CodeType) -> Any:
-    constants = [_instructions(each) if isinstance(each, CodeType) else repr(each) for each in code.co_consts]
+    """Return bytecode, names and constants of code, nested functions included."""
+    constants = [
+        _instructions(constant) if isinstance(constant, CodeType) else repr(constant)
+        for constant in code.co_consts
+    ]
     return code.co_code, code.co_names, constants

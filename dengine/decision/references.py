@@ -1,15 +1,19 @@
-"""Counting known successes and failures around a query: exact, growing by one label at a time, in K spaces at once.
+"""Labelled reference points, and the counts of labels within a radius of a query.
 
     >>> index = RadiusIndex(dim=2, capacity=10_000)
     >>> index.add(points, labels, spaces)
     >>> n_success, n_failure = index.count(queries, radius=0.3)
 
-Brute force, in float32, takes tens of microseconds and scripts to TorchScript: one implementation counts in the engine, in
-the scikit-learn classifier and in the exported file. Trials must be independent to be counted. A part, known by a hash of
-its number or of its trace, has no vote on itself, and m trials of it are worth m / (1 + (m - 1) rho): rho, the intraclass
-correlation of its labels, is an upper confidence bound, and 1 while few parts came twice.
+The search is brute force in float32. It takes tens of microseconds and compiles to TorchScript, so
+one implementation counts in the engine, in the scikit-learn classifier and in the exported file.
 
-Sources: Kish (1965), Survey Sampling, the design effect; Rao and Scott (1992), Biometrics 48, for counts of clusters.
+Trials must be independent to be counted. A part is known by a hash of its number, or of its trace.
+Its own references have no vote on it, and m references of one part are worth m / (1 + (m - 1) rho)
+votes, where rho is an upper confidence bound on the intraclass correlation of its labels, and 1
+while few parts came twice.
+
+References: Kish (1965), Survey Sampling, the design effect; Rao and Scott (1992), Biometrics 48,
+for counts of clusters.
 """
 
 import hashlib
@@ -21,61 +25,114 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-FEWEST_PARTS = 20  # that came at least twice; fewer say nothing
-NEIGHBOURS = 30  # of other parts, that say what is usual where a trace lies
-SAMPLE = 3000  # of the newest points: the work does not grow
+FEWEST_PARTS = 20  # that came at least twice; fewer say nothing about agreement
+N_NEIGHBOURS = 30  # of other parts, whose labels say what is usual around a point
+SAMPLE = 3000  # newest points that are looked at: the work does not grow
 FILTER_SIZE = 2**16  # bits, a power of two
 CONFIDENCE = 1.645  # standard errors above the estimate: 95 %, one-sided
-
-
-def label_agreement(
-    points: NDArray[np.float32], labels: NDArray[np.int8], spaces: NDArray[np.int64], parts: NDArray[np.int64]
-) -> float:
-    """Upper bound on the intraclass correlation, in [0, 1], of labels within a part beyond what its place explains.
-
-    points (n, d), labels (n,), spaces (n,), parts (n,) hashes, 0 for a point of no known part; a part lies in one space.
-    """
-    points, labels, spaces, parts = points[-SAMPLE:], labels[-SAMPLE:], spaces[-SAMPLE:], parts[-SAMPLE:]
-    _, part, times = np.unique(parts, return_inverse=True, return_counts=True)
-    again = (times[part] > 1) & (parts != 0)
-    if len(np.unique(part[again])) < FEWEST_PARTS:
-        return 1.0
-    rest = np.zeros(len(labels))  # of a label, beyond what its place explains
-    for space in np.unique(spaces):
-        here = np.flatnonzero(spaces == space)
-        rest[here] = labels[here] - _rate_of_others(points[here], labels[here], part[here])
-    own, squares, m = (np.bincount(part[again], w, len(times)) for w in (rest[again], rest[again] ** 2, None))
-    alike, pairs = own**2 - squares, m * (m - 1.0)  # products of different traces of one part, and their number
-    spread = float((rest[again] ** 2).mean())
-    rho = float(alike.sum() / (pairs.sum() * spread))
-    error = float(np.sqrt(((alike / spread - rho * pairs) ** 2).sum()) / pairs.sum())
-    return float(np.clip(rho + CONFIDENCE * error, 0.0, 1.0))
-
-
-def _rate_of_others(points: NDArray[np.float32], labels: NDArray[np.int8], part: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(n,) success rate among the nearest points of other parts; one half where there is none."""
-    from scipy.spatial.distance import cdist
-
-    distances = cdist(points, points, "sqeuclidean")
-    distances[part[:, None] == part] = np.inf
-    k = min(NEIGHBOURS, len(points) - 1)
-    nearest = np.argpartition(distances, k - 1, axis=1)[:, :k]
-    return np.asarray((labels[nearest].sum(1) + 0.5) / (k + 1.0))
-
 
 Counts = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
-class RadiusIndex(nn.Module):
-    """A bounded block of labelled points in K spaces, and counts around queries. The oldest leaves first, blind to labels.
+def label_agreement(
+    points: NDArray[np.float32],
+    labels: NDArray[np.int8],
+    spaces: NDArray[np.int64],
+    parts: NDArray[np.int64],
+) -> float:
+    """Bound from above how far the labels of one part go together beyond what its place explains.
 
-    dim : dimension d of a point.  capacity : points held at most.
-    points (d, capacity) float32; labels (2, capacity) float32, ones, and 1.0 or 0.0; spaces (capacity,) int64; parts
-    (capacity,) int64 hashes, 0 for no known part; first (capacity,) int64, the slot that a part's votes are gathered in;
-    repeats () int64, points of parts that are there already; agreement () float64, `label_agreement`; total () int64,
-    points ever added.
-    numbers (capacity,) int64 of the labels, 0 for none.  known : hashes of all parts that are held, and of some that
-    have left: a query of another part need not be compared. Neither compiles.
+    Parameters
+    ----------
+    points : array of float32, shape (n, d)
+        The newest `SAMPLE` are used.
+    labels : array of int, shape (n,)
+        1 is success, 0 is failure.
+    spaces : array of int64, shape (n,)
+        Space of each point; all points of a part are in one.
+    parts : array of int64, shape (n,)
+        Hash of each point's part; 0 for an unknown part.
+
+    Returns
+    -------
+    float
+        Upper confidence bound on the intraclass correlation, from 0 to 1; 1 if fewer than
+        `FEWEST_PARTS` parts came twice.
+    """
+    points, labels = points[-SAMPLE:], labels[-SAMPLE:]
+    spaces, parts = spaces[-SAMPLE:], parts[-SAMPLE:]
+    _, part, n_times = np.unique(parts, return_inverse=True, return_counts=True)
+    repeated = (n_times[part] > 1) & (parts != 0)
+    if len(np.unique(part[repeated])) < FEWEST_PARTS:
+        return 1.0
+    residuals = np.zeros(len(labels))
+    for space in np.unique(spaces):
+        rows = np.flatnonzero(spaces == space)
+        residuals[rows] = labels[rows] - _success_rate_around(
+            points[rows], labels[rows], part[rows]
+        )
+    sums = np.bincount(part[repeated], residuals[repeated], len(n_times))
+    squares = np.bincount(part[repeated], residuals[repeated] ** 2, len(n_times))
+    m = np.bincount(part[repeated], None, len(n_times))
+    products = sums**2 - squares  # of the residuals of different points of one part
+    n_pairs = m * (m - 1.0)
+    variance = float((residuals[repeated] ** 2).mean())
+    rho = float(products.sum() / (n_pairs.sum() * variance))
+    deviations = products / variance - rho * n_pairs
+    error = float(np.sqrt((deviations**2).sum()) / n_pairs.sum())
+    return float(np.clip(rho + CONFIDENCE * error, 0.0, 1.0))
+
+
+def _success_rate_around(
+    points: NDArray[np.float32], labels: NDArray[np.int8], part: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return, for each point, the success rate among the nearest points of other parts, (n,).
+
+    Half a success in one trial is added to the counts: the rate is one half without neighbours.
+    """
+    from scipy.spatial.distance import cdist
+
+    distances = cdist(points, points, "sqeuclidean")
+    distances[part[:, None] == part] = np.inf
+    k = min(N_NEIGHBOURS, len(points) - 1)
+    nearest = np.argpartition(distances, k - 1, axis=1)[:, :k]
+    return np.asarray((labels[nearest].sum(1) + 0.5) / (k + 1.0))
+
+
+class RadiusIndex(nn.Module):
+    """A bounded block of labelled points in K spaces that counts labels around queries.
+
+    When it is full, the oldest point leaves first, whatever its label. `put`, `squared_distances`
+    and `count_near` compile to TorchScript; `numbers` and what uses it stay in Python.
+
+    Parameters
+    ----------
+    dim : int
+        Dimension d of a point.
+    capacity : int, default 10000
+        Largest number of points.
+
+    Attributes
+    ----------
+    points : Tensor of float32, shape (d, capacity)
+    labels : Tensor of float32, shape (2, capacity)
+        A row of ones, and a row of 1.0 (success) or 0.0: one product counts both.
+    spaces : Tensor of int64, shape (capacity,)
+        Space of each point.
+    parts : Tensor of int64, shape (capacity,)
+        Hash of each point's part; 0 for an unknown part.
+    first : Tensor of int64, shape (capacity,)
+        First slot that holds a point of the same part.
+    repeats : Tensor of int64, shape ()
+        Number of points whose part is in an earlier slot.
+    agreement : Tensor of float64, shape ()
+        See `label_agreement`.
+    total : Tensor of int64, shape ()
+        Number of points ever added.
+    part_filter : Tensor of bool, shape (FILTER_SIZE,)
+        Whether a part whose hash has these last bits may be in `parts`.
+    numbers : array of int64, shape (capacity,)
+        Sequence number of each point's label, 0 if there is none.
     """
 
     points: Tensor
@@ -90,7 +147,9 @@ class RadiusIndex(nn.Module):
 
     def __init__(self, dim: int, capacity: int = 10_000) -> None:
         super().__init__()
-        self.dim, self.capacity = dim, capacity
+        self.dim = dim
+        self.capacity = capacity
+        self.filter_mask = FILTER_SIZE - 1
         self.register_buffer("points", torch.zeros(dim, capacity))
         self.register_buffer("labels", torch.ones(2, capacity))
         self.register_buffer("spaces", torch.zeros(capacity, dtype=torch.int64))
@@ -100,41 +159,62 @@ class RadiusIndex(nn.Module):
         self.register_buffer("agreement", torch.ones((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros((), dtype=torch.int64))
         self.register_buffer("part_filter", torch.zeros(FILTER_SIZE, dtype=torch.bool))
-        self.filter_mask = FILTER_SIZE - 1
         self.numbers = np.zeros(capacity, dtype=np.int64)
 
     def __len__(self) -> int:
         return self.size()
 
-    def held(self, name: str) -> NDArray[Any]:
-        """Of the n points held, in the order of their places: points (n, d), labels (n,), spaces, parts or numbers."""
+    def column(self, name: str) -> NDArray[Any]:
+        """Return one attribute of the n points in the index, by slot.
+
+        Parameters
+        ----------
+        name : {"points", "labels", "spaces", "parts", "numbers"}
+
+        Returns
+        -------
+        array, shape (n,), of points (n, d)
+            Labels are int8; most columns are views.
+        """
         block = self.numbers if name == "numbers" else getattr(self, name).numpy()
-        held: NDArray[Any] = block[..., : len(self)]
-        return held.T if name == "points" else held[1].astype(np.int8) if name == "labels" else held
+        values: NDArray[Any] = block[..., : len(self)]
+        if name == "points":
+            return values.T
+        return values[1].astype(np.int8) if name == "labels" else values
 
     @torch.jit.export
     def size(self) -> int:
-        """Points held."""
+        """Return the number of points in the index."""
         return min(int(self.total.item()), self.capacity)
 
     @torch.jit.export
     def put(self, point: Tensor, label: float, space: int, part: int = 0) -> None:
-        """Add one point (d,) of space `space` and of `part`; on a full block it takes the oldest one's place."""
+        """Add one point; in a full index it replaces the oldest.
+
+        Parameters
+        ----------
+        point : Tensor of float32, shape (d,)
+        label : float
+            1.0 is success, 0.0 is failure.
+        space : int
+        part : int, default 0
+            Hash of its part; 0 for an unknown part.
+        """
         total = int(self.total.item())
         slot = total % self.capacity
         self.points[:, slot] = point
         self.labels[1, slot] = label
         self.spaces[slot] = space
         self.total.fill_(total + 1)
-        self.join(slot, part)
+        self.set_part(slot, part)
 
     @torch.jit.export
-    def join(self, slot: int, part: int) -> None:
-        """Make `part` that of a slot that is held, and find the slot in which its votes are gathered."""
+    def set_part(self, slot: int, part: int) -> None:
+        """Set the part of a slot, and keep `first`, `repeats` and `part_filter` in order."""
         leaving = int(self.parts[slot].item())
         if leaving != 0 and int(self.repeats.item()) > 0:
             same = self.parts == leaving
-            if int(same.sum().item()) > 1:  # the leaving part's others stay together
+            if int(same.sum().item()) > 1:  # the other points of the leaving part stay together
                 same[slot] = False
                 self.first.masked_fill_(same, int(same.nonzero()[0].item()))
                 self.repeats.sub_(1)
@@ -149,90 +229,153 @@ class RadiusIndex(nn.Module):
 
     @torch.jit.export
     def squared_distances(self, z: Tensor, part: int = 0) -> Tensor:
-        """(K, d) one query in every space -> (size,) squared distance to each point, in that point's own space.
+        """Return the squared distance from a query to each point, in that point's own space.
 
-        part : of the query; its own points are infinitely far.
+        Parameters
+        ----------
+        z : Tensor of float32, shape (K, d)
+            One query, embedded in every space.
+        part : int, default 0
+            Hash of the query's part, whose own points are infinitely far; 0 excludes none.
+
+        Returns
+        -------
+        Tensor of float32, shape (n,)
         """
         n = self.size()
         own = z.t()  # (d, K)
         if z.size(0) > 1:
-            own = own.index_select(1, self.spaces[:n])  # (d, size): a reference of fold k is met in space k only
+            own = own.index_select(1, self.spaces[:n])  # (d, n): the query in each point's space
         distances = (self.points.narrow(1, 0, n) - own).square_().sum(0)
-        # The filter spares nearly all queries of new parts the comparison with every reference.
+        # The filter spares nearly all queries of new parts the comparison with every point.
         if part != 0 and bool(self.part_filter[part & self.filter_mask].item()):
             distances.masked_fill_(self.parts[:n] == part, float("inf"))
         return distances
 
     @torch.jit.export
     def count_near(self, distances: Tensor, radius: float) -> tuple[int, int]:
-        """(successes, failures) within `radius`. Several points of one part are worth less than as many parts: `votes`."""
+        """Count the labels within a radius.
+
+        Parameters
+        ----------
+        distances : Tensor of float32, shape (n,)
+            Squared, as of `squared_distances`.
+        radius : float
+            A point at this distance counts.
+
+        Returns
+        -------
+        n_success, n_failure : int
+            Several points of one part are worth less than as many parts, see `count_votes`.
+        """
         n = distances.size(0)
         if n == 0:
             return 0, 0
         limit = radius * radius
         if int(self.repeats.item()) > 0:
-            return self.votes(distances <= limit)
-        inside = torch.le(distances, limit, out=torch.empty_like(distances))  # in float32, as the product takes it
-        counts: list[float] = torch.mv(self.labels.narrow(1, 0, n), inside).tolist()  # exact below 2**24 points
+            return self.count_votes(distances <= limit)
+        # In float32, as the product takes it; the sums are exact below 2**24 points.
+        inside = torch.le(distances, limit, out=torch.empty_like(distances))
+        counts: list[float] = torch.mv(self.labels.narrow(1, 0, n), inside).tolist()
         return int(counts[1]), int(counts[0]) - int(counts[1])
 
-    def votes(self, inside: Tensor) -> tuple[int, int]:
-        """(successes, failures) of the points `inside`, (size,) bool, in votes: m points of a part are worth
-        m / (1 + (m - 1) agreement), one vote where its labels always agree. Rounded: bounds are of whole trials.
+    def count_votes(self, inside: Tensor) -> tuple[int, int]:
+        """Count the votes of the points `inside`, (n,) bool, where parts came more than once.
+
+        m points of a part are worth m / (1 + (m - 1) agreement) votes: one vote where its labels
+        always agree. Returns successes and failures, rounded, for bounds are of whole trials.
         """
         slots = inside.nonzero().flatten()
-        own = self.first.index_select(0, slots)
-        ones = torch.ones(own.size(0), dtype=torch.float64)
-        times = torch.zeros(self.capacity, dtype=torch.float64).index_add_(0, own, ones)
-        worth = 1.0 / (1.0 + (times.index_select(0, own) - 1.0) * self.agreement)
+        first = self.first.index_select(0, slots)
+        ones = torch.ones(first.size(0), dtype=torch.float64)
+        m = torch.zeros(self.capacity, dtype=torch.float64).index_add_(0, first, ones)
+        worth = 1.0 / (1.0 + (m.index_select(0, first) - 1.0) * self.agreement)
         successes = float((worth * self.labels[1].index_select(0, slots)).sum().item())
         failures = float(worth.sum().item()) - successes
         return int(successes + 0.5), int(failures + 0.5)
 
-    def keep(self, point: Tensor, label: float, space: int, part: int = 0, number: int = 0) -> None:
-        """Add one point (d,), as `put`; number : of its label."""
+    def add_one(
+        self, point: Tensor, label: float, space: int, part: int = 0, number: int = 0
+    ) -> None:
+        """Add one point, as `put`, with the sequence number of its label."""
         self.numbers[int(self.total) % self.capacity] = number
         self.put(point, label, space, part)
 
-    def renumber(self, was: int, number: int) -> None:
-        """Give the point of a label another number; one that has left needs none."""
-        self.numbers[self.numbers == was] = number
+    def renumber(self, old: int, new: int) -> None:
+        """Change the number of a label; nothing happens if its point has left."""
+        self.numbers[self.numbers == old] = new
 
     def add(
-        self, points: ArrayLike, labels: ArrayLike, spaces: ArrayLike | None = None,
-        parts: ArrayLike | None = None, numbers: ArrayLike | None = None,
-    ) -> None:  # fmt: skip
-        """Add points (n, d) with labels (n,), 1 = success, 0 = failure.
+        self,
+        points: ArrayLike,
+        labels: ArrayLike,
+        spaces: ArrayLike | None = None,
+        parts: ArrayLike | None = None,
+        numbers: ArrayLike | None = None,
+    ) -> None:
+        """Add many points; of more than fit, the newest.
 
-        spaces : (n,) the space each lives in, 0 if None.  parts : (n,) int64 hashes of their parts; None: of no known part.
-        numbers : (n,) of their labels; None: 0.
+        Parameters
+        ----------
+        points : array, shape (n, d)
+        labels : array, shape (n,)
+            1 is success, 0 is failure.
+        spaces : array of int, shape (n,), optional
+            0 if None.
+        parts : array of int64, shape (n,), optional
+            Hashes; unknown parts if None.
+        numbers : array of int64, shape (n,), optional
+            Sequence numbers of the labels; 0 if None.
+
+        Raises
+        ------
+        ValueError
+            For other shapes.
         """
-        z, y = np.array(points, dtype=np.float32), np.array(labels, dtype=np.float32)  # copies: torch needs writable ones
-        k, own = (np.zeros(len(z), np.int64) if v is None else np.array(v, dtype=np.int64) for v in (spaces, parts))
-        if z.ndim != 2 or z.shape[1] != self.dim or {y.shape, k.shape, own.shape} != {(len(z),)}:
+        z = np.array(points, dtype=np.float32)  # copies, for torch needs writable arrays
+        y = np.array(labels, dtype=np.float32)
+        zeros = np.zeros(len(z), np.int64)
+        k = zeros if spaces is None else np.array(spaces, dtype=np.int64)
+        own = zeros if parts is None else np.array(parts, dtype=np.int64)
+        n = (len(z),)
+        if z.ndim != 2 or z.shape[1] != self.dim or {y.shape, k.shape, own.shape} != {n}:
+            wanted = f"points (n, {self.dim}) with n labels, n spaces and n parts"
             got = f"{z.shape}, {y.shape}, {k.shape} and {own.shape}"
-            raise ValueError(f"Expected points (n, {self.dim}) with n labels, n spaces and n parts, got {got}.")
+            raise ValueError(f"Expected {wanted}, got {got}.")
         total = int(self.total)
-        keep = slice(max(0, len(z) - self.capacity), None)  # of more than fit, the newest
-        slots = (total + np.arange(len(z))[keep]) % self.capacity
-        self.points[:, slots] = torch.from_numpy(z[keep].T)
-        self.labels[1, slots] = torch.from_numpy(y[keep])
-        self.spaces[slots] = torch.from_numpy(k[keep])
-        self.parts[slots] = torch.from_numpy(own[keep])
-        self.numbers[slots] = 0 if numbers is None else np.asarray(numbers)[keep]
+        newest = slice(max(0, len(z) - self.capacity), None)
+        slots = (total + np.arange(len(z))[newest]) % self.capacity
+        self.points[:, slots] = torch.from_numpy(z[newest].T)
+        self.labels[1, slots] = torch.from_numpy(y[newest])
+        self.spaces[slots] = torch.from_numpy(k[newest])
+        self.parts[slots] = torch.from_numpy(own[newest])
+        self.numbers[slots] = 0 if numbers is None else np.asarray(numbers)[newest]
         self.total.fill_(total + len(z))
         if own.any() or int(self.repeats) > 0:
-            self._gather_parts()
+            self._index_parts()
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
-        """Give the point of a label another one, or take it out where `label` is None; the others keep their order of age.
+        """Change the label of a point, or remove the point.
 
-        A point that has left already needs nothing. Returns False, and changes nothing, where the point is another part's.
+        Parameters
+        ----------
+        number : int
+            Sequence number of its label.
+        part : int
+            Hash of its part.
+        label : int or None
+            None removes the point; the others keep their order of age.
+
+        Returns
+        -------
+        bool
+            False, with nothing changed, if the point is of another part. True also if the point has
+            left already.
         """
-        held = np.flatnonzero(self.held("numbers") == number)
-        if not len(held):
+        slots = np.flatnonzero(self.column("numbers") == number)
+        if not len(slots):
             return True
-        slot, n = int(held[0]), len(self)
+        slot, n = int(slots[0]), len(self)
         if int(self.parts[slot]) != part:
             return False
         if label is not None:
@@ -240,56 +383,80 @@ class RadiusIndex(nn.Module):
             return True
         order = (int(self.total) - n + torch.arange(n)) % self.capacity  # oldest first
         order = order[order != slot]
-        for block in (self.points, self.labels, self.spaces, self.parts, torch.from_numpy(self.numbers)):
+        numbers = torch.from_numpy(self.numbers)
+        for block in (self.points, self.labels, self.spaces, self.parts, numbers):
             block[..., : n - 1] = block[..., order]
             block[..., n - 1 :] = 0
         self.labels[:, n - 1 :] = 1.0
         self.total.fill_(n - 1)
-        self._gather_parts()
+        self._index_parts()
         return True
 
-    def weigh(self) -> None:
-        """Estimate how far the labels of one part go together, for all counts from now on."""
+    def estimate_agreement(self) -> None:
+        """Set `agreement` from the points in the index, for all counts from now on."""
         if int(self.repeats) > 0:
-            self.agreement.fill_(label_agreement(*map(self.held, ("points", "labels", "spaces", "parts"))))
+            columns = map(self.column, ("points", "labels", "spaces", "parts"))
+            self.agreement.fill_(label_agreement(*columns))
 
-    def _gather_parts(self) -> None:
-        """Find for every slot the first one of its part, and how many are not that."""
-        n, parts, slots = len(self), self.held("parts"), np.arange(self.capacity)
+    def _index_parts(self) -> None:
+        """Compute `first`, `repeats` and `part_filter` anew from `parts`."""
+        parts = self.column("parts")
+        slots = np.arange(self.capacity)
         _, first, inverse = np.unique(parts, return_index=True, return_inverse=True)
-        slots[:n] = np.where(parts != 0, first[inverse], slots[:n])
+        slots[: len(self)] = np.where(parts != 0, first[inverse], slots[: len(self)])
         self.first.copy_(torch.from_numpy(slots))
         self.repeats.fill_(int((slots != np.arange(self.capacity)).sum()))
         self.part_filter.zero_()
         self.part_filter[torch.from_numpy(parts & self.filter_mask)] = True
 
     def count(self, queries: ArrayLike, radius: float) -> Counts:
-        """(n_success, n_failure), each (n,): labels around each query (n, d), or (n, K, d) for K spaces.
+        """Count labels around queries, in Python.
 
-        radius : of the ball, its surface included.
+        Parameters
+        ----------
+        queries : array, shape (n, d) or (n, K, d)
+            (n, K, d) for K spaces.
+        radius : float
+            A point at this distance counts.
+
+        Returns
+        -------
+        n_success, n_failure : array of int64, shape (n,)
         """
         z = torch.from_numpy(np.array(queries, dtype=np.float32))
         z = z[:, None, :] if z.dim() == 2 else z  # (n, K, d)
-        found = [self.count_near(self.squared_distances(query), radius) for query in z]
-        counts = np.array(found, dtype=np.int64).reshape(-1, 2)
+        pairs = [self.count_near(self.squared_distances(query), radius) for query in z]
+        counts = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         return counts[:, 0], counts[:, 1]
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Plain arrays, copies: points (d, n), labels, spaces, parts and numbers (n,), and total, points ever added."""
-        own = {name: self.held(name).copy() for name in ("labels", "spaces", "parts", "numbers")}
-        whole = {name: getattr(self, name).numpy().copy() for name in ("agreement", "total")}
-        return {"points": self.held("points").T.copy()} | own | whole
+        """Return the state as plain arrays, copies, which `from_state` takes.
+
+        They are points (d, n), labels, spaces, parts and numbers (n,), agreement and total ().
+        """
+        names = ("labels", "spaces", "parts", "numbers")
+        state = {"points": self.column("points").T.copy()}
+        state |= {name: self.column(name).copy() for name in names}
+        return state | {name: getattr(self, name).numpy().copy() for name in ("agreement", "total")}
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
-        """The index that `get_state` was taken from: the same points in the same places."""
+        """Return an index with the points of a state, in the same slots."""
         index = cls(len(state["points"]), capacity)
-        index.add(state["points"].T, *(state[name] for name in ("labels", "spaces", "parts", "numbers")))
+        columns = (state[name] for name in ("labels", "spaces", "parts", "numbers"))
+        index.add(state["points"].T, *columns)
         index.agreement.fill_(float(state["agreement"]))
         index.total.fill_(int(state["total"]))
         return index
 
     def digest(self) -> str:
-        """SHA-256 of what is held: points as (d, n) float32, labels as float32, spaces as int64, one after the other."""
-        arrays = self.held("points").T, self.held("labels").astype(np.float32), self.held("spaces")
-        return hashlib.sha256(b"".join(np.ascontiguousarray(each).tobytes() for each in arrays)).hexdigest()
+        """Return the SHA-256 of the points, as hexadecimal digits.
+
+        The bytes are points (d, n) float32, labels float32 and spaces int64, one after the other.
+        """
+        points = self.column("points").T
+        labels = self.column("labels").astype(np.float32)
+        arrays = (points, labels, self.column("spaces"))
+        return hashlib.sha256(
+            b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
+        ).hexdigest()

@@ -139,9 +139,9 @@ class Twin(nn.Module):
         self.register_buffer("scale", torch.from_numpy(model.scale)[:, None])
         # A reference of space k stands far away in every other space: one subtraction, no gathering.
         places = np.full((model.n_spaces, index.dim, len(index)), FAR, dtype=np.float32)
-        places[index.held("spaces"), :, np.arange(len(index))] = index.held("points")
+        places[index.column("spaces"), :, np.arange(len(index))] = index.column("points")
         self.register_buffer("places", torch.from_numpy(places))
-        self.register_buffer("success", torch.from_numpy(index.held("labels").astype(np.int64)))
+        self.register_buffer("success", torch.from_numpy(index.column("labels").astype(np.int64)))
 
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
         """(C, T) float32 -> action, reason, lower, upper, n_success, n_failure, embedding (K, d)."""

@@ -120,7 +120,7 @@ def load_past_version(
     index = _restore_index(stored, added, recipe)
     return PastVersion(
         index=index,
-        labels=[by_number.get(number) for number in index.held("numbers").tolist()],
+        labels=[by_number.get(number) for number in index.column("numbers").tolist()],
         thresholds=_restore_thresholds(stored, later, recipe.policy),
         last_seq=max(by_number, default=stored.last_seq),
         novelty=_score_novelty(stored, item),
@@ -147,7 +147,7 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
         if label.point is not None:
             fold = int(fold_of(np.array([label.content_hash], dtype=np.int64), spaces)[0])
             point = torch.from_numpy(label.point)
-            index.keep(point, float(label.success), fold, label.content_hash, label.seq)
+            index.add_one(point, float(label.success), fold, label.content_hash, label.seq)
     return index
 
 
@@ -967,10 +967,10 @@ def _nearest(
         yield Neighbour(
             decision_id=decision_id,
             part=None if stored is None else stored.decision.part,
-            success=bool(index.held("labels")[slot]),
+            success=bool(index.column("labels")[slot]),
             source=None if label is None else label.source,
             distance=float(distances[slot]),
-            space=int(index.held("spaces")[slot]),
+            space=int(index.column("spaces")[slot]),
             inside=bool(distances[slot] <= neighbourhood.radius),
             trace=None if stored is None else stored.trace,
         )

@@ -313,7 +313,7 @@ class ModelPrediction(EngineModel):
         )
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
         self.index.add(points / self.scale[folds, None], y, folds, hashes, numbers)
-        self.index.weigh()
+        self.index.estimate_agreement()
         self._note = repeats_note(X, hashes)
         self.gate = (
             fit_novelty(X, self.novelty, hashes) if self.novelty else NoveltyGate(*self.trace_shape)
@@ -424,7 +424,7 @@ class ModelPrediction(EngineModel):
         """Add one labelled trace (channels, samples) to the index, in the space of its fold; returns its point (d,)."""
         if point is None:
             point = self._reference_point(x, hash_, embedding)
-        self.index.keep(
+        self.index.add_one(
             torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number
         )
         return point
@@ -546,7 +546,7 @@ class ModelPrediction(EngineModel):
     def defect(self) -> str:
         return (
             ""
-            if np.isfinite(self.index.held("points")).all()
+            if np.isfinite(self.index.column("points")).all()
             else "the embedding of a reference is not finite"
         )
 

@@ -42,7 +42,7 @@ def state(engine: DataEngine) -> tuple:
     """All that decides what an engine does next."""
     held = engine.store.labelled(engine.recipe.window)
     rule = engine.model and {name: t.tolist() for name, t in engine.model.rule.state_dict().items()}
-    numbers = engine.model and sorted(engine.model.index.held("numbers").tolist())
+    numbers = engine.model and sorted(engine.model.index.column("numbers").tolist())
     return (
         (engine.version, core_of(engine).new_labels, engine.safe_mode, engine.policy, engine.certificate(), rule),
         (held.seq.tolist(), held.labels.tolist(), numbers),
@@ -82,13 +82,13 @@ def test_a_label_is_corrected_and_forgotten_for_the_very_next_decision_and_comes
     engine = make()
     cycle = next(c for c in reversed(play(engine, data, 0, 150, confirm=True)) if c.success)
     name, probe, n = cycle.decision.id, data.X[cycle.index] + np.float32(1e-4), len(engine.model.index)
-    before, spaces = engine.decide(probe), engine.model.index.held("spaces").copy()
+    before, spaces = engine.decide(probe), engine.model.index.column("spaces").copy()
     said = engine.correct(name, False, author="kim")
     after = engine.decide(probe)
     assert (after.n_success, after.n_failure) == (before.n_success - 1, before.n_failure + 1)
     assert (after.embedding, after.model_version) == (before.embedding, before.model_version)
-    assert engine.model.index.held("spaces").tolist() == spaces.tolist()
-    assert set(spaces) == set(fold_of(engine.model.index.held("parts"), engine.model.n_spaces))
+    assert engine.model.index.column("spaces").tolist() == spaces.tolist()
+    assert set(spaces) == set(fold_of(engine.model.index.column("parts"), engine.model.n_spaces))
     assert "counts as a failure, was a success" in said.text
     event = engine.store.events(1)[0]
     assert (event.number, event.kind, event.author) == (said.event, "correct", "kim")
@@ -200,9 +200,9 @@ def test_a_part_that_came_twice_is_corrected_where_it_was_meant(data: Dataset) -
     engine.report(twice[0].id, True)
     engine.report(twice[1].id, True)
     engine.correct(twice[0].id, False)
-    assert engine.model.index.held("labels")[-2:].tolist() == [0, 1]
+    assert engine.model.index.column("labels")[-2:].tolist() == [0, 1]
     engine.forget(twice[1].id)
-    assert engine.model.index.held("labels")[-1] == 0
+    assert engine.model.index.column("labels")[-1] == 0
     assert int(engine.model.index.repeats) == 0
 
 
@@ -214,7 +214,7 @@ def test_a_full_ring_loses_the_forgotten_reference_and_keeps_the_age_of_the_othe
     play(engine, data, 130, 139, confirm=True)
     with again(engine, tmp_path) as reopened:
         assert asked(reopened, data) == asked(engine, data)
-        np.testing.assert_array_equal(reopened.model.index.held("points"), engine.model.index.held("points"))
+        np.testing.assert_array_equal(reopened.model.index.column("points"), engine.model.index.column("points"))
         assert state(reopened) == state(engine)
 
 
@@ -303,8 +303,8 @@ def test_an_earlier_version_answers_again_as_a_new_one_with_what_came_since(data
     assert engine.decide(data.X[199]).model_version == version + 1
     first = engine.store.load_version(number).state
     np.testing.assert_array_equal(engine.model.get_state()["scale"], first["scale"])
-    np.testing.assert_array_equal(engine.model.index.held("points")[: first["points"].shape[1]], first["points"].T)
-    assert engine.model.index.held("labels")[0] == (not cycles[0].success)  # as it was corrected since
+    np.testing.assert_array_equal(engine.model.index.column("points")[: first["points"].shape[1]], first["points"].T)
+    assert engine.model.index.column("labels")[0] == (not cycles[0].success)  # as it was corrected since
     play(engine, data, 100, 138, confirm=True)  # and one above: the next retrain waits for forty
     assert engine.version == version + 1
     play(engine, data, 138, 160, confirm=True)

@@ -113,7 +113,7 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     engine.decide(stream.X[1])
     engine.flush()
     assert beyond(engine) == [0, 0]
-    held, labels = engine.store.get_decision(stopped.id), engine.model.index.held("labels")
+    held, labels = engine.store.get_decision(stopped.id), engine.model.index.column("labels")
     assert (held.success, engine.store.labelled().labels[held.label_seq - 1]) == (False, 0)
     (past,) = [past for past in engine.history() if past.decision.id == stopped.id]
     assert {held.source, past.source, engine.find(stopped.id).source} == {Source.STOP}
@@ -121,7 +121,7 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     assert status.sources["stop"] == status.ever.false_accepts == engine.store.tally().outcomes.false_accepts
     with pytest.raises(ReportError, match="failure from stop was reported first and stands, now came failure from stop"):
         engine.report(stopped.id, False)
-    assert labels[engine.model.index.held("numbers") == held.label_seq].tolist() == [0]
+    assert labels[engine.model.index.column("numbers") == held.label_seq].tolist() == [0]
     assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.false_accepts > 0
     engine.close()
     with DataEngine.open(tmp_path / "late.db", replaying=True) as engine:

@@ -49,7 +49,7 @@ def test_a_full_ring_holds_exactly_the_newest_points(batches: list[int], capacit
         start += size
     kept = slice(max(0, start - capacity), start)
     assert len(index) == min(start, capacity)
-    held = sorted(map(tuple, index.held("points").tolist()))
+    held = sorted(map(tuple, index.column("points").tolist()))
     assert held == sorted(map(tuple, Z[kept].tolist()))
     expected = (int(y[kept].sum()), int((1 - y[kept]).sum()))
     assert tuple(int(c[0]) for c in index.count(np.zeros((1, 2)), radius=100.0)) == expected
