@@ -99,7 +99,6 @@ def _known_marks(
     past = load_past_version(store, version, recipe, None)
     if past is None:
         return []
-<<<<<<< HEAD
     points = past.index.column("points")
     labels = past.index.column("labels")
     references = [
@@ -109,12 +108,6 @@ def _known_marks(
         Mark(id_, parts.get(id_), *_first_two(points[slot]), bool(labels[slot]), None)
         for _, slot, id_ in sorted(references)[-N_KNOWN:]
     ]
-=======
-    points, labels = answering.index.column("points"), answering.index.column("labels")
-    behind = [(label.seq, slot, label.decision_id) for slot, label in enumerate(answering.behind) if label]
-    newest = sorted(behind)[-KNOWN:]
-    return [Mark(id_, parts.get(id_), *_plane(points[slot]), bool(labels[slot]), None) for _, slot, id_ in newest]
->>>>>>> c706134 (references, classifier, code: numpydoc, plain names (RadiusIndex.column, add_one, set_part, estimate_agreement))
 
 
 def _first_two(point: np.ndarray) -> tuple[float, float]:
