@@ -607,8 +607,8 @@ def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp
     for words, text, mode in (
         ((), "Expected --token-file FILE", 0o600),
         (token, "chmod 600", 0o644),
-        (token, "at least 16 characters", 0o600),
-        (("--token-file", tmp_path / "none"), "Cannot read the token's file", 0o600),
+        (token, "at least 16 ASCII characters", 0o600),
+        (("--token-file", tmp_path / "none"), "Cannot read the token file", 0o600),
         ((*locked[:2], "--host", "localhost"), "--cert and --key together", 0o600),
         ((*locked, "--host", "localhost"), "Expected a key without a password", 0o600),
     ):
