@@ -169,9 +169,9 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
 
 
 def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
-    """Return the rule in a version's state.
+    """Return the decision rule from a version's state.
 
-    None if it is not the policy's rule, or was stale when stored.
+    None if the state has none, has another rule than the policy's, or was stored while stale.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # nothing is imported because a store names it; a running engine has imported it
@@ -594,7 +594,7 @@ def _explain_not_finite(
 def _explain_outside(
     decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
 ) -> str:
-    """Return the reason in words for a trace outside an operator's limits, with their names."""
+    """Return the reason in words for a trace outside force limits, with those that it leaves."""
     x = torch.from_numpy(trace)
     windows = circumstances.recipe.policy.windows
     left = [str(limits) for limits in windows if ForceLimitsGate([limits], circumstances.spec)(x)]

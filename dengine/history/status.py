@@ -427,9 +427,9 @@ def _estimate_error(
     n: int | None = None,
     basis: str = "audits",
 ) -> ErrorEstimate:
-    """Return the estimate for `n_wrong` wrong ones of `n_known` parts.
+    """Return the estimate if `n_wrong` of `n_known` parts were decided wrongly.
 
-    `n` parts in all, by default `n_known`.
+    `n` is the number of all parts, by default `n_known`.
     """
     low, high = wilson_interval(n_known - n_wrong, n_wrong, alpha)
     lower = 1.0 - high

@@ -274,7 +274,7 @@ def reading(url: str) -> Iterator[sa.Connection]:
         engine.dispose()
 
 
-def integrity(connection: sa.Connection, table: str = "") -> list[str]:
+def run_integrity_check(connection: sa.Connection, table: str = "") -> list[str]:
     """Run SQLite's integrity check on the file, or on one table.
 
     Return its findings, [] if all is well.
@@ -464,14 +464,14 @@ class Database:
         for name in CHECKED_TABLES if self._file is not None else ():
             try:
                 with self.reading() as connection:
-                    if findings := integrity(connection, name):
+                    if findings := run_integrity_check(connection, name):
                         return f"of the table {name} SQLite says: {findings[0]}"
             except StoreError as error:
                 return f"{error}"
         return ""
 
     def check_writable(self) -> None:
-        """Raise a StoreError if SQLite cannot write to its file."""
+        """Raise a StoreError if SQLite cannot write to its file, found by an update of no row."""
         self.write(
             lambda connection: connection.exec_driver_sql(
                 "UPDATE setting SET value = value WHERE 0"
@@ -600,9 +600,10 @@ class Database:
         )
 
     def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
-        """Return a row for each stored decision, by id.
+        """Return a row for each of these decisions that is stored, by id.
 
-        Hash, quarantined, time, and its label, NULL without one.
+        It has content_hash, quarantined and time, and of the label success, source, seq and the
+        corrected label, which are NULL if there is no label.
         """
         label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
         query = sa.select(

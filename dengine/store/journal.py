@@ -45,10 +45,7 @@ Record = StoredDecision | NewLabel | Event
 
 
 def encode_record(record: Record) -> bytes:
-    """Return a record as a journal keeps it.
-
-    Its row in JSON, then the samples of its trace or point.
-    """
+    """Return a record in bytes: its row in JSON, then the samples of its trace or point."""
     if isinstance(record, StoredDecision):
         row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
         samples = pack(record.trace)
@@ -257,10 +254,7 @@ class Journal:
         self._file.close()
 
     def _header(self) -> bytes:
-        """Return the header, HEADER bytes.
-
-        Magic, then owner, drained offset and newest ledger entry in JSON.
-        """
+        """Return the header: MAGIC, and in JSON owner, drained offset and newest ledger entry."""
         fields = {
             "owner": describe_process()[:80],
             "drained": self.drained_to,
@@ -394,10 +388,7 @@ def head_path(journal: Path) -> Path:
 
 
 def read_newest_entries(path: Path) -> set[tuple[int, str]]:
-    """Return the newest ledger entries (number, digest) that a journal and its head name.
-
-    At most two.
-    """
+    """Return the ledger entries (number, digest), at most two, that a journal and its head name."""
     entries = {_read_head(path)}
     with suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as file:
         entries.add(_parse_header(file.read(HEADER))[1])

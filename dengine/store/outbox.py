@@ -177,7 +177,10 @@ class Outbox:
             self.n_decisions = store.n_decisions()
 
     def _start(self, journal: Journal) -> None:
-        """Drain what an earlier process left in the journal, check the store, start the threads."""
+        """Drain what an earlier process left in the journal, check the store, start the threads.
+
+        If that fails, the journal is closed.
+        """
         try:
             self._compare_with_ledger(journal)  # before anything is drained
             for offset, _, blob in journal.undrained_records():
@@ -836,7 +839,7 @@ class Outbox:
                     self._changed.wait_for(lambda: self._calls or self._closed, RETRY_SECONDS)
 
     def _drain_chunk(self, journal: Journal) -> None:
-        """Have the store take the oldest synced records, at most DRAIN_CHUNK, at once."""
+        """Have the store take the oldest synced records in one call, at most DRAIN_CHUNK."""
         with self._changed:
             n = min(DRAIN_CHUNK, self._synced - self._drained)
         entries = [

@@ -207,10 +207,7 @@ def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | N
 
 
 def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
-    """Return two columns.
-
-    `predicted`, as a position in `ACTIONS`, and `Decision.inclusion_probability`.
-    """
+    """Return the columns `predicted`, a position in `ACTIONS`, and `inclusion_probability`."""
     positions = {action.value: position for position, action in enumerate(ACTIONS)}
     probability = sa.case(
         (DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0

@@ -465,10 +465,7 @@ def address(
 
 @lru_cache
 def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
-    """Return, by name, each field of a record type.
-
-    The type of its column, and whether it may be None.
-    """
+    """Return by name the type of each field of a record type, and whether it may be None."""
     fields: dict[str, tuple[type, bool]] = {}
     for name, hint in get_type_hints(record_type).items():
         is_union = isinstance(hint, UnionType)
@@ -525,10 +522,7 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
 
 
 def _to_column(value: Any, type_: type) -> Any:
-    """Return a field's value as its column holds it.
-
-    An enumeration's value, JSON, or packed float32.
-    """
+    """Return a field's value for its column, converted to plain text, JSON or packed float32."""
     if value is None:
         return None
     if issubclass(type_, StrEnum):
@@ -549,12 +543,12 @@ def _from_column(value: Any, type_: type) -> Any:
 
 
 def decision_row(item: StoredDecision) -> dict[str, Any]:
-    """Return the row of the table `decision`, without its number."""
+    """Return the row of the table `decision` for a decision, without its number."""
     return to_row(item.decision) | to_row(item, *OF_DECISION)
 
 
 def trace_row(item: StoredDecision) -> dict[str, Any]:
-    """Return the row of the table `trace`."""
+    """Return the row of the table `trace` for a decision's trace."""
     channels, samples = item.trace.shape
     return {
         "decision_id": item.decision.id,

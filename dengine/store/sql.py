@@ -319,9 +319,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _newest(
         self, connection: sa.Connection, query: sa.Select[Any], limit: int | None, last: int | None
     ) -> Sequence[Any]:
-        """Run a query for the newest `limit` labels, newest first.
+        """Run a query for the newest `limit` labels; return its rows, newest first.
 
-        Of a product by their numbers, or all would be sorted.
+        Of a product they are selected by number first, or all its labels would be sorted.
         """
         if self.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)
@@ -332,9 +332,17 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return connection.execute(query).all()  # here more than half are quarantined or forgotten
 
     def news_since(self, seq: int, limit: int) -> News:
-        """Return the oldest `limit` labels after number `seq`.
+        """Return what the product's cells stored after label number `seq`.
 
-        With them come the numbers of the newest accepted version and the newest correction.
+        Parameters
+        ----------
+        seq : int
+        limit : int
+            Number of labels at most; the oldest are returned.
+
+        Returns
+        -------
+        News
         """
         query = (
             training_query(self._scope)
@@ -514,9 +522,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
 
     def silent_total(self, since_version: int = 0) -> int:
-        """Return how many accepted parts went on without a report.
+        """Return the sum of `silent` over all labels: accepted parts without a report.
 
-        The sum of `silent` over labels, quarantined ones left out.
+        Labels of quarantined traces, and by versions before `since_version`, are left out.
         """
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
         is_counted = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
@@ -640,7 +648,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _accepted(self) -> sa.Select[Any]:
         """Return the query for the accepted versions, newest first.
 
-        Retrain, version, and whether the state is kept.
+        Its columns are retrain, version, and whether the state is kept.
         """
         query = sa.select(
             *VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept")
@@ -665,7 +673,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def load_version(self, version: int) -> ModelVersion:
         """Return an accepted version by its number.
 
-        VersionError, which names those that are kept, if it is not kept or damaged.
+        Raises
+        ------
+        VersionError
+            If it is damaged or its state is not kept; the error names the versions that are.
         """
         retrains = {
             row.version: row.retrain for row in reversed(self._read(self._accepted())) if row.kept
@@ -679,9 +690,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return self._load(retrains[version])
 
     def _load(self, retrain: int) -> ModelVersion:
-        """Return the version of a retrain, of a peer's without its rule.
+        """Return the version of a retrain; VersionError if its state is missing or damaged.
 
-        VersionError if its state is missing or damaged.
+        A peer's version is returned without the state of its rule.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
@@ -1044,9 +1055,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
 
 def _checked_wait(wait: float | None) -> float:
-    """Return a store's time limit in seconds: the argument, else DENGINE_STORE_WAIT, else 0.4.
+    """Return a store's time limit in seconds; StoreError if it is not above 0.
 
-    StoreError if not above 0.
+    It is the argument, else the environment's DENGINE_STORE_WAIT, else 0.4.
     """
     text = os.environ.get(WAIT_VARIABLE) if wait is None else None
     name = "a wait" if text is None else WAIT_VARIABLE

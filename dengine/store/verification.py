@@ -23,7 +23,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from ..errors import StoreError
-from .connections import integrity, reading
+from .connections import reading, run_integrity_check
 from .journal import journal_path, read_newest_entries, read_undrained
 from .ledger import (
     START,
@@ -160,7 +160,7 @@ def verify_history(
         journal_entries = {name: read_newest_entries(path) for name, path in journals.items()}
         waiting = {name: _count_undrained(path) for name, path in journals.items()}
     with reading(str(url)) as connection:  # a later snapshot: it has what the journals knew
-        pages = integrity(connection) if connection.dialect.name == "sqlite" else []
+        pages = run_integrity_check(connection) if connection.dialect.name == "sqlite" else []
         faults = [HistoryFault("", "file", "", finding) for finding in pages]
         checks = [CellCheck(connection, name, on_rows) for name in names]
         for check in checks:
