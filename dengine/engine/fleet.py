@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import StoreError
 from ..store.outbox import Outbox
-from ..store.records import ModelVersion, News, without_rule
+from ..store.records import ModelVersion, ProductNews, without_rule
 from .guard import GuardedModel
 from .labels import ProductLabels
 from .live_model import LiveModel
@@ -71,7 +71,7 @@ class Peers:
         """Whether news was not asked for lately."""
         return self._clock() - self._asked >= NEWS_SECONDS
 
-    def fetch_news(self) -> tuple[News, bool]:
+    def fetch_news(self) -> tuple[ProductNews, bool]:
         """Return the labels after the window's newest, at most `MOST`, and whether a peer's version is newer.
 
         Raises StoreError where the store gives no answer in time.
@@ -104,7 +104,7 @@ class Peers:
             log.warning("news of product %s comes again", self._outbox.store.product)
         self.is_lost = False
 
-    def take_in(self, news: News) -> None:
+    def take_in(self, news: ProductNews) -> None:
         """Add the labels of the news to the window and the references, in their order."""
         labelled = news.labelled
         rows = zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True)

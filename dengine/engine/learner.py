@@ -22,7 +22,7 @@ from ..model.base import EngineModel
 from ..recipe import Recipe
 from ..records import RetrainReport
 from ..store.outbox import Outbox
-from ..store.records import Change, Labelled, StoredDecision, without_rule
+from ..store.records import Change, LabelledTraces, StoredDecision, without_rule
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import MOST, ROUNDS, Peers
@@ -110,7 +110,7 @@ class Learner:
         trained_on = self.live.trained_on
         return 0 if trained_on is None else trained_on.counts_from
 
-    def _precompute(self, labelled: Labelled) -> None:
+    def _precompute(self, labelled: LabelledTraces) -> None:
         """Begin, in a thread, to compute what a retrain on these labels starts with: opening does not wait for it."""
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
         model = GuardedModel(self.live.newest)

@@ -37,7 +37,7 @@ LOOP = (
 )
 MARKS = (
     "policy_since",
-    "told_since",
+    "evidence_since",
     "began_in",
 )  # of what a change of policy set, as the store has them
 

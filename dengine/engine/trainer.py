@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..errors import DengineError, SettingError
 from ..model.base import EngineModel
 from ..reducers.base import StopRule
-from ..store.records import Labelled
+from ..store.records import LabelledTraces
 
 log = logging.getLogger("dengine")
 HUNG = 60.0  # seconds after which work in the executor is given up
@@ -48,7 +48,7 @@ class TrainingWindow:
         self._end = 0
         nothing = np.zeros(0, np.int64)
         no_traces = np.zeros((0, 1, 1), np.float32)
-        self.refill(Labelled(nothing, no_traces, nothing.astype(np.int8), nothing))
+        self.refill(LabelledTraces(nothing, no_traces, nothing.astype(np.int8), nothing))
 
     def __len__(self) -> int:
         return self._end - self._first
@@ -83,15 +83,15 @@ class TrainingWindow:
         self._first = 0
         self._end = n
 
-    def refill(self, labelled: Labelled) -> None:
+    def refill(self, labelled: LabelledTraces) -> None:
         """Hold the newest of these labelled traces, which are ordered by number, in place of all others."""
         self._block = [labelled.seq, labelled.traces, labelled.labels, labelled.hashes]
         self._end = len(labelled.seq)
         self._first = max(0, self._end - self.capacity)
 
-    def snapshot(self) -> Labelled:
+    def snapshot(self) -> LabelledTraces:
         """Return the labelled traces, oldest first; the arrays never change, and are not to be written to."""
-        return Labelled(*(column[self._first : self._end] for column in self._block))
+        return LabelledTraces(*(column[self._first : self._end] for column in self._block))
 
     def newer(self, seq: int) -> list[int]:
         """Return the sequence numbers of the window's labels after this one, in ascending order."""
@@ -274,7 +274,7 @@ class Retrainer:
 
 
 def train_candidate(
-    successor: EngineModel, data: Labelled, limits: Limits, clock: Clock
+    successor: EngineModel, data: LabelledTraces, limits: Limits, clock: Clock
 ) -> Trained:
     """Train a successor on labelled traces; any exception becomes a dropped outcome.
 

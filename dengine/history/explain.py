@@ -220,7 +220,7 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     settings = store.settings()
     if stored is None or (rule := _restore_rule(stored, policy)) is None:
         return None
-    since = int(settings.get("told_since", 0))
+    since = int(settings.get("evidence_since", 0))
     began_in = int(settings.get("began_in", 0))
     policy_since = int(settings.get("policy_since", 0))
     progress = read_rule_progress(store, stored, since, policy.label_within, policy_since)

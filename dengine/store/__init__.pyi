@@ -4,7 +4,7 @@ from .opening import open_store as open_store
 from .records import Change as Change
 from .records import Correction as Correction
 from .records import Event as Event
-from .records import Labelled as Labelled
+from .records import LabelledTraces as LabelledTraces
 from .records import ModelVersion as ModelVersion
 from .records import NewLabel as NewLabel
 from .records import OutcomeRecord as OutcomeRecord

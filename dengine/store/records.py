@@ -222,7 +222,7 @@ class StoredDecision:
 
 
 @dataclass(frozen=True, slots=True)
-class Labelled:
+class LabelledTraces:
     """Labelled traces, oldest label first, without the quarantined ones.
 
     Attributes
@@ -244,12 +244,12 @@ class Labelled:
 
 
 @dataclass(frozen=True, slots=True)
-class News:
+class ProductNews:
     """What the cells of a product stored since an engine last asked.
 
     Attributes
     ----------
-    labelled : Labelled
+    labelled : LabelledTraces
         New labels of all cells, this one included, oldest first, as corrected.
     version : int
         Number of the newest accepted version; 0 before the first.
@@ -257,7 +257,7 @@ class News:
         Number of the newest correction; 0 before the first.
     """
 
-    labelled: Labelled
+    labelled: LabelledTraces
     version: int
     correction: int = 0
 

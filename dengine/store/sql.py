@@ -49,7 +49,7 @@ from .records import (
     Change,
     Correction,
     Event,
-    Labelled,
+    LabelledTraces,
     ModelVersion,
     NewLabel,
     News,
@@ -286,7 +286,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         last: int | None = None,
         corrected_to: int | None = None,
         cell_only: bool = False,
-    ) -> Labelled:
+    ) -> LabelledTraces:
         """Return labelled traces for training, with corrected labels.
 
         A trace that is not as it was stored is left out, and an event names its decision.
@@ -304,7 +304,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         Returns
         -------
-        Labelled
+        LabelledTraces
         """
         scope = Scope(self.cell_id) if cell_only else self._scope
         query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
@@ -331,7 +331,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
                 return rows
         return connection.execute(query).all()  # here more than half are quarantined or forgotten
 
-    def news_since(self, seq: int, limit: int) -> News:
+    def news_since(self, seq: int, limit: int) -> ProductNews:
         """Return what the product's cells stored after label number `seq`.
 
         Parameters
@@ -342,7 +342,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         Returns
         -------
-        News
+        ProductNews
         """
         query = (
             training_query(self._scope)
@@ -357,11 +357,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             version = self._scope.newest_version(connection)
             correction = self._scope.newest(connection, CORRECTION.c.number)
         self._note_damage(damaged, "trace")
-        return News(labelled, version, correction)
+        return ProductNews(labelled, version, correction)
 
     def _with_traces(
         self, connection: sa.Connection, rows: Sequence[Any], scope: Scope
-    ) -> tuple[Labelled, list[str]]:
+    ) -> tuple[LabelledTraces, list[str]]:
         """Read the traces of label rows, oldest first, one by one.
 
         Returns the labelled traces, and the ids of decisions whose traces are not as they were
@@ -399,7 +399,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
                 "Expected labels that are True or False, found another: the store is damaged; "
                 "restore a copy."
             )
-        labelled = Labelled(
+        labelled = LabelledTraces(
             seq=np.array([row.seq for row in rows], dtype=np.int64)[is_kept],
             traces=traces if is_kept.all() else traces[is_kept[: len(traces)]],
             labels=np.array(labels, dtype=np.int8)[is_kept],

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dengine.engine.trainer import TrainingWindow
-from dengine.store.records import Labelled
+from dengine.store.records import LabelledTraces
 
 
 def add(window: TrainingWindow, *seqs: int) -> None:
@@ -14,7 +14,7 @@ def add(window: TrainingWindow, *seqs: int) -> None:
         window.add(np.full((1, 3), float(seq), np.float32), seq % 2, 100 + seq, seq)
 
 
-def seqs_of(labelled: Labelled) -> list[int]:
+def seqs_of(labelled: LabelledTraces) -> list[int]:
     n = len(labelled.seq)
     assert labelled.traces.shape == ((n, 1, 3) if n else (0, 1, 1))
     assert labelled.traces[:, 0, 0].tolist() == labelled.seq.tolist()
