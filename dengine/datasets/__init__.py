@@ -1,8 +1,10 @@
-"""Labelled traces as people have them: folders of CSV files, tables, arrays, archives; read into one `Dataset`.
+"""Labelled traces as people have them: folders of CSV files, tables, arrays, archives, bags.
 
->>> load_dataset("insertion")                          # 1503 simulated insertions, shipped with the package
->>> load_dataset("recorded.npz", samples=400)          # X (n, T) or (n, C, T), y (n,)
->>> load_dataset("cell_3/", channel="FZ_Base,FX_Base") # a CSV file an insertion, its label in its name
+>>> load_dataset("insertion")  # 1503 simulated insertions, shipped with the package
+>>> load_dataset("recorded.npz", samples=400)  # X (n, T) or (n, C, T), y (n,)
+>>> load_dataset("cell_3/", channel="FZ_Base,FX_Base")  # a CSV file for each insertion
+
+`load_dataset` reads them into one `Dataset`; `importing.import_labelled` puts them into a store.
 """
 
 from .dataset import Dataset, Fault, make_dataset

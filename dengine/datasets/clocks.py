@@ -1,7 +1,8 @@
-"""Which column of a recording is its clock, what its times are, and the rate that they tell.
+"""The clock of a recording: which column it is, its times in seconds, and the sampling rate.
 
-A clock is known by its name (`traces.is_time_column`), or by its values: times of day, or seconds since 1970. Any
-other column that rises steadily may be one, or a path: it is offered, and a person says so.
+A column is the clock by its name (`traces.is_time_column`), or by its values: times of day, or
+seconds since 1970. Any other column that rises steadily may be a clock or a path; users are told of
+it, and name it themselves. Text files, tables and DataFrames all ask `clock_of` and `rate_of`.
 """
 
 from __future__ import annotations
@@ -21,47 +22,54 @@ from .dataset import UnreadableError
 if TYPE_CHECKING:
     import pandas as pd
 
-NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # a cell without a number: kept as NaN
-GAP = 5.0  # median steps: a pause that a late message does not explain
-UNEVEN = 0.1  # steps: what is less off even times is read as even
-LATE = 1.5  # median steps: up to here a step is usual
-SLOW = 0.5  # seconds: no recorder of forces steps so slowly; a clock without a unit counts thousandths, or less
-RATES = (1.0, 1e6)  # hertz that are believed
-SPANS = (1e-3, 3600.0)  # seconds that a recording is believed to last
-DAY = 86400.0
+EMPTY_CELLS = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # become NaN
+MAX_GAP = 5.0  # median steps: a longer pause is no late message
+EVEN_TOLERANCE = 0.1  # steps: times that are less off even ones are read as even
+LATE_STEP = 1.5  # median steps: up to here a step is a usual one
+SLOWEST_STEP = 0.5  # seconds: a clock without a unit whose steps are longer counts milliseconds
+RATES = (1.0, 1e6)  # hertz that are plausible
+SPANS = (1e-3, 3600.0)  # plausible durations of a recording, in seconds
+DAY = units.SECONDS["d"]
 EXCEL_DAYS = (2e4, 8e4)  # since 1900: the years 1954 to 2119
-EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e9, 1.0))  # from this number on, the seconds of one
+# Times since 1970: from which number on, and the seconds in one.
+EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e9, 1.0))
 LATEST = 5e9  # seconds since 1970: the year 2128
-TELLING = 200  # rows that tell whether a column rises
-STEADY = 0.9  # of the steps of a column that rises steadily, each within a half of their median
-SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "sekunden": 1.0}
-SECONDS |= dict.fromkeys(("ms", "msec", "msecs", "millis", "millisec", "milliseconds"), 0.001)
-SECONDS |= dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "micros", "microseconds"), 1e-06)
-SECONDS |= dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosec", "nanoseconds"), 1e-09)
-SECONDS |= {"min": 60.0, "h": 3600.0, "d": DAY, "days": DAY}
-STATED = re.compile(r"[\[({</]\s*(?P<n>\d*[.,]?\d+)?\s*(?P<unit>[a-zµμ]+)\s*[\])}>]?\s*$|\bin (?P<such>[a-zµμ]+)$")
-DAY_FIRST = re.compile(r"^(\d\d?)\.(\d\d?)\.(\d{4})")  # a German day
-SLASHED_DAY = re.compile(r"^(\d\d?)/(\d\d?)/(\d{4})")
-OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
-DAY_FORM = r"\d{4}-?\d\d-?\d\d|\d{4}/\d\d?/\d\d?|\d\d?[./]\d\d?[./]\d{2,4}"
+HEAD = 200  # rows by which it is found whether a column rises
+STEADY = 0.9  # of the steps of a steady column are within half of their median
+STATED_UNIT = re.compile(
+    r"[\[({</]\s*(?P<n>\d*[.,]?\d+)?\s*(?P<unit>[a-zµμ]+)\s*[\])}>]?\s*$|\bin (?P<such>[a-zµμ]+)$"
+)
+DAY_FIRST = re.compile(r"^(\d\d?)\.(\d\d?)\.(\d{4})")  # a German date
+SLASHED_DATE = re.compile(r"^(\d\d?)/(\d\d?)/(\d{4})")
+TIME_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
+DATE_FORM = r"\d{4}-?\d\d-?\d\d|\d{4}/\d\d?/\d\d?|\d\d?[./]\d\d?[./]\d{2,4}"
 TIME_FORM = r"\d{1,2}:?\d\d(:?\d\d([.,]\d+)?)?\s*(Z|UTC|AM|PM|[+\-−]\d\d(:?\d\d)?)?"
-STAMP = re.compile(rf"({DAY_FORM})([T ]\s*{TIME_FORM})?|\d{{1,2}}:\d\d(:\d\d)?([.,]\d+)?", re.IGNORECASE)
+TIMESTAMP = re.compile(
+    rf"({DATE_FORM})([T ]\s*{TIME_FORM})?|\d{{1,2}}:\d\d(:\d\d)?([.,]\d+)?", re.IGNORECASE
+)
 
 
 class Clock(NamedTuple):
-    """A recording's clock.
+    """The clock of a recording.
 
-    name : of its column.  seconds : (n,) since the first row; NaN where a cell tells none.  said : what people should
-    know of it, "" where its name and its unit say all.
+    name : str
+        Its column.
+    seconds : array of float64, shape (n,)
+        Since the first row; NaN where a cell states no time.
+    note : str
+        What was assumed and users should know; "" where name and unit say it all.
     """
 
     name: str
     seconds: NDArray[np.float64]
-    said: str
+    note: str
 
 
 def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
-    """(n,) numbers, NaN where a cell says nothing; and under which index a cell holds what is no number."""
+    """Return the numbers of a column, shape (n,), and the index of each cell that is no number.
+
+    Empty cells become NaN.
+    """
     import pandas as pd
 
     if pd.api.types.is_numeric_dtype(cells):
@@ -72,133 +80,188 @@ def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
         try:
             values[i] = float(cell)
         except (TypeError, ValueError, OverflowError):
-            if str(cell).strip().lower() not in NOTHING:
+            if str(cell).strip().lower() not in EMPTY_CELLS:
                 wrong.append(index)
     return values, wrong
 
 
 def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
-    """Where the clock's column is; None where none is known. time : its name, as somebody stated it."""
+    """Return the position of the clock's column; None if none is known.
+
+    time : its name, if the user stated it; UnreadableError if there is no such column.
+    """
     names = [str(name) for name in frame.columns]
-    head = frame.iloc[:TELLING]
+    head = frame.iloc[:HEAD]
     if time is not None:
-        places = [i for i, name in enumerate(names) if name == time]
-        places = places or [i for i, name in enumerate(names) if units.split(name)[0] == units.split(time)[0]]
+        places = units.find_columns(time, names)
         if not places:
             raise UnreadableError(f"Expected a column {time} of times, found {listed(names)}")
         return places[0]
     if places := [i for i, name in enumerate(names) if is_time_column(name)]:
-        return max(places, key=lambda i: _rising_share(head.iloc[:, i]))  # a date beside the time of day does not
+        # Of a date and a time of day, only the latter rises.
+        return max(places, key=lambda i: _rising_share(head.iloc[:, i]))
     return next((i for i in range(len(names)) if _is_clock(head.iloc[:, i], names[i])), None)
 
 
-def rising(frame: pd.DataFrame) -> list[int]:
-    """Where columns rise steadily: each may be the clock, or how far the tool has gone."""
-    head = frame.iloc[:TELLING]
+def rising_columns(frame: pd.DataFrame) -> list[int]:
+    """Return the positions of columns that rise steadily: a clock, or the tool's path."""
+    head = frame.iloc[:HEAD]
     return [i for i in range(frame.shape[1]) if is_rising(floats(head.iloc[:, i])[0])]
 
 
 def _rising_share(cells: pd.Series) -> float:
-    """The share of a column's steps that rise."""
-    times, odd = floats(cells)
-    steps = np.diff(_stamps(cells)[0] if 2 * len(odd) >= len(cells) else times)
+    """Return the share of a column's steps that rise, of numbers or times."""
+    times, wrong = floats(cells)
+    steps = np.diff(_parse_timestamps(cells)[0] if 2 * len(wrong) >= len(cells) else times)
     return float((steps > 0).mean()) if len(steps) else 0.0
 
 
 def is_rising(times: NDArray[np.float64]) -> bool:
-    """Whether numbers rise steadily, from each to the next by about as much."""
+    """Return whether numbers rise steadily: 90 % of the steps are within half of their median."""
     steps = np.diff(times)
     if len(steps) < 2 or not (steps > 0).all():
         return False
-    middle = float(np.median(steps))
-    return bool((np.abs(steps - middle) <= middle / 2).mean() >= STEADY)
+    median = float(np.median(steps))
+    return bool((np.abs(steps - median) <= median / 2).mean() >= STEADY)
 
 
 def _is_clock(cells: pd.Series, name: str) -> bool:
-    """Whether a column is a clock by its values: times as text, times since 1970, or an unnamed column that rises
-    steadily by other steps than 1.
+    """Return whether a column is a clock by its values.
+
+    It is if it holds times as text that rise, times since 1970, or if it has no name and rises
+    steadily by steps other than 1.
     """
-    times, odd = floats(cells)
+    times, wrong = floats(cells)
     if len(cells) < 3:
         return False
-    if 2 * len(odd) >= len(cells):
-        return bool(STAMP.fullmatch(str(cells.iloc[0]).strip())) and _rising_share(cells) == 1.0
+    if 2 * len(wrong) >= len(cells):
+        is_time = TIMESTAMP.fullmatch(str(cells.iloc[0]).strip()) is not None
+        return is_time and _rising_share(cells) == 1.0
     if not is_rising(times):
         return False
-    counted = bool((np.diff(times) == 1).all())
-    unnamed = name == "" or name == "index" or re.fullmatch(r"Unnamed: \d+", name) is not None
-    return (unnamed and not counted) or _unix_time_unit(times) is not None
+    is_counter = bool((np.diff(times) == 1).all())
+    is_unnamed = name in ("", "index") or re.fullmatch(r"Unnamed: \d+", name) is not None
+    return (is_unnamed and not is_counter) or _epoch_unit(times) is not None
 
 
-def _unix_time_unit(times: NDArray[np.float64]) -> float | None:
-    """The seconds of one, where numbers are times since 1970."""
+def _epoch_unit(times: NDArray[np.float64]) -> float | None:
+    """Return the seconds in one of numbers that are times since 1970; None if they are not."""
     for least, unit in EPOCHS:
         if least <= np.abs(times[0]) and np.abs(times[0]) * unit < LATEST:
             return unit
     return None
 
 
-def clock_of(frame: pd.DataFrame, time: str | None = None, units_row: Sequence[str] = ()) -> Clock | None:
-    """The clock of a table's rows; None where none is known.
+def clock_of(
+    frame: pd.DataFrame, time: str | None = None, units_row: Sequence[str] = ()
+) -> Clock | None:
+    """Find the clock of a table whose rows are samples.
 
-    time : its column, where it was stated.  units_row : the units of all columns, where a row says them.
-    UnreadableError where a cell of it tells no time.
+    Parameters
+    ----------
+    frame : DataFrame, n rows
+    time : str, optional
+        The clock's column, if the user stated it.
+    units_row : sequence of str
+        Unit of each column, if the file has a row of units.
+
+    Returns
+    -------
+    Clock or None
+        None if no clock is known.
+
+    Raises
+    ------
+    UnreadableError
+        If a cell of the clock states no time.
     """
     place = place_of_clock(frame, time)
     if place is None or len(frame) < 2:
         return None
     column = frame.iloc[:, place]
     name = str(frame.columns[place])
-    seconds = _parts_of_seconds(frame, name)
-    odd = list[int]()
-    said = ""
+    seconds = _join_seconds(frame, name)
+    wrong = list[int]()
+    note = ""
     if seconds is None:
-        seconds, odd, said = seconds_of(column, name, units_row[place] if units_row else "")
-    if odd:
-        wanted = "in seconds or as 2026-03-01T12:00:00.002"
-        got = excerpt(str(column[odd[0]]))
-        what = f"Expected a time in column {name}, {wanted}, got {got}; a stated rate (rate_hz) needs none"
-        raise UnreadableError(what, odd[0])
+        seconds, wrong, note = seconds_of(column, name, units_row[place] if units_row else "")
+    if wrong:
+        wanted = f"a time in column {name}, in seconds or as 2026-03-01T12:00:00.002"
+        got = excerpt(str(column[wrong[0]]))
+        do = "a stated rate (rate_hz) needs none"
+        raise UnreadableError(f"Expected {wanted}, got {got}; {do}", wrong[0])
     if time is None and not is_time_column(name):
-        known = f"Column {name or place + 1} is taken as the clock by its values"
-        said = f"{known}; {said}" if said else known
-    return Clock(name, seconds, said)
+        assumed = f"Column {name or place + 1} is taken as the clock by its values"
+        note = f"{assumed}; {note}" if note else assumed
+    return Clock(name, seconds, note)
 
 
-def _parts_of_seconds(frame: pd.DataFrame, name: str) -> NDArray[np.float64] | None:
-    """Of the two columns of a ROS stamp, `stamp.secs` and `stamp.nsecs`, the time that they are together."""
+def _join_seconds(frame: pd.DataFrame, name: str) -> NDArray[np.float64] | None:
+    """Return the seconds of a ROS stamp in two columns, `stamp.secs` and `stamp.nsecs`.
+
+    None if the column `name` is not one of two such columns.
+    """
     match = re.fullmatch(r"(.*?)(n?(?:ano)?)(secs?)", name)
     if match is None:
         return None
-    known = {str(column): i for i, column in enumerate(frame.columns)}
-    whole = next((known[n] for n in (f"{match[1]}secs", f"{match[1]}sec") if n in known), None)
-    part = next(
-        (known[n] for n in (f"{match[1]}{k}" for k in ("nsecs", "nsec", "nanosec", "nanosecs")) if n in known), None
-    )
+    places = {str(column): i for i, column in enumerate(frame.columns)}
+
+    def find(endings: Sequence[str]) -> int | None:
+        names = (f"{match[1]}{ending}" for ending in endings)
+        return next((places[column] for column in names if column in places), None)
+
+    whole = find(("secs", "sec"))
+    part = find(("nsecs", "nsec", "nanosec", "nanosecs"))
     if whole is None or part is None:
         return None
-    seconds, odd = floats(frame.iloc[:, whole])
-    nanos, wrong = floats(frame.iloc[:, part])
-    return None if odd or wrong else (seconds - seconds[0]) + (nanos - nanos[0]) * 1e-9
+    seconds, wrong_seconds = floats(frame.iloc[:, whole])
+    nanoseconds, wrong_nanoseconds = floats(frame.iloc[:, part])
+    if wrong_seconds or wrong_nanoseconds:
+        return None
+    result: NDArray[np.float64] = (seconds - seconds[0]) + (nanoseconds - nanoseconds[0]) * 1e-9
+    return result
 
 
-def seconds_of(column: pd.Series, name: str, unit: str = "") -> tuple[NDArray[np.float64], list[int], str]:
-    """(n,) seconds since the first of a column's times; which cells tell none; and what was taken for granted."""
+def seconds_of(
+    column: pd.Series, name: str, unit: str = ""
+) -> tuple[NDArray[np.float64], list[int], str]:
+    """Convert a column of times to seconds.
+
+    Parameters
+    ----------
+    column : Series of n numbers, timestamps or texts
+    name : str
+        Name of the column, which may state a unit.
+    unit : str
+        Unit from a row of units; "" if there is none.
+
+    Returns
+    -------
+    seconds : array of float64, shape (n,)
+        Since the first known time; NaN where a cell states none.
+    wrong : list of int
+        Index of each cell that states no time.
+    note : str
+        What was assumed of the unit, for the user; "" for nothing.
+    """
     import pandas as pd
 
     if not pd.api.types.is_datetime64_any_dtype(column):
-        times, odd = floats(column)
-        if 2 * len(odd) < max(len(times), 1):
-            scale, said = _scale(times, name, unit)
+        times, wrong = floats(column)
+        if 2 * len(wrong) < max(len(times), 1):
+            scale, note = _seconds_per_count(times, name, unit)
             known = np.flatnonzero(~np.isnan(times))
             start = times[known[0]] if len(known) else 0.0
-            return (times - start) * scale, odd, said
-    seconds, missing = _stamps(column)
+            return (times - start) * scale, wrong, note
+    seconds, missing = _parse_timestamps(column)
     return seconds, column.index[missing].tolist(), ""
 
 
-def _stamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """(n,) seconds since the first of times as text: ISO 8601, days as 02.03.2026 or 3/2/2026, or times of day."""
+def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return seconds since the first time of a column, shape (n,), and which cells are no time.
+
+    Times are ISO 8601, dates as 02.03.2026 or 3/2/2026 with or without a time, or times of day.
+    """
     import pandas as pd
 
     if pd.api.types.is_datetime64_any_dtype(column):
@@ -206,93 +269,120 @@ def _stamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     elif pd.api.types.is_timedelta64_dtype(column):
         stamps = column
     else:
-        text = column.astype(str).str.strip().str.upper().str.replace(",", ".").str.replace("−", "-")
+        text = column.astype(str).str.strip().str.upper()
+        text = text.str.replace(",", ".").str.replace("−", "-")
         text = text.str.replace(r"\s*UTC$", "Z", regex=True).str.replace(r"\s+", " ", regex=True)
-        if text.str.fullmatch(OF_DAY).mean() > 0.5:
+        if text.str.fullmatch(TIME_OF_DAY).mean() > 0.5:
             text = text.where(text.str.count(":") > 1, "00:" + text)
             stamps = pd.to_timedelta(text, errors="coerce")
         else:
-            text = text.str.replace(DAY_FIRST, lambda m: f"{m[3]}-{m[2]:0>2}-{m[1]:0>2}", regex=True)
-            parts = text.str.extract(SLASHED_DAY).astype(float)
-            first, second = (1, 2) if (parts[0] > 12).any() else (2, 1)  # the day, in Europe; the month, in America
-            text = text.str.replace(SLASHED_DAY, lambda m: f"{m[3]}-{m[second]:0>2}-{m[first]:0>2}", regex=True)
+            text = text.str.replace(
+                DAY_FIRST, lambda m: f"{m[3]}-{m[2]:0>2}-{m[1]:0>2}", regex=True
+            )
+            parts = text.str.extract(SLASHED_DATE).astype(float)
+            # A first number beyond 12 is a day, as Europeans write it; else it is the month.
+            day, month = (1, 2) if (parts[0] > 12).any() else (2, 1)
+            text = text.str.replace(
+                SLASHED_DATE, lambda m: f"{m[3]}-{m[month]:0>2}-{m[day]:0>2}", regex=True
+            )
             text = text.str.replace(r" (\d):", r" 0\1:", regex=True)
             form = "mixed" if text.str.contains(r"\b[AP]M$").any() else "ISO8601"
             stamps = pd.to_datetime(text, errors="coerce", format=form, utc=True)
     missing = stamps.isna().to_numpy()
-    first_known = stamps[~missing]
-    start = first_known.iloc[0] if len(first_known) else None
-    if start is None:
+    known = stamps[~missing]
+    if not len(known):
         return np.full(len(column), np.nan), missing
-    delta = stamps - start
-    return delta.dt.total_seconds().to_numpy(dtype=np.float64), missing
+    elapsed = stamps - known.iloc[0]
+    return elapsed.dt.total_seconds().to_numpy(dtype=np.float64), missing
 
 
-def _scale(times: NDArray[np.float64], name: str, unit: str) -> tuple[float, str]:
-    """Seconds in one of a clock: as its name or the row of units says, else so that its steps are a recorder's."""
-    stated = _stated(name, unit)
+def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tuple[float, str]:
+    """Return the seconds in one count of a clock, and a note for the user if that was assumed.
+
+    Its name or the row of units states them; else they follow from its values.
+    """
+    stated = _stated_unit(name, unit)
     if stated is not None:
         return stated, ""
     known = times[~np.isnan(times)]
     if len(known) < 2:
         return 1.0, ""
-    since_1970 = _unix_time_unit(known)
-    if since_1970 is not None:
-        return since_1970, ""
+    epoch_unit = _epoch_unit(known)
+    if epoch_unit is not None:
+        return epoch_unit, ""
     step = float(np.median(np.abs(np.diff(known))))
     low, high = EXCEL_DAYS
     if low < known[0] < high and 0 < step * DAY < 1.0:
         return DAY, f"The clock {name} is read as days, as Excel counts them"
-    scale = next((scale for scale in (1.0, 1e-3, 1e-6) if step * scale < SLOW), 1e-9)
+    scale = next((scale for scale in (1.0, 1e-3, 1e-6) if step * scale < SLOWEST_STEP), 1e-9)
+    if scale == 1.0 and 0 < step < SLOWEST_STEP / 10:
+        return scale, ""
     words = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
-    sure = scale == 1.0 and 0 < step < SLOW / 10
-    said = f"The clock {name} names no unit and is read as {words[scale]}; rate_hz=... states another rate"
-    return scale, "" if sure else said
+    assumed = f"The clock {name} names no unit and is read as {words[scale]}"
+    return scale, f"{assumed}; rate_hz=... states another rate"
 
 
-def _stated(name: str, unit: str) -> float | None:
-    """Seconds in one by a clock's unit: of the row of units, in brackets, or at the end of its name; None: it says none."""
+def _stated_unit(name: str, unit: str) -> float | None:
+    """Return the seconds in one unit of a clock, as the row of units or its name states it.
+
+    In a name the unit stands in brackets, behind a slash or at the end; None if there is none.
+    """
     for text in (f"({unit.strip('[](){} ')})" if unit else "", name):
-        match = STATED.search(text.strip().lower())
-        known = None if match is None else SECONDS.get(match["unit"] or match["such"])
-        if match is not None and known is not None:
-            return known * float((match["n"] or "1").replace(",", "."))
+        match = STATED_UNIT.search(text.strip().lower())
+        seconds = None if match is None else units.seconds_in(match["unit"] or match["such"])
+        if match is not None and seconds is not None:
+            return seconds * float((match["n"] or "1").replace(",", "."))
     words = re.findall(r"[A-Z]?[a-zµμ]+|[A-Z]+", name)
     last = words[-1].lower() if words else ""
-    return SECONDS.get(last) if last not in ("d", "h", "min", "days") else None
+    return units.seconds_in(last) if last not in ("d", "h", "min", "days") else None
 
 
 def rate_of(clock: Clock, lines: pd.Index) -> float:
-    """Samples a second, to four digits, by a clock's usual step.
+    """Return the sampling rate in hertz, to four digits, by a clock's usual step.
 
-    UnreadableError where a time is missing, turns back or jumps, and where the rate or the duration cannot be believed.
-    lines : of the file, one a time.
+    Parameters
+    ----------
+    clock : Clock
+    lines : Index
+        Line in the file of each time, for errors.
+
+    Raises
+    ------
+    UnreadableError
+        If a time is missing, not later than the one before, or follows a gap; and if the rate or
+        the duration is not plausible.
     """
     steps = np.diff(clock.seconds)
     backwards = np.flatnonzero(~(steps > 0))
     if len(backwards):
-        what = "Expected a later time than that of the row before, or a stated rate (rate_hz)"
-        raise UnreadableError(what, lines[int(backwards[0]) + 1])
+        wanted = "a later time than that of the row before, or a stated rate (rate_hz)"
+        raise UnreadableError(f"Expected {wanted}", lines[int(backwards[0]) + 1])
     step = float(np.median(steps))
-    gaps = np.flatnonzero(steps > GAP * step)
+    gaps = np.flatnonzero(steps > MAX_GAP * step)
     if len(gaps):
-        what = f"Expected a step of {step:.3g} s in time, got a gap of {steps[gaps[0]]:.3g} s"
-        raise UnreadableError(what, lines[int(gaps[0]) + 1])
-    usual = float(steps[steps <= LATE * step].mean())  # a clock of whole milliseconds steps 4, 4, 5
-    rate = 1.0 / (step if abs(usual - step) < 0.005 * step else usual)
+        message = f"Expected a step of {step:.3g} s in time, got a gap of {steps[gaps[0]]:.3g} s"
+        raise UnreadableError(message, lines[int(gaps[0]) + 1])
+    # A clock of whole milliseconds steps 4, 4, 5: its mean step tells the rate.
+    mean = float(steps[steps <= LATE_STEP * step].mean())
+    rate = 1.0 / (step if abs(mean - step) < 0.005 * step else mean)
     span = float(clock.seconds[-1])
     if not (RATES[0] <= rate <= RATES[1] and SPANS[0] <= span <= SPANS[1]):
-        wanted = f"{RATES[0]:g} Hz to {RATES[1] / 1e6:g} MHz over {1e3 * SPANS[0]:g} ms to {SPANS[1] / 3600:g} h"
+        rates = f"{RATES[0]:g} Hz to {RATES[1] / 1e6:g} MHz"
+        wanted = f"{rates} over {1e3 * SPANS[0]:g} ms to {SPANS[1] / 3600:g} h"
         got = f"{rate:.4g} Hz over {span:.3g} s"
         do = "state the rate, rate_hz=..., or write its unit into the header, as in time [ms]"
-        raise UnreadableError(f"Expected a clock of {wanted}, column {clock.name} tells {got}; {do}")
+        message = f"Expected a clock of {wanted}, column {clock.name} tells {got}; {do}"
+        raise UnreadableError(message)
     return float(f"{rate:.4g}")
 
 
-def evenly(values: NDArray[np.float32], clock: Clock) -> NDArray[np.float32]:
-    """(C, T) values put on even times from the first to the last of a clock; as they are where it is even already."""
+def resample_evenly(values: NDArray[np.float32], clock: Clock) -> NDArray[np.float32]:
+    """Interpolate samples (C, T) at even times between the first and the last of a clock.
+
+    Returns the same array if the times are even already.
+    """
     times = clock.seconds
     even = np.linspace(times[0], times[-1], len(times))
-    if np.abs(times - even).max() < UNEVEN * (even[1] - even[0]):
+    if np.abs(times - even).max() < EVEN_TOLERANCE * (even[1] - even[0]):
         return values
     return np.stack([np.interp(even, times, row) for row in values]).astype(np.float32)

@@ -1,6 +1,8 @@
-"""A data set in memory: labelled traces of one form, what is known of them, and what could not be read.
+"""`Dataset`, labelled traces of one shape in memory, and how recordings become one.
 
-Recordings of whatever length become one block of traces honestly: what cannot be fitted is a fault, not made up.
+The readers of the family add each recording to a `RecordingCollector`. `as_dataset` brings them to
+one unit, one rate and one length; what cannot be brought to them is left out as a `Fault`, not made
+up. `LoadOptions` are the options of `load_dataset`.
 """
 
 import os
@@ -24,19 +26,26 @@ from . import units
 if TYPE_CHECKING:
     import pandas as pd
 
-NEAR = 0.03  # of the others' rate
-MOST_APART = 2.0  # times the others' rate: so far a recording is resampled
-UNKNOWN_RATE = "The rate is unknown, for nothing tells it: times are in samples until it is stated, rate_hz=..."
-MOST_WORDS = 12  # that somebody says the meaning of
-must = partial(expect, error=DataError)
+RATE_TOLERANCE = 0.03  # of the others' rate: recordings within it have one rate
+MAX_RATE_RATIO = 2.0  # a recording at a rate further from the others' is not resampled
+UNKNOWN_RATE = (
+    "The rate is unknown, for nothing tells it: times are in samples until it is stated,"
+    " rate_hz=..."
+)
+MAX_LABEL_WORDS = 12  # more different words are no labels
+expect_data = partial(expect, error=DataError)
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A recording that was left out.
+    """Why a recording was left out.
 
-    source : the file, as seen from the folder; or what the rows are of.  line : in the file, or row of a table, from 1;
-    0 where it is the whole.  what : what was expected, and what came.
+    source : str
+        The file, seen from the folder, or what the rows are of.
+    line : int
+        In the file, or row of the table, from 1; 0 for the whole.
+    what : str
+        What was expected, and what came.
     """
 
     source: str
@@ -44,11 +53,18 @@ class Fault:
     what: str
 
     def __str__(self) -> str:
-        return f"{self.source}, line {self.line}: {self.what}" if self.line else f"{self.source}: {self.what}"
+        return (
+            f"{self.source}, line {self.line}: {self.what}"
+            if self.line
+            else f"{self.source}: {self.what}"
+        )
 
 
 class UnreadableError(DataError):
-    """Why one recording is left out; becomes its `Fault`. line : of its file, 0 where it is the whole."""
+    """One recording cannot be read; the error becomes its `Fault`.
+
+    line : of the file, 0 for the whole.
+    """
 
     def __init__(self, what: str, line: int = 0) -> None:
         super().__init__(what)
@@ -56,31 +72,57 @@ class UnreadableError(DataError):
 
 
 class UnknownWordError(UnreadableError):
-    """A label in a word that nobody said the meaning of."""
+    """A label in a word whose meaning is unknown; the user can state it as `label_map`."""
 
     def __init__(self, word: str) -> None:
-        super().__init__(f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {shortened(word)}")
+        super().__init__(
+            f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {shortened(word)}"
+        )
         self.word = word
 
 
 class UnlabelledError(UnreadableError):
-    """A recording that nobody has checked yet: it is counted, and left out."""
+    """A recording whose label is empty, for its part was not checked yet."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Dataset:
-    """Labelled traces in the order they were recorded.
+    """Labelled traces, in the order of their recording.
 
-    X : (n, T) or (n, C, T) float32.  y : (n,) int8, 1 = success, 0 = failure.
-    name, unit : for people.  rate_hz : of the samples; None: nothing tells it.
-    cause : (n,) why a part failed, where that is known.
-    part : (n,) the number of the part that each trace was recorded on; None: every trace is a part of its own.
-    faults : what could not be read and was left out.  channels : the channels' names, where they have any.
-    notes : what was found about the files, and is no fault.
-    source : (n,) the file, or row, that each trace came from.  fit : how other lengths became T, as in `TraceSpec`.
-    lengths : (n,) samples as recorded.  rates : (n,) hertz, from each recording's own timestamps.
-    unlabelled : recordings that were left out since nobody has checked them yet: their label is empty.
-    ordered : whether the order says what was recorded first; that of the files in `good/` and `bad/` does not.
+    Parameters
+    ----------
+    X : array of float32, shape (n, T) or (n, C, T)
+    y : array of int8, shape (n,)
+        1 for success, 0 for failure.
+    name : str
+        For people.
+    rate_hz : float, optional
+        Sampling rate in hertz. None: unknown.
+    unit : str, default "N"
+        Unit of the samples, one for all channels or "kN, mm", one for each.
+    cause : array of str, shape (n,), optional
+        Why a part failed.
+    part : array of str, shape (n,), optional
+        Number of the part of each trace. None: each trace is of another part.
+    faults : tuple of Fault
+        What could not be read and was left out.
+    channels : tuple of str
+        Names of the channels, if they have any.
+    notes : tuple of str
+        What users should know about the files, in sentences.
+    source : array of str, shape (n,), optional
+        The file or row of each trace.
+    fit : str, default "strict"
+        How recordings of other lengths became T samples, as in `TraceSpec`.
+    lengths : array of int64, shape (n,), optional
+        Samples of each recording, as recorded.
+    rates : array of float64, shape (n,), optional
+        Rate of each recording in hertz, by its own timestamps; NaN where it has none.
+    unlabelled : int
+        Recordings that were left out because their label is empty.
+    ordered : bool, default True
+        Whether the order of the traces is that of the recording. False for files that are ordered
+        by their label, as in folders `good/` and `bad/`.
     """
 
     X: NDArray[np.float32]
@@ -104,43 +146,56 @@ class Dataset:
         return len(self.y)
 
     def __repr__(self) -> str:
-        good, names = int(self.y.sum()), f" of {', '.join(self.channels)}" if self.channels else ""
+        good = int(self.y.sum())
+        names = f" of {', '.join(self.channels)}" if self.channels else ""
         rate = "an unknown rate" if self.rate_hz is None else f"{self.rate_hz:g} Hz"
         form = f"{' x '.join(map(str, self.X.shape[1:]))} samples{names} at {rate}"
-        known = f"{good} good, {len(self) - good} bad, {self.unlabelled} unlabelled, {len(self.faults)} left out"
-        return f"<Dataset {self.name}: {len(self)} traces, {form}, {known}>"
+        labels = f"{good} good, {len(self) - good} bad, {self.unlabelled} unlabelled"
+        counts = f"{labels}, {len(self.faults)} left out"
+        return f"<Dataset {self.name}: {len(self)} traces, {form}, {counts}>"
 
     _repr_html_ = to_html
 
     @property
     def spec(self) -> TraceSpec:
-        """The contract by which a live engine takes traces of the same form, `DataEngine(trace=data.spec)`.
+        """The `TraceSpec` of live traces of the same shape, for `DataEngine(trace=data.spec)`.
 
-        Where the rate is unknown, it has that of a `TraceSpec` by default: state `rate_hz` before times matter.
+        If the rate is unknown, it is the default of `TraceSpec`: state `rate_hz` before times
+        matter.
         """
         n_channels = 1 if self.X.ndim == 2 else self.X.shape[1]
-        spec = TraceSpec(self.X.shape[-1], channels=n_channels, unit=self.unit, fit=self.fit, columns=self.channels)
+        spec = TraceSpec(
+            self.X.shape[-1],
+            channels=n_channels,
+            unit=self.unit,
+            fit=self.fit,
+            columns=self.channels,
+        )
         return spec if self.rate_hz is None else replace(spec, rate_hz=self.rate_hz)
 
     def to_frame(self) -> "pd.DataFrame":
-        """A row a trace: `label`, `part` and `cause` where known, and `FZ_0 ...`, a column a sample of each channel.
+        """Return a DataFrame with a row for each trace.
 
-        `data.to_frame().to_parquet("data.parquet")` writes what `load_dataset` reads.
+        Its columns are `label`, `part` and `cause` where known, and one for each sample of each
+        channel, `FZ_0`, `FZ_1`, ... `load_dataset` reads what
+        `data.to_frame().to_parquet("data.parquet")` writes.
         """
         import pandas as pd
 
         X = self.X if self.X.ndim == 3 else self.X[:, None]
-        channels = self.channels or ("x",) if X.shape[1] == 1 else self.channels or [f"x{c}" for c in range(X.shape[1])]
-        names = [f"{name}_{i}" for name in channels for i in range(X.shape[2])]
-        known = {"label": self.y, "part": self.part, "cause": self.cause}
-        about = pd.DataFrame({name: values for name, values in known.items() if values is not None})
-        return pd.concat([about, pd.DataFrame(X.reshape(len(X), -1), columns=names)], axis=1)
+        default = ["x"] if X.shape[1] == 1 else [f"x{c}" for c in range(X.shape[1])]
+        names = [f"{name}_{i}" for name in self.channels or default for i in range(X.shape[2])]
+        columns = {"label": self.y, "part": self.part, "cause": self.cause}
+        known = {name: values for name, values in columns.items() if values is not None}
+        samples = pd.DataFrame(X.reshape(len(X), -1), columns=names)
+        return pd.concat([pd.DataFrame(known), samples], axis=1)
 
     def cut(self, samples: int) -> "Dataset":
-        """The first `samples` samples of every trace: an earlier, harder moment to decide at."""
+        """Return the first `samples` samples of every trace: an earlier moment to decide at."""
         have = self.X.shape[-1]
-        must(1 <= samples <= have, f"1 to {have} samples of {self.name}", samples)
-        must(samples == have or self.fit != "resample", f"{have} samples of {self.name}, which was resampled", samples)
+        expect_data(1 <= samples <= have, f"1 to {have} samples of {self.name}", samples)
+        can_cut = samples == have or self.fit != "resample"
+        expect_data(can_cut, f"{have} samples of {self.name}, which was resampled", samples)
         fit = "cut" if samples < have and self.fit == "pad" else self.fit
         return replace(self, X=np.ascontiguousarray(self.X[..., :samples]), fit=fit)
 
@@ -155,31 +210,66 @@ def make_dataset(
     cause: Any = None,
     **about: Any,
 ) -> Dataset:
-    """A `Dataset` from arrays; DataError where they do not fit together."""
+    """Make a `Dataset` of arrays.
+
+    Parameters
+    ----------
+    X : array, shape (n, T) or (n, C, T)
+    y : array, shape (n,)
+        1 for success, 0 for failure.
+    rate_hz, channels, part, cause
+        As in `Dataset`; part's numbers may be integers.
+    **about
+        Other fields of `Dataset`.
+
+    Raises
+    ------
+    DataError
+        If they do not fit together.
+    """
     try:
-        X, y = as_traces(X)[:, 0] if np.ndim(X) == 2 else as_traces(X), np.asarray(y)
+        X = as_traces(X)[:, 0] if np.ndim(X) == 2 else as_traces(X)
     except TraceError as error:
         raise DataError(str(error)) from error
-    must(y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", (X.shape, y.shape))
-    must(len(y) > 0, "at least one trace", 0)
-    turned = X.ndim == 3 and X.shape[1] > X.shape[2]
-    must(not turned, "X (n, channels, samples)", X.shape, "it looks transposed; pass X.transpose(0, 2, 1)")
-    must(bool(np.isin(y, (0, 1)).all()), "labels 1 (success) and 0 (failure)", sorted(set(map(str, y.tolist()))))
-    must(rate_hz is None or 0 < rate_hz < np.inf, "a rate above 0 Hz", rate_hz)
+    y = np.asarray(y)
+    shapes = (X.shape, y.shape)
+    expect_data(y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", shapes)
+    expect_data(len(y) > 0, "at least one trace", 0)
+    is_transposed = X.ndim == 3 and X.shape[1] > X.shape[2]
+    do = "it looks transposed; pass X.transpose(0, 2, 1)"
+    expect_data(not is_transposed, "X (n, channels, samples)", X.shape, do)
+    labels = sorted(set(map(str, y.tolist())))
+    expect_data(bool(np.isin(y, (0, 1)).all()), "labels 1 (success) and 0 (failure)", labels)
+    expect_data(rate_hz is None or 0 < rate_hz < np.inf, "a rate above 0 Hz", rate_hz)
     n_channels = 1 if X.ndim == 2 else X.shape[1]
-    must(not channels or len(channels) == n_channels, f"a name for each of {n_channels} channels", channels)
+    one_each = not channels or len(channels) == n_channels
+    expect_data(one_each, f"a name for each of {n_channels} channels", channels)
     if part is not None:
         part = np.asarray(part)
-        fit = part.shape == y.shape and part.dtype.kind in "iuUS"
-        must(fit, f"{len(y)} parts' numbers, texts or integers", (part.shape, part.dtype))
+        valid = part.shape == y.shape and part.dtype.kind in "iuUS"
+        wanted = f"{len(y)} parts' numbers, texts or integers"
+        expect_data(valid, wanted, (part.shape, part.dtype))
         part = part.astype(np.str_)
-    must(cause is None or np.shape(cause) == y.shape, f"{len(y)} causes, one a trace", np.shape(cause))
-    return Dataset(X, y.astype(np.int8), rate_hz=rate_hz, channels=channels, part=part, cause=cause, **about)
+    valid = cause is None or np.shape(cause) == y.shape
+    expect_data(valid, f"{len(y)} causes, one a trace", np.shape(cause))
+    return Dataset(
+        X,
+        y.astype(np.int8),
+        rate_hz=rate_hz,
+        channels=channels,
+        part=part,
+        cause=cause,
+        **about,
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """The options of `load_dataset`, under their names; `channels` are those of `channel`, taken apart."""
+class LoadOptions:
+    """The options of `load_dataset`, by the same names.
+
+    `channels` are those of `channel`, `words` is the parsed `label_map`: words in lower case, and
+    whether they are good. Raises DataError for values that are out of range or contradict.
+    """
 
     samples: int | None = None
     part: str = "part"
@@ -199,29 +289,45 @@ class Asked:
 
     def __post_init__(self) -> None:
         if self.label is not None and self.labels is not None:
-            raise DataError("Expected a pattern of the labels (label) or a file of them (labels), got both; leave one out.")
-        must(self.fit in (None, *FITS), f"fit to be one of {', '.join(FITS)}", self.fit)
-        must(self.rate_hz is None or self.rate_hz > 0, "a rate above 0 Hz", self.rate_hz)
-        must(self.samples is None or self.samples >= 1, "1 or more samples", self.samples)
-        must(len(set(self.channels)) == len(self.channels), "each channel once", self.channels)
-        must(len(set(self.columns)) == len(self.columns), "each of the columns once", self.columns)
-        must(self.decimal in (None, ".", ","), "a decimal mark, '.' or ','", self.decimal)
+            wanted = "a pattern of the labels (label) or a file of them (labels)"
+            raise DataError(f"Expected {wanted}, got both; leave one out.")
+        expect_data(self.fit in (None, *FITS), f"fit to be one of {', '.join(FITS)}", self.fit)
+        expect_data(self.rate_hz is None or self.rate_hz > 0, "a rate above 0 Hz", self.rate_hz)
+        expect_data(self.samples is None or self.samples >= 1, "1 or more samples", self.samples)
+        is_distinct = len(set(self.channels)) == len(self.channels)
+        expect_data(is_distinct, "each channel once", self.channels)
+        is_distinct = len(set(self.columns)) == len(self.columns)
+        expect_data(is_distinct, "each of the columns once", self.columns)
+        expect_data(self.decimal in (None, ".", ","), "a decimal mark, '.' or ','", self.decimal)
         marks = (None, ".", ",", "'", "’", " ", "")
-        apart = self.thousands in marks and (not self.thousands or self.thousands != self.decimal)
-        must(apart, "a mark of thousands, ',', '.', ' ' or an apostrophe, that is not the decimal one", self.thousands)
+        valid = self.thousands in marks
+        valid = valid and (not self.thousands or self.thousands != self.decimal)
+        wanted = "a mark of thousands, ',', '.', ' ' or an apostrophe, that is not the decimal one"
+        expect_data(valid, wanted, self.thousands)
 
 
-def names_of(channel: str | Sequence[str] | None) -> tuple[str, ...]:
-    """`"FZ_Base,FX_Base"`, or a list of names, one by one."""
-    listed = channel.split(",") if isinstance(channel, str) else channel or ()
-    return tuple(name.strip() for name in listed if name.strip())
+def split_names(names: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Return names one by one, of "FZ_Base,FX_Base" or of a list of them, without blanks."""
+    items = names.split(",") if isinstance(names, str) else names or ()
+    return tuple(name.strip() for name in items if name.strip())
 
 
-class Recorded(NamedTuple):
-    """One recording as it was read.
+class Recording(NamedTuple):
+    """One recording.
 
-    trace : (C, T) float32.  rate_hz : by its own timestamps, where it has any.  units : of its channels, "" where one's is
-    not told.  length : samples as recorded, where the trace has others by now.
+    trace : array of float32, shape (C, T)
+    label : int
+        1 for success, 0 for failure.
+    source : str
+        Its file or row.
+    part : str or None
+        Number of its part.
+    rate_hz : float or None
+        Sampling rate by its own timestamps.
+    units : tuple of str
+        Unit of each channel, "" where unknown.
+    length : int
+        Samples as recorded, if the trace has others by now; else 0.
     """
 
     trace: NDArray[np.float32]
@@ -234,233 +340,411 @@ class Recorded(NamedTuple):
 
 
 @dataclass
-class Collected:
-    """Recordings, in order, and what could not be read."""
+class RecordingCollector:
+    """Collects recordings in order, and the faults of those that cannot be read.
+
+    name : str
+        Name of the data set.
+    channels : tuple of str
+    faults, recordings : list
+    notes : Counter
+        What users should know, and how many times.
+    unknown_words : Counter
+        Words in the place of labels whose meaning is unknown.
+    label_file : str
+        Path of a file that may list labels, for advice; "" for none.
+    unlabelled : int
+        Recordings whose label is empty.
+    ordered : bool
+        As in `Dataset`.
+    """
 
     name: str
     channels: tuple[str, ...]
     faults: list[Fault] = field(default_factory=list)
-    read: list[Recorded] = field(default_factory=list)
-    notes: Counter[str] = field(default_factory=Counter)  # what was found that is no fault, and how many times
-    unknown: Counter[str] = field(default_factory=Counter)  # words for labels
-    beside: str = ""  # a file that may list labels, as an error advises
+    recordings: list[Recording] = field(default_factory=list)
+    notes: Counter[str] = field(default_factory=Counter)
+    unknown_words: Counter[str] = field(default_factory=Counter)
+    label_file: str = ""
     unlabelled: int = 0
     ordered: bool = True
 
-    def take(self, source: str, read: Callable[[], Recorded], line: int = 0) -> None:
-        """Add what is read, or the fault for which it is left out. line : of the source, where it is known before."""
+    def add(self, source: str, read: Callable[[], Recording], line: int = 0) -> None:
+        """Add the recording that `read` returns, or a fault if it raises.
+
+        A recording whose label is empty is only counted. `line` of the source, if it is known.
+        """
         try:
-            self.read.append(read())
+            self.recordings.append(read())
         except UnlabelledError:
             self.unlabelled += 1
         except (OSError, TraceError, UnreadableError) as error:
             if isinstance(error, UnknownWordError):
-                self.unknown[error.word] += 1
-            self.faults.append(Fault(source, line or getattr(error, "line", 0), str(error).rstrip(".")))
+                self.unknown_words[error.word] += 1
+            line = line or getattr(error, "line", 0)
+            self.faults.append(Fault(source, line, str(error).rstrip(".")))
 
-    def must_mean_something(self) -> None:
-        """Raise DataError if more labels are unknown words than known labels, or if all known labels are of one kind and
-        more than a tenth of all are unknown words.
+    def check_label_words(self) -> None:
+        """Raise DataError if too many labels are words whose meaning is unknown.
+
+        Too many are more than the known labels, or more than a tenth of all if the known labels
+        are all good or all bad. The error proposes a `label_map`.
         """
-        kinds, n = {each.label for each in self.read}, sum(self.unknown.values())
-        if n <= (len(self.read) / 9 if len(kinds) == 1 else len(self.read)):
+        labels = {recording.label for recording in self.recordings}
+        n_known = len(self.recordings)
+        is_one_sided = len(labels) == 1
+        if sum(self.unknown_words.values()) <= (n_known / 9 if is_one_sided else n_known):
             return
-        words = [word for word, _ in self.unknown.most_common()]
-        # The one with a syllable before it is more often the bad one; a person has to say so.
-        bad = {word for word in words if any(word != other and word.endswith(other) for other in words)} or {*words[1:]}
-        bad = bad if len(kinds) != 1 else {*words} if 1 in kinds else set()
-        said = ",".join(f"{word}={'bad' if word in bad else 'good'}" for word in words)
-        do = f"say what they mean, label_map={said!r}{'' if len(kinds) == 1 else ' or the other way round'}"
-        if len(words) > MOST_WORDS:
-            do = "so many are no labels: say where they are (label), or list them in a CSV file (labels)"
-        got = ", ".join(f"{shortened(word)} {times} times" for word, times in self.unknown.most_common(4))
-        beside = f" beside {len(self.read)} {'good' if 1 in kinds else 'bad'} ones" if len(kinds) == 1 else ""
-        raise DataError(f"Expected labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0, got {got}{beside}; {do}.")
+        words = [word for word, _ in self.unknown_words.most_common()]
+        if is_one_sided:
+            bad = set(words) if 1 in labels else set()
+        else:
+            # A word that is another one with something before it is more often the bad one.
+            bad = {w for w in words if any(w != other and w.endswith(other) for other in words)}
+            bad = bad or set(words[1:])
+        label_map = ",".join(f"{word}={'bad' if word in bad else 'good'}" for word in words)
+        or_else = "" if is_one_sided else " or the other way round"
+        do = f"say what they mean, label_map={label_map!r}{or_else}"
+        if len(words) > MAX_LABEL_WORDS:
+            where = "say where they are (label), or list them in a CSV file (labels)"
+            do = f"so many are no labels: {where}"
+        counts = self.unknown_words.most_common(4)
+        got = ", ".join(f"{shortened(word)} {n} times" for word, n in counts)
+        if is_one_sided:
+            got += f" beside {n_known} {'good' if 1 in labels else 'bad'} ones"
+        wanted = f"labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0"
+        raise DataError(f"Expected {wanted}, got {got}; {do}.")
 
-    def leave_out(self, why: Mapping[int, str]) -> None:
-        """Make faults of those at these places; DataError where nothing is left."""
-        self.faults.extend(Fault(self.read[i].source, 0, what) for i, what in why.items())
-        self.read = [each for i, each in enumerate(self.read) if i not in why]
-        if not self.read:
-            n, few = len(self.faults), "; ".join(map(str, self.faults[:3]))
+    def leave_out(self, reasons: Mapping[int, str]) -> None:
+        """Replace the recordings at these positions by faults with these messages.
+
+        Raises DataError if no recording is left.
+        """
+        self.faults += [Fault(self.recordings[i].source, 0, why) for i, why in reasons.items()]
+        self.recordings = [r for i, r in enumerate(self.recordings) if i not in reasons]
+        if not self.recordings:
+            n = len(self.faults) + self.unlabelled
+            details = [str(fault) for fault in self.faults[:3]]
             if self.unlabelled:
-                few = f"{self.unlabelled} have no label yet{few and '; '}{few}"
-            raise DataError(f"Expected labelled recordings in {self.name}, found none of {n + self.unlabelled}: {few}.")
+                details.insert(0, f"{self.unlabelled} have no label yet")
+            wanted = f"labelled recordings in {self.name}"
+            raise DataError(f"Expected {wanted}, found none of {n}: {'; '.join(details)}.")
 
 
-def as_dataset(found: Collected, asked: Asked) -> Dataset:
-    """One data set of all that can be fitted; DataError where nothing can.
+def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
+    """Make one data set of the recordings that were collected.
 
-    A recording at another rate than the others is another trace of the same insertion: it is a fault, or with
-    `fit="resample"` is put on the others' rate.  One in another unit is converted, or a fault.
+    They are converted to one unit and one length. A recording at another rate than most is a fault,
+    or with `fit="resample"` is interpolated at the rate of the others. The collector is changed:
+    what does not fit moves to its faults.
+
+    Raises
+    ------
+    DataError
+        If no recording is left, or too many labels are unknown words.
     """
-    found.must_mean_something()
-    unit = _in_one_unit(found, asked)
-    asked, rate = _at_one_rate(found, asked)
-    lengths = np.array([each.trace.shape[1] for each in found.read], dtype=np.int64)
-    fit, samples = form_of(lengths, asked.fit, asked.samples)
+    collector.check_label_words()
+    unit = _convert_to_one_unit(collector, options)
+    options, rate = _bring_to_one_rate(collector, options)
+    lengths = np.array([r.trace.shape[1] for r in collector.recordings], dtype=np.int64)
+    fit, samples = choose_fit(lengths, options.fit, options.samples)
     stretch = samples / float(np.median(lengths)) if fit == "resample" else 1.0
-    unfit = [i for i, have in enumerate(lengths.tolist()) if not can_fit_length(have, samples, FITS.index(fit))]
-    found.leave_out({i: f"Expected {_wanted(samples, fit)}, got {lengths[i]}" for i in unfit})
-    block = np.stack([_fitted(each.trace, samples, fit) for each in found.read])
-    rates = np.array([each.rate_hz or np.nan for each in found.read])
-    notes = [f"{text}{f' ({n} times)' if n > 1 else ''}." for text, n in found.notes.items()]
-    if found.unlabelled:
-        seen = len(found.read) + len(found.faults) + found.unlabelled
-        notes.append(f"{found.unlabelled} of {seen} recordings of {found.name} have no label yet: they are left out.")
-    parts = [each.part or each.source for each in found.read]  # without a number it is a part of its own
+    reasons = {
+        i: f"Expected {_fit_text(samples, fit)}, got {length}"
+        for i, length in enumerate(lengths.tolist())
+        if not can_fit_length(length, samples, FITS.index(fit))
+    }
+    collector.leave_out(reasons)
+    recordings = collector.recordings
+    X = np.stack([_fit_array(recording.trace, samples, fit) for recording in recordings])
+    rates = np.array([recording.rate_hz or np.nan for recording in recordings])
+    notes = [f"{text}{f' ({n} times)' if n > 1 else ''}." for text, n in collector.notes.items()]
+    if collector.unlabelled:
+        n = len(recordings) + len(collector.faults) + collector.unlabelled
+        have = f"{collector.unlabelled} of {n} recordings of {collector.name}"
+        notes.append(f"{have} have no label yet: they are left out.")
+    if not rate:
+        notes.append(UNKNOWN_RATE)
+    # A recording without a number is a part of its own.
+    parts = [recording.part or recording.source for recording in recordings]
+    has_parts = any(recording.part is not None for recording in recordings)
+    lengths_read = [recording.length or recording.trace.shape[1] for recording in recordings]
     return make_dataset(
-        block[:, 0] if block.shape[1] == 1 else block,
-        [each.label for each in found.read],
-        name=found.name,
+        X[:, 0] if X.shape[1] == 1 else X,
+        [recording.label for recording in recordings],
+        name=collector.name,
         rate_hz=None if rate is None else float(f"{rate * stretch:.4g}"),
         fit=fit,
-        part=np.array(parts) if any(each.part is not None for each in found.read) else None,
-        faults=tuple(found.faults),
-        channels=found.channels,
+        part=np.array(parts) if has_parts else None,
+        faults=tuple(collector.faults),
+        channels=collector.channels,
         unit=unit,
-        notes=tuple(notes if rate else [*notes, UNKNOWN_RATE]),
-        unlabelled=found.unlabelled,
-        ordered=found.ordered,
-        source=np.array([each.source for each in found.read]),
-        lengths=np.array([each.length or each.trace.shape[1] for each in found.read], dtype=np.int64),
+        notes=tuple(notes),
+        unlabelled=collector.unlabelled,
+        ordered=collector.ordered,
+        source=np.array([recording.source for recording in recordings]),
+        lengths=np.array(lengths_read, dtype=np.int64),
         rates=rates if np.isfinite(rates).any() else None,
     )
 
 
-def _in_one_unit(found: Collected, asked: Asked) -> str:
-    """Convert recordings to the unit of most, or to the one that was asked for, a channel at a time; returns the units.
+def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) -> str:
+    """Convert the recordings, channel by channel, and return the unit of all, or one for each.
 
-    A recording whose unit cannot be converted, or that states none although others do, becomes a fault.
+    It is the unit that the user stated, else the one of most recordings. A recording whose unit
+    cannot be converted, or that states none although others do, becomes a fault.
     """
-    n = max((len(each.units) for each in found.read), default=0)
-    stated = asked.unit.split(",") if asked.unit and len(asked.unit.split(",")) == n else [asked.unit or ""] * n
-    wanted = [Counter(filter(None, (each.units[c] for each in found.read if each.units))) for c in range(n)]
-    most = [counts if 2 * counts.total() >= len(found.read) else Counter[str]() for counts in wanted]
-    usual = [max(counts, key=counts.__getitem__, default="") for counts in most]
-    usual = [told.strip() if units.parse(told.strip()) else most for told, most in zip(stated, usual, strict=True)]
-    why = dict[int, str]()
-    for i, recording in enumerate(found.read):
+    recordings = collector.recordings
+    n = max((len(recording.units) for recording in recordings), default=0)
+    stated = split_unit(options.unit, n)
+    targets = []
+    for c in range(n):
+        counts = Counter(r.units[c] for r in recordings if r.units and r.units[c])
+        is_usual = 2 * counts.total() >= len(recordings)
+        usual = max(counts, key=counts.__getitem__, default="") if is_usual else ""
+        targets.append(stated[c] if units.parse(stated[c]) else usual)
+    reasons = dict[int, str]()
+    for i, recording in enumerate(recordings):
         factors = np.ones(max(n, 1))
-        for c, (unit, want) in enumerate(zip(recording.units or [""] * n, usual, strict=True)):
-            name = found.channels[c] if c < len(found.channels) else f"channel {c + 1}"
-            if unit == want or (not unit and stated[c]):
+        for c, (unit, target) in enumerate(zip(recording.units or [""] * n, targets, strict=True)):
+            if unit == target or (not unit and stated[c]):
                 continue
-            factor = units.factor(unit, want) if unit else None
+            channels = collector.channels
+            name = channels[c] if c < len(channels) else f"channel {c + 1}"
+            factor = units.factor(unit, target) if unit else None
             if factor is None:
-                got = f"as {'asked' if stated[c] else 'the others are'}, got {unit or 'no unit'}"
-                do = "" if unit and want else f"; state that of all, unit={unit or want!r}, or write it into each header"
-                why.setdefault(i, f"Expected {name} in {want or 'no unit'}, {got}{do}")
+                why = "as asked" if stated[c] else "as the others are"
+                message = (
+                    f"Expected {name} in {target or 'no unit'}, {why}, got {unit or 'no unit'}"
+                )
+                if not (unit and target):
+                    do = f"state that of all, unit={unit or target!r}, or write it into each header"
+                    message = f"{message}; {do}"
+                reasons.setdefault(i, message)
                 continue
             factors[c] = factor
-            found.notes[f"{name} is converted from {unit} to {want}, times {factor:g}"] += 1
+            collector.notes[f"{name} is converted from {unit} to {target}, times {factor:g}"] += 1
         if (factors != 1).any():
             trace = (recording.trace * factors[:, None]).astype(np.float32)
-            found.read[i] = recording._replace(trace=trace)
-    found.leave_out(why)
-    if asked.unit or not any(usual):
-        return asked.unit or _unit_of(found.channels)
-    known = [want or _unit_of(found.channels[c : c + 1]) for c, want in enumerate(usual)]
-    return known[0] if len(set(known)) == 1 else ", ".join(known)
+            recordings[i] = recording._replace(trace=trace)
+    collector.leave_out(reasons)
+    if options.unit:
+        return options.unit
+    if not any(targets):
+        return _guess_unit(collector.channels)
+    channel_units = [
+        target or _guess_unit(collector.channels[c : c + 1]) for c, target in enumerate(targets)
+    ]
+    return channel_units[0] if len(set(channel_units)) == 1 else ", ".join(channel_units)
 
 
-def _at_one_rate(found: Collected, asked: Asked) -> tuple[Asked, float | None]:
-    """Leave out recordings at another rate than the others, or resample all; returns how to fit them, and the rate.
+def split_unit(unit: str | Sequence[str] | None, n: int) -> list[str]:
+    """Return the unit of each of n channels, of one for all, of "kN, mm" or of a list of n.
 
-    If all resampled recordings last equally long, they are stretched to one length. Otherwise they are padded, so that
-    equal sample numbers mean equal times.
+    None gives n times "".
     """
-    rates = np.array([each.rate_hz or np.nan for each in found.read])
+    items = unit.split(",") if isinstance(unit, str) else list(unit or ())
+    if len(items) != n:
+        items = [str(unit or "")] * n
+    return [item.strip() for item in items]
+
+
+def _bring_to_one_rate(
+    collector: RecordingCollector, options: LoadOptions
+) -> tuple[LoadOptions, float | None]:
+    """Bring the recordings to one rate; return the options to fit them by, and the rate.
+
+    Recordings at another rate than most become faults. With `fit="resample"` all are interpolated
+    at one rate instead: if they last equally long, they are stretched to one length, else padded,
+    so that equal sample numbers mean equal times. The rate is None if no recording has a clock.
+    """
+    rates = np.array([recording.rate_hz or np.nan for recording in collector.recordings])
     known = rates[~np.isnan(rates)]
     if not len(known):
-        return asked, asked.rate_hz
-    if silent := len(rates) - len(known):
-        found.notes["No clock is known, and the rate of the others is taken for it"] += silent
-    usual = float(max(known, key=lambda one: (np.abs(known - one) <= NEAR * one).sum()))
-    if asked.fit != "resample" or not (np.abs(known - usual) > NEAR * usual).any():
-        off = np.flatnonzero(np.abs(rates - usual) > NEAR * usual).tolist()
-        do = "" if asked.fit == "resample" else "; fit='resample' puts all on one rate by their own times"
-        wanted = f"Expected timestamps at {usual:g} Hz, as the others have"
-        found.leave_out({i: f"{wanted}, got {rates[i]:g} Hz{do}" for i in off})
-        kept = [each.rate_hz for each in found.read if each.rate_hz]
-        return asked, float(np.median(kept))
-    usual = float(f"{np.median(known):.2g}")  # two digits: recordings that are added do not move it, nor all samples
-    off = np.flatnonzero((rates > MOST_APART * usual) | (rates * MOST_APART < usual)).tolist()
-    found.leave_out({i: f"Expected timestamps at about {usual:g} Hz, got {rates[i]:g} Hz" for i in off})
-    have = [each.rate_hz or usual for each in found.read]
-    spans = [(each.trace.shape[1] - 1) / rate for each, rate in zip(found.read, have, strict=True)]
-    points = 1 + float(np.median(spans)) * usual
-    samples = asked.samples or round(points)
-    rate = usual if abs(samples - points) <= NEAR * points else usual * samples / points
-    for i, (each, own, span) in enumerate(zip(found.read, have, spans, strict=True)):
-        at = np.arange(1 + int(span * rate + 1e-6)) * (own / rate)
-        trace = np.stack([np.interp(at, np.arange(len(x)), x) for x in each.trace]).astype(np.float32)
-        found.read[i] = each._replace(trace=trace, length=each.trace.shape[1])
-    alike = all(abs(each.trace.shape[1] - samples) <= 1 + NEAR * samples for each in found.read)
-    low, high = min(have), max(have)
-    how = "" if alike else "; they do not last as long, so they are padded, not stretched"
-    found.notes[f"Recordings at {low:g} to {high:g} Hz are put on {rate:.4g} Hz by their own times{how}"] += 1
-    return replace(asked, samples=samples, fit="resample" if alike else "pad"), rate
+        return options, options.rate_hz
+    if n_unknown := len(rates) - len(known):
+        collector.notes["No clock is known, and the rate of the others is taken for it"] += (
+            n_unknown
+        )
+    usual = float(max(known, key=lambda r: (np.abs(known - r) <= RATE_TOLERANCE * r).sum()))
+    if options.fit != "resample" or not (np.abs(known - usual) > RATE_TOLERANCE * usual).any():
+        wanted = f"timestamps at {usual:g} Hz, as the others have"
+        do = "; fit='resample' puts all on one rate by their own times"
+        do = "" if options.fit == "resample" else do
+        others = np.flatnonzero(np.abs(rates - usual) > RATE_TOLERANCE * usual).tolist()
+        collector.leave_out({i: f"Expected {wanted}, got {rates[i]:g} Hz{do}" for i in others})
+        kept = [recording.rate_hz for recording in collector.recordings if recording.rate_hz]
+        return options, float(np.median(kept))
+    # Two digits, so that recordings that are added change neither the rate nor all samples.
+    usual = float(f"{np.median(known):.2g}")
+    is_far = (rates > MAX_RATE_RATIO * usual) | (rates * MAX_RATE_RATIO < usual)
+    wanted = f"timestamps at about {usual:g} Hz"
+    far = np.flatnonzero(is_far).tolist()
+    collector.leave_out({i: f"Expected {wanted}, got {rates[i]:g} Hz" for i in far})
+    return _resample(collector, options, usual)
 
 
-def _unit_of(channels: Sequence[str]) -> str:
-    """For people: newtons, newton metres by the names that UR cells give torques, or both."""
-    units = {"N·m" if re.match(r"(mu?|t)[xyz](_|$)", name.lower()) else "N" for name in channels} or {"N"}
-    return units.pop() if len(units) == 1 else "mixed units"
+def _resample(
+    collector: RecordingCollector, options: LoadOptions, usual: float
+) -> tuple[LoadOptions, float]:
+    """Interpolate all recordings at one rate near `usual`, in the collector.
 
-
-def form_of(lengths: NDArray[np.int64], fit: str | None, samples: int | None) -> tuple[str, int]:
-    """The fit and the samples that lengths (n,) are brought to, where they were not both asked for.
-
-    Of one length: strict. With `samples` that all have: cut. Else pad to the median: what was measured stays as it was, at
-    its own time, and a live trace that is a little shorter is taken too. Cut goes to the shortest that is not half of the
-    others.
+    Returns the options by which to fit them to one length, and the rate in hertz. With a stated
+    number of samples it is the rate at which the median recording has as many.
     """
-    low, high, median = int(lengths.min()), int(lengths.max()), int(np.median(lengths))
+    recordings = collector.recordings
+    rates = [recording.rate_hz or usual for recording in recordings]
+    spans = [(r.trace.shape[1] - 1) / rate for r, rate in zip(recordings, rates, strict=True)]
+    points = 1 + float(np.median(spans)) * usual
+    samples = options.samples or round(points)
+    is_near = abs(samples - points) <= RATE_TOLERANCE * points
+    target = usual if is_near else usual * samples / points
+    for i, (recording, rate, span) in enumerate(zip(recordings, rates, spans, strict=True)):
+        length = recording.trace.shape[1]
+        positions = np.arange(1 + int(span * target + 1e-6)) * (rate / target)
+        rows = [np.interp(positions, np.arange(length), row) for row in recording.trace]
+        trace = np.stack(rows).astype(np.float32)
+        recordings[i] = recording._replace(trace=trace, length=length)
+    lengths = [recording.trace.shape[1] for recording in recordings]
+    is_even = all(abs(length - samples) <= 1 + RATE_TOLERANCE * samples for length in lengths)
+    how = "" if is_even else "; they do not last as long, so they are padded, not stretched"
+    range_text = f"{min(rates):g} to {max(rates):g} Hz"
+    note = f"Recordings at {range_text} are put on {target:.4g} Hz by their own times{how}"
+    collector.notes[note] += 1
+    return replace(options, samples=samples, fit="resample" if is_even else "pad"), target
+
+
+def _guess_unit(channels: Sequence[str]) -> str:
+    """Return the unit of channels by their names, for people.
+
+    Newton metres for the torques of UR cells, newtons for all else, "mixed units" for both.
+    """
+    is_torque = {re.match(r"(mu?|t)[xyz](_|$)", name.lower()) is not None for name in channels}
+    if is_torque == {True, False}:
+        return "mixed units"
+    return "N·m" if True in is_torque else "N"
+
+
+def choose_fit(lengths: NDArray[np.int64], fit: str | None, samples: int | None) -> tuple[str, int]:
+    """Choose how recordings are brought to one length, where the user did not state it.
+
+    Parameters
+    ----------
+    lengths : array of int64, shape (n,)
+    fit, samples
+        As the user stated them; None: not stated.
+
+    Returns
+    -------
+    fit : str
+        strict for equal lengths; cut for stated samples that all have; else pad, which leaves each
+        sample at its own time, and takes live traces that are a little shorter.
+    samples : int
+        The median length for pad and resample; for cut the shortest that is at least half of the
+        median.
+
+    Raises
+    ------
+    DataError
+        If the lengths or the samples contradict a stated "strict".
+    """
+    low = int(lengths.min())
+    high = int(lengths.max())
+    median = int(np.median(lengths))
     if fit is None:
-        alike = low == high and samples in (None, low)
-        fit = "strict" if alike else "cut" if samples is not None and samples <= low else "pad"
+        if low == high and samples in (None, low):
+            fit = "strict"
+        else:
+            fit = "cut" if samples is not None and samples <= low else "pad"
     if fit == "strict" and low != high:
-        choose = "choose fit='pad', 'cut' or 'resample'"
-        raise DataError(f"Expected recordings of one length, got {low} to {high} samples; {choose}.")
-    as_recorded = fit != "strict" or samples in (None, low)
-    must(as_recorded, f"{low} samples, as recorded, with fit='strict'", samples, "choose fit='cut'")
+        do = "choose fit='pad', 'cut' or 'resample'"
+        raise DataError(f"Expected recordings of one length, got {low} to {high} samples; {do}.")
+    valid = fit != "strict" or samples in (None, low)
+    expect_data(
+        valid, f"{low} samples, as recorded, with fit='strict'", samples, "choose fit='cut'"
+    )
     if samples is None:
         samples = int(lengths[2 * lengths >= median].min()) if fit == "cut" else median
     return fit, samples
 
 
-def refit(data: Dataset, asked: Asked) -> Dataset:
-    """A data set whose traces have one length already, as it was asked for: its channels by name, its length, its rate."""
-    for name in (name for name in asked.channels if name not in data.channels):
-        have = ", ".join(data.channels) or "none that has a name"
-        raise DataError(f"Expected the channel {name} in {data.name}, it has {have}.")
-    if asked.rate_hz is not None or asked.unit is not None:
-        data = replace(data, rate_hz=asked.rate_hz or data.rate_hz, unit=asked.unit or data.unit)
-    if asked.channels and data.X.ndim == 3:
-        places = [data.channels.index(name) for name in asked.channels]
-        X = np.ascontiguousarray(data.X[:, places[0]] if len(places) == 1 else data.X[:, places])
-        data = replace(data, X=X, channels=asked.channels)
-    if asked.fit is None or asked.fit == data.fit == "strict":
-        return data if asked.samples is None else data.cut(asked.samples)
-    have = data.X.shape[-1]
-    fit, samples = form_of(np.array([have], dtype=np.int64), asked.fit, asked.samples)
-    if not can_fit_length(have, samples, FITS.index(fit)):
-        raise DataError(f"Expected {_wanted(samples, fit)}, {data.name} has {have}.")
-    stretch = samples / have if fit == "resample" else 1.0
+def refit(data: Dataset, options: LoadOptions, *, has_unit: bool = True) -> Dataset:
+    """Bring a data set whose traces have one length to the channels, unit, rate and length stated.
+
+    Parameters
+    ----------
+    data : Dataset
+    options : LoadOptions
+    has_unit : bool, default True
+        Whether `data.unit` is known: it is then converted to a stated unit. False: the stated
+        unit is that of the samples as they are.
+
+    Raises
+    ------
+    DataError
+        If a channel is not there, the unit cannot be converted, or the length cannot be fitted.
+    """
+    for name in options.channels:
+        if name not in data.channels:
+            have = ", ".join(data.channels) or "none that has a name"
+            raise DataError(f"Expected the channel {name} in {data.name}, it has {have}.")
+    if options.rate_hz is not None:
+        data = replace(data, rate_hz=options.rate_hz)
+    if options.channels and data.X.ndim == 3:
+        data = _select_channels(data, options.channels)
+    if options.unit is not None:
+        data = _convert_unit(data, options.unit) if has_unit else replace(data, unit=options.unit)
+    if options.fit is None or options.fit == data.fit == "strict":
+        return data if options.samples is None else data.cut(options.samples)
+    length = data.X.shape[-1]
+    lengths = np.array([length], dtype=np.int64)
+    fit, samples = choose_fit(lengths, options.fit, options.samples)
+    if not can_fit_length(length, samples, FITS.index(fit)):
+        raise DataError(f"Expected {_fit_text(samples, fit)}, {data.name} has {length}.")
+    stretch = samples / length if fit == "resample" else 1.0
     rate = None if data.rate_hz is None else data.rate_hz * stretch
-    return replace(data, X=_fitted(data.X, samples, fit), fit=fit, rate_hz=rate)
+    return replace(data, X=_fit_array(data.X, samples, fit), fit=fit, rate_hz=rate)
 
 
-def _fitted(x: NDArray[np.float32], samples: int, fit: str) -> NDArray[np.float32]:
-    """(..., T) -> (..., samples), by what fits live traces too."""
+def _select_channels(data: Dataset, channels: tuple[str, ...]) -> Dataset:
+    """Return a data set with these of its channels, and their units."""
+    places = [data.channels.index(name) for name in channels]
+    X = data.X[:, places[0]] if len(places) == 1 else data.X[:, places]
+    all_units = split_unit(data.unit, data.X.shape[1])
+    unit = data.unit if len(set(all_units)) == 1 else ", ".join(all_units[i] for i in places)
+    return replace(data, X=np.ascontiguousarray(X), channels=channels, unit=unit)
+
+
+def _convert_unit(data: Dataset, unit: str) -> Dataset:
+    """Return a data set whose samples are converted to a unit, or to one for each channel.
+
+    Raises DataError if no factor is known.
+    """
+    n = 1 if data.X.ndim == 2 else data.X.shape[1]
+    sources = split_unit(data.unit, n)
+    targets = split_unit(unit, n)
+    factors = [units.factor(a, b) for a, b in zip(sources, targets, strict=True)]
+    known = [factor for factor in factors if factor is not None]
+    if len(known) < n:
+        do = "leave unit out, or convert the samples first"
+        raise DataError(f"Expected {data.name} in {unit}, its unit is {data.unit}; {do}.")
+    if set(known) != {1.0}:
+        scale = np.array(known).reshape(-1, 1) if data.X.ndim == 3 else known[0]
+        data = replace(data, X=(data.X * scale).astype(np.float32))
+    return replace(data, unit=unit)
+
+
+def _fit_array(x: NDArray[np.float32], samples: int, fit: str) -> NDArray[np.float32]:
+    """Fit an array (..., T) to (..., samples) by `traces.fit_length`, as live traces are."""
     if x.shape[-1] == samples:
         return x
-    values: NDArray[np.float32] = fit_length(torch.from_numpy(np.array(x, order="C")), samples, FITS.index(fit)).numpy()
+    tensor = torch.from_numpy(np.array(x, order="C"))
+    values: NDArray[np.float32] = fit_length(tensor, samples, FITS.index(fit)).numpy()
     return values
 
 
-def _wanted(samples: int, fit: str) -> str:
+def _fit_text(samples: int, fit: str) -> str:
+    """Return which lengths can be fitted to `samples`, for an error."""
     if fit == "cut":
         return f"at least {samples} samples"
     return f"{(samples + 1) // 2} to {2 * samples} samples, to {fit} them to {samples}"

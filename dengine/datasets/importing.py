@@ -24,7 +24,16 @@ from ..engine.engine import DataEngine, core_of
 from ..errors import StoreError, TraceError
 from ..folds import content_hash, trace_hash
 from ..recipe import Recipe
-from ..records import REASONS, Action, Decision, Reason, TraceSpec, as_success, source_of, stored_trace_spec
+from ..records import (
+    REASONS,
+    Action,
+    Decision,
+    Reason,
+    TraceSpec,
+    as_success,
+    source_of,
+    stored_trace_spec,
+)
 from ..store.opening import UNHURRIED, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
@@ -44,7 +53,9 @@ def form_in(store: "StoreLike", source: Any) -> dict[str, Any]:
 
     Files that are added change the median that lengths are padded to: all others would come out changed, and count again.
     """
-    if not isinstance(source, str | os.PathLike) or not (Path(source).is_dir() or Path(source).suffix.lower() in TABLES):
+    if not isinstance(source, str | os.PathLike) or not (
+        Path(source).is_dir() or Path(source).suffix.lower() in TABLES
+    ):
         return {}
     try:
         with opening(store, must_exist=True) as opened:
@@ -53,7 +64,11 @@ def form_in(store: "StoreLike", source: Any) -> dict[str, Any]:
                 opened.close()
     except StoreError:
         return {}  # a new one; what else is wrong is found when it is opened to write
-    return {} if agreed is None else {"samples": agreed.samples, "fit": None if agreed.fit == "strict" else agreed.fit}
+    return (
+        {}
+        if agreed is None
+        else {"samples": agreed.samples, "fit": None if agreed.fit == "strict" else agreed.fit}
+    )
 
 
 def must_agree(data: Dataset, agreed: TraceSpec) -> None:
@@ -63,11 +78,17 @@ def must_agree(data: Dataset, agreed: TraceSpec) -> None:
     if data.lengths is not None and (stretched or spec.samples != agreed.samples):
         do = f"load it with samples={agreed.samples}, fit={agreed.fit!r}, or what is known would count again"
         wanted = f"recordings brought to {agreed.samples} samples by {agreed.fit}"
-        raise TraceError(f"Expected {wanted}, {data.name} was to {spec.samples} by {spec.fit}; {do}.")
+        raise TraceError(
+            f"Expected {wanted}, {data.name} was to {spec.samples} by {spec.fit}; {do}."
+        )
     if data.rate_hz is not None and not math.isclose(agreed.rate_hz, spec.rate_hz, rel_tol=RATE):
-        raise TraceError(f"Expected traces at {agreed.rate_hz:g} Hz, {data.name} has {spec.rate_hz:g} Hz; resample it.")
+        raise TraceError(
+            f"Expected traces at {agreed.rate_hz:g} Hz, {data.name} has {spec.rate_hz:g} Hz; resample it."
+        )
     if data.channels and agreed.columns and data.channels != agreed.columns:
-        raise TraceError(f"Expected the channels {', '.join(agreed.columns)}, got {', '.join(data.channels)}.")
+        raise TraceError(
+            f"Expected the channels {', '.join(agreed.columns)}, got {', '.join(data.channels)}."
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +127,9 @@ def import_labelled(
     Raises TraceError where the traces break the contract that the store's engine agreed on.
     """
     data = load_dataset(dataset, **form_in(store, dataset))
-    engine = DataEngine.open_or_create(store, seed, wait=UNHURRIED, recipe=recipe, allow_import=allow_import)
+    engine = DataEngine.open_or_create(
+        store, seed, wait=UNHURRIED, recipe=recipe, allow_import=allow_import
+    )
     try:
         agreed = core_of(engine).set_trace_spec(data.spec)
         must_agree(data, agreed)
@@ -146,11 +169,15 @@ def import_parts(
                 continue
             if (known := held) is None:
                 propensity = 1.0 if decision.predicted is Action.VERIFY else policy.audited_share
-                reason = REASONS[fault] if fault else decision.reason  # a bad one is kept, but never given to training
+                reason = (
+                    REASONS[fault] if fault else decision.reason
+                )  # a bad one is kept, but never given to training
                 new = replace(decision, reason=reason, propensity=propensity)
                 known = StoredDecision(new, trace.copy(), trace_hash(hash_, decision.part), bool(fault), store.clock())
                 made[decision.id] = known
-            if counts_silence and decision.action is Action.ACCEPT:  # one held without a label was counted as silent
+            if (
+                counts_silence and decision.action is Action.ACCEPT
+            ):  # one held without a label was counted as silent
                 silent += (label is None) - (held is not None)
             if label is not None:
                 source = source_of(decision.action, decision.audit, label)
@@ -168,9 +195,13 @@ def import_parts(
 def _verified(traces: NDArray[np.float32], data: Dataset) -> Iterator[Decision]:
     """For each of the traces (n, C, T) the decision that verified it."""
     times = Counter[int]()
-    parts = [None] * len(data) if data.part is None else [as_part(part) for part in data.part.tolist()]
+    parts = (
+        [None] * len(data) if data.part is None else [as_part(part) for part in data.part.tolist()]
+    )
     for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
         id_ = f"import-{hash_ & (2**64 - 1):016x}-{times[hash_]}"  # equal traces within one file are events of their own
         times[hash_] += 1
         nothing = (0.0, 1.0, 0, 0, None, 0)
-        yield Decision(id_, Action.VERIFY, Action.VERIFY, *nothing, Reason.NO_MODEL, False, 1.0, part)
+        yield Decision(
+            id_, Action.VERIFY, Action.VERIFY, *nothing, Reason.NO_MODEL, False, 1.0, part
+        )

@@ -1,9 +1,12 @@
-"""What a recording's label is: in its file's name, in a file of labels, or in a table's column.
+"""Where the label of a recording is: in its file's name, a file of labels, or a column of a table.
 
-Words, in any case: true ok okay pass passed good success successful gut i.O. io yes 1; false nok ng fail
-failed bad failure unsuccessful schlecht n.i.O. nio no 0; and a word of the first kind after a not, as in
-`run_7_not_ok.csv`. A name ends in the word, but for numbers: `part_7_NOK_1.csv` is bad. A number alone, 1
-or 0, is a label of a name only where somebody says so.
+A `LabelSource` finds the label of a recording by its name; `labels_in_names`, `labels_in_file` and
+`labels_in_column` make one, and `collect_recordings` reads recordings with their labels.
+
+Label words, in any case: true ok okay pass passed good success successful gut i.O. io yes 1; false
+nok ng fail failed bad failure unsuccessful schlecht n.i.O. nio no 0; and a word of the first kind
+after a not, as in `run_7_not_ok.csv`. A file's name ends in the word, except for numbers:
+`part_7_NOK_1.csv` is bad. A number alone, 1 or 0, is a label of a name only if the user says so.
 """
 
 import os
@@ -15,165 +18,247 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-from ..errors import DataError, instead
-from ..errors import listed as listing
-from .clocks import NOTHING
+from ..errors import DataError, instead, listed
+from .clocks import EMPTY_CELLS
 from .dataset import (
-    MOST_WORDS,
-    Asked,
-    Collected,
+    MAX_LABEL_WORDS,
     Fault,
-    Recorded,
+    LoadOptions,
+    Recording,
+    RecordingCollector,
     UnknownWordError,
     UnlabelledError,
     UnreadableError,
-    must,
+    expect_data,
 )
-from .text import SUFFIXES, Timed, place_of, read_table
+from .text import SUFFIXES, TimedTrace, column_place, read_table
 
 GOOD = ("true", "okay", "ok", "passed", "pass", "good", "successful", "success", "gut")
-BAD = ("false", "nok", "ng", "failed", "failure", "fail", "bad", "unsuccessful", "schlecht", "nio")
-MEANING = dict.fromkeys((*GOOD, "yes", "io", "1"), True) | dict.fromkeys((*BAD, "no", "0"), False)
-UNCHECKED = (*NOTHING, "-", "--", "?", "unknown", "unlabelled", "unlabeled", "unchecked", "not checked", "pending")
-COPY = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)  # what a file manager adds to a name
-LAST = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # words without a number, at the end of a name
+BAD = (
+    *("false", "nok", "ng", "failed", "failure", "fail", "bad", "unsuccessful", "schlecht"),
+    "nio",
+)
+MEANING = {
+    **dict.fromkeys((*GOOD, "yes", "io", "1"), True),
+    **dict.fromkeys((*BAD, "no", "0"), False),
+}
+UNCHECKED = (
+    *EMPTY_CELLS,
+    *("-", "--", "?", "unknown", "unlabelled", "unlabeled", "unchecked", "not checked", "pending"),
+)
+# What a file manager adds to the name of a copy.
+COPY_SUFFIX = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)
+LAST_WORD = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # without a number
 LETTER = r"[^\W\d_]"
-BEGIN = rf"(?:(?<!{LETTER})|(?<=[a-z])(?=[A-Z]))"  # of a word in a name: partOK has one, token has none
-END = rf"(?:(?!{LETTER})|(?<=[a-z])(?=[A-Z]))"
+# Ends of a word in a name: partOK has the word OK, token does not.
+WORD_START = rf"(?:(?<!{LETTER})|(?<=[a-z])(?=[A-Z]))"
+WORD_END = rf"(?:(?!{LETTER})|(?<=[a-z])(?=[A-Z]))"
 WORD = (
     r"(?P<not>(?i:not|non|no|nicht)[\W_]*)?"
     rf"(?P<word>(?i:{'|'.join(word for word in MEANING if not word.isdecimal())}"
     r"|(?:n[\W_]*)?i[\W_]?o|n[\W_]*o\.?k|o\.k))"  # i.O., n.i.O., n-ok
 )
 IN_CELL = re.compile(rf"{WORD}|(?P<digit>[01])")
-IN_NAME, AT_END = re.compile(f"{BEGIN}{WORD}{END}"), re.compile(f"{BEGIN}{WORD}$")
-GERMAN = ("ergebnis", "bewertung", "urteil")
-LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome", *GERMAN)
-SIGNALS = ("y", "class", "status", "ok")  # of a recording's columns these may be others: a position, a robot's state
-FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source", "insertion", "datei", "dateiname")
+IN_NAME = re.compile(f"{WORD_START}{WORD}{WORD_END}")
+AT_END = re.compile(f"{WORD_START}{WORD}$")
+LABEL_COLUMNS = (
+    *("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome"),
+    *("ergebnis", "bewertung", "urteil"),
+)
+# In the columns of a recording these may be something else: a position, a robot's state.
+SIGNAL_COLUMNS = ("y", "class", "status", "ok")
+FILE_COLUMNS = (
+    *("file", "filename", "file_name", "name", "path", "recording", "source", "insertion"),
+    *("datei", "dateiname"),
+)
 
-FEW = 5  # names, among which each word may be a label
+FEW_NAMES = 5  # in fewer names each word may be a label
 
-Words = Mapping[str, bool]
-NONE: Words = {}
-Known = tuple[int, str | None]  # a recording's label, and its part's number
+LabelMap = Mapping[str, bool]
+NO_WORDS: LabelMap = {}
+LabelAndPart = tuple[int, str | None]
 
 
 class NoLabelError(UnreadableError):
-    """A name without a label. words : the last of the file's name, and of each folder from the nearest on; or ""."""
+    """A name without a label.
+
+    words : the last word of the file's name, and of each folder from the nearest on; "" for none.
+    """
 
     def __init__(self, words: Sequence[str]) -> None:
-        super().__init__("Expected a label at the end of the name, as in 0001_True.csv or 0001_NOK.csv, found none")
+        form = "a label at the end of the name, as in 0001_True.csv or 0001_NOK.csv"
+        super().__init__(f"Expected {form}, found none")
         self.words = tuple(words)
 
 
-class Labels(NamedTuple):
+class LabelSource(NamedTuple):
     """Where the labels of recordings come from.
 
-    find : of a recording's name, its path as seen from the folder; UnreadableError where it has none.
-    advice : what to do where most have none.  faults : of the file that lists them.
-    rest : a name without the label in it, which the recorded order does not depend on.
+    find : callable
+        Returns the label and the part's number of a recording by its name, the path seen from the
+        folder. Raises UnreadableError if it has none.
+    advice : str
+        What to do if most recordings have no label.
+    faults : sequence of Fault
+        What is wrong in the file of labels.
+    without_label : callable
+        Returns a name without the label in it, by which recordings are put in order.
     """
 
-    find: Callable[[str], Known]
+    find: Callable[[str], LabelAndPart]
     advice: str
     faults: Sequence[Fault] = ()
-    rest: Callable[[str], str] = str
+    without_label: Callable[[str], str] = str
 
 
-def label_of(word: Any, words: Words = NONE) -> int:
-    """1 or 0 for a label; words : of one's own, in lower case, and whether they are good.
+def label_of(word: Any, words: LabelMap = NO_WORDS) -> int:
+    """Return the label that a word means: 1 for success, 0 for failure.
 
-    UnknownWordError for what is no label, UnlabelledError for nothing, as the cell of a part that was not checked yet.
+    Parameters
+    ----------
+    word : object
+        A cell or a text, in any case.
+    words : mapping of str to bool
+        The user's own words in lower case, and whether they are good; they go first.
+
+    Raises
+    ------
+    UnknownWordError
+        If the meaning of the word is unknown.
+    UnlabelledError
+        If it is empty, as the cell of a part that was not checked yet.
     """
     text = str(word).strip().lower()
     if text in words:
         return int(words[text])
     if text in UNCHECKED:
         raise UnlabelledError(f"Expected a label, got {text or 'none'}")
-    found = IN_CELL.fullmatch(text.removesuffix(".0").removesuffix("."))
-    if found is None:
+    match = IN_CELL.fullmatch(text.removesuffix(".0").removesuffix("."))
+    if match is None:
         raise UnknownWordError(str(word).strip())
-    return _meaning(found)
+    return _label_of_match(match)
 
 
-def _bare(text: str) -> str:
+def _letters(text: str) -> str:
+    """Return a text in lower case, without marks between its letters: `n.i.O.` as `nio`."""
     return re.sub(r"[\W_]", "", text).lower()
 
 
-def _meaning(found: re.Match[str]) -> int:
-    said = found.groupdict()
-    return int(MEANING[_bare(said["word"] or said["digit"])] != bool(said["not"]))
+def _label_of_match(match: re.Match[str]) -> int:
+    """Return the label of a match of `WORD`; a not before the word reverses it."""
+    groups = match.groupdict()
+    word = _letters(groups["word"] or groups["digit"])
+    return int(MEANING[word] != bool(groups["not"]))
 
 
-def meanings(told: Mapping[str, Any] | str | None) -> dict[str, bool]:
-    """`"i.O.=good,n.i.O.=bad"`, or a dict of words and labels: each word, in lower case, and whether it is good."""
-    # A word may have a comma in it: the next one begins behind a label.
-    if not isinstance(told, Mapping):
+def parse_label_map(label_map: Mapping[str, Any] | str | None) -> dict[str, bool]:
+    """Parse the user's own label words: "i.O.=good,n.i.O.=bad", or a dict of words and labels.
+
+    Returns each word in lower case, and whether it is good. Raises DataError for another form.
+    """
+    wanted = "word=good or word=bad, with commas between"
+    if isinstance(label_map, Mapping):
+        pairs = dict(label_map)
+    else:
+        # A word may have a comma in it: the next one begins behind a label.
         pair = re.compile(r"(.*?)=([^=,]*)(?:,|$)")
-        must(not pair.sub("", told or ""), "word=good or word=bad, with commas between", told)
-        told = dict(pair.findall(told or ""))
-    words = {str(word).strip().lower(): str(label).strip().lower() for word, label in told.items()}
+        expect_data(not pair.sub("", label_map or ""), wanted, label_map)
+        pairs = dict(pair.findall(label_map or ""))
+    words = {str(word).strip().lower(): str(label).strip().lower() for word, label in pairs.items()}
     for word, label in words.items():
-        must(bool(word) and IN_CELL.fullmatch(label) is not None, "word=good or word=bad, with commas between", told)
+        expect_data(bool(word) and IN_CELL.fullmatch(label) is not None, wanted, label_map)
     return {word: bool(label_of(label)) for word, label in words.items()}
 
 
-def named(pattern: str | None = None, words: Words = NONE) -> Labels:
-    """A label in the name: at the end of the file's, or as its folder's; or what a pattern's group finds in the path.
+def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> LabelSource:
+    """Return a source of labels in the paths of files.
 
-    words : as of `label_of`; a number among them is a label of a name that ends in it, or of a folder that is called so.
-    DataError for a pattern that is no regular expression with one group.
+    Parameters
+    ----------
+    pattern : str, optional
+        Regular expression whose one group finds the label in the path. None: the label is at the
+        end of the file's name, or of a folder's.
+    words : mapping of str to bool
+        As in `label_of`. A number among them is a label of a name that ends in it, and of a folder
+        that has it as name.
+
+    Raises
+    ------
+    DataError
+        For a pattern that is no regular expression with one group.
     """
-    advice = "give the pattern of it in the path (label), or list the files and their labels in a CSV file (labels)"
+    where = "give the pattern of it in the path (label)"
+    advice = f"{where}, or list the files and their labels in a CSV file (labels)"
     if pattern is None:
-        return Labels(partial(_find, words=words), advice, rest=partial(_rest, words=words))
-    with instead(DataError, f"Expected a regular expression for the label, got {pattern!r}", re.error):
+        find_label = partial(_find_label, words=words)
+        return LabelSource(find_label, advice, without_label=partial(_remove_label, words=words))
+    message = f"Expected a regular expression for the label, got {pattern!r}"
+    with instead(DataError, message, re.error):
         expression = re.compile(pattern)
-    must(expression.groups == 1, "one group in the label's pattern, as in '_(OK|NOK)_'", pattern)
+    wanted = "one group in the label's pattern, as in '_(OK|NOK)_'"
+    expect_data(expression.groups == 1, wanted, pattern)
 
-    def find(name: str) -> Known:
+    def find(name: str) -> LabelAndPart:
         match = expression.search(name)
         if match is None or match[1] is None:
-            raise UnreadableError(f"Expected a label where the pattern {pattern} finds it, found none")
+            wanted = f"a label where the pattern {pattern} finds it"
+            raise UnreadableError(f"Expected {wanted}, found none")
         return label_of(match[1], words), None
 
-    def rest(name: str) -> str:
+    def without_label(name: str) -> str:
         match = expression.search(name)
-        return name if match is None or match[1] is None else name[: match.start(1)] + name[match.end(1) :]
+        if match is None or match[1] is None:
+            return name
+        return name[: match.start(1)] + name[match.end(1) :]
 
-    return Labels(find, advice, rest=rest)
+    return LabelSource(find, advice, without_label=without_label)
 
 
-def agreed(cells: Iterable[Any], column: str, words: Words = NONE) -> int:
-    """The label that all cells of a column say, but for empty ones; errors as of `label_of`, which words are for too."""
-    told = list(dict.fromkeys(word for word in map(str, cells) if word.strip().lower() not in UNCHECKED))
-    if len(told) < 2:
-        return label_of(told[0] if told else "", words)
+def label_of_cells(cells: Iterable[Any], column: str, words: LabelMap = NO_WORDS) -> int:
+    """Return the label that all cells of a column mean; empty ones do not count.
+
+    Raises UnreadableError if they differ, and as `label_of`, whose `words` these are.
+    """
+    texts = dict.fromkeys(map(str, cells))
+    stated = [text for text in texts if text.strip().lower() not in UNCHECKED]
+    if len(stated) < 2:
+        return label_of(stated[0] if stated else "", words)
     with suppress(UnknownWordError):
-        meant = {label_of(word, words) for word in told}
-        if len(meant) == 1:
-            return meant.pop()
-    raise UnreadableError(f"Expected one label in column {column}, got {listing(told)}")
+        labels = {label_of(text, words) for text in stated}
+        if len(labels) == 1:
+            return labels.pop()
+    raise UnreadableError(f"Expected one label in column {column}, got {listed(stated)}")
 
 
-def in_column(paths: Mapping[str, Path], column: str, asked: Asked) -> Labels:
-    """A label that stands in a column of each recording, in one row or in all. paths : of the recordings, by name."""
-    how = asked if asked.columns else None  # else numbers, whose format need not be known
+def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOptions) -> LabelSource:
+    """Return a source of labels in a column of each recording's file, in one row or in all.
 
-    def find(name: str) -> Known:
-        frame = read_table(paths[name], how).frame
-        return agreed(frame.iloc[:, place_of(column, list(frame.columns))], column, asked.words), None
+    paths : the files of the recordings, by name.
+    """
+    # Without stated columns the label needs no number format.
+    table_options = options if options.columns else None
 
-    return Labels(find, f"column {column} has none; name another column (label)")
+    def find(name: str) -> LabelAndPart:
+        frame = read_table(paths[name], table_options).frame
+        cells = frame.iloc[:, column_place(column, list(frame.columns))]
+        return label_of_cells(cells, column, options.words), None
+
+    return LabelSource(find, f"column {column} has none; name another column (label)")
 
 
 class _FoundLabel(NamedTuple):
     """A word in a path that is a label.
 
-    text : the word.  start : its place in the path.  is_user_word : whether a label map has it.
-    decides : False for a word in the middle of a file's name, which cannot give the label but is an error if it
-        contradicts one, as in OK_then_NOK.
+    text : str
+        The word.
+    label : int
+    start : int
+        Its position in the path.
+    decides : bool
+        False for a word in the middle of a file's name. It cannot give the label, but is an error
+        if it contradicts one, as in OK_then_NOK.
+    is_user_word : bool
+        Whether it is in the user's label map.
     """
 
     text: str
@@ -183,91 +268,138 @@ class _FoundLabel(NamedTuple):
     is_user_word: bool = False
 
 
-def _find(name: str, words: Words) -> Known:
-    verdicts = _found_labels(name, words)
-    deciding = [each for each in verdicts if each.decides]
+def _find_label(name: str, words: LabelMap) -> LabelAndPart:
+    """Return the label in a path, and None for the part's number.
+
+    Raises NoLabelError if there is none, UnreadableError if several contradict each other.
+    """
+    labels = _found_labels(name, words)
+    deciding = [label for label in labels if label.decides]
     if not deciding:
         raise NoLabelError([_last_word(text) for text, _ in _components(name)])
-    for other in verdicts:
-        if other.label != deciding[0].label:
-            said = f"{deciding[0].text} and {other.text} contradict each other in its name or folder"
-            raise UnreadableError(f"Expected one label, {said}; say which it is by a pattern with a group for it (label)")
-    return deciding[0].label, None
+    first = deciding[0]
+    for other in labels:
+        if other.label != first.label:
+            got = f"{first.text} and {other.text} contradict each other in its name or folder"
+            do = "say which it is by a pattern with a group for it (label)"
+            raise UnreadableError(f"Expected one label, {got}; {do}")
+    return first.label, None
 
 
-def likely(names: Sequence[str], words: Words = NONE) -> Iterator[tuple[str, str, Labels]]:
-    """How labels may be told of names that do not tell them by themselves: what it rests on, the option, and its labels."""
-    digits = {"1": True, "0": False}
-    told = ",".join(f"{word}={'good' if good else 'bad'}" for word, good in (digits | dict(words)).items())
-    yield "if 1 and 0 at its end are labels", f"label_map={told!r}", named(None, digits | dict(words))
+def suggest_label_sources(
+    names: Sequence[str], words: LabelMap = NO_WORDS
+) -> Iterator[tuple[str, str, LabelSource]]:
+    """Yield ways to find labels in names that do not state them in the usual way.
+
+    Each is the condition under which it is right, the option to give, and the source, by which the
+    caller tries whether it finds labels.
+    """
+    with_digits = {"1": True, "0": False} | dict(words)
+    pairs = (f"{word}={'good' if good else 'bad'}" for word, good in with_digits.items())
+    source = labels_in_names(None, with_digits)
+    yield "if 1 and 0 at its end are labels", f"label_map={','.join(pairs)!r}", source
     patterns = {"if 1 and 0 are the folders of its labels": "(?:^|/)([01])/"}
-    ends = {each.text for name in names for each in _in_file(*_components(name)[0], words) if each.decides}
-    if ends:
-        found = "|".join(re.sub(r"\W", "[^A-Za-z]", word) for word in sorted(ends, key=len, reverse=True))
-        patterns["if the end of the file's name says it"] = f"({found})[^A-Za-z]*[.][^./]*$"
-    for why, pattern in patterns.items():
-        yield why, f"label='{pattern}'", named(pattern, words)
+    in_files = (label for name in names for label in _labels_in_file(*_components(name)[0], words))
+    endings = {label.text for label in in_files if label.decides}
+    if endings:
+        longest_first = sorted(endings, key=len, reverse=True)
+        choice = "|".join(re.sub(r"\W", "[^A-Za-z]", word) for word in longest_first)
+        condition = "if the end of the file's name says it"
+        patterns[condition] = f"({choice})[^A-Za-z]*[.][^./]*$"
+    for condition, pattern in patterns.items():
+        yield condition, f"label='{pattern}'", labels_in_names(pattern, words)
 
 
-def _rest(name: str, words: Words) -> str:
-    for each in sorted(_found_labels(name, words), key=lambda verdict: -verdict.start):
-        name = name[: each.start] + name[each.start + len(each.text) :] if each.decides else name
+def _remove_label(name: str, words: LabelMap) -> str:
+    """Return a path without the words that decide its label."""
+    for label in sorted(_found_labels(name, words), key=lambda label: -label.start):
+        if label.decides:
+            name = name[: label.start] + name[label.start + len(label.text) :]
     return name
 
 
 def _components(name: str) -> list[tuple[str, int]]:
-    """The file's name without suffix, then its folders from the nearest on; each with its place in the path."""
+    """Return the parts of a path with their positions in it.
+
+    The file's name without suffix comes first, then the folders from the nearest on.
+    """
     *folders, file = name.split("/")
-    places = [(folder, sum(len(before) + 1 for before in folders[:i])) for i, folder in enumerate(folders)]
-    return [(COPY.sub("", PurePosixPath(file).stem), len(name) - len(file)), *reversed(places)]
+    starts = [sum(len(folder) + 1 for folder in folders[:i]) for i in range(len(folders))]
+    file_stem = COPY_SUFFIX.sub("", PurePosixPath(file).stem)
+    nearest_first = reversed(list(zip(folders, starts, strict=True)))
+    return [(file_stem, len(name) - len(file)), *nearest_first]
 
 
-def _found_labels(name: str, words: Words) -> list[_FoundLabel]:
-    """All labels in a path. Where one's own words decide, others that are not at an end do not count."""
-    (file, at), *folders = _components(name)
-    found = _in_file(file, at, words)
-    for folder, place in folders:
-        found += _in_folder(folder, place, words)
-    return [each for each in found if each.decides] if any(each.is_user_word for each in found) else found
+def _found_labels(name: str, words: LabelMap) -> list[_FoundLabel]:
+    """Return all labels in a path, of the file first.
+
+    If one is a word of the user, words in the middle of a name do not count.
+    """
+    (file, start), *folders = _components(name)
+    labels = _labels_in_file(file, start, words)
+    for folder, folder_start in folders:
+        labels += _labels_in_folder(folder, folder_start, words)
+    if any(label.is_user_word for label in labels):
+        labels = [label for label in labels if label.decides]
+    return labels
 
 
-def _in_file(file: str, at: int, words: Words) -> list[_FoundLabel]:
+def _labels_in_file(file: str, start: int, words: LabelMap) -> list[_FoundLabel]:
+    """Return the labels in a file's name without suffix, which begins at `start` of the path."""
     digit = re.search(r"(?:^|(?<=[_\- ]))\d+$", file)
-    numbers = [_FoundLabel(digit[0], int(words[digit[0]]), at + digit.start())] if digit and digit[0] in words else []
-    if user_word := _find_user_word(file, at, words):
+    numbers = []
+    if digit and digit[0] in words:
+        label = int(words[digit[0]])
+        numbers.append(_FoundLabel(digit[0], label, start + digit.start()))
+    if user_word := _find_user_word(file, start, words):
         return [user_word, *numbers]
-    inside = [match for match in IN_NAME.finditer(file) if _bare(match["word"]) in (*GOOD, *BAD)]
-    hints = [_FoundLabel(match[0], _meaning(match), at + match.start(), decides=False) for match in inside]
-    for numbered, text in enumerate(_endings(file)):
+    inner = [
+        _FoundLabel(match[0], _label_of_match(match), start + match.start(), decides=False)
+        for match in IN_NAME.finditer(file)
+        if _letters(match["word"]) in (*GOOD, *BAD)
+    ]
+    for i, text in enumerate(_endings(file)):
         match = AT_END.search(text)
-        if match and not (numbered and _bare(match[0]) == "no"):  # part_no_7
-            return [_FoundLabel(match[0], _meaning(match), at + match.start()), *hints, *numbers]
-    return [*numbers, *hints]
+        is_number_sign = i > 0 and match is not None and _letters(match[0]) == "no"  # part_no_7
+        if match and not is_number_sign:
+            label = _label_of_match(match)
+            return [_FoundLabel(match[0], label, start + match.start()), *inner, *numbers]
+    return [*numbers, *inner]
 
 
-def _in_folder(folder: str, at: int, words: Words) -> list[_FoundLabel]:
+def _labels_in_folder(folder: str, start: int, words: LabelMap) -> list[_FoundLabel]:
+    """Return the label, or none, in a folder's name, which begins at `start` of the path."""
     if folder in words and folder.isdecimal():
-        return [_FoundLabel(folder, int(words[folder]), at)]
-    if user_word := _find_user_word(folder, at, words):
+        return [_FoundLabel(folder, int(words[folder]), start)]
+    if user_word := _find_user_word(folder, start, words):
         return [user_word]
     match = AT_END.search(re.sub(r"[\W_]+$", "", folder))
-    if match is None or (match.start() and _bare(match[0]) not in (*GOOD, *BAD)):
+    if match is None or (match.start() and _letters(match[0]) not in (*GOOD, *BAD)):
         return []
-    return [_FoundLabel(match[0], _meaning(match), at + match.start())]
+    return [_FoundLabel(match[0], _label_of_match(match), start + match.start())]
 
 
-def _find_user_word(text: str, at: int, words: Words) -> _FoundLabel | None:
-    """The longest of one's own words that a name ends in."""
+def _find_user_word(text: str, start: int, words: LabelMap) -> _FoundLabel | None:
+    """Return the longest word of the user's label map in which a name ends, if there is one.
+
+    start : position of the name in the path.
+    """
+    longest_first = sorted((word for word in words if not word.isdecimal()), key=len, reverse=True)
     for ending in _endings(text):
-        for word in sorted((word for word in words if not word.isdecimal()), key=len, reverse=True):
+        for word in longest_first:
             bare = re.sub(r"[\W_]+$", "", word)
-            if bare and (match := re.search(f"{BEGIN}(?i:{re.escape(bare)})$", ending)):
-                return _FoundLabel(match[0], int(words[word]), at + match.start(), is_user_word=True)
+            match = re.search(f"{WORD_START}(?i:{re.escape(bare)})$", ending)
+            if bare and match:
+                label = int(words[word])
+                return _FoundLabel(match[0], label, start + match.start(), is_user_word=True)
     return None
 
 
 def _endings(text: str) -> Iterator[str]:
-    """A name up to where a label may end: whole, and without each word with a number in it that it ends in."""
+    """Yield a name up to each position where a label may end.
+
+    That is the whole name, then the name without each word with a number in which it ends.
+    """
     text = re.sub(r"[\W_]+$", "", text)
     yield text
     while numbered := re.search(r"[^\W_]*\d[^\W_]*$", text):
@@ -277,13 +409,14 @@ def _endings(text: str) -> Iterator[str]:
 
 
 def _last_word(text: str) -> str:
+    """Return the last word of a name without numbers, "" if there is none."""
     *_, shortest = _endings(text)
-    found = LAST.search(shortest)
-    return "" if found is None else found[1]
+    match = LAST_WORD.search(shortest)
+    return "" if match is None else match[1]
 
 
-class _Row(NamedTuple):
-    """Of a file of labels. words : of the path that it names, see `_words`."""
+class _LabelRow(NamedTuple):
+    """A row of a file of labels; `words` are those of the path in `file`, see `_path_words`."""
 
     line: int
     words: tuple[str, ...]
@@ -292,143 +425,232 @@ class _Row(NamedTuple):
     part: str | None
 
 
-def listed(path: str | os.PathLike[str], part: str, names: Sequence[str], words: Words = NONE) -> Labels:
-    """A labels file: CSV with a column of files and one of labels. DataError where it cannot be read as one.
+def labels_in_file(
+    path: str | os.PathLike[str], part: str, names: Sequence[str], words: LabelMap = NO_WORDS
+) -> LabelSource:
+    """Return a source of labels in a CSV file with a column of files and one of labels.
 
-    A row names a recording by its full path, by the end of it, or by a path with more leading folders. The suffix may
-    be left out, and case is ignored.
-    part : the column of parts' numbers.  names : of all recordings.  words : as of `label_of`.
-    A file without a header, which names a .csv in its first line, has files, labels in this order. A column of files that
-    is called otherwise is known by the recordings' names in it.
+    A row names a recording by its full path, by the end of it, or by a path with more leading
+    folders. The suffix may be left out, and case is ignored. A file without a header, whose first
+    line names a .csv, has files and labels in this order. A column of files that has another name
+    is found by the names of recordings in it.
+
+    Parameters
+    ----------
+    path : path
+    part : str
+        Column of parts' numbers.
+    names : sequence of str
+        Names of all recordings.
+    words : mapping of str to bool
+        As in `label_of`.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read as one of labels.
     """
-    source, (rows, faults) = Path(path).name, _rows(path, part, names)
-    ends = defaultdict[str, list[_Row]](list)  # by the file's name alone
+    source = Path(path).name
+    rows, faults = _read_label_rows(path, part, names)
+    rows_by_file = defaultdict[str, list[_LabelRow]](list)
     for row in rows:
-        ends[row.words[0]].append(row)
-    alike = {
-        name: [row for row in ends[_words(name)[0]] if all(a == b for a, b in zip(row.words, _words(name), strict=False))]
-        for name in names
-    }
-    times = Counter(row for each in alike.values() for row in each)
-    lost = [row for row in rows if not times[row]]
-    faults += [Fault(source, row.line, f"Expected the name of a recording, found no file {row.file}") for row in lost]
+        rows_by_file[row.words[0]].append(row)
 
-    def find(name: str) -> Known:
-        if not alike[name]:
+    def is_end(row: _LabelRow, name_words: tuple[str, ...]) -> bool:
+        return all(a == b for a, b in zip(row.words, name_words, strict=False))
+
+    name_words = {name: _path_words(name) for name in names}
+    matches = {
+        name: [row for row in rows_by_file[path_words[0]] if is_end(row, path_words)]
+        for name, path_words in name_words.items()
+    }
+    n_names = Counter(row for matching in matches.values() for row in matching)
+    for row in rows:
+        if not n_names[row]:
+            message = f"Expected the name of a recording, found no file {row.file}"
+            faults.append(Fault(source, row.line, message))
+
+    def find(name: str) -> LabelAndPart:
+        if not matches[name]:
             raise UnreadableError(f"Expected a row of {source} that names it, found none")
-        row = max(alike[name], key=lambda row: (row.words == _words(name), len(row.words)))
-        if times[row] > 1 and row.words != _words(name):
-            raise UnreadableError(f"Expected its folder in {source}, line {row.line}, which names {times[row]} recordings")
+        path_words = name_words[name]
+        row = max(matches[name], key=lambda row: (row.words == path_words, len(row.words)))
+        where = f"{source}, line {row.line}"
+        if n_names[row] > 1 and row.words != path_words:
+            message = f"Expected its folder in {where}, which names {n_names[row]} recordings"
+            raise UnreadableError(message)
         try:
             return label_of(row.label, words), row.part
         except UnknownWordError as error:
-            error.args = (f"{error} in {source}, line {row.line}",)
+            error.args = (f"{error} in {where}",)
             raise
 
-    few = ", ".join(row.file for row in rows[:3]) or "no files"
-    return Labels(find, f"{source} names {few}: call its columns file and label, and the files as they are", faults)
+    files = ", ".join(row.file for row in rows[:3]) or "no files"
+    do = "call its columns file and label, and the files as they are"
+    return LabelSource(find, f"{source} names {files}: {do}", faults)
 
 
-def in_order(path: str | os.PathLike[str], part: str) -> list[str]:
-    """The words of a file of labels, of an array's traces in turn; DataError where its rows are numbered otherwise."""
-    rows, faults = _rows(path, part)
+def read_ordered_labels(path: str | os.PathLike[str], part: str) -> list[str]:
+    """Return the label words of a file that lists the traces of an array in their order.
+
+    Raises DataError if the file cannot be read, or its rows are numbered in another order.
+    """
+    rows, faults = _read_label_rows(path, part)
     numbers = [int(row.file) for row in rows if row.file.isdecimal()]
-    if faults or (numbers and numbers != list(range(numbers[0], numbers[0] + len(rows)))):
+    in_order = not numbers or numbers == list(range(numbers[0], numbers[0] + len(rows)))
+    if faults or not in_order:
         got = faults[0] if faults else numbers[:9]
         raise DataError(f"Expected a label of each trace in {path}, in their order, got {got}.")
     return [row.label for row in rows]
 
 
-def _rows(path: str | os.PathLike[str], part: str, names: Sequence[str] = ()) -> tuple[list[_Row], list[Fault]]:
+def _read_label_rows(
+    path: str | os.PathLike[str], part: str, names: Sequence[str] = ()
+) -> tuple[list[_LabelRow], list[Fault]]:
+    """Return the rows of a file of labels, one for each file, and the faults of its other lines.
+
+    Parameters as in `labels_in_file`. Raises DataError if the file or a column cannot be found.
+    """
     try:
-        table, faults, *_ = read_table(Path(path))
+        table = read_table(Path(path))
     except (OSError, UnreadableError) as error:
         raise DataError(f"Cannot read the labels in {path}: {error}.") from error
-    header, cells = list(table.columns), dict(zip(table.index, table.to_numpy().tolist(), strict=True))
-    if header[0].lower().endswith(SUFFIXES):
-        header, cells = ["file", "label", *header[2:]], {1: header, **cells}
-    ends = {_words(name)[0] for name in names}
-    named = [i for i in range(len(header)) if any(_words(row[i])[0] in ends for row in cells.values())]
-    of_file, of_label = _columns(header, path, named)
+    header = list(table.frame.columns)
+    cells = dict(zip(table.frame.index, table.frame.to_numpy().tolist(), strict=True))
+    faults = table.faults
+    if header[0].lower().endswith(SUFFIXES):  # no header, but the first row
+        cells = {1: header, **cells}
+        header = ["file", "label", *header[2:]]
+    files = {_path_words(name)[0] for name in names}
+    with_names = [
+        i
+        for i in range(len(header))
+        if any(_path_words(row[i])[0] in files for row in cells.values())
+    ]
+    of_file, of_label = _label_file_columns(header, path, with_names)
     if part != "part" and part not in header:
-        raise DataError(f"Expected a column {part} of parts' numbers in {path}, got {', '.join(header)}.")
-    rows: dict[tuple[str, ...], _Row] = {}
-    for line, said in cells.items():
-        number = said[header.index(part)] if part in header else ""
-        row = _Row(line, _words(said[of_file]), said[of_file], said[of_label], number or None)
+        wanted = f"a column {part} of parts' numbers in {path}"
+        raise DataError(f"Expected {wanted}, got {', '.join(header)}.")
+    rows: dict[tuple[str, ...], _LabelRow] = {}
+    for line, values in cells.items():
+        number = values[header.index(part)] if part in header else ""
+        file = values[of_file]
+        row = _LabelRow(line, _path_words(file), file, values[of_label], number or None)
         if rows.setdefault(row.words, row) is not row:
-            faults.append(Fault(Path(path).name, line, f"Expected each file once, {row.file} came before"))
+            message = f"Expected each file once, {row.file} came before"
+            faults.append(Fault(Path(path).name, line, message))
     return list(rows.values()), faults
 
 
-def _words(path: str) -> tuple[str, ...]:
-    """A path's file and folders, from its end, in lower case, without suffix, as Windows or another system writes it."""
-    words = [word for word in path.lower().replace("\\", "/").split("/") if word not in ("", ".")] or [""]
+def _path_words(path: str) -> tuple[str, ...]:
+    """Return a path's file without suffix, then its folders from the nearest on, in lower case.
+
+    Backslashes of Windows are read as slashes.
+    """
+    words = path.lower().replace("\\", "/").split("/")
+    words = [word for word in words if word not in ("", ".")] or [""]
     file = words.pop()
-    return next((file.removesuffix(end) for end in SUFFIXES if file.endswith(end)), file), *reversed(words)
+    suffix = next((suffix for suffix in SUFFIXES if file.endswith(suffix)), "")
+    return file.removesuffix(suffix), *reversed(words)
 
 
-def column_among(header: Sequence[str], known: Sequence[str]) -> int | None:
-    """Where the first of some known names stands in a header, in any case; None where none does."""
-    lower = [name.lower() for name in header]
-    return next((lower.index(name) for name in known if name in lower), None)
+def column_among(header: Sequence[str], names: Sequence[str]) -> int | None:
+    """Return where the first of some names stands in a header, in any case; None if none does."""
+    lower = [column.lower() for column in header]
+    return next((lower.index(name) for name in names if name in lower), None)
 
 
-def _columns(header: Sequence[str], path: str | os.PathLike[str], named: Sequence[int]) -> tuple[int, int]:
-    """Where files and labels are; of two columns the first and the second, or the other.  named : those with recordings."""
-    of_file, of_label = column_among(header, FILE_COLUMNS), column_among(header, LABEL_COLUMNS)
-    of_file = named[0] if of_file is None and len(named) == 1 else of_file
+def _label_file_columns(
+    header: Sequence[str], path: str | os.PathLike[str], with_names: Sequence[int]
+) -> tuple[int, int]:
+    """Return the positions of the column of files and of the column of labels.
+
+    They are found by their names; of two columns that have other names, files come first. Raises
+    DataError if one is not found. with_names : the columns in which recordings are named.
+    """
+    of_file = column_among(header, FILE_COLUMNS)
+    of_label = column_among(header, LABEL_COLUMNS)
+    if of_file is None and len(with_names) == 1:
+        of_file = with_names[0]
     if len(header) == 2:
-        of_file = of_file if of_file is not None else 0 if of_label is None else 1 - of_label
+        if of_file is None:
+            of_file = 0 if of_label is None else 1 - of_label
         of_label = 1 - of_file
     if of_file is None or of_label is None:
         wanted = FILE_COLUMNS[0] if of_file is None else "label"
-        raise DataError(f"Expected a column {wanted} in {path}, got {', '.join(header)}; call it so.")
+        got = ", ".join(header)
+        raise DataError(f"Expected a column {wanted} in {path}, got {got}; call it so.")
     return of_file, of_label
 
 
-def collect(places: Mapping[str, Any], read: Callable[[Any], Timed], labels: Labels, found: Collected) -> Collected:
-    """Add recordings by name, with their labels. read : what is at a place: (C, T), and a rate where it has timestamps.
+def collect_recordings(
+    places: Mapping[str, Any],
+    read: Callable[[Any], TimedTrace],
+    source: LabelSource,
+    collector: RecordingCollector,
+) -> RecordingCollector:
+    """Read recordings with their labels into a collector, and return it.
 
-    DataError where most have no label, which a name's words do not tell either.
+    Parameters
+    ----------
+    places : mapping of str to object
+        Where each recording is, by its name.
+    read : callable
+        Reads the trace at a place.
+    source : LabelSource
+    collector : RecordingCollector
+        Gets the recordings, and faults of those that cannot be read.
+
+    Raises
+    ------
+    DataError
+        If most recordings have no label, and the words of their names are no likely ones.
     """
     unlabelled = dict[str, Sequence[str]]()
-    found.faults.extend(labels.faults)
+    collector.faults.extend(source.faults)
 
-    def recorded(name: str, place: Any) -> Recorded:
+    def read_labelled(name: str, place: Any) -> Recording:
         try:
-            label, part = labels.find(name)
+            label, part = source.find(name)
         except (UnknownWordError, UnlabelledError):
             raise
         except UnreadableError as error:
             unlabelled[name] = getattr(error, "words", ())
             raise
         timed = read(place)
-        return Recorded(timed.trace, label, name, part, timed.rate_hz, timed.units)
+        return Recording(timed.trace, label, name, part, timed.rate_hz, timed.units)
 
     for name, place in places.items():
-        found.take(name, partial(recorded, name, place))
-    words = _likely_label_words(unlabelled.values(), [each.source for each in found.read])
-    found.unknown.update(words)
+        collector.add(name, partial(read_labelled, name, place))
+    labelled = [recording.source for recording in collector.recordings]
+    words = _likely_label_words(unlabelled.values(), labelled)
+    collector.unknown_words.update(words)
     if len(unlabelled) - len(words) > len(places) / 2:
-        why = next(fault for fault in reversed(found.faults) if fault.source in unlabelled)
-        none = f"{len(unlabelled)} of {len(places)} have none, as {why}"
-        raise DataError(f"Expected a label for each recording, {none}; {labels.advice}.")
-    return found
+        why = next(fault for fault in reversed(collector.faults) if fault.source in unlabelled)
+        got = f"{len(unlabelled)} of {len(places)} have none, as {why}"
+        raise DataError(f"Expected a label for each recording, {got}; {source.advice}.")
+    return collector
 
 
-def _likely_label_words(unlabelled: Collection[Sequence[str]], labelled: Sequence[str]) -> list[str]:
-    """The words of names without a label, or of their folders, that tell them apart from each other or from labelled ones.
+def _likely_label_words(
+    unlabelled: Collection[Sequence[str]], labelled: Sequence[str]
+) -> list[str]:
+    """Return words that may be labels, one for each name that has it.
 
-    unlabelled : of each name the words that may be its label.  labelled : the other names, which have none of these words.
+    They tell the names without a label apart from each other, or from those with one. The list is
+    empty if there are no such words.
+
+    unlabelled : for each name without a label the last word of its file and of its folders.
+    labelled : the names with a label, which have none of these words.
     """
-    known = {word for name in labelled for word in re.findall(r"[^\W\d_]+", name.lower())}
+    others = {word for name in labelled for word in re.findall(r"[^\W\d_]+", name.lower())}
     likely = []
     for depth in range(max(map(len, unlabelled), default=0)):
-        words = [each[depth] for each in unlabelled if depth < len(each) and each[depth]]
-        often = Counter(word.lower() for word in words)
-        # A word that is there once among many is that of another file.
-        several = sum(n > 1 or len(words) < FEW for n in often.values()) > 1
-        if (labelled or several) and 0 < len(often) <= MOST_WORDS and known.isdisjoint(often):
+        words = [name[depth] for name in unlabelled if depth < len(name) and name[depth]]
+        counts = Counter(word.lower() for word in words)
+        # A word that occurs once among many is that of another file.
+        n_repeated = sum(n > 1 or len(words) < FEW_NAMES for n in counts.values())
+        is_few = 0 < len(counts) <= MAX_LABEL_WORDS
+        if (labelled or n_repeated > 1) and is_few and others.isdisjoint(counts):
             likely.append(words)
     return min(likely, key=lambda words: len(set(words)), default=[])

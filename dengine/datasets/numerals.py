@@ -1,8 +1,9 @@
 """How a text file writes its numbers: 1043.5, 1,043.5, 1.043,5, 1 043,5 or 1'043.5.
 
-A file has one number format. It is found from all cells of all its numeric columns: a cell such as
-0,004 or 1.043,5 decides which mark is the decimal one; 1.043 alone does not. Where no cell decides and
-the values would change, the file is not read until somebody says which it is.
+A file has one number format. It is found from all cells of its numeric columns: cells such as
+0,004, 1.043,5 or 1,043,500 prove which mark is the decimal one, 1.043 alone does not. A file in
+which no cell proves it, though its values depend on it, is not read until the user states the mark.
+`write_as_python` rewrites the cells of a text file in the format that Python reads.
 """
 
 from __future__ import annotations
@@ -17,122 +18,173 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MARKS = ".,"  # that may be the decimal mark
-SPACED = r"'’\s"  # that can only group thousands; \s holds the narrow and the fixed blank, too
+SPACES = r"'’\s"  # marks that can only group thousands; \s includes the narrow and the fixed blank
 EXPONENT = r"(?:[eE][+\-−]?\d+)?"
 SIGN = r"[+\-−]?"
 NUMERAL = re.compile(
-    rf"{SIGN}(?:\d+(?:[.,]\d*)?|[.,]\d+|\d{{1,3}}([.,{SPACED}])\d{{3}}(?:\1\d{{3}})*(?:[.,]\d*)?)"
+    rf"{SIGN}(?:\d+(?:[.,]\d*)?|[.,]\d+|\d{{1,3}}([.,{SPACES}])\d{{3}}(?:\1\d{{3}})*(?:[.,]\d*)?)"
     rf"{EXPONENT}"
 )
-SAMPLED = 50  # cells of a column that tell whether it is one of numbers
-ENOUGH = 44  # three decimals each: the chance that not one ends in a zero is 0.9 ** 44, 1 %
-UNUSUAL = re.compile(r"[,−'’]|[^\S\n]")  # what a column has none of that is written as Python writes it
+SAMPLED_CELLS = 50  # of a column, by which it is found whether it is numeric
+# Cells as 1,043 that prove thousands: if these were three decimals, one of so many would end in a
+# zero, but for a chance of 0.9 ** 44, 1 %.
+MIN_GROUPED = 44
+UNUSUAL = re.compile(r"[,−'’]|[^\S\n]")  # a column without any of these is as Python writes it
 
 
 class UndecidedError(UnreadableError):
-    """A file whose cells do not tell its number format, though its values depend on it."""
+    """A file whose values depend on its number format, which no cell proves."""
 
 
 def is_numeral(cell: str) -> bool:
-    """Whether a cell is a number in any of the formats."""
+    """Return whether a cell is a number in any of the formats."""
     return NUMERAL.fullmatch(cell) is not None
 
 
 def is_numeric(cells: Sequence[str]) -> bool:
-    """Whether most of a sample of a column's cells that are not empty are numbers in any of the formats."""
-    some = [cell for cell in cells[:: max(1, len(cells) // SAMPLED)] if cell]
-    return bool(some) and 2 * sum(map(is_numeral, some)) > len(some)
+    """Return whether most cells of a sample of a column are numbers; empty ones do not count."""
+    step = max(1, len(cells) // SAMPLED_CELLS)
+    sample = [cell for cell in cells[::step] if cell]
+    return bool(sample) and 2 * sum(map(is_numeral, sample)) > len(sample)
 
 
-def _other(mark: str) -> str:
+def _other_mark(mark: str) -> str:
+    """Return "," for "." and "." for ","."""
     return MARKS.replace(mark, "")
 
 
-def _certain_pattern(mark: str) -> re.Pattern[str]:
-    """Compile the pattern of cells, a line each, that prove a mark to be the decimal one."""
+def _proof_pattern(mark: str) -> re.Pattern[str]:
+    """Compile the pattern of cells, one on each line, that prove a mark to be the decimal one."""
     m = re.escape(mark)
-    other = re.escape(_other(mark))
+    other = re.escape(_other_mark(mark))
     alone = rf"(?:0\d*|\d{{4,}}){m}\d*|{m}\d+|\d+{m}(?:\d{{0,2}}|\d{{4,}})|\d+{m}\d+[eE][+\-−]?\d+"
-    behind = rf"\d{{1,3}}(?:(?:[{other}'’]|[^\S\n])\d{{3}})+{m}\d*"  # 1,043.5
-    beside = rf"\d{{1,3}}(?:{other}\d{{3}}){{2,}}"  # 1,043,500
-    return re.compile(rf"^{SIGN}(?:{alone}|{behind}|{beside}){EXPONENT}$", re.MULTILINE)
+    after_thousands = rf"\d{{1,3}}(?:(?:[{other}'’]|[^\S\n])\d{{3}})+{m}\d*"  # 1,043.5
+    millions = rf"\d{{1,3}}(?:{other}\d{{3}}){{2,}}"  # 1,043,500
+    cell = rf"(?:{alone}|{after_thousands}|{millions})"
+    return re.compile(rf"^{SIGN}{cell}{EXPONENT}$", re.MULTILINE)
 
 
 def _ambiguous_pattern(mark: str) -> re.Pattern[str]:
-    """Compile the pattern of cells, a line each, in which a mark may be the decimal one or group thousands."""
+    """Compile the pattern of cells, one on each line, as 1,043.
+
+    In them a mark may be the decimal one or group thousands.
+    """
     return re.compile(rf"^{SIGN}[1-9]\d{{0,2}}{re.escape(mark)}\d{{3}}$", re.MULTILINE)
 
 
-DECIDING = {mark: _certain_pattern(mark) for mark in MARKS}
-UNDECIDED = {mark: _ambiguous_pattern(mark) for mark in MARKS}
+PROOFS = {mark: _proof_pattern(mark) for mark in MARKS}
+AMBIGUOUS = {mark: _ambiguous_pattern(mark) for mark in MARKS}
 SMALL = re.compile(rf"^{SIGN}[1-9]\d{{0,2}}$", re.MULTILINE)
 LARGE = re.compile(rf"^{SIGN}[1-9]\d{{3,}}$", re.MULTILINE)
 
 
-def _decides(mark: str, text: str) -> bool:
-    return mark in text and DECIDING[mark].search(text) is not None
+def _proves(mark: str, text: str) -> bool:
+    """Return whether a column's cells, one on each line, prove a mark to be the decimal one."""
+    has_marks = any(m in text for m in MARKS)  # cheaper than the pattern
+    return has_marks and PROOFS[mark].search(text) is not None
 
 
 def _looks_grouped(text: str, mark: str) -> bool:
-    """Whether a mark groups the thousands of a column, for smaller numbers have none."""
-    if mark not in text or DECIDING[mark].search(text) or LARGE.search(text) or not SMALL.search(text):
+    """Return whether a mark groups the thousands of a column.
+
+    It does if all numbers of four digits and more have it, and smaller ones do not.
+    """
+    if mark not in text or PROOFS[mark].search(text):
         return False
-    return len(UNDECIDED[mark].findall(text)) >= ENOUGH
+    if LARGE.search(text) or not SMALL.search(text):
+        return False
+    return len(AMBIGUOUS[mark].findall(text)) >= MIN_GROUPED
 
 
 def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None:
-    """The decimal mark of a file, "." or ","; None where its values do not depend on it.
+    """Find the decimal mark of a file.
 
-    columns : the name of each numeric column, and its cells, a line each. UndecidedError where the
-    values depend on it and nothing decides; UnreadableError where a column contradicts the others.
+    Parameters
+    ----------
+    columns : sequence of (name, text)
+        The numeric columns; the text has a cell on each line.
+    delimiter : str
+        Between the cells of the file.
+
+    Returns
+    -------
+    str or None
+        "." or ","; None if the values do not depend on it.
+
+    Raises
+    ------
+    UndecidedError
+        If the values depend on it and no cell proves it.
+    UnreadableError
+        If one column contradicts the others.
     """
-    certain = [mark for mark in MARKS if any(_decides(mark, text) for _, text in columns)]
-    if len(certain) > 1:  # most cells count; the others are named one by one
-        times = {mark: sum(len(DECIDING[mark].findall(text)) for _, text in columns) for mark in MARKS}
-        certain = [max(MARKS, key=times.__getitem__)]
+    proven = [mark for mark in MARKS if any(_proves(mark, text) for _, text in columns)]
+    if len(proven) > 1:  # the mark of most cells; those in the other format become faults
+        counts = {
+            mark: sum(len(PROOFS[mark].findall(text)) for _, text in columns) for mark in MARKS
+        }
+        proven = [max(MARKS, key=counts.__getitem__)]
     grouped = {mark: name for name, text in columns for mark in MARKS if _looks_grouped(text, mark)}
-    for mark in certain:
+    if proven:
+        mark = proven[0]
         if mark in grouped:
-            what = f"Expected one number format: {grouped[mark]} has {mark!r} before thousands, other columns have it "
-            do = f"state decimal={mark!r} if it is the decimal mark there too, or write the file in one format"
-            raise UnreadableError(f"{what}before decimals; {do}")
+            got = f"{grouped[mark]} has {mark!r} before thousands"
+            message = f"Expected one number format: {got}, other columns have it before decimals"
+            do = f"state decimal={mark!r} if it is the decimal mark there too"
+            raise UnreadableError(f"{message}; {do}, or write the file in one format")
         return mark
     if len(grouped) == 1:
-        return _other(next(iter(grouped)))
+        return _other_mark(next(iter(grouped)))
     for mark in MARKS:
         for name, text in columns:
-            found = UNDECIDED[mark].search(text)
-            if found is None:
+            cell = AMBIGUOUS[mark].search(text)
+            if cell is None:
                 continue
-            if LARGE.search(text):  # without a mark of thousands: so this one is none
+            if LARGE.search(text):  # without a mark before thousands: so this one is the decimal
                 return mark
             if mark == "." and delimiter in (",", " "):
-                return mark  # who groups by points has decimal commas, and parts cells by something else
-            both = f"{found[0].replace(mark, '.')} or {found[0].replace(mark, '')}"
-            what = f"Expected a cell that tells the decimal mark, {found[0]} in column {name} may be {both}"
-            raise UndecidedError(f"{what}; say which, decimal={mark!r} or thousands={mark!r}")
+                # Files that group by points have decimal commas, and other delimiters.
+                return mark
+            values = f"{cell[0].replace(mark, '.')} or {cell[0].replace(mark, '')}"
+            got = f"{cell[0]} in column {name} may be {values}"
+            do = f"say which, decimal={mark!r} or thousands={mark!r}"
+            message = f"Expected a cell that tells the decimal mark, {got}; {do}"
+            raise UndecidedError(message)
     return None
 
 
-def as_python(
+def write_as_python(
     frame: pd.DataFrame, delimiter: str, decimal: str | None, thousands: str | None
 ) -> tuple[str, dict[int, str]]:
-    """Write a table's numbers as Python does, in place; returns the decimal mark, "" where none is
-    told, and what is wrong, by the line.
+    """Rewrite the numbers of a table of texts as Python writes them, in place.
 
-    A number in another format than the file's is wrong.
-    decimal, thousands : the marks, as somebody stated them; None: as the cells tell.
+    Parameters
+    ----------
+    frame : DataFrame of str
+        Its index is the number of each line.
+    delimiter : str
+        Between the cells of the file.
+    decimal, thousands : str or None
+        Marks that the user stated; None: as the cells prove.
+
+    Returns
+    -------
+    mark : str
+        The decimal mark; "" if the values do not depend on it.
+    wrong : dict of int to str
+        What is wrong in a line: a number in another format than the file's.
     """
     cell_lists = (frame.iloc[:, i].tolist() for i in range(frame.shape[1]))
     columns = {i: cells for i, cells in enumerate(cell_lists) if is_numeric(cells)}
     texts = {i: "\n".join(cells) for i, cells in columns.items()}
     if decimal is None and thousands in (".", ","):
-        decimal = _other(str(thousands))
+        decimal = _other_mark(str(thousands))
     if decimal is None:
         decimal = decimal_of([(frame.columns[i], text) for i, text in texts.items()], delimiter)
-    told = decimal or ""
+    mark = decimal or ""
     decimal = decimal or "."
-    group = rf"[{re.escape(_other(decimal))}{SPACED}]" if thousands is None else re.escape(thousands)
+    other = re.escape(_other_mark(decimal))
+    group = rf"[{other}{SPACES}]" if thousands is None else re.escape(thousands)
     whole = rf"[1-9]\d{{0,2}}(?P<mark>{group})\d{{3}}(?:(?P=mark)\d{{3}})*|\d*"
     tail = rf"(?P<tail>{re.escape(decimal)}\d*)?(?P<power>{EXPONENT})"
     number = re.compile(rf"(?P<sign>{SIGN})(?P<whole>{whole}){tail}")
@@ -140,14 +192,16 @@ def as_python(
     for i, cells in columns.items():
         if decimal == "." and not UNUSUAL.search(texts[i]):
             continue
+        wanted = f"a number in column {frame.columns[i]} with {decimal!r} before decimals"
         for k, cell in enumerate(cells):
             match = number.fullmatch(cell)
             if match is not None:
                 digits = re.sub(r"\D", "", match["whole"])
-                said = match["sign"] + digits + (match["tail"] or "").replace(decimal, ".") + match["power"]
-                cells[k] = said.replace("−", "-")
+                decimals = (match["tail"] or "").replace(decimal, ".")
+                python = match["sign"] + digits + decimals + match["power"]
+                cells[k] = python.replace("−", "-")
             elif is_numeral(cell):
-                what = f"Expected a number in column {frame.columns[i]} with {decimal!r} before decimals"
-                wrong.setdefault(int(frame.index[k]), f"{what}, as the file has, got {cell!r}")
+                message = f"Expected {wanted}, as the file has, got {cell!r}"
+                wrong.setdefault(int(frame.index[k]), message)
         frame.isetitem(i, cells)
-    return told, wrong
+    return mark, wrong

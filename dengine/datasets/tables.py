@@ -1,7 +1,9 @@
-"""Tables: a folder of CSV files, one an insertion; one as CSV, Parquet or a DataFrame, wide, a row an insertion, or long.
+"""Recordings in tables: folders of text files, and tables as text, Parquet or a DataFrame.
 
-Columns `FZ_0 … FZ_999` of a wide table are a channel FZ, `0 … 999` or `x1 … x1000` one without need of a name; further
-channels have as many. A long table has a row a sample, as historians export it, and a column of parts.
+A folder has a file for each insertion, or tables of many. A wide table has a row for each
+insertion: columns `FZ_0 ... FZ_999` are the samples of a channel FZ, `0 ... 999` or `x1 ... x1000`
+those of a channel without a name. A long table has a row for each sample, as historians export it,
+and a column of parts. `load_dataset` calls `read_folder`, `read_tables` and `from_frame`.
 """
 
 from __future__ import annotations
@@ -24,12 +26,12 @@ from ..traces import is_time_column
 from . import labels, units
 from .clocks import floats, place_of_clock, seconds_of
 from .dataset import (
-    MOST_WORDS,
-    Asked,
-    Collected,
+    MAX_LABEL_WORDS,
     Dataset,
     Fault,
-    Recorded,
+    LoadOptions,
+    Recording,
+    RecordingCollector,
     UnknownWordError,
     UnlabelledError,
     UnreadableError,
@@ -37,124 +39,193 @@ from .dataset import (
 )
 from .numerals import UndecidedError
 from .text import SUFFIXES as TEXTS
-from .text import Sheet, Timed, cells_of, decoded, numbers, read_recording, read_table, recording_of
+from .text import (
+    TextTable,
+    TimedTrace,
+    decode,
+    parse_numbers,
+    read_recording,
+    read_table,
+    rows_to_trace,
+    split_cells,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
 FORCE = "FZ_Base"  # what a UR cell calls the force along the insertion
-NUMBERED = re.compile(r"(?P<channel>.*?)[_\-. \[]*(?P<number>\d+)\]?")  # FZ_0
-FIRST = re.compile(r"[A-Za-z]{0,6}[_\-. ]?(?P<number>\d+)[_\-. ]+(?P<channel>\D.*)")  # s000_fz
-ORDER = "\0order"  # a column of a long table's times in seconds, whose name no file has
-MANY = 8  # numbered columns of a channel, which a single recording has none of
-FEWEST = 0.75  # of a wide table's columns that are numbered
-FEW = 20  # recordings that advice on a column is tried on
+NUMBER_LAST = re.compile(r"(?P<channel>.*?)[_\-. \[]*(?P<number>\d+)\]?")  # FZ_0
+NUMBER_FIRST = re.compile(
+    r"[A-Za-z]{0,6}[_\-. ]?(?P<number>\d+)[_\-. ]+(?P<channel>\D.*)"
+)  # s000_fz
+SECONDS_COLUMN = "\0seconds"  # added to a long table; no file has this name
+MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered ones
+NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
+TRIED = 20  # recordings, on which advice about a column is tried
 SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
 
 
-def recordings_in(folder: Path, asked: Asked) -> dict[str, Path]:
-    """A folder's files by their path in it, `run_2.csv` before `run_10.csv`; of CSV files, where others are, none."""
-    skipped = None if asked.labels is None else Path(asked.labels).resolve()
-    paths = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and (p.is_file() or p.is_symlink())]
-    seen = {p.relative_to(folder): p for p in paths if p.resolve() != skipped}
-    named = {p.as_posix(): path for p, path in seen.items() if not any(word.startswith(".") for word in p.parts)}
+def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
+    """Return the files of recordings in a folder, by their path in it.
+
+    They are of one kind: Parquet and .npz files if there are any, else the text files of the most
+    frequent suffix. `run_2.csv` comes before `run_10.csv`. Hidden files and the file of labels are
+    left out. Raises DataError if there is none.
+    """
+    label_file = None if options.labels is None else Path(options.labels).resolve()
+    paths = {
+        path.relative_to(folder): path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in SUFFIXES and (path.is_file() or path.is_symlink())
+    }
+    named = {
+        inner.as_posix(): path
+        for inner, path in paths.items()
+        if path.resolve() != label_file and not any(word.startswith(".") for word in inner.parts)
+    }
     if not named:
-        have = listed(sorted(p.name for p in folder.iterdir()))
-        wanted = f"CSV files, one an insertion, or tables ({', '.join(SUFFIXES)}), in the folder {folder}"
-        raise DataError(f"Expected {wanted}, found none{f' among {have}; save them as such' if have else ''}.")
-    others = [name for name, path in named.items() if path.suffix.lower() not in TEXTS]  # beside a list of labels
-    times = Counter(path.suffix.lower() for path in named.values())
-    texts = [name for name, path in named.items() if times[path.suffix.lower()] == max(times.values())]
-    return {name: named[name] for name in sorted(others or texts, key=natural)}
+        entries = listed(sorted(path.name for path in folder.iterdir()))
+        forms = f"CSV files, one an insertion, or tables ({', '.join(SUFFIXES)})"
+        got = f"none among {entries}; save them as such" if entries else "none"
+        raise DataError(f"Expected {forms}, in the folder {folder}, found {got}.")
+    # CSV files beside other files are lists of labels.
+    others = [name for name, path in named.items() if path.suffix.lower() not in TEXTS]
+    counts = Counter(path.suffix.lower() for path in named.values())
+    most = max(counts.values())
+    texts = [name for name, path in named.items() if counts[path.suffix.lower()] == most]
+    return {name: named[name] for name in sorted(others or texts, key=natural_key)}
 
 
-def hold_many(named: Mapping[str, Path], asked: Asked) -> bool:
-    """Whether a folder's files hold many insertions each, as tables and archives do; CSV files may be one each."""
+def hold_many(named: Mapping[str, Path], options: LoadOptions) -> bool:
+    """Return whether each file of a folder holds many insertions, as tables do.
+
+    False if each text file is one recording.
+    """
     path = next(iter(named.values()))
     if path.suffix.lower() not in TEXTS:
         return True
-    header = _top(path, asked)[0]
-    if asked.time is not None and asked.part in header:
+    header = _first_rows(path, options)[0]
+    if options.time is not None and options.part in header:
         return True
-    if sum(len(names) for names in _numbered(header).values() if len(names) >= MANY) > FEWEST * len(header):
+    numbered = [names for names in _numbered_columns(header).values() if len(names) >= MIN_NUMBERED]
+    if sum(map(len, numbered)) > NUMBERED_SHARE * len(header):
         return True
-    with suppress(DataError):
-        return asked.labels is None and not [labels.named(asked.label, asked.words).find(name) for name in named]
-    if len(named) > 1 and asked.part not in header and _one_label_each(named, asked):
+    if options.labels is not None:
         return False
-    known = asked.part in header or labels.column_among(header, labels.LABEL_COLUMNS) is not None
-    if len(named) == 1 or asked.time is not None:
+    with suppress(DataError):
+        source = labels.labels_in_names(options.label, options.words)
+        for name in named:
+            source.find(name)
+        return False
+    if len(named) > 1 and options.part not in header and _has_label_column(named, options):
+        return False
+    has_label = labels.column_among(header, labels.LABEL_COLUMNS) is not None
+    if len(named) == 1 or options.time is not None:
         return True
-    return known and bool(_long_columns(read_table(path, asked).frame, asked, ""))
+    if not has_label and options.part not in header:
+        return False
+    return bool(_long_table_advice(read_table(path, options).frame, options, ""))
 
 
-def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
-    """The recordings of a folder, a file each, as `recordings_in` names them; DataError where none can be read."""
-    if asked.labels is None and asked.part != "part":
-        raise DataError(f"Expected a file of labels with a column {asked.part}: a folder's names tell no parts' numbers.")
-    label_source, column = _labels_of(named, asked)
-    found = Collected(name, asked.channels or _usual_channel(named.values(), asked, column))
-    if column is not None:
-        found.notes[f"The labels are those in column {column} of each file"] += 1
-    found.ordered = sorted(named, key=natural) == sorted(named, key=lambda name: natural(label_source.rest(name)))
-    found.notes.update(_left_aside(folder, named, asked))
-    mark = cache(partial(_mark_of, list(named.values()), asked))
+def read_folder(
+    folder: Path, named: Mapping[str, Path], name: str, options: LoadOptions
+) -> Dataset:
+    """Read a folder with a file for each insertion.
 
-    def read(path: Path) -> Timed:
+    Parameters
+    ----------
+    folder : Path
+    named : mapping of str to Path
+        The files, from `find_recordings`.
+    name : str
+        Name of the data set.
+    options : LoadOptions
+
+    Raises
+    ------
+    DataError
+        If no recording can be read, or most have no label; the error then says what to try.
+    """
+    if options.labels is None and options.part != "part":
+        wanted = f"a file of labels with a column {options.part}"
+        raise DataError(f"Expected {wanted}: a folder's names tell no parts' numbers.")
+    source, label_column = _label_source(named, options)
+    channels = options.channels or _usual_channels(named.values(), options, label_column)
+    collector = RecordingCollector(name, channels)
+    if label_column is not None:
+        collector.notes[f"The labels are those in column {label_column} of each file"] += 1
+    in_order = sorted(named, key=lambda name: natural_key(source.without_label(name)))
+    collector.ordered = sorted(named, key=natural_key) == in_order
+    collector.notes.update(_unread_files_note(folder, named, options))
+    common_mark = cache(partial(_common_decimal_mark, list(named.values()), options))
+
+    def read(path: Path) -> TimedTrace:
         notes = Counter[str]()
         try:
-            recording = read_recording(path, found.channels, asked, notes)
+            recording = read_recording(path, collector.channels, options, notes)
         except UndecidedError:
             notes.clear()
-            if mark() is None:
+            mark = common_mark()
+            if mark is None:
                 raise
-            recording = read_recording(path, found.channels, asked, notes, mark())
-        found.notes.update(notes)
+            recording = read_recording(path, collector.channels, options, notes, mark)
+        collector.notes.update(notes)
         return recording
 
     try:
-        labels.collect(named, read, label_source, found).must_mean_something()
+        labels.collect_recordings(named, read, source, collector).check_label_words()
     except DataError as error:
         advice = None
-        if not (asked.label or asked.labels):
-            advice = _listing(folder, named, asked) or (None if found.unknown else _advice(named, asked))
+        if not (options.label or options.labels):
+            advice = _label_file_advice(folder, named, options)
+            if advice is None and not collector.unknown_words:
+                advice = _label_advice(named, options)
         if advice is None:
             raise
         raise DataError(f"{str(error).rpartition(';')[0]}; {advice}.") from error
-    return as_dataset(found, asked)
+    return as_dataset(collector, options)
 
 
-def _labels_of(named: Mapping[str, Path], asked: Asked) -> tuple[labels.Labels, str | None]:
-    """Where a folder's labels are; and in which column of its files, if there.
+def _label_source(
+    named: Mapping[str, Path], options: LoadOptions
+) -> tuple[labels.LabelSource, str | None]:
+    """Return the source of a folder's labels, and the column of its files that has them, or None.
 
-    A column is looked at where it is asked for, or where it has a label's name and no file's name tells a label.
+    A column is taken if the user names it, or if it has the name of a label and no file's name
+    states one.
     """
-    if asked.labels is not None:
-        return labels.listed(asked.labels, asked.part, list(named), asked.words), None
-    header = _top(next(iter(named.values())), asked)[0]
-    if asked.label is not None:
-        column = asked.label if asked.label in header else None
+    if options.labels is not None:
+        names = list(named)
+        source = labels.labels_in_file(options.labels, options.part, names, options.words)
+        return source, None
+    header = _first_rows(next(iter(named.values())), options)[0]
+    if options.label is not None:
+        column = options.label if options.label in header else None
     else:
-        usual = [known for known in labels.LABEL_COLUMNS if known not in labels.SIGNALS]
+        usual = [name for name in labels.LABEL_COLUMNS if name not in labels.SIGNAL_COLUMNS]
         place = labels.column_among(header, usual)
-        column = (
-            None if place is None or set(_count_labels(named, labels.named(None, asked.words))) != {None} else header[place]
-        )
+        column = None if place is None else header[place]
+        in_names = labels.labels_in_names(None, options.words)
+        if column is not None and set(_count_labels(named, in_names)) != {None}:
+            column = None
     if column is not None:
-        return labels.in_column(named, column, asked), column
-    return labels.named(asked.label, asked.words), None
+        return labels.labels_in_column(named, column, options), column
+    return labels.labels_in_names(options.label, options.words), None
 
 
-def _one_label_each(named: Mapping[str, Path], asked: Asked) -> bool:
-    """Whether a column of the files tells labels, and the first file has one in it, as a recording has."""
+def _has_label_column(named: Mapping[str, Path], options: LoadOptions) -> bool:
+    """Return whether a column of the files has labels, and the first file one label in it."""
     with suppress(DataError):
-        source, column = _labels_of(named, asked)
+        source, column = _label_source(named, options)
         return column is not None and _count_labels([next(iter(named))], source)[None] == 0
     return False
 
 
-def _count_labels(names: Iterable[str], source: labels.Labels) -> Counter[Any]:
-    """Count the labels of names, the words that may be labels, "" for an empty one, and None for no label at all."""
+def _count_labels(names: Iterable[str], source: labels.LabelSource) -> Counter[Any]:
+    """Count the labels that a source finds for names.
+
+    The keys are labels, words whose meaning is unknown, "" for an empty label, and None for none.
+    """
     counts = Counter[Any]()
     for name in names:
         try:
@@ -166,381 +237,555 @@ def _count_labels(names: Iterable[str], source: labels.Labels) -> Counter[Any]:
     return counts
 
 
-def _look_like_labels(found: Counter[Any]) -> bool:
-    """Whether most are labels, or words so few that a person can say their meaning."""
-    words = set(+found) - {None, ""}
-    return found.total() > 2 * found[None] and (words <= {0, 1} or 2 <= len(words) <= MOST_WORDS)
+def _look_like_labels(counts: Counter[Any]) -> bool:
+    """Return whether most are labels, or words so few that a user can state their meaning."""
+    words = set(+counts) - {None, ""}
+    is_few = words <= {0, 1} or 2 <= len(words) <= MAX_LABEL_WORDS
+    return counts.total() > 2 * counts[None] and is_few
 
 
-def _listing(folder: Path, named: Mapping[str, Path], asked: Asked) -> str | None:
-    """How to name the file of labels that is in the folder: its last line names a recording, and it has most of them."""
+def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOptions) -> str | None:
+    """Return advice to give a file of labels that is in the folder, None if there is none.
+
+    Its last line names another file, and it has labels for most recordings.
+    """
     stems = {path.stem.lower() for path in named.values()}
     for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in TEXTS):
-        words = {word.lower().removesuffix(path.suffix) for word in _top(path, Asked())[-1]}
+        last_row = _first_rows(path, LoadOptions())[-1]
+        words = {word.lower().removesuffix(path.suffix) for word in last_row}
         if words.isdisjoint(stems - {path.stem.lower()}):
             continue
         with suppress(DataError):
-            if _look_like_labels(_count_labels(named, labels.listed(path, asked.part, list(named), asked.words))):
+            source = labels.labels_in_file(path, options.part, list(named), options.words)
+            if _look_like_labels(_count_labels(named, source)):
                 return f"{path.name} names files: give it, labels={str(path)!r}"
     return None
 
 
-def _advice(named: Mapping[str, Path], asked: Asked) -> str | None:
-    """How to say where the labels of recordings are, if that was tried on them and tells most; else None."""
-    likely = [
-        (_count_labels(named, source), f"{why}, say so: {do}")
-        for why, do, source in labels.likely(list(named), asked.words)
+def _label_advice(named: Mapping[str, Path], options: LoadOptions) -> str | None:
+    """Return advice where the labels of recordings are, if it was tried and finds most; else None.
+
+    Ways to read names are tried on all recordings, columns on twenty of them.
+    """
+    suggestions = [
+        (_count_labels(named, source), f"{condition}, say so: {do}")
+        for condition, do, source in labels.suggest_label_sources(list(named), options.words)
     ]
-    found, advice = max(likely, key=lambda each: -each[0][None])
-    if _look_like_labels(found) and found[0] and found[1]:
+    counts, advice = max(suggestions, key=lambda suggestion: -suggestion[0][None])
+    if _look_like_labels(counts) and counts[0] and counts[1]:
         return advice
-    some = dict(list(named.items())[:: max(len(named) // FEW, 1)])
-    columns = [name for name in _top(next(iter(named.values())), asked)[0] if name and not is_time_column(name)]
-    known = {name: _count_labels(some, labels.in_column(some, name, asked)) for name in columns}
-    telling = [name for name, found in known.items() if not found[None] and _look_like_labels(found) and len(+found) > 1]
-    if telling:
-        column = min(telling, key=lambda name: len(set(known[name]) - {0, 1, ""}))
-        return f"if column {column} tells them, name it: label={column!r}"
-    return None
+    sample = dict(list(named.items())[:: max(len(named) // TRIED, 1)])
+    header = _first_rows(next(iter(named.values())), options)[0]
+    counts_by_column = {
+        column: _count_labels(sample, labels.labels_in_column(sample, column, options))
+        for column in header
+        if column and not is_time_column(column)
+    }
+    likely = [
+        column
+        for column, counts in counts_by_column.items()
+        if not counts[None] and _look_like_labels(counts) and len(+counts) > 1
+    ]
+    if not likely:
+        return None
+    column = min(likely, key=lambda column: len(set(counts_by_column[column]) - {0, 1, ""}))
+    return f"if column {column} tells them, name it: label={column!r}"
 
 
-def _mark_of(paths: Sequence[Path], asked: Asked) -> str | None:
-    """The decimal mark of all files of a folder whose cells tell theirs; None where they have several, or none."""
+def _common_decimal_mark(paths: Sequence[Path], options: LoadOptions) -> str | None:
+    """Return the decimal mark that the files of a folder prove; None if it is none, or several."""
     marks = set[str]()
     for path in paths:
         with suppress(UnreadableError, OSError):
-            marks |= {read_table(path, asked).decimal} - {""}
+            marks |= {read_table(path, options).decimal} - {""}
     return marks.pop() if len(marks) == 1 else None
 
 
-def _left_aside(folder: Path, named: Mapping[str, Path], asked: Asked) -> list[str]:
-    """What to know of text files that are none of the recordings, for most files have another suffix."""
+def _unread_files_note(folder: Path, named: Mapping[str, Path], options: LoadOptions) -> list[str]:
+    """Return a note on the text files with another suffix than the recordings, or no note."""
     suffix = next(iter(named.values())).suffix.lower()
-    skipped = None if asked.labels is None else Path(asked.labels).resolve()
+    label_file = None if options.labels is None else Path(options.labels).resolve()
     paths = (path for path in folder.rglob("*") if path.suffix.lower() in TEXTS and path.is_file())
-    aside = sorted(p.name for p in paths if p.suffix.lower() != suffix and p.resolve() != skipped)
-    return [f"Not read, for most files are {suffix}: {listed(aside)}"] if aside else []
+    others = (path for path in paths if path.suffix.lower() != suffix)
+    unread = sorted(path.name for path in others if path.resolve() != label_file)
+    return [f"Not read, for most files are {suffix}: {listed(unread)}"] if unread else []
 
 
-def _top(path: Path, asked: Asked) -> list[list[str]]:
-    """The cells of a text file's first lines; none where they cannot be read, which is said when the whole file is."""
+def _first_rows(path: Path, options: LoadOptions) -> list[list[str]]:
+    """Return the header and the first rows of a text file.
+
+    One empty row if they cannot be read: the error comes when the whole file is read.
+    """
     with suppress(UnreadableError, OSError), path.open("rb") as file:
-        text, _ = decoded(b"\n".join(file.read(2**18).split(b"\n")[:100]))
-        cells = cells_of(text, asked.columns)
+        lines = file.read(2**18).split(b"\n")[:100]
+        text, _ = decode(b"\n".join(lines))
+        cells = split_cells(text, options.columns)
         return [cells.header, *cells.rows.values()]
     return [[]]
 
 
-def natural(name: str) -> list[tuple[int, int, str]]:
-    """A key that sorts numbers in a name by their size."""
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Return a sort key by which numbers in names are ordered by their size."""
     words = re.split(r"(\d+)", name.lower())
     return [(0, int(word), "") if word.isdecimal() else (1, 0, word) for word in words if word]
 
 
-def _usual_channel(paths: Iterable[Path], asked: Asked, label: str | None = None) -> tuple[str, ...]:
-    """The force, or the only channel that there is. label : a column that is none."""
-    headers = [tuple(name for name in _channels_in(_top(path, asked), asked) if name != label) for path in paths]
-    if not any(headers) or FORCE.lower() in {name.lower() for header in headers for name in header}:
+def _usual_channels(
+    paths: Iterable[Path], options: LoadOptions, label: str | None = None
+) -> tuple[str, ...]:
+    """Return the force if a file has it, else the only channel of most files.
+
+    label : the column of labels, which is no channel. Raises DataError if there are several.
+    """
+    headers = []
+    for path in paths:
+        channels = _channels_of_header(_first_rows(path, options), options)
+        headers.append(tuple(name for name in channels if name != label))
+    names = {name.lower() for header in headers for name in header}
+    if not names or FORCE.lower() in names:
         return (FORCE,)
-    return _chosen(Counter(headers).most_common(1)[0][0], asked)
+    most_frequent = Counter(headers).most_common(1)[0][0]
+    return _choose_channels(most_frequent, options)
 
 
-def _channels_in(top: list[list[str]], asked: Asked) -> list[str]:
-    """The names of a header that are no clock's. top : the header, and some rows."""
+def _channels_of_header(first_rows: list[list[str]], options: LoadOptions) -> list[str]:
+    """Return the columns of a file that are no clock, given its header and some rows."""
     import pandas as pd
 
-    header, *rows = top
-    whole = [row for row in rows if len(row) == len(header)]
+    header, *rows = first_rows
+    complete = [row for row in rows if len(row) == len(header)]
     clock = None
     with suppress(UnreadableError):
-        frame = pd.DataFrame(whole, columns=header, dtype=object)
-        clock = place_of_clock(frame, asked.time)
-    return [name for i, name in enumerate(header) if name and i != clock and not is_time_column(name)]
+        frame = pd.DataFrame(complete, columns=header, dtype=object)
+        clock = place_of_clock(frame, options.time)
+    return [
+        name for i, name in enumerate(header) if name and i != clock and not is_time_column(name)
+    ]
 
 
-def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
-    """CSV and Parquet files of one form, one after the other. DataError where their columns are not the same."""
-    found = Collected(name, ())
+def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> Dataset:
+    """Read text and Parquet files that are tables of one form, one after the other.
+
+    Raises DataError if one cannot be read, or their columns or units differ.
+    """
+    collector = RecordingCollector(name, ())
     tables: dict[str, pd.DataFrame] = {}
-    units_by = dict[str, list[str]]()
+    units_by_source = dict[str, list[str]]()
     for source, path in named.items():
         try:
             is_text = path.suffix.lower() in TEXTS
-            frame, faults, _, units_row, _ = read_table(path, asked, found.notes) if is_text else _parquet(path)
+            table = read_table(path, options, collector.notes) if is_text else _read_parquet(path)
         except UnreadableError as error:
-            raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
-        if frame.empty:
+            fault = Fault(path.name, error.line, str(error))
+            raise DataError(f"Cannot read {path}: {fault}.") from error
+        if table.frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
-        found.faults += [replace(fault, source=source) for fault in faults]
-        tables[source] = frame
-        units_by[source] = units_row
-        found.beside = next((str(p) for p in path.parent.glob("*.csv") if p not in named.values()), found.beside)
-    first, *others = units_by
-    for source in others:
-        if units_by[source] != units_by[first]:
-            one, two = (", ".join(units_by[name]) or "none" for name in (first, source))
-            raise DataError(f"Expected the same units in {first} and in {source}, got {one} and {two}; convert one.")
-    return _from_tables(tables, asked, found, units_by[first])
+        collector.faults += [replace(fault, source=source) for fault in table.faults]
+        tables[source] = table.frame
+        units_by_source[source] = table.units
+        others = (str(other) for other in path.parent.glob("*.csv") if other not in named.values())
+        collector.label_file = next(others, collector.label_file)
+    first, *sources = units_by_source
+    for source in sources:
+        if units_by_source[source] != units_by_source[first]:
+            one, two = (", ".join(units_by_source[s]) or "none" for s in (first, source))
+            wanted = f"the same units in {first} and in {source}"
+            raise DataError(f"Expected {wanted}, got {one} and {two}; convert one.")
+    return _from_tables(tables, options, collector, units_by_source[first])
 
 
-def _parquet(path: Path) -> Sheet:
+def _read_parquet(path: Path) -> TextTable:
+    """Return a Parquet file as a table whose rows count from 1; DataError if it is damaged."""
     import pandas as pd
 
     with read_errors(path, "a Parquet file", "pyarrow", "files"):
-        return Sheet(_with_row_numbers(pd.read_parquet(path)), [], 0, [], "")
+        return TextTable(_number_rows(pd.read_parquet(path)), [], 0, [], "")
 
 
-def _with_row_numbers(frame: pd.DataFrame) -> pd.DataFrame:
-    """With names that are texts, and rows from 1."""
+def _number_rows(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table whose columns have texts as names and whose rows count from 1."""
     return frame.set_axis(list(map(str, frame.columns)), axis=1).set_axis(range(1, len(frame) + 1))
 
 
-def from_frame(frame: pd.DataFrame, asked: Asked) -> Dataset:
-    """A table in memory, whose rows count from 1."""
-    return _from_tables({"row": _with_row_numbers(frame)}, asked, Collected("data", ()))
+def from_frame(frame: pd.DataFrame, options: LoadOptions) -> Dataset:
+    """Make a data set of a DataFrame, a wide or a long table; its rows count from 1 in faults."""
+    return _from_tables({"row": _number_rows(frame)}, options, RecordingCollector("data", ()))
 
 
 def _from_tables(
-    tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected, units_row: Sequence[str] = ()
+    tables: Mapping[str, pd.DataFrame],
+    options: LoadOptions,
+    collector: RecordingCollector,
+    units_row: Sequence[str] = (),
 ) -> Dataset:
-    """Check tables of one form, and read them as wide or as long ones.
+    """Make a data set of tables of one form, wide or long.
 
-    tables : by the names of their files, or "row" for a frame in memory; their index numbers the lines.
-    units_row : the units of their columns.
+    Raises DataError if their columns differ, or are lists; and for a long table without the options
+    that say which column is what.
+
+    tables : by the names of their files, or "row" for a DataFrame; the index is the line.
+    units_row : unit of each column.
     """
-    first, *_ = tables
+    first = next(iter(tables))
     for source, frame in tables.items():
-        for name in frame.columns:
-            cell = frame[name].iloc[0] if (frame.columns == name).sum() == 1 and len(frame) else None
-            if isinstance(cell, list | tuple | np.ndarray):
-                do = "give a trace a row, its samples a column each, or load_dataset((X, y)) with the lists as X"
-                raise DataError(f"Expected a number or a text a cell in {source}, column {name} holds lists; {do}.")
-        twice = frame.columns[frame.columns.duplicated()]
-        if len(twice):
-            raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
-        if apart := listed(sorted(_form(frame) ^ _form(tables[first]))):
-            raise DataError(f"Expected the same columns in {first} and in {source}, only one of them has {apart}.")
-    if asked.time is not None or asked.labels is not None:
-        return _from_long(
-            _one_long(tables, asked), asked, found, first, dict(zip(tables[first].columns, units_row, strict=False))
-        )
-    if advice := _long_columns(tables[first], asked, found.beside):
-        have = listed(tables[first].columns)
-        raise DataError(f"Expected a row an insertion, got a row a sample: {have}; a long table needs {advice}.")
+        _check_columns(frame, source)
+        if differing := listed(sorted(_column_forms(frame) ^ _column_forms(tables[first]))):
+            wanted = f"the same columns in {first} and in {source}"
+            raise DataError(f"Expected {wanted}, only one of them has {differing}.")
+    if options.time is not None or options.labels is not None:
+        column_units = dict(zip(tables[first].columns, units_row, strict=False))
+        frame = _concatenate_long(tables, options)
+        return _from_long(frame, options, collector, first, column_units)
+    if advice := _long_table_advice(tables[first], options, collector.label_file):
+        columns = listed(tables[first].columns)
+        got = f"a row a sample: {columns}"
+        raise DataError(f"Expected a row an insertion, got {got}; a long table needs {advice}.")
     for source, frame in tables.items():
-        _take_rows(frame, asked, found, source)
-    return as_dataset(found, asked)
+        _add_wide_rows(frame, options, collector, source)
+    return as_dataset(collector, options)
 
 
-def _form(frame: pd.DataFrame) -> set[str]:
-    """The columns of a table, without regard to how many samples it has of a channel."""
-    several = {name: channel for channel, names in _numbered(frame.columns).items() if len(names) > 1 for _, name in names}
-    return {several.get(name, name) for name in frame.columns}
+def _check_columns(frame: pd.DataFrame, source: str) -> None:
+    """Raise DataError for a column that holds lists, or occurs twice."""
+    for name in frame.columns:
+        is_single = (frame.columns == name).sum() == 1 and len(frame) > 0
+        if is_single and isinstance(frame[name].iloc[0], list | tuple | np.ndarray):
+            wanted = f"a number or a text a cell in {source}"
+            do = "give a trace a row, its samples a column each"
+            do = f"{do}, or load_dataset((X, y)) with the lists as X"
+            raise DataError(f"Expected {wanted}, column {name} holds lists; {do}.")
+    repeated = frame.columns[frame.columns.duplicated()]
+    if len(repeated):
+        message = f"Expected each column once in {source}, {repeated[0]} is there more often."
+        raise DataError(message)
 
 
-def _take_rows(frame: pd.DataFrame, asked: Asked, found: Collected, source: str) -> None:
-    """A row an insertion.
+def _column_forms(frame: pd.DataFrame) -> set[str]:
+    """Return the columns of a table, with one name for all numbered columns of a channel."""
+    channel_of = {
+        name: channel
+        for channel, columns in _numbered_columns(frame.columns).items()
+        if len(columns) > 1
+        for _, name in columns
+    }
+    return {channel_of.get(name, name) for name in frame.columns}
 
-    An empty cell before others is a NaN: the engine finds it, and the part is verified. A row whose last cells are empty is
-    a shorter trace. A row with text in it, or no label, is a fault.
+
+def _add_wide_rows(
+    frame: pd.DataFrame, options: LoadOptions, collector: RecordingCollector, source: str
+) -> None:
+    """Add each row of a wide table to a collector as a recording.
+
+    An empty cell before others is NaN, which the engine finds. A row whose last cells are empty is
+    a shorter trace. A row with text among its samples, or without a label, is a fault.
     """
-    label = _label_column(frame, asked)
-    if asked.part != "part" and asked.part not in frame:
-        raise DataError(f"Expected a column {asked.part} of parts' numbers, found {listed(frame.columns)}.")
-    columns = _sample_columns([name for name in frame.columns if name not in (label, asked.part)], asked)
-    values, wrong = numbers(frame[[name for names in columns.values() for name in names]])
-    found.channels = tuple(filter(None, columns))
-    parts = [""] * len(frame) if asked.part not in frame else frame[asked.part].astype(object).fillna("").tolist()
+    label_column = _label_column(frame, options)
+    if options.part != "part" and options.part not in frame:
+        wanted = f"a column {options.part} of parts' numbers"
+        raise DataError(f"Expected {wanted}, found {listed(frame.columns)}.")
+    others = [name for name in frame.columns if name not in (label_column, options.part)]
+    columns = _sample_columns(others, options)
+    all_columns = [name for names in columns.values() for name in names]
+    values, wrong = parse_numbers(frame[all_columns])
+    traces = values.reshape(len(frame), len(columns), -1)
+    collector.channels = tuple(filter(None, columns))
+    parts = [""] * len(frame)
+    if options.part in frame:
+        parts = frame[options.part].astype(object).fillna("").tolist()
 
-    def recorded(line: int, trace: NDArray[np.float32], word: Any, part: Any) -> Recorded:
+    def read(line: int, trace: NDArray[np.float32], word: Any, part: Any) -> Recording:
         if line in wrong:
             raise UnreadableError(wrong[line])
         number = str(part).removesuffix(".0").strip() or None
-        return Recorded(_without_trailing_nan(trace), labels.label_of(word, asked.words), f"{source}, line {line}", number)
+        label = labels.label_of(word, options.words)
+        return Recording(_without_trailing_nan(trace), label, f"{source}, line {line}", number)
 
-    for row in zip(frame.index, values.reshape(len(frame), len(columns), -1), frame[label].tolist(), parts, strict=True):
-        found.take(source, partial(recorded, *row), row[0])
+    for row in zip(frame.index, traces, frame[label_column].tolist(), parts, strict=True):
+        collector.add(source, partial(read, *row), row[0])
 
 
-def _one_long(tables: Mapping[str, pd.DataFrame], asked: Asked) -> pd.DataFrame:
+def _concatenate_long(tables: Mapping[str, pd.DataFrame], options: LoadOptions) -> pd.DataFrame:
     """Concatenate long tables.
 
-    The same part's number in two files means two parts: the file's name is then put before it. Exception: a part that ends
-    one file and begins the next is one part.
+    The same part's number in two files means two parts: the file's name is then put before it.
+    Exception: a part that ends one file and begins the next is one part.
     """
     import pandas as pd
 
     frame = pd.concat(tables.values())
-    if len(tables) == 1 or asked.part not in frame:
+    if len(tables) == 1 or options.part not in frame:
         return frame
-    at, last, homes = dict[str, str](), "", list[str]()
+    file_of = dict[str, str]()  # of each part of the file before
+    last = ""
+    full_names = list[str]()
     for source, table in tables.items():
-        part = table[asked.part].astype(str).tolist()
-        at = {number: at[last] if number == last == part[0] else source for number in part}
-        homes, last = homes + [f"{at[number]}/{number}" for number in part], part[-1]
-    number, home = frame[asked.part].astype(str).where(frame[asked.part].notna()), pd.Series(homes, frame.index)
-    twice = home.groupby(number.to_numpy()).transform("nunique") > 1
-    return frame.assign(**{asked.part: number.where(~twice, home)})
+        parts = table[options.part].astype(str).tolist()
+        file_of = {part: file_of[last] if part == last == parts[0] else source for part in parts}
+        full_names += [f"{file_of[part]}/{part}" for part in parts]
+        last = parts[-1]
+    part = frame[options.part].astype(str).where(frame[options.part].notna())
+    full_name = pd.Series(full_names, frame.index)
+    is_repeated = full_name.groupby(part.to_numpy()).transform("nunique") > 1
+    return frame.assign(**{options.part: part.where(~is_repeated, full_name)})
 
 
-def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str, written: Mapping[str, str]) -> Dataset:
-    """A row a sample: the rows of a part, by their times, are one insertion. A label is a column, or in a file of parts.
+def _from_long(
+    frame: pd.DataFrame,
+    options: LoadOptions,
+    collector: RecordingCollector,
+    source: str,
+    column_units: Mapping[str, str],
+) -> Dataset:
+    """Make a data set of a long table: the rows of a part, by their times, are one insertion.
 
-    written : the units of columns.
+    Its label is in a column, or in a file of parts. Raises DataError if the column of parts or of
+    times is not found.
+
+    column_units : unit of each column, from a row of units.
     """
-    time = asked.time or next((name for name in frame.columns if is_time_column(name)), "")
-    for name in (asked.part, time):
+    time = _time_column(frame, options)
+    for name in (options.part, time):
         if name not in frame:
             wanted = f"a row a sample in {source}, with columns of parts (part) and times (time)"
-            advice = f"; name {names}" if (names := _long_columns(frame, asked, found.beside)) else ""
+            names = _long_table_advice(frame, options, collector.label_file)
+            advice = f"; name {names}" if names else ""
             raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
-    label = None if asked.labels is not None else _label_column(frame, asked)
-    frame = _row_a_sample(frame, [asked.part, time, *([label] if label else [])], asked)
-    left = [name for name in frame.columns if name not in (asked.part, time, label) and not floats(frame[name])[1]]
-    found.channels = _chosen(left, asked)
-    order, *_ = seconds_of(frame[time], time, written.get(time, ""))
-    parts = {str(part): rows for part, rows in frame.assign(**{ORDER: order}).groupby(asked.part, sort=False)}
+    label = None if options.labels is not None else _label_column(frame, options)
+    frame = _pivot_signals(frame, [options.part, time, *([label] if label else [])], options)
+    others = [name for name in frame.columns if name not in (options.part, time, label)]
+    numeric = [name for name in others if not floats(frame[name])[1]]
+    collector.channels = _choose_channels(numeric, options)
+    seconds, *_ = seconds_of(frame[time], time, column_units.get(time, ""))
+    with_seconds = frame.assign(**{SECONDS_COLUMN: seconds})
+    groups = with_seconds.groupby(options.part, sort=False)
+    rows_of_part = {str(part): rows for part, rows in groups}
+    places = [frame.columns.get_loc(name) for name in collector.channels]
+    read_options = replace(options, time=time)
 
-    places = [frame.columns.get_loc(name) for name in found.channels]
-    how = replace(asked, time=time)
+    def read(rows: pd.DataFrame) -> TimedTrace:
+        rows = rows.sort_values(SECONDS_COLUMN, kind="stable").drop(columns=SECONDS_COLUMN)
+        units_row = [column_units.get(name, "") for name in rows.columns]
+        timed = rows_to_trace(rows, places, read_options, collector.notes, units_row)
+        channels = collector.channels
+        channel_units = (column_units.get(name) or units.split(name)[1] for name in channels)
+        return timed._replace(units=tuple(channel_units))
 
-    def read(rows: pd.DataFrame) -> Timed:
-        rows = rows.sort_values(ORDER, kind="stable").drop(columns=ORDER)
-        timed = recording_of(rows, places, how, found.notes, [written.get(name, "") for name in rows.columns])
-        return timed._replace(units=tuple(written.get(name) or units.split(name)[1] for name in found.channels))
+    def find(part: str) -> labels.LabelAndPart:
+        cells = rows_of_part[part][label]
+        return labels.label_of_cells(cells, str(label), options.words), None
 
-    def find(part: str) -> labels.Known:
-        return labels.agreed(parts[part][label], str(label), asked.words), None
-
-    source_of_labels = labels.Labels(find, "name the column of labels (label)")
-    if asked.labels is not None:
-        source_of_labels = labels.listed(asked.labels, "part", list(parts), asked.words)
-    return as_dataset(labels.collect(parts, read, source_of_labels, found), asked)
+    label_source = labels.LabelSource(find, "name the column of labels (label)")
+    if options.labels is not None:
+        parts = list(rows_of_part)
+        label_source = labels.labels_in_file(options.labels, "part", parts, options.words)
+    labels.collect_recordings(rows_of_part, read, label_source, collector)
+    return as_dataset(collector, options)
 
 
-def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.DataFrame:
-    """Of a table with a row a signal, told apart by tags, one with a column each; known : of parts, times, and labels."""
-    apart = [] if not frame.duplicated(known[:2]).any() else [name for name in frame if name not in known]
-    tags = [name for name in apart if floats(frame[name])[1] and not frame.duplicated([*known[:2], name]).any()]
-    values = [name for name in apart if name not in tags and not floats(frame[name])[1]]
+def _time_column(frame: pd.DataFrame, options: LoadOptions) -> str:
+    """Return the column of times: the one that the user states, in any case, else by its name.
+
+    A stated column that is not there is returned as stated; "" if no name is a clock's.
+    """
+    columns = [str(name) for name in frame.columns]
+    if options.time:
+        places = units.find_columns(options.time, columns)
+        return columns[places[0]] if places else options.time
+    return next((name for name in columns if is_time_column(name)), "")
+
+
+def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -> pd.DataFrame:
+    """Return a table with a row for each sample, of one with a row for each signal's value.
+
+    Such a table tells signals apart by a column of tags. Any other is returned as it is. Raises
+    DataError if the user does not name the channels among the tags.
+
+    keys : columns of parts, times and, if there is one, labels.
+    """
+    if not frame.duplicated(keys[:2]).any():
+        return frame
+    others = [name for name in frame if name not in keys]
+    texts = [name for name in others if floats(frame[name])[1]]
+    tags = [name for name in texts if not frame.duplicated([*keys[:2], name]).any()]
+    values = [name for name in others if name not in texts]
     if not tags or len(values) != 1:
         return frame
-    have = frame[tags[0]].unique().tolist()
-    if not asked.channels or not set(asked.channels) <= set(have):
-        told = f"{listed(have)}, as column {tags[0]} calls them"
-        raise DataError(f"Expected the channel to be named, as in channel={have[0]!r}; there are {told}.")
-    picked = frame[frame[tags[0]].isin(asked.channels)]
-    wide = picked.pivot(index=known, columns=tags[0], values=values[0])  # noqa: PD010 - pivot_table would average
-    came = {part: i for i, part in enumerate(picked[known[0]].unique())}  # a pivot sorts S10 before S9
-    wide = wide.reset_index().sort_values(known[0], key=lambda parts: parts.map(came), kind="stable")
+    tag = tags[0]
+    signals = frame[tag].unique().tolist()
+    if not options.channels or not set(options.channels) <= set(signals):
+        have = f"{listed(signals)}, as column {tag} calls them"
+        wanted = f"the channel to be named, as in channel={signals[0]!r}"
+        raise DataError(f"Expected {wanted}; there are {have}.")
+    rows = frame[frame[tag].isin(options.channels)]
+    wide = rows.pivot(index=keys, columns=tag, values=values[0])  # noqa: PD010 - pivot_table would average
+    # A pivot sorts S10 before S9: restore the order of the parts.
+    order = {part: i for i, part in enumerate(rows[keys[0]].unique())}
+    wide = wide.reset_index()
+    wide = wide.sort_values(keys[0], key=lambda parts: parts.map(order), kind="stable")
     return wide.set_axis(range(1, len(wide) + 1))
 
 
-def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
-    """How to say which column is what, where that was not said, if a table looks as if it had a row a sample."""
+def _long_table_advice(frame: pd.DataFrame, options: LoadOptions, label_file: str) -> str:
+    """Return advice which columns to name, if a table looks as if it had a row for each sample.
+
+    "" if it does not, or the user named them all.
+
+    label_file : path of a file that may list the labels of parts.
+    """
     frame = frame.loc[:, ~frame.columns.duplicated(keep=False)]
-    if max(map(len, _numbered(frame.columns).values()), default=0) > 2:
+    if max(map(len, _numbered_columns(frame.columns).values()), default=0) > 2:
         return ""
-    part = asked.part if asked.part in frame and frame[asked.part].duplicated().any() else ""
-    time = asked.time or next((name for name in frame.columns if is_time_column(name)), "")
-    time = time or next(
-        (name for name in frame.columns if part and name != part and _rises_within_parts(frame, part, name)), ""
-    )
+    has_parts = options.part in frame and frame[options.part].duplicated().any()
+    part = options.part if has_parts else ""
+    time = _time_column(frame, options)
+    if part and not time:
+        others = [name for name in frame.columns if name != part]
+        time = next((name for name in others if _rises_within_parts(frame, part, name)), "")
     if not (time or part):
         return ""
     rows = frame.mask(frame == "").bfill()  # a label may stand in a part's last row alone
     others = [name for name in frame.columns if name not in (time, part)]
     changes = {name: int((rows[name] != rows[name].shift()).sum()) for name in others}
     few = [name for name, n in changes.items() if 2 <= n <= len(frame) / 5]
-    if not (part or few):
-        return ""
-    hints = [] if part else [f"part={(part := max(few, key=changes.__getitem__))!r}"]
-    if not asked.time:
+    hints = []
+    if not part:
+        if not few:
+            return ""
+        part = max(few, key=changes.__getitem__)
+        hints.append(f"part={part!r}")
+    if not options.time:
         hints.append(f"time={time!r}" if time else "the column of times (time)")
-    if not (asked.label or asked.labels):
-        label = min(few, key=lambda name: (name.lower() not in labels.LABEL_COLUMNS, changes[name]), default=part)
-        hints.append(f"label={label!r}" if label != part else _parts_listing(frame[part], beside, asked))
-    return f"the columns that tell which part it is, when, and the label, as in {', '.join(hints)}" if hints else ""
+    if not (options.label or options.labels):
+        is_other = {name: name.lower() not in labels.LABEL_COLUMNS for name in few}
+        label = min(few, key=lambda name: (is_other[name], changes[name]), default=part)
+        if label != part:
+            hints.append(f"label={label!r}")
+        else:
+            hints.append(_parts_file_advice(frame[part], label_file, options))
+    if not hints:
+        return ""
+    which = "the columns that tell which part it is, when, and the label"
+    return f"{which}, as in {', '.join(hints)}"
 
 
 def _rises_within_parts(frame: pd.DataFrame, part: str, name: str) -> bool:
-    """Whether a column's numbers, or times as text, rise from row to row of each part."""
+    """Return whether the numbers or times of a column rise from row to row of each part."""
     with suppress(ValueError, TypeError):
-        values, odd, _ = seconds_of(frame[name], name)
-        same = (frame[part] == frame[part].shift()).to_numpy()
-        return not odd and bool(same.any()) and bool((np.diff(values)[same[1:]] > 0).all())
+        values, wrong, _ = seconds_of(frame[name], name)
+        is_same_part = (frame[part] == frame[part].shift()).to_numpy()
+        steps = np.diff(values)[is_same_part[1:]]
+        return not wrong and bool(is_same_part.any()) and bool((steps > 0).all())
     return False
 
 
-def _parts_listing(parts: pd.Series, beside: str, asked: Asked) -> str:
-    """How to name a file of parts and labels: the one beside the table, if it has most of them."""
-    named = [str(part) for part in parts.unique()]
+def _parts_file_advice(parts: pd.Series, label_file: str, options: LoadOptions) -> str:
+    """Return advice to give a file of parts and labels, `label_file` if it has most parts."""
+    names = [str(part) for part in parts.unique()]
     with suppress(DataError):
-        if _look_like_labels(_count_labels(named, labels.listed(beside, "part", named, asked.words))):
-            return f"labels={beside!r}, a file of parts and labels"
+        source = labels.labels_in_file(label_file, "part", names, options.words)
+        if _look_like_labels(_count_labels(names, source)):
+            return f"labels={label_file!r}, a file of parts and labels"
     return "and a CSV file of parts and labels (labels)"
 
 
-def _chosen(have: Sequence[str], asked: Asked) -> tuple[str, ...]:
-    """The channels that were asked for, the force, or the only one; DataError for one that is not there, or several."""
-    chosen = asked.channels or ((FORCE,) if FORCE in have else tuple(have))
-    missing = [name for name in chosen if name not in have]
+def _choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str, ...]:
+    """Return the channels that the user stated, else the force, else the only one available.
+
+    Raises DataError for a channel that is not available, and if several are and none was stated.
+    """
+    default = (FORCE,) if FORCE in available else tuple(available)
+    chosen = options.channels or default
+    missing = [name for name in chosen if name not in available]
     if missing or not chosen:
-        raise DataError(f"Expected the channel {listed(missing) or 'of the samples'}, found {listed(have) or 'none'}.")
-    if not asked.channels and len(chosen) > 1:
-        one = min(chosen, key=chosen.count)  # a name that is there twice is none
-        raise DataError(f"Expected the channel to be named, as in channel={one!r}; there are {listed(have)}.")
+        wanted = f"the channel {listed(missing) or 'of the samples'}"
+        raise DataError(f"Expected {wanted}, found {listed(available) or 'none'}.")
+    if not options.channels and len(chosen) > 1:
+        example = min(chosen, key=chosen.count)  # not a name that occurs twice
+        wanted = f"the channel to be named, as in channel={example!r}"
+        raise DataError(f"Expected {wanted}; there are {listed(available)}.")
     return chosen
 
 
 def _without_trailing_nan(trace: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(C, T) without the last samples that no channel has; whole where there is none at all."""
+    """Return a trace (C, T) without the last samples that are NaN in all channels.
+
+    A trace of nothing but NaN is returned whole.
+    """
     known = np.flatnonzero(~np.isnan(trace).all(axis=0))
     return trace[:, : known[-1] + 1] if len(known) else trace
 
 
-def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
-    if asked.label is not None:
-        if asked.label not in frame:
-            raise DataError(f"Expected a column {asked.label} of labels, found {listed(frame.columns)}.")
-        return asked.label
-    if (known := labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)) is not None:
-        return str(frame.columns[known])
-    several = {name for names in _numbered(frame.columns).values() if len(names) > 1 for _, name in names}
-    left = [name for name in frame.columns if name not in several]
-    if asked.time is None and len(left) == len(frame.columns) and any(is_time_column(name) for name in left):
+def _label_column(frame: pd.DataFrame, options: LoadOptions) -> str:
+    """Return the column of labels: the one that the user states, else by its name.
+
+    Raises DataError, with advice, if there is none.
+    """
+    if options.label is not None:
+        if options.label not in frame:
+            wanted = f"a column {options.label} of labels"
+            raise DataError(f"Expected {wanted}, found {listed(frame.columns)}.")
+        return options.label
+    place = labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)
+    if place is not None:
+        return str(frame.columns[place])
+    numbered = {
+        name
+        for columns in _numbered_columns(frame.columns).values()
+        if len(columns) > 1
+        for _, name in columns
+    }
+    others = [name for name in frame.columns if name not in numbered]
+    has_clock = any(is_time_column(name) for name in others)
+    if options.time is None and not numbered and has_clock:
         do = "as in one recording; give a folder of such CSV files"
-        raise DataError(f"Expected a row an insertion, got {listed(left)}, {do}.")
-    likely = [name for name in left if 2 <= frame[name].nunique() <= MOST_WORDS]
-    do = (
-        f"name it: label={min(likely, key=lambda name: frame[name].nunique())!r}" if likely else "add one that is called so"
-    )
-    raise DataError(f"Expected a column of labels, y or label, found {listed(left or frame.columns)}; {do}.")
+        raise DataError(f"Expected a row an insertion, got {listed(others)}, {do}.")
+    counts = {name: frame[name].nunique() for name in others}
+    likely = [name for name, n in counts.items() if 2 <= n <= MAX_LABEL_WORDS]
+    do = "add one that is called so"
+    if likely:
+        do = f"name it: label={min(likely, key=counts.__getitem__)!r}"
+    columns = listed(others or frame.columns)
+    raise DataError(f"Expected a column of labels, y or label, found {columns}; {do}.")
 
 
-def _numbered(names: Iterable[str]) -> dict[str, list[tuple[int, str]]]:
-    """Channel -> the numbers that its columns have, and these columns, by the pattern that most of one channel have."""
-    found: list[dict[str, list[tuple[int, str]]]] = [{}, {}]
-    for groups, pattern in zip(found, (NUMBERED, FIRST), strict=True):
+def _numbered_columns(names: Iterable[str]) -> dict[str, list[tuple[int, str]]]:
+    """Return the numbered columns of each channel, as (number, column).
+
+    Names as `FZ_0` and as `s000_fz` are tried; the form that gives a channel most columns is taken.
+    """
+    forms = []
+    for pattern in (NUMBER_LAST, NUMBER_FIRST):
+        channels = dict[str, list[tuple[int, str]]]()
         for match in filter(None, map(pattern.fullmatch, names)):
-            groups.setdefault(match["channel"], []).append((int(match["number"]), match[0]))
-    return max(found, key=lambda groups: max(map(len, groups.values()), default=0))
+            columns = channels.setdefault(match["channel"], [])
+            columns.append((int(match["number"]), match[0]))
+        forms.append(channels)
+    return max(forms, key=lambda channels: max(map(len, channels.values()), default=0))
 
 
-def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:
-    """Channel -> its columns, in the order of their numbers: where one is missing, what comes after it would be shifted."""
-    several = {name: sorted(those) for name, those in _numbered(names).items() if len(those) > 1}
-    if not several:
-        raise DataError(f"Expected samples in numbered columns, as FZ_0, FZ_1, ..., found {listed(names)}.")
-    for those in several.values():
-        steps = np.diff([number for number, _ in those])
+def _sample_columns(names: list[str], options: LoadOptions) -> dict[str, list[str]]:
+    """Return the columns of each channel of a wide table, in the order of their numbers.
+
+    Raises DataError if there are none, if a number is missing, for what comes after it would be
+    shifted, or if the channels have different numbers of samples.
+    """
+    channels = {
+        channel: sorted(columns)
+        for channel, columns in _numbered_columns(names).items()
+        if len(columns) > 1
+    }
+    if not channels:
+        wanted = "samples in numbered columns, as FZ_0, FZ_1, ..."
+        raise DataError(f"Expected {wanted}, found {listed(names)}.")
+    for columns in channels.values():
+        steps = np.diff([number for number, _ in columns])
         odd = np.flatnonzero(steps != np.median(steps))
         if len(odd):
             i = int(odd[0])
-            after = f"after {those[i][1]} comes {those[i + 1][1]}"
-            raise DataError(f"Expected columns that are numbered one by one, {after}.")
-    chosen = _chosen(list(several), asked)
-    if len({len(several[name]) for name in chosen}) > 1:
-        counts = ", ".join(f"{name} {len(several[name])}" for name in chosen)
+            got = f"after {columns[i][1]} comes {columns[i + 1][1]}"
+            raise DataError(f"Expected columns that are numbered one by one, {got}.")
+    chosen = _choose_channels(list(channels), options)
+    if len({len(channels[name]) for name in chosen}) > 1:
+        counts = ", ".join(f"{name} {len(channels[name])}" for name in chosen)
         raise DataError(f"Expected as many samples of each channel, got {counts}.")
-    return {name: [column for _, column in several[name]] for name in chosen}
+    return {name: [column for _, column in channels[name]] for name in chosen}

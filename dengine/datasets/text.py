@@ -1,4 +1,9 @@
-"""Text files of numbers in the dialects that people's tools write: .csv, .tsv, .txt and .dat."""
+"""Text files of numbers in the dialects that people's tools write: .csv, .tsv, .txt and .dat.
+
+`read_table` reads a file as a table of texts: it finds the encoding, the delimiter, the header, the
+row of units and the number format. `read_recording` makes a trace of one file, and `rows_to_trace`
+of rows of any table.
+"""
 
 from __future__ import annotations
 
@@ -15,35 +20,65 @@ from numpy.typing import NDArray
 
 from ..errors import excerpt, listed
 from . import units
-from .clocks import NOTHING, STAMP, clock_of, evenly, floats, is_rising, rate_of, rising
-from .dataset import Asked, Fault, UnreadableError
-from .numerals import as_python, is_numeral
+from .clocks import (
+    EMPTY_CELLS,
+    TIMESTAMP,
+    clock_of,
+    floats,
+    is_rising,
+    rate_of,
+    resample_evenly,
+    rising_columns,
+)
+from .dataset import Fault, LoadOptions, UnreadableError
+from .numerals import is_numeral, write_as_python
 
 if TYPE_CHECKING:
     import pandas as pd
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 LARGEST = 128 * 2**20  # bytes of one text file
-BEGINS = re.compile(r"\s*[+-]?\d*\.?\d*(?:(?<=\d)[eE][+-]?\d+)?")  # what of a cell is a number
-DELIMITERS = ("\t", ";", "|", ",", " ", "")  # in the order in which equals are taken; " ": any blanks; "": one column
-SAMPLED = 30  # lines, from the end, that tell the delimiter, and
-CELLS = 40  # cells of each
-WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')  # between blanks; a unit goes with its name
-COMMENTS = ("comment", "comments", "kommentar", "remark")
-HINT = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
-UNIT = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")  # a cell of a row of units, beside what `units` knows
+NUMBER_PREFIX = re.compile(r"\s*[+-]?\d*\.?\d*(?:(?<=\d)[eE][+-]?\d+)?")  # of a damaged number
+# Of equally good ones the first is taken. " ": any blanks; "": one column.
+DELIMITERS = ("\t", ";", "|", ",", " ", "")
+SAMPLED_LINES = 30  # from the end, by which the delimiter is found
+SAMPLED_CELLS = 40  # of each of these lines
+# A word between blanks; a unit in brackets belongs to the name before it.
+WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')
+COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
+DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
+# A cell of a row of units, beside the units that `units.parse` knows.
+UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")
 
 
-class Timed(NamedTuple):
-    """One recording's values. trace : (C, T).  rate_hz : by its timestamps.  units : a channel each, "" where unknown."""
+class TimedTrace(NamedTuple):
+    """The samples of one recording.
+
+    trace : array of float32, shape (C, T)
+    rate_hz : float or None
+        Sampling rate by its timestamps.
+    units : tuple of str
+        Unit of each channel, "" where unknown.
+    """
 
     trace: NDArray[np.float32]
     rate_hz: float | None = None
     units: tuple[str, ...] = ()
 
 
-class Cells(NamedTuple):
-    """A text's cells. line : of the header.  units : a column each, "" where none.  rows : by the numbers of lines."""
+class TextCells(NamedTuple):
+    """The cells of a text.
+
+    header : list of str
+        Names of the columns.
+    line : int
+        Line of the header, from 1.
+    units : list of str
+        Unit of each column, "" where the row of units states none.
+    rows : dict of int to list of str
+        The data rows by their line.
+    delimiter : str
+    """
 
     header: list[str]
     line: int
@@ -52,69 +87,97 @@ class Cells(NamedTuple):
     delimiter: str
 
 
-class Sheet(NamedTuple):
-    """A table of texts, whose index are the numbers of its lines, and what was wrong with other lines."""
+class TextTable(NamedTuple):
+    """A text file as a table.
+
+    frame : DataFrame
+        Its index is the line of each row.
+    faults : list of Fault
+        What is wrong with lines that were left out.
+    line : int
+        Line of the header, from 1.
+    units : list of str
+        Unit of each column, "" where unknown.
+    decimal : str
+        The decimal mark that its cells prove, "" where they prove none.
+    """
 
     frame: pd.DataFrame
     faults: list[Fault]
     line: int
     units: list[str]
-    decimal: str  # the mark, where its cells tell it; else ""
+    decimal: str
 
 
-def cells_of(text: str, columns: Sequence[str] = ()) -> Cells:
-    """The cells of the lines that are not blank; UnreadableError for a line of megabytes, or where no header is.
+def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
+    """Split a text into cells; blank lines are left out.
 
-    columns : their names, where the file has no header, or another one.
+    columns : names of the columns, if the file has no header or another one. Raises UnreadableError
+    for a line of megabytes, and if there is no header.
     """
     lines = {i: line for i, line in enumerate(text.splitlines(), start=1) if line.strip()}
-    hint = HINT.fullmatch(next(iter(lines.values()), "").strip())
-    if hint:
+    stated = DELIMITER_LINE.fullmatch(next(iter(lines.values()), "").strip())
+    if stated:
         del lines[min(lines)]
     try:
-        delimiter = hint[1] if hint else _delimiter(list(lines.values()))
-        rows = {i: _split(line, delimiter) for i, line in lines.items()}
+        delimiter = stated[1] if stated else _find_delimiter(list(lines.values()))
+        rows = {i: _split_line(line, delimiter) for i, line in lines.items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
-    return _from_header(rows, delimiter, list(columns))
+    return _find_header(rows, delimiter, list(columns))
 
 
-def _split(line: str, delimiter: str) -> list[str]:
-    if delimiter in ("", " "):
-        words = [quoted.replace('""', '"') or plain for quoted, plain in WORD.findall(line)]
-        return words if delimiter else [line.strip().strip("\"'")]
-    return [word.strip().strip("'") for word in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
+def _split_line(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line, without quotes and blanks around them."""
+    if delimiter == "":
+        return [line.strip().strip("\"'")]
+    if delimiter == " ":
+        return [quoted.replace('""', '"') or plain for quoted, plain in WORD.findall(line)]
+    row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    return [cell.strip().strip("'") for cell in row]
 
 
-def _delimiter(lines: Sequence[str]) -> str:
-    """What parts the most cells into numbers and times, as many in each line and in the header."""
-    few = [units.LEADING.sub("", line) for line in lines[-SAMPLED:]]
-    top = [units.LEADING.sub("", line) for line in lines[:-1][:100]]
+def _find_delimiter(lines: Sequence[str]) -> str:
+    """Return the delimiter that splits lines best.
+
+    It gives the most cells that are numbers or times, the same number of cells in each line, and a
+    header with as many.
+    """
+    sample = [units.COMMENT_MARK.sub("", line) for line in lines[-SAMPLED_LINES:]]
+    top = [units.COMMENT_MARK.sub("", line) for line in lines[:-1][:100]]
 
     def score(delimiter: str) -> float:
-        rows = [_split(line, delimiter) for line in few]
-        width, times = Counter(map(len, rows)).most_common(1)[0]
+        rows = [_split_line(line, delimiter) for line in sample]
+        width, n_rows = Counter(map(len, rows)).most_common(1)[0]
         if width == 1 and delimiter:
             return 0.0
-        named = width if rows[0][-1:] != [""] else width - 1  # a delimiter at the end of the data alone
-        cells = [cell for row in rows if len(row) == width for cell in row[:CELLS]]
-        values = sum(map(_is_value, cells))
-        heads = (
-            row for row in (_without_trailing_empty(_split(line, delimiter)) for line in top) if len(row) in (named, width)
+        # The rows of data alone may end in a delimiter.
+        n_names = width if rows[0][-1:] != [""] else width - 1
+        cells = [cell for row in rows if len(row) == width for cell in row[:SAMPLED_CELLS]]
+        n_values = sum(map(_is_value, cells))
+        headers = (_without_trailing_empty(_split_line(line, delimiter)) for line in top)
+        has_header = any(
+            2 * sum(map(_is_value, row[:SAMPLED_CELLS])) <= min(len(row), SAMPLED_CELLS)
+            for row in headers
+            if len(row) in (n_names, width)
         )
-        headed = any(2 * sum(map(_is_value, row[:CELLS])) <= min(len(row), CELLS) for row in heads)
-        return values / len(cells) * times / len(rows) * (1.0 if headed else 0.5)
+        return n_values / len(cells) * n_rows / len(rows) * (1.0 if has_header else 0.5)
 
     scores = {delimiter: score(delimiter) for delimiter in DELIMITERS} if lines else {"": 0.0}
     best = max(scores.values())
     if best > 0:
         return next(delimiter for delimiter in DELIMITERS if scores[delimiter] > 0.98 * best)
-    counts = {each: Counter(len(_split(line, each)) for line in few).most_common(1) for each in "\t;|," if few}
-    return next((each for each, found in counts.items() if found[0][0] > 1), ",")
+    for delimiter in "\t;|," if sample else "":
+        widths = Counter(len(_split_line(line, delimiter)) for line in sample)
+        if widths.most_common(1)[0][0] > 1:
+            return delimiter
+    return ","
 
 
 def _is_value(cell: str) -> bool:
-    return is_numeral(cell) or STAMP.fullmatch(cell) is not None or cell.lower() in NOTHING
+    """Return whether a cell is a number, a time, or empty."""
+    is_number = is_numeral(cell)
+    return is_number or TIMESTAMP.fullmatch(cell) is not None or cell.lower() in EMPTY_CELLS
 
 
 def _without_trailing_empty(row: list[str]) -> list[str]:
@@ -126,99 +189,138 @@ def _without_trailing_empty(row: list[str]) -> list[str]:
 
 
 def _is_unit(cell: str) -> bool:
-    return UNIT.fullmatch(cell) is not None or units.parse(cell) is not None
+    """Return whether a cell may stand in a row of units; empty ones may."""
+    return UNIT_CELL.fullmatch(cell) is not None or units.parse(cell) is not None
 
 
-def _from_header(lines: dict[int, list[str]], delimiter: str, columns: list[str]) -> Cells:
-    """The cells from the header on, without what a recorder writes above it; and the row of units below it.
+def _find_header(
+    rows_by_line: dict[int, list[str]], delimiter: str, columns: list[str]
+) -> TextCells:
+    """Find the header, the row of units and the data among the rows of a text.
 
-    A row is data if it has numbers in most of the columns that are numeric in the last 20 rows. If two lines stand above
-    the data and the first can be the header, it is the header, and the second is a damaged row. UnreadableError where
-    there is no header.
+    A row is data if it has numbers in most of the columns that are numeric in the last 20 rows.
+    What stands above the header is left out. If two lines stand above the data and the first can be
+    the header, it is the header, and the second is a damaged row. Raises UnreadableError if there
+    is no header and no `columns` are given.
     """
-    places = list(lines)
-    rows = list(lines.values())
-    usual = Counter(map(_numeric_columns, (rows if columns else rows[1:])[-20:])).most_common(1)
+    lines = list(rows_by_line)
+    rows = list(rows_by_line.values())
+    last_rows = (rows if columns else rows[1:])[-20:]
+    usual = Counter(map(_numeric_columns, last_rows)).most_common(1)
     numeric = usual[0][0] if usual else frozenset()
-    data = next((k for k, row in enumerate(rows) if 2 * len(_numeric_columns(row) & numeric) > len(numeric)), 0)
-    above = [_without_mark(row, delimiter) for row in rows[: max(data, 1)]]
-    in_units = [any(row) and all(map(_is_unit, row)) for row in above]
-    header = max(data - 1 - (data > 1 and in_units[-1]), 0)
-    if header == 1 and len(rows[0]) >= len(rows[data]) and not in_units[0]:
+    is_data = (2 * len(_numeric_columns(row) & numeric) > len(numeric) for row in rows)
+    data = next((k for k, is_row_data in enumerate(is_data) if is_row_data), 0)
+    above = [_without_comment_mark(row, delimiter) for row in rows[: max(data, 1)]]
+    is_units = [any(row) and all(map(_is_unit, row)) for row in above]
+    header = max(data - 1 - (data > 1 and is_units[-1]), 0)
+    if header == 1 and len(rows[0]) >= len(rows[data]) and not is_units[0]:
         header = data = 0
     units_row = above[header + 1] if header + 1 < data else []
     if columns:
-        data_rows = dict(zip(places[data:], rows[data:], strict=True))
-        return Cells(columns, 0, _stripped(units_row, len(columns)), data_rows, delimiter)
+        data_rows = dict(zip(lines[data:], rows[data:], strict=True))
+        return TextCells(columns, 0, _pad_units(units_row, len(columns)), data_rows, delimiter)
     names = above[header] if above else []
     numbered = _numeric_columns(names)
     # Whole numbers may be names.
     if 2 * len(numbered) > len(names) and not all(names[i].isdecimal() for i in numbered):
-        advice = _columns_advice(rows)
-        raise UnreadableError(f"Expected a header, its first line is of numbers; {advice}", places[header])
+        message = f"Expected a header, its first line is of numbers; {_columns_advice(rows)}"
+        raise UnreadableError(message, lines[header])
     first = max(data, 1)
-    data_rows = dict(zip(places[first:], rows[first:], strict=True))
-    if names[-1:] and names[-1].lower() in COMMENTS and all(len(row) < len(names) for row in data_rows.values()):
-        names = names[:-1]  # LabVIEW's, of which its rows say nothing
-    return Cells(names, places[header] if places else 0, _stripped(units_row, len(names)), data_rows, delimiter)
+    data_rows = dict(zip(lines[first:], rows[first:], strict=True))
+    is_narrower = all(len(row) < len(names) for row in data_rows.values())
+    if names[-1:] and names[-1].lower() in COMMENT_COLUMNS and is_narrower:
+        names = names[:-1]  # LabVIEW's, which its rows leave out
+    line = lines[header] if lines else 0
+    return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter)
 
 
 def _numeric_columns(row: list[str]) -> frozenset[int]:
-    """Where a row has numbers, or nan."""
-    return frozenset(i for i, word in enumerate(row) if is_numeral(word) or word.lower() == "nan")
+    """Return the positions at which a row has numbers, or nan."""
+    return frozenset(i for i, cell in enumerate(row) if is_numeral(cell) or cell.lower() == "nan")
 
 
-def _without_mark(row: list[str], delimiter: str) -> list[str]:
-    """A header without the # or % by which another program takes it for a comment."""
-    first = units.LEADING.sub("", row[0])
-    return row[1:] if not first and delimiter == " " else [first, *row[1:]]  # `# time fx` has a word too many
+def _without_comment_mark(row: list[str], delimiter: str) -> list[str]:
+    """Return a header without the # or % by which another program takes it for a comment."""
+    first = units.COMMENT_MARK.sub("", row[0])
+    if not first and delimiter == " ":
+        return row[1:]  # in `# time fx` the mark is a word of its own
+    return [first, *row[1:]]
 
 
-def _stripped(units_row: list[str], n: int) -> list[str]:
-    """A row of units as n units, one for each column, without brackets."""
+def _pad_units(units_row: list[str], n: int) -> list[str]:
+    """Return a row of units without brackets, as n units, "" for each that is missing."""
     return [cell.strip("[](){} ") for cell in units_row][:n] + [""] * (n - len(units_row))
 
 
 def _columns_advice(rows: list[list[str]]) -> str:
-    """How to name the columns of a file without a header."""
-    some = [row for row in rows[:200] if len(row) == len(rows[0])]
+    """Return advice on how to name the columns of a file without a header."""
+    sample = [row for row in rows[:200] if len(row) == len(rows[0])]
     try:
-        first = [float(row[0].replace(",", ".")) for row in some]
+        first = [float(row[0].replace(",", ".")) for row in sample]
     except ValueError:
         first = []
-    names = ["time" if not i and is_rising(np.array(first)) else f"c{i}" for i in range(len(rows[0]))]
+    names = [f"c{i}" for i in range(len(rows[0]))]
+    if is_rising(np.array(first)):
+        names[0] = "time"
     return f"write one above, or name its {len(names)} columns, columns={','.join(names)[:200]!r}"
 
 
-def decoded(raw: bytes) -> tuple[str, str]:
-    """A file's text, and what it is encoded as: UTF-8, UTF-16 by its mark or its zeros, else Windows-1252 or Latin-1."""
-    begin, tries = raw[:400], ["utf-8-sig", "Windows-1252"]
-    if begin[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        tries = ["UTF-16"]
-    elif b"\0" in begin:
-        tries = ["UTF-16-LE" if begin[1::2].count(0) > begin[::2].count(0) else "UTF-16-BE"]
-    for encoding in tries:
+def decode(content: bytes) -> tuple[str, str]:
+    """Return the text of a file, and the name of its encoding.
+
+    UTF-8, UTF-16 by its mark or its zeros, else Windows-1252 or Latin-1.
+    """
+    head = content[:400]
+    encodings = ["utf-8-sig", "Windows-1252"]
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        encodings = ["UTF-16"]
+    elif b"\0" in head:
+        is_little = head[1::2].count(0) > head[::2].count(0)
+        encodings = ["UTF-16-LE" if is_little else "UTF-16-BE"]
+    for encoding in encodings:
         with suppress(UnicodeDecodeError):
-            return raw.decode(encoding), encoding
-    return raw.decode("latin-1"), "Latin-1"
+            return content.decode(encoding), encoding
+    return content.decode("latin-1"), "Latin-1"
 
 
 def read_table(
-    path: Path, asked: Asked | None = None, notes: Counter[str] | None = None, decimal: str | None = None
-) -> Sheet:
-    """A text file's cells, each row under the number of its line; rows of too few or too many cells are faults.
+    path: Path,
+    options: LoadOptions | None = None,
+    notes: Counter[str] | None = None,
+    decimal: str | None = None,
+) -> TextTable:
+    """Read a text file as a table.
 
-    asked : how its numbers and columns are written, as somebody stated it; None: numbers stay as they are written.
-    notes : counts what people should know.  decimal : the mark of the other files, where the file's own cells tell none.
-    UnreadableError for a file that is empty or too large, or whose number format is not known.
+    Parameters
+    ----------
+    path : Path
+    options : LoadOptions, optional
+        How its numbers and columns are written, where the user stated it. None: numbers stay texts
+        as they are written.
+    notes : Counter, optional
+        Counts what users should know; it is added to.
+    decimal : str, optional
+        Decimal mark of the other files of a folder, used if the cells of this one prove none.
+
+    Returns
+    -------
+    TextTable
+        Rows of too few or too many cells, and with numbers in another format, are among its faults.
+
+    Raises
+    ------
+    UnreadableError
+        If the file is empty or too large, has no header, or its number format is undecided.
     """
     import pandas as pd
 
     size = path.stat().st_size
     if size > LARGEST:
-        raise UnreadableError(f"Expected at most {LARGEST // 2**20} MB, got {size // 2**20} MB; split it, or write Parquet")
-    text, encoding = decoded(path.read_bytes())
-    cells = cells_of(text, () if asked is None else asked.columns)
+        wanted = f"at most {LARGEST // 2**20} MB"
+        do = "split it, or write Parquet"
+        raise UnreadableError(f"Expected {wanted}, got {size // 2**20} MB; {do}")
+    text, encoding = decode(path.read_bytes())
+    cells = split_cells(text, () if options is None else options.columns)
     if notes is not None and encoding != "utf-8-sig":
         notes[f"Text is read as {encoding}, not UTF-8"] += 1
     if not cells.header:
@@ -227,88 +329,136 @@ def read_table(
     if not header:
         raise UnreadableError("Expected a header, the first line names no column", cells.line)
     n = len(header)
-    whole = {i: row[:n] for i, row in cells.rows.items() if len(row) >= n and not any(row[n:])}
-    wrong = {i: f"Expected {n} columns, got {len(row)}" for i, row in cells.rows.items() if i not in whole}
-    frame = pd.DataFrame(list(whole.values()), index=list(whole), columns=header, dtype=object)
+    complete = {i: row[:n] for i, row in cells.rows.items() if len(row) >= n and not any(row[n:])}
+    wrong = {
+        i: f"Expected {n} columns, got {len(row)}"
+        for i, row in cells.rows.items()
+        if i not in complete
+    }
+    frame = pd.DataFrame(
+        list(complete.values()), index=list(complete), columns=header, dtype=object
+    )
     mark = ""
-    if asked is not None:
-        mark, odd = as_python(frame, cells.delimiter, asked.decimal or decimal, asked.thousands)
-        wrong |= odd
+    if options is not None:
+        decimal = options.decimal or decimal
+        mark, odd_cells = write_as_python(frame, cells.delimiter, decimal, options.thousands)
+        wrong |= odd_cells
     faults = [Fault(path.name, i, what) for i, what in sorted(wrong.items())]
-    return Sheet(frame.drop(index=[i for i in wrong if i in whole]), faults, cells.line, cells.units[:n], mark)
+    frame = frame.drop(index=[i for i in wrong if i in complete])
+    return TextTable(frame, faults, cells.line, cells.units[:n], mark)
 
 
-def numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
-    """(n, columns), NaN where a cell says nothing; and what is wrong with each row that holds what is no number."""
-    block, wrong = np.empty(frame.shape), dict[int, str]()
+def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
+    """Convert a table to numbers.
+
+    Returns an array of float32, shape (n, columns), in which empty cells are NaN, and a message for
+    the index of each row that has a cell that is no number.
+    """
+    values = np.empty(frame.shape)
+    wrong = dict[int, str]()
     for i, name in enumerate(frame.columns):
-        block[:, i], odd = floats(cells := frame.iloc[:, i])
+        cells = frame.iloc[:, i]
+        values[:, i], odd = floats(cells)
         for index in odd:
             cell = str(cells[index])
-            said = excerpt(cell, BEGINS.match(cell).end())  # type: ignore[union-attr]  # it matches nothing, too
-            wrong.setdefault(index, f"Expected a number in column {name}, got {said}")
-    with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which the engine finds
-        return block.astype(np.float32), wrong
+            prefix = NUMBER_PREFIX.match(cell)  # always matches: it may be empty
+            got = excerpt(cell, prefix.end() if prefix else 0)
+            wrong.setdefault(index, f"Expected a number in column {name}, got {got}")
+    with np.errstate(over="ignore"):  # what overflows becomes an infinity, which the engine finds
+        return values.astype(np.float32), wrong
 
 
 def read_recording(
-    path: Path, channels: Sequence[str], asked: Asked, notes: Counter[str], decimal: str | None = None
-) -> Timed:
-    """One file's channels (C, T), and its rate by its timestamps; UnreadableError names the line at fault.
+    path: Path,
+    channels: Sequence[str],
+    options: LoadOptions,
+    notes: Counter[str],
+    decimal: str | None = None,
+) -> TimedTrace:
+    """Read the channels of a file that holds one recording.
 
-    notes, decimal : as of `read_table`.
+    `notes` and `decimal` are as in `read_table`. Raises UnreadableError, with the line, for a cell
+    or row that cannot be read.
     """
-    frame, faults, line, units_row, _ = read_table(path, asked, notes, decimal)
-    places = [place_of(name, list(frame.columns), line) for name in channels]
-    if faults:
-        raise UnreadableError(faults[0].what, faults[0].line)
-    if frame.empty:
-        raise UnreadableError("Expected samples below the header, found none", line)
-    of_channels = tuple(units_row[i] or units.split(str(frame.columns[i]))[1] for i in places)
-    return recording_of(frame, places, asked, notes, units_row)._replace(units=of_channels)
+    table = read_table(path, options, notes, decimal)
+    header = list(table.frame.columns)
+    places = [column_place(name, header, table.line) for name in channels]
+    if table.faults:
+        raise UnreadableError(table.faults[0].what, table.faults[0].line)
+    if table.frame.empty:
+        raise UnreadableError("Expected samples below the header, found none", table.line)
+    channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
+    timed = rows_to_trace(table.frame, places, options, notes, table.units)
+    return timed._replace(units=channel_units)
 
 
-def recording_of(
-    rows: pd.DataFrame, places: Sequence[int], asked: Asked, notes: Counter[str], units_row: Sequence[str] = ()
-) -> Timed:
-    """Rows, a sample each, as (C, T), and their rate, unless it was stated. places : of the channels' columns.
+def rows_to_trace(
+    rows: pd.DataFrame,
+    places: Sequence[int],
+    options: LoadOptions,
+    notes: Counter[str],
+    units_row: Sequence[str] = (),
+) -> TimedTrace:
+    """Convert the rows of a table, one for each sample, to a trace with its rate.
 
-    An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
-    units_row : the units of all columns.  With `fit="resample"` the samples are put on even times by the clock.
+    Parameters
+    ----------
+    rows : DataFrame, T rows
+    places : sequence of int
+        Positions of the columns of the C channels.
+    options : LoadOptions
+        A stated rate is taken instead of a clock's. With `fit="resample"` the samples are
+        interpolated at even times.
+    notes : Counter
+        Counts what users should know; it is added to.
+    units_row : sequence of str
+        Unit of each column, if there is a row of units.
+
+    Returns
+    -------
+    TimedTrace
+        An empty cell is NaN, which the engine finds.
+
+    Raises
+    ------
+    UnreadableError
+        For a cell that is no number, or a clock that cannot be read.
     """
-    values, wrong = numbers(rows.iloc[:, places])
+    values, wrong = parse_numbers(rows.iloc[:, places])
     if wrong:
         raise UnreadableError(wrong[min(wrong)], min(wrong))
     trace = np.ascontiguousarray(values.T)
-    clock = None if asked.rate_hz is not None else clock_of(rows, asked.time, units_row)
+    if options.rate_hz is not None:
+        return TimedTrace(trace)
+    clock = clock_of(rows, options.time, units_row)
     if clock is None:
-        known = set(range(rows.shape[1])) if asked.rate_hz is not None else set(places)
-        offered = [str(rows.columns[i]) for i in rising(rows) if i not in known]
-        for name in offered[:1]:
-            notes[f"No clock is known; column {name} rises steadily: time={name!r} if it is one"] += 1
-        return Timed(trace)
+        for i in rising_columns(rows):
+            if i not in places:
+                name = str(rows.columns[i])
+                rises = f"column {name} rises steadily: time={name!r} if it is one"
+                notes[f"No clock is known; {rises}"] += 1
+                break
+        return TimedTrace(trace)
     rate = rate_of(clock, rows.index)
-    if clock.said:
-        notes[clock.said] += 1
-    return Timed(evenly(trace, clock) if asked.fit == "resample" else trace, rate)
+    if clock.note:
+        notes[clock.note] += 1
+    if options.fit == "resample":
+        trace = resample_evenly(trace, clock)
+    return TimedTrace(trace, rate)
 
 
-def place_of(name: str, header: Sequence[str], line: int = 1) -> int:
-    """Where a header has a name, as it is, in any case, or without its unit; UnreadableError for none, or several."""
-    bare = units.split(name)[0].lower()
-    for same in (
-        lambda word: word == name,
-        lambda word: word.lower() == name.lower(),
-        lambda word: units.split(word)[0].lower() == bare,
-    ):
-        places = [i for i, word in enumerate(header) if same(word)]
-        if places:
-            break
-    have = listed(header)
+def column_place(name: str, header: Sequence[str], line: int = 1) -> int:
+    """Return the position of a column in a header, found by `units.find_columns`.
+
+    Raises UnreadableError, with the header's line, if there is none or several.
+    """
+    places = units.find_columns(name, header)
+    columns = listed(header)
     if not places:
-        raise UnreadableError(f"Expected a column {name}, got {have}", line)
+        raise UnreadableError(f"Expected a column {name}, got {columns}", line)
     if len(places) > 1:
-        anew = ",".join(f"{word}_{i}" if word in header[:i] else word for i, word in enumerate(header))
-        do = f"name them anew, columns={anew!r}"
-        raise UnreadableError(f"Expected a column {name}, got it twice or more in {have}; {do}", line)
+        names = (f"{word}_{i}" if word in header[:i] else word for i, word in enumerate(header))
+        do = f"name them anew, columns={','.join(names)!r}"
+        message = f"Expected a column {name}, got it twice or more in {columns}; {do}"
+        raise UnreadableError(message, line)
     return places[0]

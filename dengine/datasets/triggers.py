@@ -1,7 +1,9 @@
-"""When an insertion begins, told from signals, live ones or of a file; and where each of its samples goes.
+"""When an insertion begins, told from live signals or those of a file, and where its samples go.
 
-A signal is a channel (`FZ_Base`), a field of the controller (`output_int_register_25`, `actual_TCP_speed[0]`), or a topic
-of a file. What a timestamp leaves out is a NaN at its place, so that whoever decides finds it: nothing is filled in.
+A signal is a channel (`FZ_Base`), a field of the controller (`output_int_register_25`,
+`actual_TCP_speed[0]`), or a topic of a bag. The recorder of the UR cell and the reader of bags use
+`as_trigger`, `StartFinder` and `place`. A sample that did not come is NaN at its place, which the
+engine finds: nothing is filled in.
 """
 
 import re
@@ -16,28 +18,79 @@ from ..errors import SettingError, shortened
 
 Signals = Mapping[str, NDArray[np.float64]]  # (n,) each
 Active = NDArray[np.bool_]
-NEAR = 1.5  # steps: to the next sample, when none is missing
-SIZE = r"(?=.*[1-9])\d+(\.\d+)?"  # a number above zero
-BITS, REGISTER = "actual_digital_output_bits", "output_int_register_25"
-# Pattern of the number; the number, signal and quiet_s of one that says nothing else; whether it is on, of signals (1, n).
-KINDS: dict[str, tuple[str, float | None, str, float, Callable[[Any, Any], Any]]] = {
-    "bit": (r"[012]?\d|3[01]", None, BITS, 0.0, lambda held, bit: held[0].astype(np.int64) >> int(bit) & 1 != 0),
-    "register": (r"(-?\d+)?", None, REGISTER, 0.0, lambda held, n: held[0] != 0 if n is None else held[0] == n),
-    "contact": (SIZE, None, "FZ_Base", 0.2, lambda held, newtons: np.abs(held[0]) >= newtons),
-    "motion": (f"({SIZE})?", 0.002, "actual_TCP_speed", 0.1, lambda v, speed: np.linalg.norm(v, axis=0) > speed),
+MAX_STEP = 1.5  # steps from one sample to the next if none is missing
+POSITIVE = r"(?=.*[1-9])\d+(\.\d+)?"
+BITS = "actual_digital_output_bits"
+REGISTER = "output_int_register_25"
+
+
+class TriggerKind(NamedTuple):
+    """A kind of trigger.
+
+    pattern : str
+        Regular expression of its number in a text.
+    number, signal, quiet_s
+        Those of a trigger whose text does not state them; see `Trigger`.
+    is_active : callable
+        Returns whether it is on, shape (n,), of the values of its signals (k, n), and its number.
+    """
+
+    pattern: str
+    number: float | None
+    signal: str
+    quiet_s: float
+    is_active: Callable[[Any, Any], Any]
+
+
+def _is_bit_set(values: Any, bit: float) -> Any:
+    """Return whether a bit of the first signal is set."""
+    return values[0].astype(np.int64) >> int(bit) & 1 != 0
+
+
+def _has_value(values: Any, number: float | None) -> Any:
+    """Return whether the first signal has a value, or any but zero for None."""
+    return values[0] != 0 if number is None else values[0] == number
+
+
+def _has_contact(values: Any, newtons: float) -> Any:
+    """Return whether the force of the first signal is large enough, in either direction."""
+    return np.abs(values[0]) >= newtons
+
+
+def _is_moving(values: Any, speed: float) -> Any:
+    """Return whether the vector of all signals is longer than a speed."""
+    return np.linalg.norm(values, axis=0) > speed
+
+
+KINDS = {
+    "bit": TriggerKind(r"[012]?\d|3[01]", None, BITS, 0.0, _is_bit_set),
+    "register": TriggerKind(r"(-?\d+)?", None, REGISTER, 0.0, _has_value),
+    "contact": TriggerKind(POSITIVE, None, "FZ_Base", 0.2, _has_contact),
+    "motion": TriggerKind(f"({POSITIVE})?", 0.002, "actual_TCP_speed", 0.1, _is_moving),
 }
-EXAMPLES = "bit=0, register@output_int_register_25, register=1@/phase, contact=5, contact=5@FZ_Base, motion=0.002"
+EXAMPLES = (
+    "bit=0, register@output_int_register_25, register=1@/phase, contact=5, contact=5@FZ_Base,"
+    " motion=0.002"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Trigger:
-    """When an insertion begins: where what it looks at goes on. `as_trigger` makes one.
+    """When an insertion begins: as soon as a condition on a signal is met. Made by `as_trigger`.
 
-    kind, number : bit: of a word of bits, this one is set, counted from 0.  register: the signal holds this value; None:
-        any but zero.  contact: the force is this many newtons or more above what the sensor shows in free motion.
-        motion: the tool moves faster than this, in metres a second; the signal is a vector.
-    quiet_s : seconds that it must have been off before it counts as going on: a force that plays around the threshold is
-        one contact.
+    Parameters
+    ----------
+    kind : {"bit", "register", "contact", "motion"}
+        bit: bit `number` of a word is set, counted from 0. register: the signal has the value
+        `number`, or any but zero if that is None. contact: the force is at least `number` newtons
+        above what the sensor shows in free motion. motion: the tool moves faster than `number`
+        metres a second; the signal is a vector.
+    number : float or None
+    signal : str
+        Name of the signal.
+    quiet_s : float
+        Seconds that the condition must not have been met before: a force that varies around the
+        threshold is one contact.
     """
 
     kind: str
@@ -47,34 +100,47 @@ class Trigger:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The names of the signals that it looks at."""
-        return tuple(f"{self.signal}[{i}]" for i in range(3)) if self.kind == "motion" else (self.signal,)
+        """Names of the signals that are read: three for a vector, else one."""
+        if self.kind == "motion":
+            return tuple(f"{self.signal}[{i}]" for i in range(3))
+        return (self.signal,)
 
     def active(self, signals: Signals) -> Active:
-        """(n,) whether it is on; a NaN in a signal is off."""
-        held = np.stack([np.nan_to_num(signals[name]) for name in self.signals])
-        return np.asarray(KINDS[self.kind][-1](held, self.number))
+        """Return whether the condition is met at each of n samples; not where a signal is NaN.
+
+        signals : arrays of shape (n,) by the names of the signals.
+        """
+        values = np.stack([np.nan_to_num(signals[name]) for name in self.signals])
+        return np.asarray(KINDS[self.kind].is_active(values, self.number))
 
 
-def as_trigger(asked: Any) -> Trigger:
-    """A trigger as it is, or from text: KIND, =NUMBER, @SIGNAL, the last two where they are not left to it.
+def as_trigger(value: Any) -> Trigger:
+    """Return a trigger as it is, or parse its text: KIND, then =NUMBER and @SIGNAL if need be.
 
-    bit=0 is digital output 0; register@NAME any value but zero; contact=5 is 5 N of FZ_Base; motion=0.002 is 2 mm a second.
+    bit=0 is digital output 0, register@NAME any value but zero, contact=5 is 5 N of FZ_Base,
+    motion=0.002 is 2 mm a second. Raises SettingError for any other value.
     """
-    if isinstance(asked, Trigger):
-        return asked
-    found = re.fullmatch(r"(\w+)(?:=([^@]*))?(?:@(.+))?", asked.strip()) if isinstance(asked, str) else None
-    kind, number, signal = found.groups(default="") if found else ("", "", "")
-    if kind not in KINDS or not re.fullmatch(KINDS[kind][0], number):
-        raise SettingError(f"Expected a trigger, as {EXAMPLES}; got {shortened(asked)}.")
-    _, usual, usually, quiet_s, _ = KINDS[kind]
-    return Trigger(kind, float(number) if number else usual, signal or usually, quiet_s)
+    if isinstance(value, Trigger):
+        return value
+    form = r"(\w+)(?:=([^@]*))?(?:@(.+))?"
+    match = re.fullmatch(form, value.strip()) if isinstance(value, str) else None
+    kind, number, signal = match.groups(default="") if match else ("", "", "")
+    if kind not in KINDS or not re.fullmatch(KINDS[kind].pattern, number):
+        raise SettingError(f"Expected a trigger, as {EXAMPLES}; got {shortened(value)}.")
+    default = KINDS[kind]
+    stated = float(number) if number else default.number
+    return Trigger(kind, stated, signal or default.signal, default.quiet_s)
 
 
 class Placed(NamedTuple):
-    """A window of a stream.
+    """A stretch of a stream as a trace.
 
-    trace : (C, T) float32, NaN where no sample came.  missing : (m,) the places of these.  repeated : samples.
+    trace : array of float32, shape (C, T)
+        NaN where no sample came.
+    missing : array of int64, shape (m,)
+        The places of these.
+    repeated : int
+        Samples whose place was taken, which were left out.
     """
 
     trace: NDArray[np.float32]
@@ -83,47 +149,79 @@ class Placed(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where an insertion begins. time : seconds.  seen : its first sample came; False: at `time`, or later in a gap."""
+    """Where an insertion begins.
+
+    time : float
+        In seconds.
+    seen : bool
+        Whether its first sample came. False: it began at `time`, or later in a gap.
+    """
 
     time: float
     seen: bool = True
 
 
 class StartFinder:
-    """Finds where a trigger goes on, sample by sample. step : seconds from one to the next.  quiet_s : off before that."""
+    """Finds where a trigger starts, sample by sample.
+
+    Parameters
+    ----------
+    step : float
+        Seconds from one sample to the next.
+    quiet_s : float
+        Seconds that the trigger must have been off before a start.
+    """
 
     def __init__(self, step: float, quiet_s: float = 0.0) -> None:
-        self.step, self.quiet_s = step, quiet_s
+        self.step = step
+        self.quiet_s = quiet_s
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: what is on at the first sample began before it, and is no start."""
+        """Forget all samples. A trigger that is on at the next one is no start."""
         self._off_since: float | None = None
         self._last_off = 0.0
 
     def feed(self, time: float, active: bool) -> Start | None:
-        """Where an insertion begins, if this sample shows it.
+        """Take the next sample, and return the start of an insertion if this sample shows one.
 
-        Where samples are missing just before this one, it may have begun in any of them: then no sample's place in its
-        trace is known.
+        If samples are missing just before it, the insertion may have begun in any of them, so the
+        place of no sample in its trace is known: `Start.seen` is False.
         """
         if not active:
             self._off_since = time if self._off_since is None else self._off_since
             self._last_off = time
             return None
-        began, self._off_since = self._off_since, None
-        if began is None or time - began < self.quiet_s - self.step / 2:
+        off_since = self._off_since
+        self._off_since = None
+        if off_since is None or time - off_since < self.quiet_s - self.step / 2:
             return None
-        seen = time - self._last_off < NEAR * self.step
+        seen = time - self._last_off < MAX_STEP * self.step
         return Start(time) if seen else Start(self._last_off + self.step, seen=False)
 
 
-def place(times: Sequence[float], values: NDArray[np.float64], start: float, samples: int, step: float) -> Placed:
-    """The samples from `start` on, each where its time puts it. times : (n,) seconds, increasing.  values : (n, C)."""
+def place(
+    times: Sequence[float], values: NDArray[np.float64], start: float, samples: int, step: float
+) -> Placed:
+    """Put samples into a trace, each at the place that its time gives.
+
+    Parameters
+    ----------
+    times : sequence of n floats
+        Seconds, increasing.
+    values : array of float64, shape (n, C)
+    start : float
+        Time of the first place.
+    samples : int
+        Places in the trace.
+    step : float
+        Seconds from one place to the next.
+    """
     trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
     at = np.rint((np.asarray(times, dtype=np.float64) - start) / step).astype(np.int64)
     inside = (at >= 0) & (at < samples)
     places, first = np.unique(at[inside], return_index=True)
-    with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which is found and reported as one
+    with np.errstate(over="ignore"):  # what overflows becomes an infinity, which the engine finds
         trace[:, places] = values[inside][first].T
-    return Placed(trace, np.setdiff1d(np.arange(samples), places), int(inside.sum()) - len(places))
+    missing = np.setdiff1d(np.arange(samples), places)
+    return Placed(trace, missing, int(inside.sum()) - len(places))

@@ -1,8 +1,13 @@
-"""Units as headers write them, `FZ [kN]`, `F/kN` or `FZ_kN`, and the factor between two of them."""
+"""Units as headers of recordings write them, and columns by their names without unit.
+
+`split` takes the unit off a name, `FZ [kN]`, `F/kN` or `FZ_kN`; `factor` converts between two
+units; `seconds_in` reads the units of clocks; `find_columns` finds a column as a user writes it.
+"""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 PREFIXES = {
     "G": 1e9,
@@ -18,7 +23,7 @@ PREFIXES = {
     "n": 1e-9,
     "": 1.0,
 }
-# What a prefix may stand before, with the dimension and the factor; and what stands alone.
+# Units that may have a prefix, with their dimension and factor.
 BASES = {
     **dict.fromkeys(("N", "Newton", "newton", "Newtons"), ("N", 1.0)),
     **dict.fromkeys(("Nm", "N·m", "N*m", "N.m", "N m"), ("Nm", 1.0)),
@@ -38,6 +43,26 @@ BASES = {
     "W": ("W", 1.0),
     "K": ("K", 1.0),
 }
+# Seconds in one unit of a clock, by its name in lower case. "min", "h" and "d" are units of a clock
+# alone: `F_min` is a minimum.
+SECONDS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), 1.0),
+    **{
+        f"{p}{base}": PREFIXES[p]
+        for p in ("m", "u", "µ", "μ", "n")
+        for base in ("s", "sec", "secs")
+    },
+    **{
+        f"{name}{base}": PREFIXES[prefix]
+        for name, prefix in (("milli", "m"), ("micro", "u"), ("nano", "n"))
+        for base in ("s", "sec", "seconds")
+    },
+    "min": 60.0,
+    "h": 3600.0,
+    "d": 86400.0,
+    "days": 86400.0,
+}
+# Units that have no prefix, and that nothing is converted to.
 ALONE = (
     "°",
     "deg",
@@ -57,44 +82,75 @@ ALONE = (
     "mV/V",
     "V/V",
 )
-CLOSED = re.compile(r"(?P<name>.*?)\s*[\[({<]\s*(?P<unit>[^\[\](){}<>]*?)\s*[\])}>]\s*")  # FZ [kN]
-SLASHED = re.compile(r"(?P<name>.*\S)\s*/\s*(?P<unit>\S+)|(?P<other>.*\S) in (?P<such>\S+)")  # F/kN, F in kN
+BRACKETED = re.compile(
+    r"(?P<name>.*?)\s*[\[({<]\s*(?P<unit>[^\[\](){}<>]*?)\s*[\])}>]\s*"
+)  # FZ [kN]
+SLASHED = re.compile(
+    r"(?P<name>.*\S)\s*/\s*(?P<unit>\S+)|(?P<other>.*\S) in (?P<such>\S+)"
+)  # F/kN, F in kN
 ENDING = re.compile(r"(?P<name>.*[^_. -])[_. -]+(?P<unit>[A-Za-zµμ·]+)")  # FZ_kN
-LEADING = re.compile(r"^\s*[#%]+\s*")  # of a line that another program takes for a comment
+COMMENT_MARK = re.compile(r"^\s*[#%]+\s*")  # by which other programs know a comment
 
 
 def parse(unit: str) -> tuple[str, float] | None:
-    """A unit's dimension and its factor, ("N", 1000.0) of kN; None for what is no unit."""
+    """Return the dimension of a unit and its factor, ("N", 1000.0) for kN; None if it is none."""
     if unit in ALONE:
         return unit, 1.0
     for base in sorted(BASES, key=len, reverse=True):
         prefix = unit.removesuffix(base)
         if unit.endswith(base) and prefix in PREFIXES:
-            dimension, factor = BASES[base]
-            return dimension, PREFIXES[prefix] * factor
+            dimension, base_factor = BASES[base]
+            return dimension, PREFIXES[prefix] * base_factor
     return None
 
 
 def factor(unit: str, other: str) -> float | None:
-    """What turns numbers in one unit into those in another; None where nothing does."""
+    """Return the factor that converts numbers in one unit to another; None if there is none."""
     if unit == other:
         return 1.0
-    one = parse(unit)
-    two = parse(other)
-    return None if one is None or two is None or one[0] != two[0] else float(f"{one[1] / two[1]:.12g}")
+    source = parse(unit)
+    target = parse(other)
+    if source is None or target is None or source[0] != target[0]:
+        return None
+    return float(f"{source[1] / target[1]:.12g}")
+
+
+def seconds_in(unit: str) -> float | None:
+    """Return the seconds in one unit of a clock, in any case; None for what is no unit of time."""
+    return SECONDS.get(unit.lower())
 
 
 def split(name: str) -> tuple[str, str]:
-    """A column's name without its unit, and the unit; "" where it says none."""
-    plain = LEADING.sub("", name.strip())
-    if match := CLOSED.fullmatch(plain):
+    """Return the name of a column without its unit, and the unit; "" if it states none."""
+    plain = COMMENT_MARK.sub("", name.strip())
+    if match := BRACKETED.fullmatch(plain):
         return (match["name"], match["unit"]) if parse(match["unit"]) else (plain, "")
     if match := SLASHED.fullmatch(plain):
         before = match["name"] or match["other"]
         unit = match["unit"] or match["such"]
         return (before, unit) if parse(unit) else (plain, "")
     match = ENDING.fullmatch(plain)
-    unit = match["unit"] if match else ""
-    # One letter is more often an axis or an index, as in v_s, than a unit; N is one. `pos_in` is no inch.
+    if match is None:
+        return plain, ""
+    unit = match["unit"]
+    # One letter is more often an axis or an index, as in v_s, than a unit, except N. The `in` of
+    # `pos_in` is no inch.
     is_unit = (len(unit) > 1 or unit == "N") and unit not in ALONE and parse(unit)
-    return (match["name"], unit) if match and is_unit else (plain, "")
+    return (match["name"], unit) if is_unit else (plain, "")
+
+
+def find_columns(name: str, columns: Sequence[str]) -> list[int]:
+    """Return where columns have a name: as it is written, else in any case, else without unit.
+
+    The list is empty if no column has it, and longer than one if several have.
+    """
+    bare = split(name)[0].lower()
+    for is_same in (
+        lambda column: column == name,
+        lambda column: column.lower() == name.lower(),
+        lambda column: split(column)[0].lower() == bare,
+    ):
+        places = [i for i, column in enumerate(columns) if is_same(column)]
+        if places:
+            return places
+    return []

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.dataset import must
+from ..datasets.dataset import expect_data
 from ..datasets.importing import ImportReport, import_parts
 from ..errors import DataError, StoreError, instead
 from ..recipe import Recipe
@@ -98,7 +98,7 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
         if kind == "part":
             line = _part(words, spec, where)
             again = line.decision.id in parts
-            must(not again, f"one line of each part, in {where}", line.decision.id, "the journal was pasted together")
+            expect_data(not again, f"one line of each part, in {where}", line.decision.id, "the journal was pasted together")
             lines += last  # the next part comes: no sooner is an accepted one counted of which nothing was heard
             last = [line] if line.label is None else []
         else:
@@ -130,16 +130,16 @@ def _missing_at_end(path: str | os.PathLike[str], crcs: list[int]) -> str:
 def _words(said: bytes, where: str) -> list[str]:
     with instead(DataError, f"Expected UTF-8 in {where}, it is damaged, or no journal", UnicodeDecodeError):
         words = said.decode("utf-8").split(",")
-    must(words[0] in ("part", "label"), f"a line that begins with part or label in {where}", words[0])
+    expect_data(words[0] in ("part", "label"), f"a line that begins with part or label in {where}", words[0])
     return words
 
 
 def _labelled(words: list[str], parts: Mapping[str, JournalLine], where: str) -> JournalLine:
     held = len(words) == 2 and words[0] in parts and words[1] in LABELS
-    must(held, f"an earlier part's id and a label of 1 or 0 in {where}", ",".join(words))
+    expect_data(held, f"an earlier part's id and a label of 1 or 0 in {where}", ",".join(words))
     known = parts[words[0]]
     held = known.decision.action is not Action.REJECT and known.label is None
-    must(held, f"one label of a part that was not rejected in {where}", words[0])
+    expect_data(held, f"one label of a part that was not rejected in {where}", words[0])
     return replace(known, label=LABELS[words[1]])
 
 
@@ -149,10 +149,10 @@ def _part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
         action, predicted, reason = Action(decided[0]), Action(decided[1]), Reason(decided[2])
         bound = float(decided[3]), float(decided[4]), int(decided[5]), int(decided[6])
     held = 0.0 <= bound[0] <= bound[1] <= 1.0 and 0 <= min(bound[2:]) <= max(bound[2:]) < LARGEST_COUNT
-    must(held, f"bounds between 0 and 1 and counts in {where}", ",".join(decided[3:7]))
+    expect_data(held, f"bounds between 0 and 1 and counts in {where}", ",".join(decided[3:7]))
     rejected = action is Action.REJECT
     held = id_ != "" and (label == "" or (label in LABELS and not rejected))
-    must(held, f"an id, and a label of 1, 0 or nothing in {where}", (id_, label))
+    expect_data(held, f"an id, and a label of 1, 0 or nothing in {where}", (id_, label))
     trace = np.zeros((1, 0), dtype=np.float32) if rejected else _trace(words[10:], spec, where)
     known = (*bound, None, 0, reason, reason is Reason.AUDIT, 1.0, part or None)
     return JournalLine(Decision(id_, action, predicted, *known), trace, LABELS.get(label))
@@ -161,7 +161,7 @@ def _part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
 def _trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
     expected = spec.channels * spec.samples
     held = len(words) == expected or (spec.fit != "strict" and len(words) > 0 and len(words) % spec.channels == 0)
-    must(held, f"{expected} samples in {where}", len(words), "it is damaged, or of another cell")
+    expect_data(held, f"{expected} samples in {where}", len(words), "it is damaged, or of another cell")
     with instead(DataError, f"The samples in {where} are no row of numbers", ValueError), np.errstate(over="ignore"):
         values = np.array([float(word) for word in words]).astype(np.float32)
     return as_trace(values.reshape(spec.channels, -1), spec)

@@ -11,7 +11,7 @@ import pytest
 
 from dengine import DataEngine, Dataset, TraceSpec, load_dataset
 from dengine.datasets.importing import import_labelled
-from dengine.datasets.labels import named
+from dengine.datasets.labels import labels_in_names
 from dengine.errors import DataError, TraceError
 from tests.support.recording_forms import LABEL_FORMS
 
@@ -156,24 +156,24 @@ CONTRADICTIONS = (
 @pytest.mark.parametrize("form", LABEL_FORMS)
 def test_a_label_is_read_from_a_name_or_its_folder_as_people_write_them(form: str) -> None:
     good, bad = LABEL_FORMS[form]
-    assert [name for name in good if named().find(name) != (1, None)] == []
-    assert [name for name in bad if named().find(name) != (0, None)] == []
+    assert [name for name in good if labels_in_names().find(name) != (1, None)] == []
+    assert [name for name in bad if labels_in_names().find(name) != (0, None)] == []
 
 
 @pytest.mark.parametrize("name", NO_LABELS.split(", "))
 def test_a_number_or_a_part_of_another_word_is_no_label(name: str) -> None:
     with pytest.raises(DataError, match="Expected a label at the end of the name"):
-        named().find(name)
+        labels_in_names().find(name)
 
 
 @pytest.mark.parametrize("name", CONTRADICTIONS.split(", "))
 def test_two_labels_in_a_name_that_contradict_each_other_are_an_error(name: str) -> None:
     with pytest.raises(DataError, match=r"Expected one label.*contradict each other.*\(label\)"):
-        named().find(name)
+        labels_in_names().find(name)
 
 
 def test_a_number_is_a_label_of_a_name_where_somebody_says_so_and_never_against_a_word() -> None:
-    told = named(None, {"1": True, "0": False})
+    told = labels_in_names(None, {"1": True, "0": False})
     assert [told.find(name)[0] for name in ("run_1.csv", "part_003/run_0.csv", "1/7.csv", "0/a.csv", "x-1.csv")] == [
         1,
         0,
