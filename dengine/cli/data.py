@@ -103,12 +103,12 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     trained on. A store that has been used keeps its own recipe and seed. Ctrl-C keeps what was imported; the same
     command goes on from there.
     """
-    from ..datasets.importing import form_in, import_labelled
+    from ..datasets.importing import stored_form, import_labelled
     from ..engine.engine import DataEngine, core_of
     from ..experiments.tables import retrain_line
     from ..store.opening import UNHURRIED
 
-    before = form_in(store, source.data)  # of what the store has, where no other form was asked for
+    before = stored_form(store, source.data)  # of what the store has, where no other form was asked for
     data = replace(source, how={**before, **source.how}).load()
     try:
         with steps(f"importing {data.name}", len(data)) as count:

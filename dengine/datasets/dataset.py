@@ -729,8 +729,8 @@ def _convert_unit(data: Dataset, unit: str) -> Dataset:
         do = "leave unit out, or convert the samples first"
         raise DataError(f"Expected {data.name} in {unit}, its unit is {data.unit}; {do}.")
     if set(known) != {1.0}:
-        scale = np.array(known).reshape(-1, 1) if data.X.ndim == 3 else known[0]
-        data = replace(data, X=(data.X * scale).astype(np.float32))
+        X = data.X * np.array(known).reshape(-1, 1)  # in float64
+        data = replace(data, X=X.astype(np.float32))
     return replace(data, unit=unit)
 
 

@@ -1,9 +1,10 @@
-"""Labelled recordings, put into a store as if an engine had verified each of them.
+"""Importing labelled recordings into a store, as if an engine had verified each of them.
 
     report = import_labelled("engine.db", "recorded.npz", recipe="conv")
     DataEngine.open("engine.db").retrain()
 
-A trace is imported once: its id comes from its content. Traces that a cell recorded itself have other ids.
+A trace is imported once: its id comes from its content. Traces that a cell recorded itself have
+other ids. `export.cell_journal` imports the journals of exported cells by `import_parts`.
 """
 
 import math
@@ -45,68 +46,84 @@ if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
 CHUNK = 500  # traces committed together
-RATE = 0.02  # as near as rates that are measured from timestamps come to each other
+RATE_TOLERANCE = 0.02  # relative error of rates that are measured from timestamps
 
 
-def form_in(store: "StoreLike", source: Any) -> dict[str, Any]:
-    """The `samples` and `fit` that give recordings the form of those in a store; empty for a new store, or other sources.
+def stored_form(store: "StoreLike", source: Any) -> dict[str, Any]:
+    """Return the `samples` and `fit` by which recordings get the form of those in a store.
 
-    Files that are added change the median that lengths are padded to: all others would come out changed, and count again.
+    Without them files that are added would change the median length to which all are padded: all
+    would come out changed, and count again. Empty for a new store, and for other sources than
+    folders and tables.
     """
-    if not isinstance(source, str | os.PathLike) or not (
-        Path(source).is_dir() or Path(source).suffix.lower() in TABLES
-    ):
+    if not isinstance(source, str | os.PathLike):
+        return {}
+    path = Path(source)
+    if not (path.is_dir() or path.suffix.lower() in TABLES):
         return {}
     try:
         with opening(store, must_exist=True) as opened:
-            agreed = stored_trace_spec(opened.settings())
+            spec = stored_trace_spec(opened.settings())
             if opened is not store:
                 opened.close()
     except StoreError:
-        return {}  # a new one; what else is wrong is found when it is opened to write
-    return (
-        {}
-        if agreed is None
-        else {"samples": agreed.samples, "fit": None if agreed.fit == "strict" else agreed.fit}
-    )
+        return {}  # a new store; any other error comes again when it is opened to be written
+    if spec is None:
+        return {}
+    return {"samples": spec.samples, "fit": None if spec.fit == "strict" else spec.fit}
 
 
-def must_agree(data: Dataset, agreed: TraceSpec) -> None:
-    """TraceError where a data set has another rate or other channels, or was brought to its length in another way."""
-    spec = data.spec
-    stretched = spec.fit != agreed.fit and "resample" in (spec.fit, agreed.fit)
-    if data.lengths is not None and (stretched or spec.samples != agreed.samples):
-        do = f"load it with samples={agreed.samples}, fit={agreed.fit!r}, or what is known would count again"
-        wanted = f"recordings brought to {agreed.samples} samples by {agreed.fit}"
-        raise TraceError(
-            f"Expected {wanted}, {data.name} was to {spec.samples} by {spec.fit}; {do}."
-        )
-    if data.rate_hz is not None and not math.isclose(agreed.rate_hz, spec.rate_hz, rel_tol=RATE):
-        raise TraceError(
-            f"Expected traces at {agreed.rate_hz:g} Hz, {data.name} has {spec.rate_hz:g} Hz; resample it."
-        )
-    if data.channels and agreed.columns and data.channels != agreed.columns:
-        raise TraceError(
-            f"Expected the channels {', '.join(agreed.columns)}, got {', '.join(data.channels)}."
-        )
+def check_agreement(data: Dataset, spec: TraceSpec) -> None:
+    """Raise TraceError if a data set does not agree with the `TraceSpec` of a store.
+
+    It must have its rate and channels, and its recordings must have been brought to one length in
+    the same way.
+    """
+    data_spec = data.spec
+    is_other_fit = data_spec.fit != spec.fit and "resample" in (data_spec.fit, spec.fit)
+    if data.lengths is not None and (is_other_fit or data_spec.samples != spec.samples):
+        wanted = f"recordings brought to {spec.samples} samples by {spec.fit}"
+        got = f"{data.name} was to {data_spec.samples} by {data_spec.fit}"
+        do = f"load it with samples={spec.samples}, fit={spec.fit!r}"
+        raise TraceError(f"Expected {wanted}, {got}; {do}, or what is known would count again.")
+    is_other_rate = not math.isclose(spec.rate_hz, data_spec.rate_hz, rel_tol=RATE_TOLERANCE)
+    if data.rate_hz is not None and is_other_rate:
+        got = f"{data.name} has {data_spec.rate_hz:g} Hz"
+        raise TraceError(f"Expected traces at {spec.rate_hz:g} Hz, {got}; resample it.")
+    if data.channels and spec.columns and data.channels != spec.columns:
+        wanted = ", ".join(spec.columns)
+        raise TraceError(f"Expected the channels {wanted}, got {', '.join(data.channels)}.")
 
 
 @dataclass(frozen=True, slots=True)
 class ImportReport:
-    """What became of a data set's traces: taken in, taken in but kept from training, or known from an earlier import.
+    """How many labels of a data set, or of a cell's journal, an import took.
 
-    cut : bytes of a journal's last line that was not finished, and was left out.
-    contradicted : labels that say the opposite of what an earlier import took in, and were left out.
-    aside : what of a journal was set aside, in a sentence; "" where nothing was.
+    Parameters
+    ----------
+    imported : int
+        Labels that train.
+    quarantined : int
+        Labels of traces with a fault, which are stored but never train.
+    repeated : int
+        Labels that an earlier import took.
+    resumed : bool
+        Whether the store existed before.
+    cut : int
+        Bytes of a journal's last line that was not finished, and was left out.
+    contradicted : int
+        Labels that contradict those of an earlier import, and were left out.
+    set_aside : str
+        What of a journal was set aside, in a sentence; "" if nothing was.
     """
 
     imported: int
     quarantined: int
-    known: int
+    repeated: int
     resumed: bool
     cut: int = 0
     contradicted: int = 0
-    aside: str = ""
+    set_aside: str = ""
 
 
 def import_labelled(
@@ -117,25 +134,45 @@ def import_labelled(
     on_traces: Callable[[int], None] | None = None,
     allow_import: bool = False,
 ) -> ImportReport:
-    """Put every labelled trace of a data set into a new or a used store, in order, in chunks that are all or none.
+    """Put every labelled trace of a data set into a store, in order.
 
-    An import that was interrupted goes on where it stopped, and the same file twice counts no label twice.
+    Chunks of them are stored all or none: an import that was interrupted continues where it
+    stopped. The same file twice counts no label twice.
 
-    dataset : anything `load_dataset` takes.
-    recipe, seed : of a new store's engine, conv and 0 by default; a used store has its own, and others are a SettingError.
-    on_traces : called with the number of traces that were just dealt with.  allow_import : as for `DataEngine.open`.
-    Raises TraceError where the traces break the contract that the store's engine agreed on.
+    Parameters
+    ----------
+    store : path, URL or store
+        A new store or a used one.
+    dataset : object
+        Anything `load_dataset` takes.
+    recipe, seed : optional
+        Of a new store's engine, by default conv and 0. A used store has its own; others are a
+        SettingError.
+    on_traces : callable, optional
+        Called with the number of traces that were just imported.
+    allow_import : bool
+        As for `DataEngine.open`.
+
+    Returns
+    -------
+    ImportReport
+
+    Raises
+    ------
+    TraceError
+        If the traces do not agree with those of the store.
     """
-    data = load_dataset(dataset, **form_in(store, dataset))
+    data = load_dataset(dataset, **stored_form(store, dataset))
     engine = DataEngine.open_or_create(
         store, seed, wait=UNHURRIED, recipe=recipe, allow_import=allow_import
     )
     try:
-        agreed = core_of(engine).set_trace_spec(data.spec)
-        must_agree(data, agreed)
-        traces = as_traces(data.X, agreed)
-        parts = list(zip(_verified(traces, data), traces, map(as_success, data.y), strict=True))
-        report = import_parts(engine.store, parts, agreed, engine.policy, on_traces)
+        spec = core_of(engine).set_trace_spec(data.spec)
+        check_agreement(data, spec)
+        traces = as_traces(data.X, spec)
+        decisions = _verifying_decisions(traces, data)
+        parts = list(zip(decisions, traces, map(as_success, data.y), strict=True))
+        report = import_parts(engine.store, parts, spec, engine.policy, on_traces)
     finally:
         if isinstance(store, str | os.PathLike):
             engine.close()
@@ -149,59 +186,112 @@ def import_parts(
     policy: Policy,
     on_traces: Callable[[int], None] | None = None,
 ) -> ImportReport:
-    """Put parts, each with its decision, its trace (C, T) and its label, None where nothing was heard of it, into a store.
+    """Put parts with their decisions into a store, in chunks that are stored all or none.
 
-    A part has a second row where its label came later. The report counts labels.
+    Parameters
+    ----------
+    store : SqlStore
+    parts : sequence of (Decision, array of float32 of shape (C, T), bool or None)
+        The decision, the trace and the label of each; None if nothing was heard of the part. A part
+        whose label came later has a second row.
+    spec : TraceSpec
+        Of the traces.
+    policy : Policy
+        Under which the decisions were made.
+    on_traces : callable, optional
+        Called with the number of parts of each chunk.
+
+    Returns
+    -------
+    ImportReport
+        It counts labels.
     """
-    gate, counts, silent = TraceGate(spec), Counter[str](), 0
-    if counts_silence := policy.stops == "some":
+    gate = TraceGate(spec)
+    counts = Counter[str]()
+    n_silent = 0  # accepted parts since the last label of which nothing was heard
+    counts_silence = policy.stops == "some"
+    if counts_silence:
         since = int(store.settings().get("policy_since", 0))
-        silent = len(store.unreported_accepts(since)) - store.silent_total(since)
+        n_silent = len(store.unreported_accepts(since)) - store.silent_total(since)
     for start in range(0, len(parts), CHUNK):
-        made: dict[str, StoredDecision] = {}
+        new: dict[str, StoredDecision] = {}
         labels: list[NewLabel] = []
         for decision, trace, label in parts[start : start + CHUNK]:
-            fault, hash_ = gate(torch.from_numpy(trace))
-            held = made.get(decision.id) or store.get_decision(decision.id)
-            if held is not None and held.source is not None:  # a forgotten one has a label too
+            fault, hash_of_content = gate(torch.from_numpy(trace))
+            earlier = new.get(decision.id) or store.get_decision(decision.id)
+            if earlier is not None and earlier.source is not None:  # a forgotten one has a label
                 if label is not None:
-                    counts["known" if label == held.success else "contradicted"] += 1
+                    counts["repeated" if label == earlier.success else "contradicted"] += 1
                 continue
-            if (known := held) is None:
-                propensity = 1.0 if decision.predicted is Action.VERIFY else policy.audited_share
-                reason = (
-                    REASONS[fault] if fault else decision.reason
-                )  # a bad one is kept, but never given to training
-                new = replace(decision, reason=reason, propensity=propensity)
-                known = StoredDecision(new, trace.copy(), trace_hash(hash_, decision.part), bool(fault), store.clock())
-                made[decision.id] = known
-            if (
-                counts_silence and decision.action is Action.ACCEPT
-            ):  # one held without a label was counted as silent
-                silent += (label is None) - (held is not None)
-            if label is not None:
-                source = source_of(decision.action, decision.audit, label)
-                of = decision.id, label, source, 0, None, 0 if fault else silent
-                labels.append(NewLabel(*of, store.clock(), known.content_hash, known.time))
-                silent = silent if fault else 0
-                counts["quarantined" if fault else "imported"] += 1
-        store.apply_records([*made.values(), *labels])
+            stored = earlier
+            if stored is None:
+                is_certain = decision.predicted is not Action.VERIFY
+                propensity = policy.audited_share if is_certain else 1.0
+                # A trace with a fault is stored, but never used for training.
+                reason = REASONS[fault] if fault else decision.reason
+                stored = StoredDecision(
+                    replace(decision, reason=reason, propensity=propensity),
+                    trace.copy(),
+                    trace_hash(hash_of_content, decision.part),
+                    bool(fault),
+                    store.clock(),
+                )
+                new[decision.id] = stored
+            if counts_silence and decision.action is Action.ACCEPT:
+                # A decision that was stored without a label was counted as silent.
+                n_silent += (label is None) - (earlier is not None)
+            if label is None:
+                continue
+            labels.append(
+                NewLabel(
+                    decision.id,
+                    label,
+                    source_of(decision.action, decision.audit, label),
+                    model_version=0,
+                    point=None,
+                    silent=0 if fault else n_silent,
+                    time=store.clock(),
+                    content_hash=stored.content_hash,
+                    decided=stored.time,
+                )
+            )
+            n_silent = n_silent if fault else 0
+            counts["quarantined" if fault else "imported"] += 1
+        store.apply_records([*new.values(), *labels])
         if on_traces is not None:
             on_traces(min(CHUNK, len(parts) - start))
-    taken = counts["imported"], counts["quarantined"], counts["known"]
-    return ImportReport(*taken, resumed=True, contradicted=counts["contradicted"])
-
-
-def _verified(traces: NDArray[np.float32], data: Dataset) -> Iterator[Decision]:
-    """For each of the traces (n, C, T) the decision that verified it."""
-    times = Counter[int]()
-    parts = (
-        [None] * len(data) if data.part is None else [as_part(part) for part in data.part.tolist()]
+    return ImportReport(
+        counts["imported"],
+        counts["quarantined"],
+        counts["repeated"],
+        resumed=True,
+        contradicted=counts["contradicted"],
     )
+
+
+def _verifying_decisions(traces: NDArray[np.float32], data: Dataset) -> Iterator[Decision]:
+    """Yield for each trace, of shape (n, C, T), the decision to verify it without a model.
+
+    Its id is made of the trace's content; equal traces of one data set have different ids.
+    """
+    n_equal = Counter[int]()
+    parts: list[str | None] = [None] * len(data)
+    if data.part is not None:
+        parts = [as_part(part) for part in data.part.tolist()]
     for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
-        id_ = f"import-{hash_ & (2**64 - 1):016x}-{times[hash_]}"  # equal traces within one file are events of their own
-        times[hash_] += 1
-        nothing = (0.0, 1.0, 0, 0, None, 0)
         yield Decision(
-            id_, Action.VERIFY, Action.VERIFY, *nothing, Reason.NO_MODEL, False, 1.0, part
+            id=f"import-{hash_ & (2**64 - 1):016x}-{n_equal[hash_]}",
+            action=Action.VERIFY,
+            predicted=Action.VERIFY,
+            lower=0.0,
+            upper=1.0,
+            n_success=0,
+            n_failure=0,
+            embedding=None,
+            model_version=0,
+            reason=Reason.NO_MODEL,
+            audit=False,
+            propensity=1.0,
+            part=part,
         )
+        n_equal[hash_] += 1

@@ -171,7 +171,7 @@ def import_journal(store: "StoreLike", path: str | os.PathLike[str], any_model: 
     """Put what a cell learned into the store of its engine, each part once, however often its journal is imported.
 
     Rule and certificate count the parts as the engine's own. The report counts labels. Of a journal that lacks a line, what
-    stands before is taken: `ImportReport.aside`.
+    stands before is taken: `ImportReport.set_aside`.
     any_model : take a journal of a model that the store has not noted as exported from it.
     Raises DataError, before anything is stored, for a line that cannot be read, and a journal of another store's model;
     StoreError while an engine runs on the cell.
@@ -192,7 +192,7 @@ def import_journal(store: "StoreLike", path: str | os.PathLike[str], any_model: 
         parts = [(line.decision, line.trace, line.label) for line in _with_known_outcomes(journal, policy.stops)]
         report = import_parts(opened, parts, spec, policy)
     opened.close()
-    return replace(report, cut=journal.cut, aside=journal.aside)
+    return replace(report, cut=journal.cut, set_aside=journal.aside)
 
 
 def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:

@@ -203,7 +203,8 @@ def test_a_character_that_the_screen_has_not_is_a_question_mark(trained: Path, t
 
 def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained: Path, data: Path) -> None:
     again = document("train", "--data", data, "--store", trained)
-    nothing = {"imported": 0, "quarantined": 0, "known": 160, "resumed": True, "cut": 0, "contradicted": 0, "aside": ""}
+    nothing = {"imported": 0, "quarantined": 0, "repeated": 160, "resumed": True, "cut": 0, "contradicted": 0}
+    nothing["set_aside"] = ""
     assert again["import"] == nothing
     shown = document("status", trained)
     assert shown["labels"] == shown["sources"]["verification"] == shown["reasons"]["no_model"] == 160
@@ -221,7 +222,7 @@ def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_th
     X, y = easy.X, easy.y
     X[0, 3], X[1], X[2:8] = np.nan, 7.0, X[2]
     first, report = import_labelled(store, (X[:70], y[:70]), "pca"), import_labelled(store, (X, y))
-    assert (first.imported, first.quarantined, report.imported, report.known) == (68, 2, 90, 70)
+    assert (first.imported, first.quarantined, report.imported, report.repeated) == (68, 2, 90, 70)
     np.testing.assert_array_equal(store.labelled().labels, y[2:])  # bad ones are kept, and never trained on
 
 

@@ -45,7 +45,7 @@ def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_
 def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_length(folder: Path, tmp_path: Path) -> None:
     store = tmp_path / "engine.db"
     assert document("train", "--data", folder, "--store", store, "--reducer", "pca")["import"]["imported"] == 77
-    assert document("train", "--data", folder, "--store", store)["import"]["known"] == 77
+    assert document("train", "--data", folder, "--store", store)["import"]["repeated"] == 77
     with DataEngine.open(store) as engine:
         assert (engine.trace.fit, engine.trace.columns) == ("pad", ("FZ_Base",))
         frames = [pd.read_csv(path) for path in sorted(folder.iterdir()) if len(path.read_bytes()) > 10**5][:3]

@@ -56,8 +56,8 @@ def test_each_line_counts_once(store: str, make_data: Callable[..., Dataset], tm
     part = write(tmp_path / "cell.csv", new.X[:20], new.y[:20])
     first = import_journal(store, part)
     whole = import_journal(store, write(part, new.X, new.y))
-    assert (first.imported, first.quarantined, first.known) == (19, 1, 0)
-    assert (whole.imported, whole.quarantined, whole.known) == (10, 0, 20)
+    assert (first.imported, first.quarantined, first.repeated) == (19, 1, 0)
+    assert (whole.imported, whole.quarantined, whole.repeated) == (10, 0, 20)
     with DataEngine.open(store) as engine:
         assert engine.retrain().n_traces == 200 + 29
 
@@ -88,7 +88,7 @@ def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp
     for again in (False, True):  # the same file twice counts nothing twice
         report = import_journal(path, journal)
         n = 6 if stops == "all" else 5
-        assert (report.imported, report.quarantined, report.known) == ((0, 0, n) if again else (n, 0, 0))
+        assert (report.imported, report.quarantined, report.repeated) == ((0, 0, n) if again else (n, 0, 0))
         with DataEngine.open(path) as engine:
             known, last = engine.store.outcomes_since(200), engine.store.labelled(n)
             outcomes, sources = engine.store.tally().outcomes, engine.store.status()["sources"]
@@ -157,7 +157,7 @@ def test_late_labels_are_imported_once_by_their_own_ids(data: Dataset, make_data
     path, X = new_store(data, tmp_path / "engine.db", stops=stops), make_data(9, seed=4).X
     for again in (False, True):
         report = import_journal(path, write_lines(tmp_path / "cell.csv", X, LATE))
-        assert (report.imported, report.known, report.contradicted) == ((0, 4, 0) if again else (4, 0, 0))
+        assert (report.imported, report.repeated, report.contradicted) == ((0, 4, 0) if again else (4, 0, 0))
     with DataEngine.open(path) as engine:
         held = [engine.store.get_decision(f"a-{i}") for i in range(1, 7)]
         assert [known and known.success for known in held] == [True, False, None, True, True, None]

@@ -83,6 +83,12 @@ def test_a_mark_of_thousands_is_no_decimal_one(form: str, tmp_path: Path) -> Non
     assert data.rate_hz == 250.0
 
 
+def test_millions_prove_which_mark_groups_thousands(tmp_path: Path) -> None:
+    write(tmp_path / "a_OK.csv", ["F"], ["1,043", "1,043,500"], delimiter=";")
+    write(tmp_path / "b_OK.csv", ["F"], ["1.043", "1.043.500"], delimiter=";")
+    assert load_dataset(tmp_path, channel="F").X.tolist() == [[1043.0, 1043500.0]] * 2
+
+
 def test_a_file_that_does_not_tell_its_decimal_mark_is_refused_until_somebody_states_it(tmp_path: Path) -> None:
     cells = ["1.043", "1.102", "2.250", "2.375"] * 5
     for name in ("a_OK.csv", "b_NOK.csv"):
@@ -210,6 +216,16 @@ def test_without_a_clock_the_rate_is_unknown_and_a_column_that_rises_is_offered(
     trained = dengine("train", "--data", tmp_path, "--channel", "Kraft", "--store", tmp_path / "a.db", "--reducer", "pca")
     assert "The rate is unknown" in trained.stderr
     assert "unknown rate" in repr(load_dataset(tmp_path, channel="Kraft"))
+
+
+def test_a_clock_is_named_in_any_case_and_without_its_unit(tmp_path: Path) -> None:
+    write(tmp_path / "folder" / "a_OK.csv", ["Takt [s]", "F"], times(), texts())
+    long = write(tmp_path / "long.csv", ["part", "Takt", "F", "label"], ["1"] * N, times(), texts(), ["OK"] * N)
+    for time in ("Takt", "TAKT", "takt [s]"):
+        assert load_dataset(tmp_path / "folder", time=time).rate_hz == 250.0
+        assert load_dataset(long, time=time, channel="F").rate_hz == 250.0
+    with pytest.raises(DataError, match="Expected a column Uhr of times"):
+        load_dataset(tmp_path / "folder", time="Uhr", channel="F")
 
 
 def test_a_count_of_samples_is_no_clock(tmp_path: Path) -> None:

@@ -440,7 +440,7 @@ def test_recordings_that_are_added_do_not_make_those_before_count_again(tmp_path
     for i in range(9, 29):
         write_csv(tmp_path / "cell" / f"{i}_NOK.csv", rng.normal(size=96))
     again = import_labelled(store, tmp_path / "cell")
-    assert (first.imported, again.imported, again.known) == (9, 20, 9)
+    assert (first.imported, again.imported, again.repeated) == (9, 20, 9)
     with pytest.raises(TraceError, match="to 104 samples by pad, cell was to 96 by pad; load it with samples=104"):
         import_labelled(store, load_dataset(tmp_path / "cell"))
     with pytest.raises(TraceError, match="was to 104 by resample"):

@@ -101,7 +101,7 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
     rejects = [Action.REJECT] if learned.guarantee == "local" else []
     assert {d.action for d in decisions} >= {Action.VERIFY, Action.ACCEPT, *rejects}
     report = import_journal(tmp_path / "imported.db", journal)
-    assert report.contradicted == report.cut == report.known == 0
+    assert report.contradicted == report.cut == report.repeated == 0
     found = []
     for name in ("imported", "own"):
         with DataEngine.open(tmp_path / f"{name}.db") as engine:

@@ -297,7 +297,7 @@ def kill_programs(outcome: Outcome, place: Place, times: int, program: Path) -> 
         with place.store() as store:
             outcome.lost += missing(store, acknowledged)
         journal.write_bytes(b"".join(journal.read_bytes().splitlines(keepends=True)[:-3]))
-        outcome.must("its head knows" in import_journal(place.store(), journal).aside, "the last lines can be removed")
+        outcome.must("its head knows" in import_journal(place.store(), journal).set_aside, "the last lines can be removed")
     except DengineError as error:
         outcome.tell(error)
 
