@@ -103,7 +103,7 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     trained on. A store that has been used keeps its own recipe and seed. Ctrl-C keeps what was imported; the same
     command goes on from there.
     """
-    from ..datasets.importing import stored_form, import_labelled
+    from ..datasets.importing import import_labelled, stored_form
     from ..engine.engine import DataEngine, core_of
     from ..experiments.tables import retrain_line
     from ..store.opening import UNHURRIED

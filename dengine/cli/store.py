@@ -248,6 +248,7 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
     from ..export.cell_journal import import_journal
 
     report = import_journal(store, journal, any_model=any_model)
-    tell({"store": store, "journal": journal} | asdict(report), facts(f"{journal} into {store}", rows_of(report, "set_aside")))
+    table = facts(f"{journal} into {store}", rows_of(report, "set_aside"))
+    tell({"store": store, "journal": journal} | asdict(report), table)
     if report.set_aside:
         raise click.ClickException(report.set_aside)
