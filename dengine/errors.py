@@ -81,6 +81,7 @@ def as_options(text: str) -> str:
     """
 
     def to_option(match: re.Match[str]) -> str:
+        """Return an option as typed, `--rate-hz 500`, of a match of `OPTION`."""
         name = (match[1] or match[3]).replace("_", "-")
         value = match[2] or ""
         if value[:1] in QUOTES:
@@ -138,7 +139,7 @@ class TraceConflictError(TraceError):
 
 
 def expect(
-    valid: bool, wanted: str, got: Any, do: str = "", error: type[DengineError] = SettingError
+    valid: bool, wanted: str, actual: Any, do: str = "", error: type[DengineError] = SettingError
 ) -> None:
     """Raise an error unless `valid`.
 
@@ -147,16 +148,16 @@ def expect(
     valid : bool
     wanted : str
         What was expected.
-    got : object
+    actual : object
         What came; shown by `shortened`.
     do : str
         What the user can do about it.
     error : type
-        Class of the error. Its message is "Expected `wanted`, got `got`; `do`."
+        Class of the error. Its message is "Expected `wanted`, got `actual`; `do`."
     """
     if not valid:
         advice = f"; {do}" if do else ""
-        raise error(f"Expected {wanted}, got {shortened(got)}{advice}.")
+        raise error(f"Expected {wanted}, got {shortened(actual)}{advice}.")
 
 
 @contextmanager

@@ -51,7 +51,7 @@ def read_key(path: str | os.PathLike[str], error: type[DengineError]) -> bytes:
     return secret
 
 
-def check_size(size: float, what: object) -> None:
+def check_size(size: float, source: object) -> None:
     """Raise DataError if arrays would need too much memory.
 
     The limit is `MAX_BYTES`, or half of the machine's memory if that is less.
@@ -60,7 +60,7 @@ def check_size(size: float, what: object) -> None:
     ----------
     size : float
         Bytes of all arrays.
-    what : object
+    source : object
         What they are in, for the error.
     """
     limit = MAX_BYTES
@@ -68,7 +68,7 @@ def check_size(size: float, what: object) -> None:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         limit = min(MAX_BYTES, memory // 2) if memory > 0 else MAX_BYTES
     if size > limit:
-        wanted = f"at most {_size_text(limit)} of arrays in {what}"
+        wanted = f"at most {_size_text(limit)} of arrays in {source}"
         do = "split it, or read it where there is more memory"
         raise DataError(f"Expected {wanted}, got {_size_text(size)}; {do}.")
 

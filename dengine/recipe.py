@@ -123,9 +123,12 @@ class Recipe:
     reducer: Any = "conv"
     params: Params = field(default_factory=dict)
     policy: Policy = field(default_factory=Policy)
+    # The descriptor gives a value of this type when it is read.
     radius: float = ReducerDefault("default_radius", check_radius)  # type: ignore[assignment]
     folds: int = 5
-    retrain_every: int = ReducerDefault("default_retrain_every", _check_retrain_every)  # type: ignore[assignment]
+    retrain_every: int = ReducerDefault(  # type: ignore[assignment]
+        "default_retrain_every", _check_retrain_every
+    )
     budget: float = 0.45
     max_steps: int | None = None
     window: int = 10_000
@@ -231,9 +234,9 @@ class Recipe:
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
         if missing and str(recipe.reducer) not in RECIPES:
-            got = f"a recipe of {recipe.name} without {listed(missing)}"
+            actual = f"a recipe of {recipe.name} without {listed(missing)}"
             do = "restore the store from a copy"
-            raise StoreError(f"Expected {where} to hold every setting, got {got}; {do}.")
+            raise StoreError(f"Expected {where} to hold every setting, got {actual}; {do}.")
         return recipe
 
     def to_toml(self) -> str:
@@ -296,8 +299,8 @@ def _read_text(path: Path) -> str | None:
             raise SettingError(f"Expected {limit}, {path} is larger.")
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        got = f"{error.reason} at byte {error.start}"
-        raise SettingError(f"{path} is not UTF-8 text: {got}; save it as UTF-8.") from error
+        actual = f"{error.reason} at byte {error.start}"
+        raise SettingError(f"{path} is not UTF-8 text: {actual}; save it as UTF-8.") from error
     except OSError as error:  # a name that is too long among them
         raise SettingError(
             f"Cannot read the recipe {str(path)[:200]}: {error.strerror}."

@@ -77,14 +77,14 @@ def as_trace(trace: Any, spec: TraceSpec | None) -> NDArray[np.float32]:
         x = _match_spec(x, spec)
     elif len(x) > x.shape[1] and _is_frame(trace):
         wanted = "a DataFrame of one trace, a row a sample, a column a channel"
-        got = f"{x.shape[1]} rows of {len(x)} columns"
+        actual = f"{x.shape[1]} rows of {len(x)} columns"
         do = "pass one row, as a Series, if each is a trace"
-        raise TraceError(f"Expected {wanted}, got {got}; {do}.")
+        raise TraceError(f"Expected {wanted}, got {actual}; {do}.")
     elif len(x) > x.shape[1]:
-        got = f"{len(x)} channels of {x.shape[1]} samples, which looks transposed"
+        actual = f"{len(x)} channels of {x.shape[1]} samples, which looks transposed"
         meant = f"TraceSpec(samples={x.shape[1]}, channels={len(x)})"
         do = f"turn it, trace.T, or agree on {meant} first if it is meant"
-        raise TraceError(f"Expected (channels, samples), got {got}; {do}.")
+        raise TraceError(f"Expected (channels, samples), got {actual}; {do}.")
     x = np.ascontiguousarray(x)
     return x if x.flags.writeable else x.copy()  # torch warns of read-only, memory-mapped arrays
 
@@ -494,7 +494,7 @@ def infer_trace_spec(x: NDArray[np.float32], trace: Any) -> tuple[TraceSpec, boo
         wanted = f"a first trace of {MIN_SAMPLES} samples or more"
         why = "for it sets the contract of all that follow"
         do = f"record longer, or start with {_spec_advice(x)} if it is meant"
-        got = f"{spec.channels} x {spec.samples}"
-        raise TraceError(f"Expected {wanted}, {why}, got {got}; {do}.")
+        actual = f"{spec.channels} x {spec.samples}"
+        raise TraceError(f"Expected {wanted}, {why}, got {actual}; {do}.")
     reason, _ = TraceGate(spec)(torch.from_numpy(x))
     return spec, reason == 0

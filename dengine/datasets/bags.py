@@ -201,8 +201,8 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
     topics += [options.label] if options.label else []
     for topic in topics:
         if topic not in types:
-            got = listed(types) or "none"
-            raise DataError(f"Expected the topic {topic} in {path}, found {got}.")
+            actual = listed(types) or "none"
+            raise DataError(f"Expected the topic {topic} in {path}, found {actual}.")
     messages = _read_messages(files, wrenches[0], topics)
     return _cut_dataset(messages, trigger, channels, name, options)
 
@@ -283,6 +283,7 @@ def _labels_in_topic(
             words.setdefault(names[n_begun - 1], word)
 
     def find(name: str) -> labels.LabelAndPart:
+        """Return the label of an insertion."""
         if name not in words:
             wanted = f"a message of {topic} before the next insertion begins"
             raise UnreadableError(f"Expected {wanted}, found none")

@@ -187,9 +187,9 @@ def clock_of(
         seconds, wrong, note = seconds_of(column, name, units_row[place] if units_row else "")
     if wrong:
         wanted = f"a time in column {name}, in seconds or as 2026-03-01T12:00:00.002"
-        got = excerpt(str(column[wrong[0]]))
+        actual = excerpt(str(column[wrong[0]]))
         do = "a stated rate (rate_hz) needs none"
-        raise UnreadableError(f"Expected {wanted}, got {got}; {do}", wrong[0])
+        raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", wrong[0])
     if time is None and not is_time_column(name):
         assumed = f"Column {name or place + 1} is taken as the clock by its values"
         note = f"{assumed}; {note}" if note else assumed
@@ -250,8 +250,8 @@ def seconds_of(
         times, wrong = floats(column)
         if 2 * len(wrong) < max(len(times), 1):
             scale, note = _seconds_per_count(times, name, unit)
-            known = np.flatnonzero(~np.isnan(times))
-            start = times[known[0]] if len(known) else 0.0
+            rows = np.flatnonzero(~np.isnan(times))
+            start = times[rows[0]] if len(rows) else 0.0
             return (times - start) * scale, wrong, note
     seconds, missing = _parse_timestamps(column)
     return seconds, column.index[missing].tolist(), ""
@@ -289,10 +289,10 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
             form = "mixed" if text.str.contains(r"\b[AP]M$").any() else "ISO8601"
             stamps = pd.to_datetime(text, errors="coerce", format=form, utc=True)
     missing = stamps.isna().to_numpy()
-    known = stamps[~missing]
-    if not len(known):
+    valid = stamps[~missing]
+    if not len(valid):
         return np.full(len(column), np.nan), missing
-    elapsed = stamps - known.iloc[0]
+    elapsed = stamps - valid.iloc[0]
     return elapsed.dt.total_seconds().to_numpy(dtype=np.float64), missing
 
 
@@ -304,15 +304,15 @@ def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tupl
     stated = _stated_unit(name, unit)
     if stated is not None:
         return stated, ""
-    known = times[~np.isnan(times)]
-    if len(known) < 2:
+    times = times[~np.isnan(times)]
+    if len(times) < 2:
         return 1.0, ""
-    epoch_unit = _epoch_unit(known)
+    epoch_unit = _epoch_unit(times)
     if epoch_unit is not None:
         return epoch_unit, ""
-    step = float(np.median(np.abs(np.diff(known))))
+    step = float(np.median(np.abs(np.diff(times))))
     low, high = EXCEL_DAYS
-    if low < known[0] < high and 0 < step * DAY < 1.0:
+    if low < times[0] < high and 0 < step * DAY < 1.0:
         return DAY, f"The clock {name} is read as days, as Excel counts them"
     scale = next((scale for scale in (1.0, 1e-3, 1e-6) if step * scale < SLOWEST_STEP), 1e-9)
     if scale == 1.0 and 0 < step < SLOWEST_STEP / 10:
@@ -369,9 +369,9 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     if not (RATES[0] <= rate <= RATES[1] and SPANS[0] <= span <= SPANS[1]):
         rates = f"{RATES[0]:g} Hz to {RATES[1] / 1e6:g} MHz"
         wanted = f"{rates} over {1e3 * SPANS[0]:g} ms to {SPANS[1] / 3600:g} h"
-        got = f"{rate:.4g} Hz over {span:.3g} s"
+        actual = f"{rate:.4g} Hz over {span:.3g} s"
         do = "state the rate, rate_hz=..., or write its unit into the header, as in time [ms]"
-        message = f"Expected a clock of {wanted}, column {clock.name} tells {got}; {do}"
+        message = f"Expected a clock of {wanted}, column {clock.name} tells {actual}; {do}"
         raise UnreadableError(message)
     return float(f"{rate:.4g}")
 

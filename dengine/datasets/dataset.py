@@ -44,19 +44,19 @@ class Fault:
         The file, seen from the folder, or what the rows are of.
     line : int
         In the file, or row of the table, from 1; 0 for the whole.
-    what : str
+    message : str
         What was expected, and what came.
     """
 
     source: str
     line: int
-    what: str
+    message: str
 
     def __str__(self) -> str:
         return (
-            f"{self.source}, line {self.line}: {self.what}"
+            f"{self.source}, line {self.line}: {self.message}"
             if self.line
-            else f"{self.source}: {self.what}"
+            else f"{self.source}: {self.message}"
         )
 
 
@@ -66,8 +66,8 @@ class UnreadableError(DataError):
     line : of the file, 0 for the whole.
     """
 
-    def __init__(self, what: str, line: int = 0) -> None:
-        super().__init__(what)
+    def __init__(self, message: str, line: int = 0) -> None:
+        super().__init__(message)
         self.line = line
 
 
@@ -186,9 +186,9 @@ class Dataset:
         default = ["x"] if X.shape[1] == 1 else [f"x{c}" for c in range(X.shape[1])]
         names = [f"{name}_{i}" for name in self.channels or default for i in range(X.shape[2])]
         columns = {"label": self.y, "part": self.part, "cause": self.cause}
-        known = {name: values for name, values in columns.items() if values is not None}
+        columns = {name: values for name, values in columns.items() if values is not None}
         samples = pd.DataFrame(X.reshape(len(X), -1), columns=names)
-        return pd.concat([pd.DataFrame(known), samples], axis=1)
+        return pd.concat([pd.DataFrame(columns), samples], axis=1)
 
     def cut(self, samples: int) -> "Dataset":
         """Return the first `samples` samples of every trace: an earlier moment to decide at."""
@@ -409,11 +409,11 @@ class RecordingCollector:
             where = "say where they are (label), or list them in a CSV file (labels)"
             do = f"so many are no labels: {where}"
         counts = self.unknown_words.most_common(4)
-        got = ", ".join(f"{shortened(word)} {n} times" for word, n in counts)
+        actual = ", ".join(f"{shortened(word)} {n} times" for word, n in counts)
         if is_one_sided:
-            got += f" beside {n_known} {'good' if 1 in labels else 'bad'} ones"
+            actual += f" beside {n_known} {'good' if 1 in labels else 'bad'} ones"
         wanted = f"labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0"
-        raise DataError(f"Expected {wanted}, got {got}; {do}.")
+        raise DataError(f"Expected {wanted}, got {actual}; {do}.")
 
     def leave_out(self, reasons: Mapping[int, str]) -> None:
         """Replace the recordings at these positions by faults with these messages.
@@ -559,15 +559,15 @@ def _bring_to_one_rate(
     so that equal sample numbers mean equal times. The rate is None if no recording has a clock.
     """
     rates = np.array([recording.rate_hz or np.nan for recording in collector.recordings])
-    known = rates[~np.isnan(rates)]
-    if not len(known):
+    clocked = rates[~np.isnan(rates)]
+    if not len(clocked):
         return options, options.rate_hz
-    if n_unknown := len(rates) - len(known):
+    if n_unknown := len(rates) - len(clocked):
         collector.notes["No clock is known, and the rate of the others is taken for it"] += (
             n_unknown
         )
-    usual = float(max(known, key=lambda r: (np.abs(known - r) <= RATE_TOLERANCE * r).sum()))
-    if options.fit != "resample" or not (np.abs(known - usual) > RATE_TOLERANCE * usual).any():
+    usual = float(max(clocked, key=lambda r: (np.abs(clocked - r) <= RATE_TOLERANCE * r).sum()))
+    if options.fit != "resample" or not (np.abs(clocked - usual) > RATE_TOLERANCE * usual).any():
         wanted = f"timestamps at {usual:g} Hz, as the others have"
         do = "; fit='resample' puts all on one rate by their own times"
         do = "" if options.fit == "resample" else do
@@ -576,7 +576,7 @@ def _bring_to_one_rate(
         kept = [recording.rate_hz for recording in collector.recordings if recording.rate_hz]
         return options, float(np.median(kept))
     # Two digits, so that recordings that are added change neither the rate nor all samples.
-    usual = float(f"{np.median(known):.2g}")
+    usual = float(f"{np.median(clocked):.2g}")
     is_far = (rates > MAX_RATE_RATIO * usual) | (rates * MAX_RATE_RATIO < usual)
     wanted = f"timestamps at about {usual:g} Hz"
     far = np.flatnonzero(is_far).tolist()
@@ -724,12 +724,12 @@ def _convert_unit(data: Dataset, unit: str) -> Dataset:
     sources = split_unit(data.unit, n)
     targets = split_unit(unit, n)
     factors = [units.factor(a, b) for a, b in zip(sources, targets, strict=True)]
-    known = [factor for factor in factors if factor is not None]
-    if len(known) < n:
+    scales = [factor for factor in factors if factor is not None]
+    if len(scales) < n:
         do = "leave unit out, or convert the samples first"
         raise DataError(f"Expected {data.name} in {unit}, its unit is {data.unit}; {do}.")
-    if set(known) != {1.0}:
-        X = data.X * np.array(known).reshape(-1, 1)  # in float64
+    if set(scales) != {1.0}:
+        X = data.X * np.array(scales).reshape(-1, 1)  # in float64
         data = replace(data, X=X.astype(np.float32))
     return replace(data, unit=unit)
 

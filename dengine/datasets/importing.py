@@ -83,13 +83,13 @@ def check_agreement(data: Dataset, spec: TraceSpec) -> None:
     is_other_fit = data_spec.fit != spec.fit and "resample" in (data_spec.fit, spec.fit)
     if data.lengths is not None and (is_other_fit or data_spec.samples != spec.samples):
         wanted = f"recordings brought to {spec.samples} samples by {spec.fit}"
-        got = f"{data.name} was to {data_spec.samples} by {data_spec.fit}"
+        actual = f"{data.name} was to {data_spec.samples} by {data_spec.fit}"
         do = f"load it with samples={spec.samples}, fit={spec.fit!r}"
-        raise TraceError(f"Expected {wanted}, {got}; {do}, or what is known would count again.")
+        raise TraceError(f"Expected {wanted}, {actual}; {do}, or what is known would count again.")
     is_other_rate = not math.isclose(spec.rate_hz, data_spec.rate_hz, rel_tol=RATE_TOLERANCE)
     if data.rate_hz is not None and is_other_rate:
-        got = f"{data.name} has {data_spec.rate_hz:g} Hz"
-        raise TraceError(f"Expected traces at {spec.rate_hz:g} Hz, {got}; resample it.")
+        actual = f"{data.name} has {data_spec.rate_hz:g} Hz"
+        raise TraceError(f"Expected traces at {spec.rate_hz:g} Hz, {actual}; resample it.")
     if data.channels and spec.columns and data.channels != spec.columns:
         wanted = ", ".join(spec.columns)
         raise TraceError(f"Expected the channels {wanted}, got {', '.join(data.channels)}.")

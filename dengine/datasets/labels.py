@@ -199,6 +199,7 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
     expect_data(expression.groups == 1, wanted, pattern)
 
     def find(name: str) -> LabelAndPart:
+        """Return the label that the pattern finds in a path."""
         match = expression.search(name)
         if match is None or match[1] is None:
             wanted = f"a label where the pattern {pattern} finds it"
@@ -206,6 +207,7 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
         return label_of(match[1], words), None
 
     def without_label(name: str) -> str:
+        """Return a path without what the pattern finds in it."""
         match = expression.search(name)
         if match is None or match[1] is None:
             return name
@@ -280,9 +282,9 @@ def _find_label(name: str, words: LabelMap) -> LabelAndPart:
     first = deciding[0]
     for other in labels:
         if other.label != first.label:
-            got = f"{first.text} and {other.text} contradict each other in its name or folder"
+            actual = f"{first.text} and {other.text} contradict each other in its name or folder"
             do = "say which it is by a pattern with a group for it (label)"
-            raise UnreadableError(f"Expected one label, {got}; {do}")
+            raise UnreadableError(f"Expected one label, {actual}; {do}")
     return first.label, None
 
 
@@ -471,6 +473,7 @@ def labels_in_file(
             faults.append(Fault(source, row.line, message))
 
     def find(name: str) -> LabelAndPart:
+        """Return the label and the part in the row that names a recording most exactly."""
         if not matches[name]:
             raise UnreadableError(f"Expected a row of {source} that names it, found none")
         path_words = name_words[name]
@@ -499,8 +502,8 @@ def read_ordered_labels(path: str | os.PathLike[str], part: str) -> list[str]:
     numbers = [int(row.file) for row in rows if row.file.isdecimal()]
     in_order = not numbers or numbers == list(range(numbers[0], numbers[0] + len(rows)))
     if faults or not in_order:
-        got = faults[0] if faults else numbers[:9]
-        raise DataError(f"Expected a label of each trace in {path}, in their order, got {got}.")
+        actual = faults[0] if faults else numbers[:9]
+        raise DataError(f"Expected a label of each trace in {path}, in their order, got {actual}.")
     return [row.label for row in rows]
 
 
@@ -578,8 +581,8 @@ def _label_file_columns(
         of_label = 1 - of_file
     if of_file is None or of_label is None:
         wanted = FILE_COLUMNS[0] if of_file is None else "label"
-        got = ", ".join(header)
-        raise DataError(f"Expected a column {wanted} in {path}, got {got}; call it so.")
+        actual = ", ".join(header)
+        raise DataError(f"Expected a column {wanted} in {path}, got {actual}; call it so.")
     return of_file, of_label
 
 
@@ -610,6 +613,7 @@ def collect_recordings(
     collector.faults.extend(source.faults)
 
     def read_labelled(name: str, place: Any) -> Recording:
+        """Return a recording with its label; note its name if it has none."""
         try:
             label, part = source.find(name)
         except (UnknownWordError, UnlabelledError):
@@ -627,8 +631,8 @@ def collect_recordings(
     collector.unknown_words.update(words)
     if len(unlabelled) - len(words) > len(places) / 2:
         why = next(fault for fault in reversed(collector.faults) if fault.source in unlabelled)
-        got = f"{len(unlabelled)} of {len(places)} have none, as {why}"
-        raise DataError(f"Expected a label for each recording, {got}; {source.advice}.")
+        actual = f"{len(unlabelled)} of {len(places)} have none, as {why}"
+        raise DataError(f"Expected a label for each recording, {actual}; {source.advice}.")
     return collector
 
 

@@ -226,8 +226,8 @@ def _find_file_reader(
         return (), partial(_read_store, path, name, options)
     by_kind = {file.suffix.lower() in TABLES: file for file in named.values()}
     if len(by_kind) > 1:
-        got = f"{by_kind[True].name} and {by_kind[False].name}"
-        raise DataError(f"Expected tables or .npz files in {path}, got {got}.")
+        actual = f"{by_kind[True].name} and {by_kind[False].name}"
+        raise DataError(f"Expected tables or .npz files in {path}, got {actual}.")
     if True in by_kind:
         read = partial(read_tables, named, name, options)
         return ("label", "labels", "time", *TEXT_FORMAT), read
@@ -336,14 +336,14 @@ def _read_archives(
             all_names = all_names + names
             continue
         for key in () if every else sorted({*arrays, *new}):
-            one = arrays.get(key, np.array("none"))
+            old = arrays.get(key, np.array("none"))
             other = new.get(key, np.array("none"))
-            is_alike = one.ndim == other.ndim > 0 and one.shape[1:] == other.shape[1:]
+            is_alike = old.ndim == other.ndim > 0 and old.shape[1:] == other.shape[1:]
             if is_alike and key != "channels":
-                arrays[key] = np.concatenate([one, other])
-            elif not np.array_equal(one, other):
-                got = f"{one.shape or one} and {other.shape or other}"
-                raise DataError(f"Expected {key} alike in {first} and {source}, got {got}.")
+                arrays[key] = np.concatenate([old, other])
+            elif not np.array_equal(old, other):
+                actual = f"{old.shape or old} and {other.shape or other}"
+                raise DataError(f"Expected {key} alike in {first} and {source}, got {actual}.")
     return arrays, all_names
 
 
@@ -425,6 +425,7 @@ def _from_arrays(X: Any, y: Any, options: LoadOptions, name: str = "data", **abo
     collector = RecordingCollector(name, ())
 
     def to_label(word: Any) -> float:
+        """Return a label, NaN for an empty one, and 0 for an unknown word, which is counted."""
         try:
             return label_of(word, options.words)
         except UnlabelledError:
@@ -444,8 +445,8 @@ def _from_arrays(X: Any, y: Any, options: LoadOptions, name: str = "data", **abo
     if not is_empty.any():
         return make_dataset(X, labels, name=name, **about)
     n = int(is_empty.sum())
-    got = f"{n} that have no label yet"
-    expect_data(not is_empty.all(), f"labelled traces in {name}", got)
+    actual = f"{n} that have no label yet"
+    expect_data(not is_empty.all(), f"labelled traces in {name}", actual)
     for key in ("part", "cause"):
         if about.get(key) is not None:
             about[key] = np.asarray(about[key])[~is_empty]
@@ -471,6 +472,7 @@ def _from_list(traces: list[Any], labels: list[Any], options: LoadOptions) -> Da
     collector = RecordingCollector("data", options.channels or default)
 
     def read(number: int, trace: Any, word: Any) -> Recording:
+        """Return a trace of the list as a recording; raise UnreadableError for a bad one."""
         columns = list(map(str, getattr(trace, "columns", ())))
         for name in collector.channels:
             if columns and name not in columns:

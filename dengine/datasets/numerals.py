@@ -128,8 +128,8 @@ def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None
     if proven:
         mark = proven[0]
         if mark in grouped:
-            got = f"{grouped[mark]} has {mark!r} before thousands"
-            message = f"Expected one number format: {got}, other columns have it before decimals"
+            actual = f"{grouped[mark]} has {mark!r} before thousands"
+            message = f"Expected one number format: {actual}, other columns have it before decimals"
             do = f"state decimal={mark!r} if it is the decimal mark there too"
             raise UnreadableError(f"{message}; {do}, or write the file in one format")
         return mark
@@ -146,9 +146,9 @@ def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None
                 # Files that group by points have decimal commas, and other delimiters.
                 return mark
             values = f"{cell[0].replace(mark, '.')} or {cell[0].replace(mark, '')}"
-            got = f"{cell[0]} in column {name} may be {values}"
+            actual = f"{cell[0]} in column {name} may be {values}"
             do = f"say which, decimal={mark!r} or thousands={mark!r}"
-            message = f"Expected a cell that tells the decimal mark, {got}; {do}"
+            message = f"Expected a cell that tells the decimal mark, {actual}; {do}"
             raise UndecidedError(message)
     return None
 

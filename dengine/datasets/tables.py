@@ -86,8 +86,8 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     if not named:
         entries = listed(sorted(path.name for path in folder.iterdir()))
         forms = f"CSV files, one an insertion, or tables ({', '.join(SUFFIXES)})"
-        got = f"none among {entries}; save them as such" if entries else "none"
-        raise DataError(f"Expected {forms}, in the folder {folder}, found {got}.")
+        actual = f"none among {entries}; save them as such" if entries else "none"
+        raise DataError(f"Expected {forms}, in the folder {folder}, found {actual}.")
     # CSV files beside other files are lists of labels.
     others = [name for name, path in named.items() if path.suffix.lower() not in TEXTS]
     counts = Counter(path.suffix.lower() for path in named.values())
@@ -160,6 +160,7 @@ def read_folder(
     common_mark = cache(partial(_common_decimal_mark, list(named.values()), options))
 
     def read(path: Path) -> TimedTrace:
+        """Read a recording; if its decimal mark is undecided, by that of the other files."""
         notes = Counter[str]()
         try:
             recording = read_recording(path, collector.channels, options, notes)
@@ -388,9 +389,9 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
     first, *sources = units_by_source
     for source in sources:
         if units_by_source[source] != units_by_source[first]:
-            one, two = (", ".join(units_by_source[s]) or "none" for s in (first, source))
+            actual = [", ".join(units_by_source[s]) or "none" for s in (first, source)]
             wanted = f"the same units in {first} and in {source}"
-            raise DataError(f"Expected {wanted}, got {one} and {two}; convert one.")
+            raise DataError(f"Expected {wanted}, got {' and '.join(actual)}; convert one.")
     return _from_tables(tables, options, collector, units_by_source[first])
 
 
@@ -438,8 +439,8 @@ def _from_tables(
         return _from_long(frame, options, collector, first, column_units)
     if advice := _long_table_advice(tables[first], options, collector.label_file):
         columns = listed(tables[first].columns)
-        got = f"a row a sample: {columns}"
-        raise DataError(f"Expected a row an insertion, got {got}; a long table needs {advice}.")
+        actual = f"a row a sample: {columns}"
+        raise DataError(f"Expected a row an insertion, got {actual}; a long table needs {advice}.")
     for source, frame in tables.items():
         _add_wide_rows(frame, options, collector, source)
     return as_dataset(collector, options)
@@ -494,6 +495,7 @@ def _add_wide_rows(
         parts = frame[options.part].astype(object).fillna("").tolist()
 
     def read(line: int, trace: NDArray[np.float32], word: Any, part: Any) -> Recording:
+        """Return a row as a recording; raise UnreadableError for a bad cell or label."""
         if line in wrong:
             raise UnreadableError(wrong[line])
         number = str(part).removesuffix(".0").strip() or None
@@ -563,6 +565,7 @@ def _from_long(
     read_options = replace(options, time=time)
 
     def read(rows: pd.DataFrame) -> TimedTrace:
+        """Return the rows of a part as a trace, in the order of their times."""
         rows = rows.sort_values(SECONDS_COLUMN, kind="stable").drop(columns=SECONDS_COLUMN)
         units_row = [column_units.get(name, "") for name in rows.columns]
         timed = rows_to_trace(rows, places, read_options, collector.notes, units_row)
@@ -617,7 +620,8 @@ def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -
         wanted = f"the channel to be named, as in channel={signals[0]!r}"
         raise DataError(f"Expected {wanted}; there are {have}.")
     rows = frame[frame[tag].isin(options.channels)]
-    wide = rows.pivot(index=keys, columns=tag, values=values[0])  # noqa: PD010 - pivot_table would average
+    # pivot_table would average.
+    wide = rows.pivot(index=keys, columns=tag, values=values[0])  # noqa: PD010
     # A pivot sorts S10 before S9: restore the order of the parts.
     order = {part: i for i, part in enumerate(rows[keys[0]].unique())}
     wide = wide.reset_index()
@@ -711,8 +715,8 @@ def _without_trailing_nan(trace: NDArray[np.float32]) -> NDArray[np.float32]:
 
     A trace of nothing but NaN is returned whole.
     """
-    known = np.flatnonzero(~np.isnan(trace).all(axis=0))
-    return trace[:, : known[-1] + 1] if len(known) else trace
+    measured = np.flatnonzero(~np.isnan(trace).all(axis=0))
+    return trace[:, : measured[-1] + 1] if len(measured) else trace
 
 
 def _label_column(frame: pd.DataFrame, options: LoadOptions) -> str:
@@ -782,8 +786,8 @@ def _sample_columns(names: list[str], options: LoadOptions) -> dict[str, list[st
         odd = np.flatnonzero(steps != np.median(steps))
         if len(odd):
             i = int(odd[0])
-            got = f"after {columns[i][1]} comes {columns[i + 1][1]}"
-            raise DataError(f"Expected columns that are numbered one by one, {got}.")
+            actual = f"after {columns[i][1]} comes {columns[i + 1][1]}"
+            raise DataError(f"Expected columns that are numbered one by one, {actual}.")
     chosen = _choose_channels(list(channels), options)
     if len({len(channels[name]) for name in chosen}) > 1:
         counts = ", ".join(f"{name} {len(channels[name])}" for name in chosen)

@@ -147,6 +147,7 @@ def _find_delimiter(lines: Sequence[str]) -> str:
     top = [units.COMMENT_MARK.sub("", line) for line in lines[:-1][:100]]
 
     def score(delimiter: str) -> float:
+        """Return how well a delimiter splits the lines, from 0 to 1."""
         rows = [_split_line(line, delimiter) for line in sample]
         width, n_rows = Counter(map(len, rows)).most_common(1)[0]
         if width == 1 and delimiter:
@@ -343,7 +344,7 @@ def read_table(
         decimal = options.decimal or decimal
         mark, odd_cells = write_as_python(frame, cells.delimiter, decimal, options.thousands)
         wrong |= odd_cells
-    faults = [Fault(path.name, i, what) for i, what in sorted(wrong.items())]
+    faults = [Fault(path.name, i, message) for i, message in sorted(wrong.items())]
     frame = frame.drop(index=[i for i in wrong if i in complete])
     return TextTable(frame, faults, cells.line, cells.units[:n], mark)
 
@@ -362,8 +363,8 @@ def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, s
         for index in odd:
             cell = str(cells[index])
             prefix = NUMBER_PREFIX.match(cell)  # always matches: it may be empty
-            got = excerpt(cell, prefix.end() if prefix else 0)
-            wrong.setdefault(index, f"Expected a number in column {name}, got {got}")
+            actual = excerpt(cell, prefix.end() if prefix else 0)
+            wrong.setdefault(index, f"Expected a number in column {name}, got {actual}")
     with np.errstate(over="ignore"):  # what overflows becomes an infinity, which the engine finds
         return values.astype(np.float32), wrong
 
@@ -384,7 +385,7 @@ def read_recording(
     header = list(table.frame.columns)
     places = [column_place(name, header, table.line) for name in channels]
     if table.faults:
-        raise UnreadableError(table.faults[0].what, table.faults[0].line)
+        raise UnreadableError(table.faults[0].message, table.faults[0].line)
     if table.frame.empty:
         raise UnreadableError("Expected samples below the header, found none", table.line)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)

@@ -375,7 +375,7 @@ def test_an_error_shows_the_character_that_is_wrong(cell: str, shown: str, make_
     lines[5] = f"{lines[5].partition(',')[0]},{cell}"
     path.write_text("\n".join(lines), encoding="utf-8")
     (fault,) = load_dataset(tmp_path).faults
-    assert (fault.line, shown in fault.what, len(fault.what) < 200) == (6, True, True), fault.what
+    assert (fault.line, shown in fault.message, len(fault.message) < 200) == (6, True, True), fault.message
 
 
 def test_a_row_a_signal_and_an_array_of_channels_are_the_traces_that_they_were(make_data, tmp_path: Path) -> None:

@@ -124,7 +124,8 @@ def test_a_number_in_another_format_than_its_files_is_a_fault_with_its_line(tmp_
         write(tmp_path / name, ["Zeit", "Kraft"], german(times()), cells, delimiter=";")
     data = load_dataset(tmp_path)
     assert [(f.source, f.line) for f in data.faults] == [("b_OK.csv", 9)]
-    assert "Expected a number in column Kraft with ',' before decimals, as the file has, got '12.5'" in data.faults[0].what
+    refusal = "Expected a number in column Kraft with ',' before decimals, as the file has, got '12.5'"
+    assert refusal in data.faults[0].message
 
 
 def test_a_column_that_contradicts_the_files_decimal_mark_is_named(tmp_path: Path) -> None:
@@ -240,7 +241,7 @@ def test_lost_messages_are_found_by_any_clock(tmp_path: Path) -> None:
         write(tmp_path / name, ["%time", "field.wrench.force.z"], [stamps[i] for i in kept], [texts()[i] for i in kept])
     data = load_dataset(tmp_path)
     assert [(f.source, f.line) for f in data.faults] == [("b_OK.csv", 42)]
-    assert "Expected a step of 0.004 s in time, got a gap of 0.084 s" in data.faults[0].what
+    assert "Expected a step of 0.004 s in time, got a gap of 0.084 s" in data.faults[0].message
 
 
 UNBELIEVED = {
@@ -330,11 +331,11 @@ def test_a_unit_that_nothing_converts_or_that_is_not_told_is_a_fault(tmp_path: P
         write(tmp_path / f"{i}_OK.csv", ["time", f"FZ [{unit}]" if unit else "FZ"], times(), texts())
     data = load_dataset(tmp_path, channel="FZ")
     assert (data.unit, [f.source for f in data.faults]) == ("kN", ["2_OK.csv", "3_OK.csv"])
-    assert [f.what.partition(";")[0] for f in data.faults] == [
+    assert [f.message.partition(";")[0] for f in data.faults] == [
         "Expected FZ in kN, as the others are, got mm",
         "Expected FZ in kN, as the others are, got no unit",
     ]
-    assert "unit='kN'" in data.faults[1].what
+    assert "unit='kN'" in data.faults[1].message
     assert [f.source for f in load_dataset(tmp_path, channel="FZ", unit="kN").faults] == ["2_OK.csv"]
 
 
@@ -416,7 +417,7 @@ def test_resampled_recordings_are_imported_once_also_when_others_are_added(tmp_p
                 FZ=lambda frame: frame["FZ"] + rng.normal(size=len(frame))
             ).to_csv(tmp_path / "cell" / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False)
         found = document(*words, *(() if known else ("--reducer", "pca")))["import"]
-        assert (found["imported"], found["known"]) == (until - known, known)
+        assert (found["imported"], found["repeated"]) == (until - known, known)
 
 
 def left_out(data: Dataset) -> list[str]:

@@ -138,7 +138,7 @@ def test_each_fault_is_named_with_file_and_line_and_nothing_else_is_lost(make_da
     assert {f.source for f in loaded.faults} == set(BROKEN)
     for fault in loaded.faults:
         assert fault.line == BROKEN[fault.source][1], fault
-        assert fault.what.startswith(BROKEN[fault.source][2]), fault
+        assert fault.message.startswith(BROKEN[fault.source][2]), fault
     np.testing.assert_array_equal(loaded.X, data.X)
 
 
@@ -214,7 +214,7 @@ def test_a_labels_file_that_does_not_fit_is_named_line_by_line(small: Dataset, t
     assert (data.source.tolist(), data.y.tolist()) == ([f"{i}.csv" for i in (0, 1, 4, 5, 6)], [1, 0, 1, 1, 0])
     said = [(f.source, f.line) for f in data.faults]
     assert said == [("labels.csv", 5), ("labels.csv", 8), ("labels.csv", 6), ("2.csv", 0), ("3.csv", 0), ("7.csv", 0)]
-    assert "in labels.csv, line 4" in data.faults[3].what
+    assert "in labels.csv, line 4" in data.faults[3].message
 
 
 PATHS = ["run_0.csv", "./sub/Run_1.csv", "C:\\data\\sub\\Run_2.CSV", "/old/cell/sub/Run_3.csv", "Run_4", '"sub/Run_5.csv"']
@@ -303,8 +303,8 @@ def test_rows_of_a_table_that_cannot_be_read_are_named(small: Dataset, tmp_path:
     path.write_text("\n".join(lines) + "\n")
     data = load_dataset(path)
     assert [(f.source, f.line) for f in data.faults] == [("wide.csv", 4), ("wide.csv", 7), ("wide.csv", 10)]
-    assert "Expected 51 columns, got 46" in data.faults[0].what
-    assert "Expected a number in column FZ_0, got 'abc'" in data.faults[1].what
+    assert "Expected 51 columns, got 46" in data.faults[0].message
+    assert "Expected a number in column FZ_0, got 'abc'" in data.faults[1].message
     kept = [i for i in range(24) if i not in (2, 5, 8)]
     np.testing.assert_array_equal(data.y, small.y[kept])
     expected = small.X[kept].copy()
