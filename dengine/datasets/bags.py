@@ -309,7 +309,7 @@ class RecordedInsertion(NamedTuple):
 
 
 def _usual_step(times: Times) -> float:
-    """Return the usual seconds between two messages, even if they come in bursts."""
+    """Return the seconds between two messages: the median step, or in bursts the mean one."""
     span = min(SPAN, len(times) - 1)
     single = float(np.median(np.diff(times)))
     many = float(np.median((times[span:] - times[:-span]) / span))
@@ -340,7 +340,9 @@ def _cut_stream(
     quiet_s: float,
     rate_hz: float | None,
 ) -> Iterator[RecordedInsertion]:
-    """Yield the insertions of a stream in turn.
+    """Cut a stream where its trigger starts, and yield each insertion with its trace, or its fault.
+
+    An insertion with missing messages, or times that turn back, has a fault.
 
     Parameters
     ----------

@@ -539,9 +539,10 @@ def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) ->
 
 
 def split_unit(unit: str | Sequence[str] | None, n: int) -> list[str]:
-    """Return the unit of each of n channels, of one for all, of "kN, mm" or of a list of n.
+    """Return the unit of each of n channels.
 
-    None gives n times "".
+    "kN, mm" or a list states one for each channel; any other text is the unit of all; None gives
+    n times "".
     """
     items = unit.split(",") if isinstance(unit, str) else list(unit or ())
     if len(items) != n:
@@ -631,17 +632,20 @@ def choose_fit(lengths: NDArray[np.int64], fit: str | None, samples: int | None)
     Parameters
     ----------
     lengths : array of int64, shape (n,)
-    fit, samples
-        As the user stated them; None: not stated.
+    fit : str or None
+        In `FITS`, if the user stated it.
+    samples : int or None
+        The length of all, if the user stated it.
 
     Returns
     -------
     fit : str
-        strict for equal lengths; cut for stated samples that all have; else pad, which leaves each
-        sample at its own time, and takes live traces that are a little shorter.
+        The stated one. Else strict for equal lengths; cut for stated samples that all have; else
+        pad, which leaves each sample at its own time, and takes live traces that are a little
+        shorter.
     samples : int
-        The median length for pad and resample; for cut the shortest that is at least half of the
-        median.
+        The stated ones. Else the median length for pad and resample; for cut the shortest that is
+        at least half of the median.
 
     Raises
     ------

@@ -398,9 +398,10 @@ def _find_user_word(text: str, start: int, words: LabelMap) -> _FoundLabel | Non
 
 
 def _endings(text: str) -> Iterator[str]:
-    """Yield a name up to each position where a label may end.
+    """Yield the beginnings of a name at whose end a label may stand.
 
-    That is the whole name, then the name without each word with a number in which it ends.
+    First the whole name, then the name without its last word as long as that has a number in it:
+    `part_NOK_7`, `part_NOK_`, `part_NOK`.
     """
     text = re.sub(r"[\W_]+$", "", text)
     yield text

@@ -379,9 +379,10 @@ def _parts_first(x: NDArray[Any], labels: NDArray[Any] | None) -> NDArray[Any]:
 
 
 def _missing_arrays(named: Files, options: LoadOptions) -> str:
-    """Return what is missing in archives, and which of their arrays could be it, for an error.
+    """Return the message of an error: the arrays X and y are missing, and which could be them.
 
-    Traces have two or three dimensions; labels have one, as long as one of the traces'.
+    An array of two or three dimensions may hold the traces; one of one dimension, as long as an
+    axis of the traces, the labels.
     """
     arrays, all_names = _read_archives(named, options, every=True)
     traces = [name for name, x in arrays.items() if x.ndim in (2, 3) and len(x)]

@@ -246,9 +246,10 @@ def _look_like_labels(counts: Counter[Any]) -> bool:
 
 
 def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOptions) -> str | None:
-    """Return advice to give a file of labels that is in the folder, None if there is none.
+    """Return advice, for an error, to give a file of labels that is in the folder.
 
-    Its last line names another file, and it has labels for most recordings.
+    Such a file names other files in its last line, and has labels for most recordings. None if
+    there is none.
     """
     stems = {path.stem.lower() for path in named.values()}
     for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in TEXTS):
@@ -264,9 +265,10 @@ def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOpt
 
 
 def _label_advice(named: Mapping[str, Path], options: LoadOptions) -> str | None:
-    """Return advice where the labels of recordings are, if it was tried and finds most; else None.
+    """Return advice, for an error, how the user can say where the labels of recordings are.
 
-    Ways to read names are tried on all recordings, columns on twenty of them.
+    Other ways to read names are tried on all recordings, then each column on twenty of them. None
+    if no way finds labels for most.
     """
     suggestions = [
         (_count_labels(named, source), f"{condition}, say so: {do}")
@@ -334,9 +336,11 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 def _usual_channels(
     paths: Iterable[Path], options: LoadOptions, label: str | None = None
 ) -> tuple[str, ...]:
-    """Return the force if a file has it, else the only channel of most files.
+    """Return the force if a file has it or none has channels, else the only channel of most files.
 
-    label : the column of labels, which is no channel. Raises DataError if there are several.
+    Raises DataError if these have several.
+
+    label : the column of labels, which is no channel.
     """
     headers = []
     for path in paths:
@@ -421,8 +425,8 @@ def _from_tables(
 ) -> Dataset:
     """Make a data set of tables of one form, wide or long.
 
-    Raises DataError if their columns differ, or are lists; and for a long table without the options
-    that say which column is what.
+    They are taken as long if the options name a column of times or a file of labels. Raises
+    DataError if their columns differ or hold lists, and for a long table without these options.
 
     tables : by the names of their files, or "row" for a DataFrame; the index is the line.
     units_row : unit of each column.
@@ -598,10 +602,11 @@ def _time_column(frame: pd.DataFrame, options: LoadOptions) -> str:
 
 
 def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -> pd.DataFrame:
-    """Return a table with a row for each sample, of one with a row for each signal's value.
+    """Pivot a table with a row for each value of each signal to one with a row for each sample.
 
-    Such a table tells signals apart by a column of tags. Any other is returned as it is. Raises
-    DataError if the user does not name the channels among the tags.
+    Such a table has a column of tags that names the signal of each row; the signals become columns.
+    Any other table is returned unchanged. Raises DataError if the user does not name the channels
+    among the tags.
 
     keys : columns of parts, times and, if there is one, labels.
     """
@@ -683,7 +688,10 @@ def _rises_within_parts(frame: pd.DataFrame, part: str, name: str) -> bool:
 
 
 def _parts_file_advice(parts: pd.Series, label_file: str, options: LoadOptions) -> str:
-    """Return advice to give a file of parts and labels, `label_file` if it has most parts."""
+    """Return advice, for an error, to give a file of parts and labels.
+
+    It names `label_file` if that has labels for most parts.
+    """
     names = [str(part) for part in parts.unique()]
     with suppress(DataError):
         source = labels.labels_in_file(label_file, "part", names, options.words)

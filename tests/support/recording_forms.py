@@ -8,7 +8,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "recording_forms.md"
-BEGIN, END = "<!-- {}: written by tests/support/recording_forms.py -->", "<!-- end of {} -->"
+BEGIN = "<!-- {}: written by tests/support/recording_forms.py -->"
+END = "<!-- end of {} -->"
 STEP = 0.004  # seconds: 250 Hz
 
 # A delimiter's name -> what stands between the cells.
@@ -173,13 +174,15 @@ def tables() -> dict[str, str]:
         "A time is written as": in_code(TIMES),
         "The unit kN of a channel": in_code(UNITS),
     }
-    lines = ["| what | forms that are read |", "| --- | --- |", *(f"| {what} | {forms} |" for what, forms in rows.items())]
-    said = [f"| {form} | {in_code(tuple(good))} | {in_code(tuple(bad))} |" for form, (good, bad) in LABEL_FORMS.items()]
+    lines = ["| what | forms that are read |", "| --- | --- |", *(f"| {name} | {forms} |" for name, forms in rows.items())]
+    label_rows = [
+        f"| {form} | {in_code(tuple(good))} | {in_code(tuple(bad))} |" for form, (good, bad) in LABEL_FORMS.items()
+    ]
     empty = ", ".join(f"`{word}`" for word in NOT_CHECKED if word.strip())
     head = ["| the label is | good | bad |", "| --- | --- | --- |"]
     labels = [
         *head,
-        *said,
+        *label_rows,
         "",
         f"An empty label, or {empty}, is of a part that was not checked yet: it is counted, and left out.",
     ]
@@ -189,7 +192,8 @@ def tables() -> dict[str, str]:
 def page(text: str) -> str:
     """A page with its lists as they are now."""
     for name, table in tables().items():
-        begin, end = BEGIN.format(name), END.format(name)
+        begin = BEGIN.format(name)
+        end = END.format(name)
         before, _, rest = text.partition(begin)
         text = f"{before}{begin}\n\n{table}\n\n{end}{rest.partition(end)[2]}"
     return text

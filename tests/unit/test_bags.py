@@ -15,8 +15,12 @@ pytest.importorskip("mcap_ros2.writer", reason='mcap is not installed: pip insta
 
 STEP = 2_000_000  # nanoseconds
 BEGIN = 1_700_000_000_000_000_000
-SAMPLES, REST = 60, 40  # of an insertion, and between two
-FORCE, PHASE, CHECK = "/ft/wrench", "/phase", "/height_check/ok"
+# of an insertion, and between two
+SAMPLES = 60
+REST = 40
+FORCE = "/ft/wrench"
+PHASE = "/phase"
+CHECK = "/height_check/ok"
 
 
 def vector(values: np.ndarray) -> dict[str, float]:
@@ -81,8 +85,8 @@ def test_a_recording_is_cut_into_its_insertions_with_their_labels(bag: Bag, tmp_
 
 @pytest.mark.parametrize("signal", ["FZ", "FX_Base"])
 def test_it_is_cut_by_the_same_triggers_as_a_live_one(bag: Bag, tmp_path: Path, signal: str) -> None:
-    asked = {**ASKED, "trigger": Trigger("contact", 5.0, signal, quiet_s=0.05)}
-    np.testing.assert_array_equal(load_dataset(bag.write(tmp_path / "a.mcap"), **asked).X, bag.traces[:, 2].astype("f4"))
+    options = {**ASKED, "trigger": Trigger("contact", 5.0, signal, quiet_s=0.05)}
+    np.testing.assert_array_equal(load_dataset(bag.write(tmp_path / "a.mcap"), **options).X, bag.traces[:, 2].astype("f4"))
     with pytest.raises(DataError, match="it never does"):  # 0.08 s of rest are less than the 0.2 s of its text
         load_dataset(tmp_path / "a.mcap", **{**ASKED, "trigger": f"contact=5@{signal}"})
 
@@ -132,11 +136,12 @@ def test_times_that_turn_back_are_a_fault_unless_a_rate_is_stated(bag: Bag, tmp_
 
 
 def test_labels_are_listed_by_number_too_with_the_parts(bag: Bag, tmp_path: Path) -> None:
-    path, table = bag.write(tmp_path / "cell.mcap"), tmp_path / "labels.csv"
+    path = bag.write(tmp_path / "cell.mcap")
+    table = tmp_path / "labels.csv"
     rows = [f"{i},{'OK' if good else 'NOK'},P{i // 2}" for i, good in enumerate(bag.good, start=1)]
     table.write_text("\n".join(["insertion,label,part", *rows[:-1], "77,OK,P9"]), encoding="utf-8")
-    asked = {name: ASKED[name] for name in ("trigger", "samples")}
-    data = load_dataset(path, labels=table, **asked)
+    options = {name: ASKED[name] for name in ("trigger", "samples")}
+    data = load_dataset(path, labels=table, **options)
     np.testing.assert_array_equal(data.y, bag.good[:-1])
     assert data.part.tolist() == [f"P{i // 2}" for i in range(1, 8)]
     assert [fault.source for fault in data.faults] == ["labels.csv", "cell/8"]
@@ -154,7 +159,7 @@ def test_an_insertion_that_nobody_labelled_is_a_fault_and_most_of_them_an_error(
 
 def test_what_cannot_be_cut_is_said_with_what_to_give(bag: Bag, tmp_path: Path) -> None:
     path = bag.write(tmp_path / "cell.mcap")
-    for change, said in (
+    for change, message in (
         ({"trigger": None}, "Expected what cuts .* as trigger='register@/phase' and label='/height_check/ok'"),
         ({"label": None}, "Expected the labels of the insertions in .*, as label='/height_check/ok'"),
         ({"trigger": "register@/nothing"}, "Expected the topic /nothing"),
@@ -164,7 +169,7 @@ def test_what_cannot_be_cut_is_said_with_what_to_give(bag: Bag, tmp_path: Path) 
         ({"trigger": f"register@{FORCE}"}, "Expected messages with a field data"),
         ({"trigger": "contact=500"}, "it never does"),
     ):
-        with pytest.raises(DataError, match=said):
+        with pytest.raises(DataError, match=message):
             load_dataset(path, **(ASKED | change))
     for source in ("insertion", (np.zeros((2, 5)), [0, 1])):
         with pytest.raises(DataError, match="Expected no trigger for"):

@@ -55,7 +55,8 @@ def test_the_first_trace_of_a_lost_stop_sets_a_contract_as_any_other(place) -> N
 
 
 def test_a_wrong_contract_that_nothing_was_learned_by_says_how_to_start_over(tmp_path: Path, make_data) -> None:
-    data, place = make_data(3), tmp_path / "engine.db"
+    data = make_data(3)
+    place = tmp_path / "engine.db"
     with DataEngine("pca", store=place) as engine:
         engine.decide(np.arange(20.0))
     with DataEngine.open(place) as engine:  # it is known after a restart, too

@@ -31,7 +31,8 @@ def test_quantised_traces_are_scaled_back(saved) -> None:
 def test_a_stated_unit_converts_samples_whose_own_unit_is_known_and_is_refused_where_nothing_converts_it(
     saved, make_data, tmp_path: Path
 ) -> None:
-    X, y = np.arange(12, dtype=np.float32).reshape(3, 4), [1, 0, 1]
+    X = np.arange(12, dtype=np.float32).reshape(3, 4)
+    y = [1, 0, 1]
     archive = load_dataset(saved(X=X, y=y, unit="kN"), unit="N")
     np.testing.assert_array_equal(archive.X, 1000 * X)
     assert archive.unit == "N"

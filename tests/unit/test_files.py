@@ -23,7 +23,8 @@ TEXT = b"my notes\n"
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory, make_data) -> Path:
-    path, data = tmp_path_factory.mktemp("outputs") / "engine.db", make_data(70)
+    path = tmp_path_factory.mktemp("outputs") / "engine.db"
+    data = make_data(70)
     with DataEngine("pca", retrain_every=60, store=path) as engine:
         learn(engine, data, range(len(data)))
     return path
@@ -66,7 +67,7 @@ def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_pat
     first, second = (write_output(tmp_path / name, name.encode()) for name in ("a.csv", "b.png"))
     write_manifest(tmp_path, [first])
     listed = json.loads(write_manifest(tmp_path, [second]).read_text())["sha256"]
-    assert listed == {each.name: hashlib.sha256(each.read_bytes()).hexdigest() for each in (first, second)}
+    assert listed == {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in (first, second)}
     (tmp_path / "manifest.json").write_text('{"name": "my web page"}')
     with pytest.raises(OutputError, match="was left as it was"):
         write_manifest(tmp_path, [first])
@@ -78,7 +79,7 @@ def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path
         present.write_bytes(TEXT)
         done = dengine("export", store, "--out", target)
         assert (done.exit_code, present.read_bytes()) == (1, TEXT)
-        assert [each.name for each in tmp_path.iterdir()] == [present.name]
+        assert [file.name for file in tmp_path.iterdir()] == [present.name]
         present.unlink()
     target.write_bytes(TEXT)
     (tmp_path / ".dengine-0000000000000000.partial").symlink_to(store)
@@ -122,7 +123,7 @@ def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(store: Pat
     assert done.stdout.startswith(f"OutputError Cannot write {model}: File too large; choose a folder"), done.stderr
     assert model.read_bytes() == before
     load_exported(model)
-    assert {each.name for each in tmp_path.iterdir()} == {"model.ts", "model.ts.sha256"}
+    assert {file.name for file in tmp_path.iterdir()} == {"model.ts", "model.ts.sha256"}
 
 
 def test_a_folder_with_somebody_elses_table_keeps_it_and_the_tables_are_shown(tmp_path: Path) -> None:
@@ -137,4 +138,4 @@ def test_a_folder_with_somebody_elses_table_keeps_it_and_the_tables_are_shown(tm
     assert "certain" in done.output  # what took long is shown all the same
     assert dengine(*words, "--force").exit_code == 0
     listed = set(json.loads((tmp_path / "manifest.json").read_text())["sha256"])
-    assert listed == {each.name for each in tmp_path.iterdir()} - {"data.png", "manifest.json"}
+    assert listed == {file.name for file in tmp_path.iterdir()} - {"data.png", "manifest.json"}

@@ -20,7 +20,7 @@ from tests.support.command_line import dengine
 SECRET = "hunter2"
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES", "")
 NOBODY = f"postgresql+psycopg://robot:{SECRET}@127.0.0.1:1/cell"
-ERRORS = [each for each in vars(all_errors).values() if isinstance(each, type) and issubclass(each, DengineError)]
+ERRORS = [value for value in vars(all_errors).values() if isinstance(value, type) and issubclass(value, DengineError)]
 
 
 @pytest.mark.parametrize(

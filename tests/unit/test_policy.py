@@ -73,13 +73,14 @@ HELD = {  # by seconds, or by channel 1, of samples 0 to 5 ten a second, and of 
 }
 
 
-@pytest.mark.parametrize(("window", "said"), HELD.items())
-def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits(window: str, said: int) -> None:
-    x, held = torch.arange(6, dtype=torch.float32), recipe(windows=(window,))
+@pytest.mark.parametrize(("window", "expected"), HELD.items())
+def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits(window: str, expected: int) -> None:
+    x = torch.arange(6, dtype=torch.float32)
+    limited = recipe(windows=(window,))
     spec = TraceSpec(6, rate_hz=10.0, channels=2, columns=("F", "Z"))
-    assert ForceLimitsGate(held.policy.windows, spec)(torch.stack([x, -x])) == said
-    assert Recipe.from_toml(held.to_toml()) == held
-    assert str(*held.policy.windows) == window
+    assert ForceLimitsGate(limited.policy.windows, spec)(torch.stack([x, -x])) == expected
+    assert Recipe.from_toml(limited.to_toml()) == limited
+    assert str(*limited.policy.windows) == window
 
 
 def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts_it(make_data, tmp_path: Path) -> None:
@@ -87,9 +88,9 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
     with trained(data, tmp_path / "cell.db") as engine:
         x = next(x for x in data.X if engine.decide(x).action is Action.ACCEPT)
         engine.set_policy(replace(engine.policy, windows=(f"0:0.1::{x[:50].max() - 0.1}:reject",)))
-        made = engine.decide(x)
-        assert (made.action, made.predicted, made.reason) == (Action.REJECT, Action.VERIFY, Reason.OUTSIDE)
-        assert (made.propensity, "alone the model" in repr(made)) == (0.0, False)
+        decision = engine.decide(x)
+        assert (decision.action, decision.predicted, decision.reason) == (Action.REJECT, Action.VERIFY, Reason.OUTSIDE)
+        assert (decision.propensity, "alone the model" in repr(decision)) == (0.0, False)
         engine.set_shadow(True)
         assert engine.decide(x).action is Action.VERIFY
         for nowhere in ("0.3:0.4:0:", "0.1001:0.1019:0:", "0:1:0::channel=1", "0:1:0::along=FZ"):
@@ -99,7 +100,7 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
         status = engine.status()
         assert (status.newest.outside, status.newest.rejected, status.actions["reject"]) == (2, 0, 1)
         assert (status.certificate.rejected.n, status.certificate.accepted.n) == (0, 0)
-        assert "leaves an operator's window, 0:0.1::" in engine.explain(made.id).sentences[0]
+        assert "leaves an operator's window, 0:0.1::" in engine.explain(decision.id).sentences[0]
         assert engine.status(last=3).alarm == "2 of the newest parts leave a window."
     with pytest.raises(SettingError, match=r"\(windows 0:0\.1::.*:reject\), got windows 0:0\.2:0:;"):
         DataEngine.open_or_create(tmp_path / "cell.db", recipe=recipe(windows=["0:0.2:0:"]))

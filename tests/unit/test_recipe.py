@@ -57,11 +57,11 @@ def test_the_recipe_files_equal_the_defaults_in_the_code(name: str, repo: Path) 
 def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text('reducer = "pca"\nradius = 0.7\n[policy]\nalpha = 0.2\n', encoding="utf-8")
-    mine = Recipe.load(path)
+    loaded = Recipe.load(path)
     base = RECIPES["pca"]
-    assert mine == replace(base, radius=0.7, policy=replace(base.policy, alpha=0.2))
-    assert Recipe.load(str(path)) == mine
-    assert Recipe.load(mine) is mine
+    assert loaded == replace(base, radius=0.7, policy=replace(base.policy, alpha=0.2))
+    assert Recipe.load(str(path)) == loaded
+    assert Recipe.load(loaded) is loaded
     assert Recipe.load("pca") is base
     with pytest.raises(SettingError, match=r"conv, umap, umap-learn, pca, rocket, paper.*covn is none"):
         Recipe.load("covn")

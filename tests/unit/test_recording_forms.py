@@ -151,7 +151,8 @@ def pd_pair(folder: Path) -> tuple[list[pd.DataFrame], list[int]]:
 
 @pytest.mark.parametrize("form", TIMES)
 def test_times_are_read_in_all_forms_and_a_long_table_is_sorted_by_them(form: str, tmp_path: Path) -> None:
-    cells, order = [TIMES[form](i) for i in range(N)], np.random.default_rng(0).permutation(N)
+    cells = [TIMES[form](i) for i in range(N)]
+    order = np.random.default_rng(0).permutation(N)
     write(tmp_path / "cell" / "a_OK.csv", ["Time", "FZ"], cells, texts(), delimiter=";")
     data = load_dataset(tmp_path / "cell")
     np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
@@ -364,8 +365,8 @@ def test_columns_without_a_header_are_named_as_the_error_advises(tmp_path: Path)
     assert "line 1: Expected a header, its first line is of numbers" in refused.stderr
     advised = re.search(r"--columns (\S+?);", refused.stderr)[1]
     assert advised == "time,c1,c2"
-    found = document("data", tmp_path, "--columns", advised, "--channel", "c2")["survey"]
-    assert (found["traces"], found["rate_hz"]) == (2, 250.0)
+    record = document("data", tmp_path, "--columns", advised, "--channel", "c2")["survey"]
+    assert (record["traces"], record["rate_hz"]) == (2, 250.0)
     data = load_dataset(tmp_path, columns="time,fx,fy", channel="fy")
     np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
     with pytest.raises(DataError, match="Expected 2 columns, got 3"):
@@ -406,18 +407,16 @@ def test_recordings_at_several_rates_are_resampled_by_their_own_times(as_long: b
 
 
 def test_resampled_recordings_are_imported_once_also_when_others_are_added(tmp_path: Path) -> None:
-    rng, words = (
-        np.random.default_rng(0),
-        ("train", "--data", tmp_path / "cell", "--fit", "resample", "--store", tmp_path / "a.db"),
-    )
+    rng = np.random.default_rng(0)
+    words = ("train", "--data", tmp_path / "cell", "--fit", "resample", "--store", tmp_path / "a.db")
     (tmp_path / "cell").mkdir()
-    for known, until in ((0, 30), (30, 30), (30, 34)):
-        for i in range(known, until):
+    for first, until in ((0, 30), (30, 30), (30, 34)):
+        for i in range(first, until):
             pd.DataFrame(uneven(rate := rng.uniform(228, 280), 500 / rate), columns=["time", "FZ"]).assign(
                 FZ=lambda frame: frame["FZ"] + rng.normal(size=len(frame))
             ).to_csv(tmp_path / "cell" / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False)
-        found = document(*words, *(() if known else ("--reducer", "pca")))["import"]
-        assert (found["imported"], found["repeated"]) == (until - known, known)
+        record = document(*words, *(() if first else ("--reducer", "pca")))["import"]
+        assert (record["imported"], record["repeated"]) == (until - first, first)
 
 
 def left_out(data: Dataset) -> list[str]:

@@ -173,23 +173,26 @@ def test_two_labels_in_a_name_that_contradict_each_other_are_an_error(name: str)
 
 
 def test_a_number_is_a_label_of_a_name_where_somebody_says_so_and_never_against_a_word() -> None:
-    told = labels_in_names(None, {"1": True, "0": False})
-    assert [told.find(name)[0] for name in ("run_1.csv", "part_003/run_0.csv", "1/7.csv", "0/a.csv", "x-1.csv")] == [
+    source_of_labels = labels_in_names(None, {"1": True, "0": False})
+    assert [
+        source_of_labels.find(name)[0] for name in ("run_1.csv", "part_003/run_0.csv", "1/7.csv", "0/a.csv", "x-1.csv")
+    ] == [
         1,
         0,
         1,
         0,
         1,
     ]
-    assert told.find("part_0001_OK_1.csv") == (1, None)
+    assert source_of_labels.find("part_0001_OK_1.csv") == (1, None)
     with pytest.raises(DataError, match="contradict"):
-        told.find("part_0001_NOK_1.csv")
+        source_of_labels.find("part_0001_NOK_1.csv")
     with pytest.raises(DataError, match="at the end of the name"):
-        told.find("run_11.csv")
+        source_of_labels.find("run_11.csv")
 
 
 def test_labels_come_from_folders_a_pattern_or_a_file(small: Dataset, tmp_path: Path) -> None:
-    names, rows = [], []
+    names = []
+    rows = []
     for i, (x, y) in enumerate(zip(small.X, small.y, strict=True)):
         write_csv(tmp_path / "sorted" / ("good" if y else "bad") / f"{i}.csv", x)
         write_csv(tmp_path / "coded" / f"{i}_{'q1' if y else 'q0'}_cell3.csv", x)
@@ -212,8 +215,8 @@ def test_a_labels_file_that_does_not_fit_is_named_line_by_line(small: Dataset, t
     (tmp_path / "labels.csv").write_text("\n".join(["file,label", *rows]) + "\n")
     data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
     assert (data.source.tolist(), data.y.tolist()) == ([f"{i}.csv" for i in (0, 1, 4, 5, 6)], [1, 0, 1, 1, 0])
-    said = [(f.source, f.line) for f in data.faults]
-    assert said == [("labels.csv", 5), ("labels.csv", 8), ("labels.csv", 6), ("2.csv", 0), ("3.csv", 0), ("7.csv", 0)]
+    places = [(f.source, f.line) for f in data.faults]
+    assert places == [("labels.csv", 5), ("labels.csv", 8), ("labels.csv", 6), ("2.csv", 0), ("3.csv", 0), ("7.csv", 0)]
     assert "in labels.csv, line 4" in data.faults[3].message
 
 
@@ -263,7 +266,8 @@ def test_unasked_lengths_that_differ_are_padded_and_never_resampled(uneven: tupl
 
 
 def test_what_cannot_honestly_be_fitted_is_a_fault(uneven: tuple[list[np.ndarray], list[int]]) -> None:
-    X, y = [*uneven[0], np.ones(20), np.ones(300), np.array([])], [*uneven[1], 1, 1, 1]
+    X = [*uneven[0], np.ones(20), np.ones(300), np.array([])]
+    y = [*uneven[1], 1, 1, 1]
     data = load_dataset((X, y))
     assert len(data) == 15
     assert [(f.source, f.line) for f in data.faults] == [("data", 18), ("trace 16", 0), ("trace 17", 0)]
@@ -341,7 +345,7 @@ def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(few
 
 
 @pytest.mark.parametrize(
-    ("asked", "words"),
+    ("options", "words"),
     [
         ({}, r"4 of 4 have none.*give the pattern of it in the path \(label\), or list the files"),
         ({"label": "("}, "regular expression"),
@@ -352,12 +356,12 @@ def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(few
         ({"part": "workpiece"}, "Expected a file of labels with a column workpiece"),
     ],
 )
-def test_where_a_folders_labels_are_not_is_said(small: Dataset, tmp_path: Path, asked: dict, words: str) -> None:
+def test_where_a_folders_labels_are_not_is_said(small: Dataset, tmp_path: Path, options: dict, words: str) -> None:
     for i, x in enumerate(small.X[2:6], start=2):
         write_csv(tmp_path / "cell" / f"run_{i}.csv", x)
     (tmp_path / "labels.csv").write_text("a,b\nOK,1\nNOK,2\n")
     with pytest.raises(DataError, match=words):
-        load_dataset(tmp_path / "cell", **(asked | ({"labels": tmp_path / "labels.csv"} if "labels" in asked else {})))
+        load_dataset(tmp_path / "cell", **(options | ({"labels": tmp_path / "labels.csv"} if "labels" in options else {})))
 
 
 def test_parts_keep_their_whole_names_and_a_row_without_one_is_a_part_of_its_own(small: Dataset) -> None:
@@ -425,15 +429,16 @@ REFUSED: dict[str, tuple[Callable[[Dataset, Path], Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("what", REFUSED)
-def test_what_would_be_misread_is_refused(what: str, small: Dataset, tmp_path: Path) -> None:
-    source, words = REFUSED[what]
+@pytest.mark.parametrize("form", REFUSED)
+def test_what_would_be_misread_is_refused(form: str, small: Dataset, tmp_path: Path) -> None:
+    source, words = REFUSED[form]
     with pytest.raises(DataError, match=words):
         load_dataset(source(small, tmp_path))
 
 
 def test_recordings_that_are_added_do_not_make_those_before_count_again(tmp_path: Path) -> None:
-    rng, store = np.random.default_rng(0), tmp_path / "cell.db"
+    rng = np.random.default_rng(0)
+    store = tmp_path / "cell.db"
     for i in range(9):
         write_csv(tmp_path / "cell" / f"{i}_OK.csv", rng.normal(size=100 + i))
     first = import_labelled(store, tmp_path / "cell", "pca")

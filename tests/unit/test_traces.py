@@ -70,10 +70,10 @@ def test_units_that_are_no_text_or_too_many_are_refused(unit: Any) -> None:
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4", ">f8", "i1", "i2", ">i2", "i4", "i8", "u2", "?"])
 def test_every_real_dtype_is_cast_to_float32(dtype: str) -> None:
     x = np.arange(100).astype(dtype)
-    got = as_trace(x, None)
-    assert got.dtype == np.float32
-    assert got.flags.c_contiguous
-    np.testing.assert_array_equal(got[0], x.astype(np.float32))
+    result = as_trace(x, None)
+    assert result.dtype == np.float32
+    assert result.flags.c_contiguous
+    np.testing.assert_array_equal(result[0], x.astype(np.float32))
     assert as_trace(x.reshape(50, 2), TraceSpec(2, channels=50)).shape == (50, 2)  # it is agreed on
 
 
@@ -156,26 +156,26 @@ def test_cut_and_pad_keep_what_was_measured_at_its_own_time() -> None:
 @settings(max_examples=60, deadline=None)
 def test_resample_is_linear_interpolation_over_the_whole(have: int, channels: int, seed: int) -> None:
     x = np.random.default_rng(seed).normal(size=(channels, have)).astype(np.float32)
-    got = as_trace(x, TraceSpec(SAMPLES, channels=channels, fit="resample"))
+    result = as_trace(x, TraceSpec(SAMPLES, channels=channels, fit="resample"))
     grid = np.linspace(0, have - 1, SAMPLES)
     expected = np.stack([np.interp(grid, np.arange(have), row.astype(np.float64)) for row in x])
-    np.testing.assert_allclose(got, expected, atol=1e-6)
-    np.testing.assert_array_equal(got[:, 0], x[:, 0])
+    np.testing.assert_allclose(result, expected, atol=1e-6)
+    np.testing.assert_array_equal(result[:, 0], x[:, 0])
 
 
 @given(have=st.integers(1, 500), samples=st.integers(1, 120), fit=st.integers(1, 3), seed=st.integers(0, 99))
 @settings(max_examples=150, deadline=None)
 def test_what_cannot_honestly_be_fitted_is_not_finite_and_nothing_else_is(have, samples: int, fit: int, seed: int) -> None:
     x = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, have)).astype(np.float32))
-    got = fit_length(x, samples, fit)
-    assert got.shape == (2, samples)
-    assert bool(got.isfinite().all()) == can_fit_length(have, samples, fit)
+    result = fit_length(x, samples, fit)
+    assert result.shape == (2, samples)
+    assert bool(result.isfinite().all()) == can_fit_length(have, samples, fit)
     honest = have >= samples if fit == 1 else samples <= 2 * have <= 4 * samples
     assert can_fit_length(have, samples, fit) == honest
     if not honest:  # it keeps what there is
         kept = min(have, samples - 1)
-        assert torch.equal(got[:, :kept], x[:, :kept])
-        assert got[:, kept:].isnan().all()
+        assert torch.equal(result[:, :kept], x[:, :kept])
+        assert result[:, kept:].isnan().all()
 
 
 def other_lengths(data: Dataset) -> list[np.ndarray]:
@@ -195,10 +195,12 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(fit: s
     engine = DataEngine("pca", trace=TraceSpec(SAMPLES, fit=fit), retrain_every=10**6)
     learn(engine, make_data(300, samples=SAMPLES), range(300))
     engine.retrain()
-    exported, decided = load_exported(export_torchscript(engine, tmp_path / "fit.ts")), []
+    exported = load_exported(export_torchscript(engine, tmp_path / "fit.ts"))
+    decided = []
     assert exported.trace == engine.trace
     for x in other_lengths(make_data(130, samples=SAMPLES, seed=7)):
-        ours, theirs = engine.decide(x), exported.decide(x)
+        ours = engine.decide(x)
+        theirs = exported.decide(x)
         raw = exported.module.decide(torch.from_numpy(x))  # the compiled fit, as a cell program calls it
         for name in ("action", "reason", "lower", "upper", "n_success", "n_failure"):
             assert getattr(ours, name) == getattr(theirs, name)
@@ -207,11 +209,12 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(fit: s
             np.testing.assert_array_equal(np.array(ours.embedding, dtype=np.float32), theirs.embedding)
             np.testing.assert_array_equal(raw[6].numpy(), theirs.embedding)
         decided.append((x, ours))
-    for x, one in decided:
+    for x, decision in decided:
         lost = not can_fit_length(len(x), SAMPLES, FITS.index(fit)) or np.isnan(x[:SAMPLES]).any()
-        assert (one.reason is Reason.NOT_FINITE) == lost
-    assert {one.action for _, one in decided} >= {Action.VERIFY, Action.ACCEPT}
-    lost, labels = engine.decide(np.linspace(0, 9, 30)), core_of(engine).new_labels
+        assert (decision.reason is Reason.NOT_FINITE) == lost
+    assert {decision.action for _, decision in decided} >= {Action.VERIFY, Action.ACCEPT}
+    lost = engine.decide(np.linspace(0, 9, 30))
+    labels = core_of(engine).new_labels
     engine.report(lost.id, True)
     kept = engine.store.get_decision(lost.id)  # and never learned from
     assert (lost.reason, kept.quarantined, core_of(engine).new_labels) == (Reason.NOT_FINITE, True, labels)
@@ -225,11 +228,11 @@ def recording(samples: int = 60) -> pd.DataFrame:
 
 def test_a_dataframe_has_samples_in_rows_and_channels_in_columns() -> None:
     frame = recording()
-    got = as_trace(frame, None)
-    np.testing.assert_array_equal(got, frame[["FX", "FY", "FZ"]].to_numpy(dtype=np.float32).T)
-    assert spec_of(got, frame) == TraceSpec(60, channels=3, columns=("FX", "FY", "FZ"))
-    np.testing.assert_array_equal(as_trace(frame, TraceSpec(60, channels=3)), got)
-    np.testing.assert_array_equal(as_trace(frame["FZ"], None), got[2:])
+    result = as_trace(frame, None)
+    np.testing.assert_array_equal(result, frame[["FX", "FY", "FZ"]].to_numpy(dtype=np.float32).T)
+    assert spec_of(result, frame) == TraceSpec(60, channels=3, columns=("FX", "FY", "FZ"))
+    np.testing.assert_array_equal(as_trace(frame, TraceSpec(60, channels=3)), result)
+    np.testing.assert_array_equal(as_trace(frame["FZ"], None), result[2:])
 
 
 def test_columns_that_do_not_match_are_named_and_time_is_no_channel() -> None:

@@ -24,9 +24,9 @@ BITS = "actual_digital_output_bits"
     ],
 )
 def test_a_trigger_is_on_where_its_signals_say_so(trigger: str, signals: dict, on: list) -> None:
-    found = as_trigger(trigger)
-    assert set(found.signals) == set(signals)
-    seen = found.active({name: np.array(values, dtype=float) for name, values in signals.items()})
+    parsed = as_trigger(trigger)
+    assert set(parsed.signals) == set(signals)
+    seen = parsed.active({name: np.array(values, dtype=float) for name, values in signals.items()})
     assert seen.astype(int).tolist() == on
 
 
@@ -59,8 +59,9 @@ def test_what_is_no_trigger_is_refused_with_examples(text: object) -> None:
 )
 def test_an_insertion_begins_where_the_trigger_goes_on_after_it_was_quiet(active: str, quiet: int, starts: list) -> None:
     finder = StartFinder(STEP, quiet * STEP)
-    found = [finder.feed(i * STEP, each == "x") for i, each in enumerate(active)]
-    assert [(round(each.time / STEP, 6), each.seen) for each in found if each is not None] == [(i, True) for i in starts]
+    results = [finder.feed(i * STEP, mark == "x") for i, mark in enumerate(active)]
+    begun = [start for start in results if start is not None]
+    assert [(round(start.time / STEP, 6), start.seen) for start in begun] == [(i, True) for i in starts]
 
 
 def test_a_start_in_a_gap_is_known_to_be_unseen() -> None:
