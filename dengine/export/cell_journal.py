@@ -98,7 +98,8 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
         if kind == "part":
             line = _part(words, spec, where)
             again = line.decision.id in parts
-            expect_data(not again, f"one line of each part, in {where}", line.decision.id, "the journal was pasted together")
+            wanted = f"one line of each part, in {where}"
+            expect_data(not again, wanted, line.decision.id, "the journal was pasted together")
             lines += last  # the next part comes: no sooner is an accepted one counted of which nothing was heard
             last = [line] if line.label is None else []
         else:
