@@ -1,6 +1,8 @@
-"""A trained version on its way to answering: it catches up on labels, is stored, and waits for that.
+"""A trained version on its way to answering: it catches up on labels, is stored, and waits for
+that.
 
-`learner.Learner` takes a candidate through these steps, either to the end or one short step between two cycles.
+`learner.Learner` takes a candidate through these steps, either to the end or one short step between
+two cycles.
 """
 
 from __future__ import annotations
@@ -93,7 +95,8 @@ class Candidate:
     def accept(self, version: int, corrected_to: int) -> RetrainReport:
         """Complete the report, and where there is a model, accept it as the version of this number.
 
-        `corrected_to` is the newest correction that its labels had. Returns the report, which the store keeps.
+        `corrected_to` is the newest correction that its labels had. Returns the report, which the
+        store keeps.
         """
         self.report = replace(self.report, seconds=self._seconds)  # storing it comes on top
         if self.model is not None:
@@ -102,7 +105,9 @@ class Candidate:
         return self.report
 
     def begin_storing(self, storing: Future[int], seconds: float) -> None:
-        """Note that the version's commit has begun, which a step does not wait for until so many seconds are over."""
+        """Note that the version's commit has begun, which a step does not wait for until so many
+        seconds are over.
+        """
         self.storing = storing
         self._store_until = time.monotonic() + seconds
 
@@ -114,5 +119,8 @@ class Candidate:
         return storing.running() or time.monotonic() < self._store_until
 
     def number(self, version: int) -> None:
-        """Take the number that the store gave the version, because a peer's came before it; 0 leaves it as it is."""
+        """Take the number that the store gave the version, because a peer's came before it.
+
+        0 leaves it as it is.
+        """
         self.report = replace(self.report, version=version or self.report.version)

@@ -1,7 +1,9 @@
-"""What `DataEngine` is made of: its objects are composed here, and a decision and a report walk through them.
+"""What `DataEngine` is made of: its objects are composed here, and a decision and a report walk
+through them.
 
-`DataEngine` is the public face of `EngineCore`. `dengine serve` uses the core itself, by `engine.core_of`, for what only a
-server needs: a decision that must not wait, one that came too late, retrains step by step, and the state of the store.
+`DataEngine` is the public face of `EngineCore`. `dengine serve` uses the core itself, by
+`engine.core_of`, for what only a server needs: a decision that must not wait, one that came too
+late, retrains step by step, and the state of the store.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from .guard import GuardedModel
 from .labels import CellLabels, ProductLabels
 from .learner import Learner
 from .live_model import LiveModel
-from .settings import EngineSettings, SettingsInForce, peers_trace
+from .settings import EngineSettings, SettingsInForce, read_peers_trace_spec
 from .trainer import Clock, Limits, Retrainer, TrainingWindow
 
 if TYPE_CHECKING:
@@ -47,8 +49,8 @@ log = logging.getLogger("dengine")
 class ExclusiveUse:
     """A block that one thread enters at a time, and that SIGINT does not interrupt.
 
-    Another thread gets a StoreError. A SIGINT that comes meanwhile is handled when the block ends, so that a label is
-    stored and counted, or neither.
+    Another thread gets a StoreError. A SIGINT that comes meanwhile is handled when the block ends,
+    so that a label is stored and counted, or neither.
     """
 
     def __init__(self) -> None:
@@ -59,11 +61,12 @@ class ExclusiveUse:
     def __enter__(self) -> None:
         if not self._lock.acquire(blocking=False):
             raise StoreError(
-                "Expected an engine that one thread uses, got a call while another thread is in one; use it in one thread."
+                "Expected an engine that one thread uses, got a call while another thread "
+                "is in one; use it in one thread."
             )
         try:
-            # Python delivers signals to the main thread alone. An ignored signal interrupts nothing, nor does one
-            # that C code handles.
+            # Python delivers signals to the main thread alone. An ignored signal interrupts
+            # nothing, nor does one that C code handles.
             is_main = threading.current_thread() is threading.main_thread()
             handler = signal.getsignal(signal.SIGINT) if is_main else None
             if callable(handler):
@@ -102,7 +105,8 @@ class EngineCore:
     executor : concurrent.futures.Executor, optional
         Trains while the cell goes on; None trains in line.
     replaying : bool
-        End a retrain by steps alone, and wait for the store without a time limit, so that a seed repeats exactly.
+        End a retrain by steps alone, and wait for the store without a time limit, so that a seed
+        repeats exactly.
     clock : callable
         Seconds, of any origin, by which retrains are timed.
     on_safe_mode : callable, optional
@@ -174,9 +178,11 @@ class EngineCore:
         decision_id: str | None = None,
         timed_out: bool = False,
     ) -> Decision:
-        """Decide on one trace and record the decision; arguments, result and errors as of `DataEngine.decide`.
+        """Decide on one trace and record the decision; arguments, result and errors as of
+        `DataEngine.decide`.
 
-        With `timed_out` the caller waits no more and verifies, so the decision is VERIFY, `Reason.LATE`.
+        With `timed_out` the caller waits no more and verifies, so the decision is VERIFY,
+        `Reason.LATE`.
         """
         self.outbox.check_usable()
         with self.exclusive:
@@ -200,8 +206,9 @@ class EngineCore:
     def try_decide(self, trace: ArrayLike, part: str | int | None = None) -> Decision | None:
         """Decide as `decide` does where that waits for nothing; else do nothing and return None.
 
-        It may be called in any thread while no other uses the engine. It waits for neither store nor disk, and runs no
-        code of the user's, nor umap-learn's. `process_retrains` later swaps versions and announces safe mode.
+        It may be called in any thread while no other uses the engine. It waits for neither store
+        nor disk, and runs no code of the user's, nor umap-learn's. `process_retrains` later swaps
+        versions and announces safe mode.
         """
         self.outbox.check_usable()
         with self.outbox.try_lock() as is_free, self.exclusive:
@@ -210,7 +217,7 @@ class EngineCore:
                 self.live.newest.keeps_references and not self.settings.now.recipe.user_classes
             )
             is_quick = is_own_code and (answering is None or answering.is_compiled)
-            has_work = self._is_first_trace or self.settings.waiting or self.feedback.remedy
+            has_work = self._is_first_trace or self.settings.is_unsaved or self.feedback.remedy
             if not (is_free and is_quick) or has_work:
                 return None
             torch.set_num_threads(1)  # it holds for the present thread only
@@ -221,11 +228,13 @@ class EngineCore:
     def record_timeout(
         self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str
     ) -> Decision:
-        """Record VERIFY, `Reason.LATE`, for a caller that timed out, without asking the model; in any thread.
+        """Record VERIFY, `Reason.LATE`, for a caller that timed out, without asking the model.
 
-        The decision is on disk when this returns, and an id that has a decision keeps it. With a store in memory, and
-        before the first trace, it is returned unrecorded: `decide` must record it, with `timed_out`. Errors as of
-        `DataEngine.decide`.
+        In any thread.
+
+        The decision is on disk when this returns, and an id that has a decision keeps it. With a
+        store in memory, and before the first trace, it is returned unrecorded: `decide` must record
+        it, with `timed_out`. Errors as of `DataEngine.decide`.
         """
         self.outbox.check_usable()
         id_ = as_id(decision_id)
@@ -253,7 +262,10 @@ class EngineCore:
         timed_out: bool = False,
         decision_id: str | None = None,
     ) -> StoredDecision:
-        """Decide on a trace and hand the decision to the outbox, without waiting; returns it with its number."""
+        """Decide on a trace and hand the decision to the outbox, without waiting.
+
+        Returns it with its number.
+        """
         x = self._check_trace(trace)
         self.learner.catch_up()
         self.feedback.confirm_silent()
@@ -265,11 +277,15 @@ class EngineCore:
         return self.outbox.record_decision(item)
 
     def _sync_decision(self, stored: StoredDecision) -> StoredDecision:
-        """Wait until a decision is on disk; one that cannot be written becomes VERIFY. Returns the one that counts."""
+        """Wait until a decision is on disk; one that cannot be written becomes VERIFY.
+
+        Returns the one that counts.
+        """
         try:
             self.outbox.sync()
         except NotTakenError:
-            # A decision that lets a part go on unchecked must outlive this process, or its id would have two answers.
+            # A decision that lets a part go on unchecked must outlive this process, or its id would
+            # have two answers.
             decision = stored.decision
             if decision.action is not Action.VERIFY:
                 item = self._maker.decide(
@@ -284,7 +300,10 @@ class EngineCore:
         return stored
 
     def _verify_unrecorded(self, decision_id: str, part: str | None, error: StoreError) -> Decision:
-        """Return VERIFY for an id that may have a decision which cannot be looked up; nothing is recorded."""
+        """Return VERIFY for an id that may have a decision which cannot be looked up.
+
+        Nothing is recorded.
+        """
         log.warning(
             "whether %r was decided before cannot be looked up; it is verified: %s",
             decision_id,
@@ -295,7 +314,9 @@ class EngineCore:
     # The contract of traces
 
     def set_trace_spec(self, spec: TraceSpec, inferred: bool = False) -> TraceSpec:
-        """Set the contract of traces where none is set yet, in the store as well; returns the one in force.
+        """Set the contract of traces where none is set yet, in the store as well.
+
+        Returns the one in force.
 
         A product's peers may have set one before. `inferred` says that it comes from a first trace.
         """
@@ -303,7 +324,7 @@ class EngineCore:
             return self.settings.now.trace
         try:
             if self.store.product is not None:
-                spec = self.outbox.call_store(lambda: peers_trace(self.store)) or spec
+                spec = self.outbox.call_store(lambda: read_peers_trace_spec(self.store)) or spec
         except StoreError:  # the cell's own first trace stands
             log.exception("the product's contract of traces cannot be had")
         settings = replace(self.settings.now, trace=spec, inferred=inferred)
@@ -323,7 +344,7 @@ class EngineCore:
         if spec is not None:
             if self.set_trace_spec(spec, inferred=True) != spec:  # a peer's trace came first
                 return convert_trace(trace, self.settings.now.trace, False)
-        elif self.settings.waiting:
+        elif self.settings.is_unsaved:
             self.settings.save()
         if self._is_first_trace and self.settings.now.trace is not None and np.isfinite(x).all():
             self._is_first_trace = False
@@ -336,7 +357,10 @@ class EngineCore:
     def report(
         self, decision_id: str, success: bool, trace: ArrayLike | None, part: str | int | None
     ) -> RetrainReport | None:
-        """Learn the outcome of a decision; arguments, result and errors as of `DataEngine.report`."""
+        """Learn the outcome of a decision.
+
+        Arguments, result and errors are those of `DataEngine.report`.
+        """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)
         self.outbox.check_usable()
@@ -353,10 +377,14 @@ class EngineCore:
     def _record_lost_accept(
         self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any
     ) -> StoredDecision:
-        """Record the accept behind a line stop whose decision was lost; UnknownDecisionError without its trace."""
+        """Record the accept behind a line stop whose decision was lost.
+
+        UnknownDecisionError without its trace.
+        """
         if trace is None or success:
             raise UnknownDecisionError(
-                f"Expected the id of a decision of this cell, got {decision_id!r}, which is unknown; "
+                f"Expected the id of a decision of this cell, got {decision_id!r}, which is "
+                "unknown; "
                 "a system stop whose decision was lost can be reported with its trace."
             )
         x = self._check_trace(trace)
@@ -372,14 +400,19 @@ class EngineCore:
             return self.learner.retrain()
 
     def start_retrain(self) -> RetrainReport | None:
-        """Begin to retrain in the executor, and return None; without one retrain in line and return the report."""
+        """Begin to retrain in the executor, and return None.
+
+        Without one retrain in line and return the report.
+        """
         return self.learner.start_retrain()
 
     def process_retrains(self, brief: bool = False) -> RetrainReport | None:
-        """Swap in a trained version, retrain where one is due, and announce safe mode: between two parts.
+        """Swap in a trained version, retrain where one is due, and announce safe mode: between two
+        parts.
 
-        With `brief` a version that an executor has trained comes one step further, a few milliseconds, and not to the
-        end. Returns the report of the newest retrain, once; None without one.
+        With `brief` a version that an executor has trained comes one step further, a few
+        milliseconds, and not to the end. Returns the report of the newest retrain, once; None
+        without one.
         """
         with self.exclusive:
             self.learner.collect(to_the_end=not brief)
@@ -390,18 +423,26 @@ class EngineCore:
     # The store
 
     def load_decision_ids(self) -> None:
-        """Load the ids of all decisions (a second for a million), so that `decide` looks up no new id in the store."""
+        """Load the ids of all decisions (a second for a million), so that `decide` looks up no new
+        id in the store.
+        """
         self.flush()
         self.outbox.load_ids()
 
     def flush(self, wait: float | None = None) -> None:
-        """Return when everything is on disk; NotTakenError after `wait` seconds, None: the store's own limit."""
+        """Return when everything is on disk.
+
+        NotTakenError after `wait` seconds, None: the store's own limit.
+        """
         self.feedback.store_pending()
         self.outbox.flush(wait)
         self.learner.catch_up()
 
     def close(self) -> None:
-        """Bring in a retrain under way, write everything, and close the store; a second call does nothing."""
+        """Bring in a retrain under way, write everything, and close the store.
+
+        A second call does nothing.
+        """
         with self.exclusive:
             if self.outbox.is_usable:
                 self.feedback.store_pending()
@@ -411,7 +452,8 @@ class EngineCore:
     def exported(self, trace: TraceSpec | None = None) -> Exportable:
         """Return the decision as an exporter takes it; `trace` is another contract of traces.
 
-        Raises ExportError before the first retrain, for a baseline, and where the store was changed from outside.
+        Raises ExportError before the first retrain, for a baseline, and where the store was changed
+        from outside.
         """
         if self.outbox.integrity_error:
             error = self.outbox.integrity_error
@@ -453,16 +495,22 @@ class EngineCore:
 
     @property
     def store_lag(self) -> float:
-        """Age in seconds of the oldest record in the journal that the store has not taken; 0.0 where it has all."""
+        """Age in seconds of the oldest record in the journal that the store has not taken; 0.0
+        where it has all.
+        """
         return self.outbox.lag
 
     @property
     def retrain_fault(self) -> str:
-        """Why nothing new is learned where retrains are dropped again and again; "" where they are not."""
+        """Why nothing new is learned where retrains are dropped again and again; "" where they are
+        not.
+        """
         return retrain_fault(self.learner.dropped, self.live.version)
 
     def complete_status(self, status: Status) -> Status:
-        """Return a status that was read from the store with the fields that only the running engine knows."""
+        """Return a status that was read from the store with the fields that only the running engine
+        knows.
+        """
         return replace(
             status,
             version=self.live.version,

@@ -3,11 +3,12 @@
     engine.correct(decision.id, success=False, author="kim")
     engine.rollback(3)
 
-Each is an event that is kept for ever. Nothing is overwritten: a correction is a later row, an earlier version answers
-again as a new one, and what was decided stays as it was decided.
+`DataEngine` passes these verbs on to `Corrections`. Each one is an event that is kept for ever.
+Nothing is overwritten: a correction is a later row, an earlier version answers again as a new one,
+and a decision stays as it was decided.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,22 +30,31 @@ from ..store.records import (
 from .core import EngineCore
 from .settings import EvidenceWindow
 
-# What a rule is made of, and its evidence measured by.
+# Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
-SHADOW = {
+# Settings of a policy that have an effect on a baseline.
+BASELINE_SETTINGS = ("audit_rate", "stops", "label_within", "windows", "shadow")
+SHADOW_TEXTS = {
     True: "shadow mode: every part is verified from now on",
     False: "the shadow mode ended: the model decides again",
 }
-SAID = {True: "success", False: "failure"}
+LABEL_TEXTS = {True: "success", False: "failure"}
 
 
 @dataclass(frozen=True, slots=True)
 class Changed:
     """What a verb that puts something right did.
 
-    kind : "correct", "forget", "rollback", "policy" or "shadow".  text : in words.
-    event : number of the event that was recorded; None where everything was as asked already, and nothing changed.
-    version : of the model that answers now.
+    Attributes
+    ----------
+    kind : str
+        "correct", "forget", "rollback", "policy" or "shadow".
+    text : str
+        A sentence for people.
+    event : int or None
+        Number of the recorded event; None where everything was so already, and nothing changed.
+    version : int
+        Of the model that answers now.
     """
 
     kind: str
@@ -54,180 +64,266 @@ class Changed:
 
 
 class Corrections:
-    """Puts things right in a store, and in what an engine has learned."""
+    """Puts things right in a store, and in what an engine has learned.
+
+    Parameters
+    ----------
+    core : EngineCore
+    """
 
     def __init__(self, core: EngineCore) -> None:
         self._core = core
         self._store = core.store
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
-        """Say that a label was wrong, or that a forgotten one counts again, from the next decision on.
+        """Correct a wrong label, or let a forgotten one count again, from the next decision on.
 
-        References, the next retrain, the rule's evidence and the certificate take the label as corrected; its trace's fold
-        stays. A baseline, which cannot take a label back, is trained anew at once. What was reported stays in the store.
-        author : who says so, for the record.
-        Raises ReportError for an unknown decision, and for one without a label. A label that is so already changes nothing.
+        References, the next retrain, the rule and the certificate take the label as corrected; the
+        fold of its trace stays. A baseline, which cannot take a label back, is trained anew at
+        once. The label as it was reported stays in the store.
+
+        Parameters
+        ----------
+        decision_id : str
+        success : bool
+            The right label. The label that counts already changes nothing.
+        author : str
+            Who says so, for the record.
+
+        Returns
+        -------
+        Changed
+
+        Raises
+        ------
+        ReportError
+            For an unknown decision, and for one without a label.
         """
         label = as_success(success)
-        (known,) = self._to_correct([decision_id])
-        if known.success is label:
-            return self._unchanged(
-                "correct", f"Decision {known.decision.id} counts as a {SAID[label]} already"
-            )
-        was = "forgotten" if known.success is None else f"a {SAID[known.success]}"
-        text = f"decision {known.decision.id} counts as a {SAID[label]}, was {was}"
-        data = {"decisions": {known.decision.id: {"was": known.success, "now": label}}}
-        return self._correct(Change("correct", text, data, author, (known.decision.id,), label))
+        (stored,) = self._find_labelled([decision_id])
+        id_ = stored.decision.id
+        if stored.success is label:
+            text = f"Decision {id_} counts as a {LABEL_TEXTS[label]} already"
+            return self._unchanged("correct", text)
+        before = "forgotten" if stored.success is None else f"a {LABEL_TEXTS[stored.success]}"
+        text = f"decision {id_} counts as a {LABEL_TEXTS[label]}, was {before}"
+        data = {"decisions": {id_: {"was": stored.success, "now": label}}}
+        return self._change_labels(Change("correct", text, data, author, (id_,), label))
 
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
-        """Leave labels out of all that is learned and counted, from the next decision on; `correct` brings one back.
+        """Leave labels out of all that is learned and counted, from the next decision on; `correct`
+        brings one back.
 
-        Traces, and labels as they were reported, stay in the store; the version that was trained with them goes on until
-        the next retrain. A guarantee assumes that what is forgotten is chosen blind to its label; the certificate takes a
-        forgotten outcome of what was certain for a wrong decision, so that forgetting earns nothing.
-        Raises ReportError for an unknown decision, and for one without a label; then none is forgotten.
+        Traces, and labels as they were reported, stay in the store; the version that was trained
+        with them goes on until the next retrain. A guarantee assumes that the choice of what is
+        forgotten does not depend on the label. The certificate counts a forgotten outcome of a
+        certain decision as wrong, so that forgetting earns nothing.
+
+        Parameters
+        ----------
+        *decision_ids : str
+        author, reason : str
+            For the record.
+
+        Returns
+        -------
+        Changed
+
+        Raises
+        ------
+        ReportError
+            For an unknown decision, and for one without a label; then none is forgotten.
         """
         if not decision_ids:
             raise ReportError(
                 "Expected the ids of decisions to forget, got none; name at least one."
             )
-        known = self._to_correct(list(dict.fromkeys(decision_ids)))
-        was = {each.decision.id: each.success for each in known if each.success is not None}
-        if not was:
-            return self._unchanged(
-                "forget", f"{_labels([each.decision.id for each in known])} forgotten already"
-            )
-        text = f"{_labels(list(was))} forgotten" + (f": {reason}" if reason else "")
-        data = {
-            "decisions": {id_: {"was": label, "now": None} for id_, label in was.items()},
-            "reason": reason,
+        decisions = self._find_labelled(list(dict.fromkeys(decision_ids)))
+        labels = {
+            stored.decision.id: stored.success for stored in decisions if stored.success is not None
         }
-        return self._correct(Change("forget", text, data, author, tuple(was), None))
+        if not labels:
+            ids = [stored.decision.id for stored in decisions]
+            return self._unchanged("forget", f"{_labels_are(ids)} forgotten already")
+        text = f"{_labels_are(list(labels))} forgotten" + (f": {reason}" if reason else "")
+        changes = {id_: {"was": label, "now": None} for id_, label in labels.items()}
+        data = {"decisions": changes, "reason": reason}
+        return self._change_labels(Change("forget", text, data, author, tuple(labels), None))
 
     def rollback(self, version: int, author: str = "") -> Changed:
-        """Let an earlier version answer again, as a new version, so that the history goes on in one line.
+        """Let an earlier version answer again, as a new version, so that the history goes on in one
+        line.
 
-        Labels that came since are among its references, corrections count, and the rule keeps what it was told. The next
-        retrain goes on from this version. A reducer that is stored by its traces (umap-learn), and a baseline, are fitted
-        again: the first on what it was fitted on, the second on the same traces with the labels as they count now.
-        Raises StoreError for a version that is not kept, which names those that are.
+        Labels that came since are among its references, corrections count, and the rule in force
+        goes on. The next retrain starts from this version. A reducer that is stored by its traces
+        (umap-learn), and a baseline, are fitted again: the first on the traces that it was fitted
+        on, the second on the same traces with the labels as they count now.
+
+        Parameters
+        ----------
+        version : int
+        author : str
+            For the record.
+
+        Returns
+        -------
+        Changed
+
+        Raises
+        ------
+        StoreError
+            For a version that is not kept; it names those that are.
         """
         if isinstance(version, bool) or not isinstance(version, int | np.integer):
             raise SettingError(
                 f"Expected the number of a version, got {version!r}; `store.retrains()` lists them."
             )
         self._make_ready()
-        if version == self._core.live.version and version > 0:
+        before = self._core.live.version
+        if version == before and version > 0:
             return self._unchanged("rollback", f"Version {version} answers already")
-        before, now = self._core.live.version, self._core.live.next_version
-        text = f"version {version} answers again, as version {now} after {before}"
-        event = Change("rollback", text, {"to": int(version), "was": before, "now": now}, author)
+        new = self._core.live.next_version
+        text = f"version {version} answers again, as version {new} after {before}"
+        data = {"to": int(version), "was": before, "now": new}
+        event = Change("rollback", text, data, author)
         self._core.learner.roll_back(int(version), event)
         return self._done(event)
 
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
-        """Decide by another policy from the next decision on; every earlier one keeps the bounds that it was decided by.
+        """Decide by another policy from the next decision on.
 
-        Where anything but the audit rate changes, under "pooled" and "cost" where that does, the rule starts anew, told of
-        what is decided from now on: a tolerance chosen after the data was seen is not one of those that alpha was spent
-        on, and old bounds are of another scale.
-        `certificate` speaks of what is decided since this change; one who may choose among m policies' certificates errs
-        with up to m alpha. A safe mode goes on, where the new rule has one, until fresh evidence ends it. A part that was
-        accepted before, and of which nothing was heard, stays unobserved.
-        In the shadow mode, `Policy(shadow=True)`, each part that the model is certain of is an audit:
-        `Decision.predicted` says what it would have done, and all is learned from as ever. It lasts over restarts.
-        Raises SettingError for what is no policy, for windows that the traces cannot hold, and, of a model that was handed
-        in, for anything but audit_rate, stops, label_within, windows and shadow.
+        Every earlier one keeps the bounds that it was decided by.
+
+        Where anything but the audit rate changes, and under "pooled" and "cost" where that does
+        too, the rule starts anew, and is updated with decisions from now on only: alpha was not
+        spent on a tolerance that was chosen after the data was seen, and the old bounds are of
+        another scale. `certificate` speaks of decisions since this change; whoever may choose among
+        the certificates of m policies errs with probability up to m alpha.
+
+        A safe mode goes on, where the new rule has one, until fresh evidence ends it. A part that
+        was accepted before, and was not reported, stays unobserved. In the shadow mode,
+        `Policy(shadow=True)`, each part that the model is certain of is an audit:
+        `Decision.predicted` says what the model would have done, and all is learned from as always.
+        It lasts over restarts.
+
+        Parameters
+        ----------
+        policy : Policy
+        author : str
+            For the record.
+
+        Returns
+        -------
+        Changed
+
+        Raises
+        ------
+        SettingError
+            For what is no policy, for force limits that the traces cannot hold, and, of a model
+            that was handed in, for anything but audit_rate, stops, label_within, windows and
+            shadow.
         """
-        expect(
-            isinstance(policy, Policy),
-            "a Policy",
-            policy,
-            "for example Policy(alpha=0.05, lower_bound=0.95)",
-        )
-        now = self._core.settings.now
-        live = self._core.live
-        was, wished = now.recipe.policy.to_values(), policy.to_values()
-        new = {name: value for name, value in wished.items() if value != was[name]}
-        if not new:
+        example = "for example Policy(alpha=0.05, lower_bound=0.95)"
+        expect(isinstance(policy, Policy), "a Policy", policy, example)
+        present = self._core.settings.now
+        old_values = present.recipe.policy.to_values()
+        new_values = policy.to_values()
+        changes = {name: value for name, value in new_values.items() if value != old_values[name]}
+        if not changes:
             return self._unchanged("policy", "The policy is in force already")
-        own = now.model is not None  # a model that was handed in keeps its rule
-        idle = (
-            sorted(set(new) - {"audit_rate", "stops", "shadow", "label_within", "windows"})
-            if own
-            else []
-        )
-        if idle:
-            said = f"so {', '.join(idle)} would have no effect"
-            do = "change only audit_rate, stops, label_within, windows and shadow"
-            raise SettingError(
-                f"A model that was handed in decides by its own numbers, {said}; {do}."
-            )
+        is_baseline = present.model is not None  # it keeps its rule
+        if is_baseline:
+            _check_baseline_settings(changes)
         self._make_ready()
-        # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.
-        before = now.recipe.policy.inclusion_probability
-        asked = policy.guarantee in SORTING_GUARANTEES and policy.inclusion_probability != before
-        anew = not own and (asked or any(name in new for name in SCORING))
+        # An audit counts by its inclusion probability, so the pooled evidence must be of one audit
+        # rate.
+        is_sorting = policy.guarantee in SORTING_GUARANTEES
+        old_probability = present.recipe.policy.inclusion_probability
+        rate_counts = is_sorting and policy.inclusion_probability != old_probability
+        starts_anew = not is_baseline and (rate_counts or any(name in changes for name in SCORING))
+        live = self._core.live
         since = 0 if live.answering is None else live.next_version
-        evidence = (
-            EvidenceWindow(since, SAFE_MODES.index(live.newest.safe_mode)) if anew else now.evidence
-        )
-        settings = replace(
-            now, recipe=replace(now.recipe, policy=policy), policy_since=since, evidence=evidence
-        )
-        kind, text = (
-            POLICY_CHANGED,
-            "the policy's "
-            + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items()),
-        )
-        if list(new) == ["shadow"]:
-            kind, text = SHADOW_CHANGED, SHADOW[policy.shadow]
-        event = Change(
-            kind, text, {"old": was, "new": wished}, author, settings=settings.to_store()
-        )
-        self._core.learner.set_policy(policy if anew else None, evidence, event)
+        evidence = present.evidence
+        if starts_anew:
+            evidence = EvidenceWindow(since, SAFE_MODES.index(live.newest.safe_mode))
+        recipe = replace(present.recipe, policy=policy)
+        settings = replace(present, recipe=recipe, policy_since=since, evidence=evidence)
+        if list(changes) == ["shadow"]:
+            kind = SHADOW_CHANGED
+            text = SHADOW_TEXTS[policy.shadow]
+        else:
+            kind = POLICY_CHANGED
+            steps = [f"{name} {old_values[name]} -> {value}" for name, value in changes.items()]
+            text = f"the policy's {', '.join(steps)}"
+        data = {"old": old_values, "new": new_values}
+        event = Change(kind, text, data, author, settings=settings.to_store())
+        self._core.learner.set_policy(policy if starts_anew else None, evidence, event)
         self._core.settings.change(settings)
         self._core.feedback.begin_policy()
         return self._done(event, "the rule of the policy in force has none")
 
     def _make_ready(self) -> None:
-        """Swap in what an executor trains, and store what waits: a correction comes after all that was known before."""
+        """Bring in all that is under way, because a correction comes after everything that was
+        known before it.
+        """
         self._core.outbox.check_usable()
         self._core.learner.make_ready()
 
-    def _to_correct(self, ids: Sequence[Any]) -> list[StoredDecision]:
-        self._make_ready()
-        found = []
-        for each in ids:
-            known = self._store.get_decision(each) if isinstance(each, str) else None
-            if known is None:
-                raise unknown_decision(each)
-            if known.source is None:
-                raise nothing_to_correct(each)
-            found.append(known)
-        return found
+    def _find_labelled(self, decision_ids: Sequence[Any]) -> list[StoredDecision]:
+        """Return decisions that have labels.
 
-    def _correct(self, change: Change) -> Changed:
+        ReportError for an unknown id, and for a decision without a label.
+        """
+        self._make_ready()
+        decisions = []
+        for id_ in decision_ids:
+            stored = self._store.get_decision(id_) if isinstance(id_, str) else None
+            if stored is None:
+                raise unknown_decision(id_)
+            if stored.source is None:
+                raise nothing_to_correct(id_)
+            decisions.append(stored)
+        return decisions
+
+    def _change_labels(self, change: Change) -> Changed:
+        """Store a change of labels, learn it, and return what was done."""
         self._store.apply_change(change)
-        for name in change.decisions:
-            self._core.outbox.evict_decision(name)
+        for id_ in change.decisions:
+            self._core.outbox.evict_decision(id_)
         self._core.learner.apply_corrections()
         return self._done(change)
 
     def _done(
         self, change: Change, reason_ended: str = "what was told anew keeps the tolerance"
     ) -> Changed:
+        """Announce a safe mode that the change began or ended, for this reason, and return what was
+        done.
+        """
         number = self._store.events(1)[0].number
         self._core.feedback.announce_safe_mode(reason_ended)
         return Changed(change.kind, _sentence(f"{change.text}."), number, self._core.live.version)
 
     def _unchanged(self, kind: str, text: str) -> Changed:
+        """Return that everything was as asked for already, so that no event was recorded."""
         return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._core.live.version)
 
 
+def _check_baseline_settings(changes: Mapping[str, Any]) -> None:
+    """Raise SettingError for changes of a policy that have no effect on a handed-in model."""
+    idle = sorted(set(changes) - set(BASELINE_SETTINGS))
+    if idle:
+        effect = f"so {', '.join(idle)} would have no effect"
+        do = "change only audit_rate, stops, label_within, windows and shadow"
+        raise SettingError(
+            f"A model that was handed in decides by its own numbers, {effect}; {do}."
+        )
+
+
 def _sentence(text: str) -> str:
+    """Return the text with its first letter in upper case."""
     return text[0].upper() + text[1:]
 
 
-def _labels(ids: Sequence[str]) -> str:
+def _labels_are(ids: Sequence[str]) -> str:
+    """Return the beginning of a sentence on the labels of these decisions, up to its verb."""
     return f"the labels of {listed(ids)} are" if len(ids) > 1 else f"the label of {ids[0]} is"

@@ -1,4 +1,6 @@
-"""`DataEngine`, the public face of dengine: decide, report, retrain, run. Source: the paper's section "Data engine".
+"""`DataEngine`, the public face of dengine: decide, report, retrain, run.
+
+Source: the paper's section "Data engine".
 
 engine = DataEngine(reducer="conv", policy=Policy(alpha=0.05, lower_bound=0.95), store="engine.db")
 for cycle in engine.run(cell, cycles=1503):
@@ -51,11 +53,11 @@ from .core import EngineCore
 from .corrections import Changed, Corrections
 from .settings import (
     EngineSettings,
-    as_peers,
-    chosen_recipe,
-    classes_of,
-    peers_trace,
-    refuse_idle,
+    check_model_settings,
+    choose_recipe,
+    fill_from_peers,
+    named_classes,
+    read_peers_trace_spec,
 )
 from .trainer import Clock
 
@@ -74,8 +76,9 @@ WARM_UP = 100  # cycles of a loop, after which the objects that are there are ta
 def frozen_objects() -> Iterator[None]:
     """Let Python's garbage collector ignore, until the block ends, all objects that exist now.
 
-    A collection goes through 280,000 objects of imported libraries in 150 ms and finds nothing, so none is made before
-    the block either. It affects the whole process: use it in the one that owns the loop.
+    A collection goes through 280,000 objects of imported libraries in 150 ms and finds nothing, so
+    none is made before the block either. It affects the whole process: use it in the one that owns
+    the loop.
     """
     gc.freeze()
     try:
@@ -97,7 +100,10 @@ def uncollected() -> Iterator[None]:
 
 
 def core_of(engine: DataEngine) -> EngineCore:
-    """Return the internal interface of an engine, which `dengine serve` and the tests use; it may change."""
+    """Return the internal interface of an engine, which `dengine serve` and the tests use.
+
+    It may change.
+    """
     return engine._core
 
 
@@ -117,7 +123,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     Parameters
     ----------
     reducer : str or object, optional
-        A name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
+        A name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or
+        conv.
     policy : Policy, optional
         The error level alpha, the lower bound, and what else the user decides.
     trace : TraceSpec, optional
@@ -125,15 +132,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     radius, folds, retrain_every, budget : optional
         As in `Recipe`; None: the recipe decides, or the reducer.
     store : str, path or SqlStore, optional
-        A file or a URL (SQLite, PostgreSQL); None remembers in memory. A store that is not empty is opened by
-        `DataEngine.open`.
+        A file or a URL (SQLite, PostgreSQL); None remembers in memory. A store that is not empty is
+        opened by `DataEngine.open`.
     seed : int
         Of the reducer, and of the coin that draws audits.
     recipe : Recipe, str or path, optional
-        A recipe, its name or a TOML file, for all settings that are not given beside it; it names its own reducer.
+        A recipe, its name or a TOML file, for all settings that are not given beside it; it names
+        its own reducer.
     model : Model, optional
-        A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within, windows and
-        shadow count then.
+        A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
+        windows and shadow count then.
     executor : concurrent.futures.Executor, optional
         Retrains while the cell goes on; None retrains in line, between cycles.
     replaying : bool
@@ -186,16 +194,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             "policy": policy,
         }
         if model is not None:
-            refuse_idle(reducer, given)
+            check_model_settings(reducer, given)
             if recipe is None:
                 # The schedule of conv is its own.
                 recipe = Recipe(retrain_every=Reducer.default_retrain_every)
-        settings = EngineSettings(chosen_recipe(reducer, recipe, given), seed, trace=trace)
+        settings = EngineSettings(choose_recipe(reducer, recipe, given), seed, trace=trace)
         # Before a store is made: a wrong setting leaves none behind.
         settings, template = settings.with_template(model)
         with opening(store) as opened:
             if settings.trace is None:
-                settings = replace(settings, trace=peers_trace(opened))
+                settings = replace(settings, trace=read_peers_trace_spec(opened))
             self._start(
                 settings,
                 template,
@@ -208,7 +216,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             with self._closed_on_failure():
                 if opened.settings():  # now that the cell is owned, nobody else begins it
                     raise StoreError(
-                        "The store is not empty; use DataEngine.open(url) to go on with it, or name another store."
+                        "The store is not empty; use DataEngine.open(url) to go on with it, "
+                        "or name another store."
                     )
                 self.store.save_settings(self._core.settings.now.to_store())
                 if opened.product is not None:
@@ -255,11 +264,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         wait : float, optional
             Seconds that a call waits for the database, as `SqlStore` takes it.
         allow_import : bool or collection of str
-            Whether a `module:Class` that the store names is imported, or which of them. A class that `reducer` names
-            is allowed.
+            Whether a `module:Class` that the store names is imported, or which of them. A class
+            that `reducer` names is allowed.
         **options
-            executor, replaying, clock and on_safe_mode, as `DataEngine` takes them. With reading=True the engine
-            neither decides nor learns, and another engine may own the store: to export from it, for one.
+            executor, replaying, clock and on_safe_mode, as `DataEngine` takes them. With
+            reading=True the engine neither decides nor learns, and another engine may own the
+            store: to export from it, for one.
 
         Returns
         -------
@@ -296,7 +306,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         allow_import: bool = False,
         **settings: Any,
     ) -> Self:
-        """Go on with a used store, or start on a new one: the same line at every start of a program.
+        """Go on with a used store, or start on a new one: the same line at every start of a
+        program.
 
         Parameters
         ----------
@@ -305,8 +316,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         wait, allow_import
             As for `open`; a class that the settings name is allowed.
         **settings
-            As `DataEngine` takes them. Those that are given must be the ones that a used store was made with: the
-            settings of a running cell do not change in silence.
+            As `DataEngine` takes them. Those that are given must be the ones that a used store was
+            made with: the settings of a running cell do not change in silence.
 
         Returns
         -------
@@ -318,9 +329,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             Where a given setting is not the used store's.
         """
         with opening(store, wait=wait) as opened:
-            allowed = allow_import or classes_of(**settings)
+            allowed = allow_import or named_classes(**settings)
             if not opened.settings():
-                return cls(store=opened, **as_peers(settings | {"seed": seed}, opened, allowed))
+                return cls(
+                    store=opened, **fill_from_peers(settings | {"seed": seed}, opened, allowed)
+                )
             names = ("model", "executor", "replaying", "clock", "on_safe_mode")
             options = {name: settings.pop(name) for name in names if name in settings}
             recipe = settings.get("recipe")
@@ -329,14 +342,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 reducer = recipe.reducer
             engine = cls.open(opened, reducer=reducer, allow_import=allowed, **options)
             with engine._closed_on_failure():
-                engine._core.settings.now.must_agree_with(settings | {"seed": seed})
+                engine._core.settings.now.check_request(settings | {"seed": seed})
             return engine
 
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A second call does nothing. Raises StoreError where the journal did not take everything; close again when the
-        disk is well.
+        A second call does nothing. Raises StoreError where the journal did not take everything;
+        close again when the disk is well.
         """
         self._core.close()
 
@@ -361,19 +374,20 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         part : str or int, optional
             The part's number. A part that comes again has one vote, and none on itself.
         decision_id : str, optional
-            An id of the caller's. The same id and trace have the same decision for ever, and the decision is on disk
-            when this returns.
+            An id of the caller's. The same id and trace have the same decision for ever, and the
+            decision is on disk when this returns.
 
         Returns
         -------
         Decision
-            VERIFY where anything else than the errors below fails. Where an id cannot be looked up, the VERIFY is not
-            recorded.
+            VERIFY where anything else than the errors below fails. Where an id cannot be looked up,
+            the VERIFY is not recorded.
 
         Raises
         ------
         TraceError
-            For a wrong shape, a first trace of less than 10 samples, and an id that belongs to another trace.
+            For a wrong shape, a first trace of less than 10 samples, and an id that belongs to
+            another trace.
         ReportError
             For an id that is no id.
         """
@@ -392,9 +406,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ----------
         decision_id : str
         success : bool
-            The result of the verification; False for a line stop after an accept, True for a part known to be good.
-            A line stop that comes after the part was confirmed, however late, takes that back and counts as a
-            correction. The label of a rejected part that somebody looked at trains, and does not update the rule.
+            The result of the verification; False for a line stop after an accept, True for a part
+            known to be good. A line stop that comes after the part was confirmed, however late,
+            takes that back and counts as a correction. The label of a rejected part that somebody
+            looked at trains, and does not update the rule.
         trace, part : optional
             Only for a line stop whose decision was lost: it is then stored with this trace.
 
@@ -415,8 +430,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Drive a cell, and yield a record of each cycle as it happens.
 
-        Python's garbage collector works between decisions, and after a hundred cycles only on newer objects
-        (`gc.freeze`). What the cell raises propagates, after everything known is written.
+        Python's garbage collector works between decisions, and after a hundred cycles only on newer
+        objects (`gc.freeze`). What the cell raises propagates, after everything known is written.
 
         Parameters
         ----------
@@ -445,7 +460,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 yield self._cycle(cell, index)
 
     def _cycle(self, cell: Cell, index: int) -> Cycle:
-        """Insert one part, decide, do what the decision says, and report its outcome; returns the record of it."""
+        """Insert one part, decide, do what the decision says, and report its outcome.
+
+        Returns the record of it.
+        """
         trace = cell.insert()
         with uncollected():
             begin = self._core.clock()
@@ -474,7 +492,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     # Learning
 
     def retrain(self) -> RetrainReport:
-        """Retrain now, in line; a version that fails, or cannot be stored, is dropped and recorded."""
+        """Retrain now, in line.
+
+        A version that fails, or cannot be stored, is dropped and recorded.
+        """
         return self._core.retrain()
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
@@ -482,7 +503,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._corrections.correct(decision_id, success, author)
 
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
-        """Leave labels out of all that is learned and counted from now on; see `Corrections.forget`."""
+        """Leave labels out of all that is learned and counted from now on.
+
+        See `Corrections.forget`.
+        """
         return self._corrections.forget(*decision_ids, author=author, reason=reason)
 
     def rollback(self, version: int, author: str = "") -> Changed:
@@ -501,11 +525,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._corrections.set_policy(policy, author)
 
     def set_shadow(self, on: bool, author: str = "") -> Changed:
-        """Verify every part from the next decision on, or end that: `set_policy` with another `shadow`."""
+        """Verify every part from the next decision on, or end that: `set_policy` with another
+        `shadow`.
+        """
         return self.set_policy(replace(self.policy, shadow=on), author)
 
     def certificate(self) -> Certificate:
-        """Return what can be said, with confidence 1 - alpha, of what was decided unchecked under this policy."""
+        """Return what can be said, with confidence 1 - alpha, of what was decided unchecked under
+        this policy.
+        """
         self.flush()
         policy = self.policy
         since = self._core.settings.now.policy_since
@@ -526,7 +554,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def model(self) -> Any:
-        """The model that answers, a baseline as its author knows it; None before the first retrain."""
+        """The model that answers, a baseline as its author knows it.
+
+        None before the first retrain.
+        """
         answering = self._core.live.answering
         return None if answering is None else answering.user_model
 
@@ -537,11 +568,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def safe_mode(self) -> str:
-        """Why every part is verified until fresh evidence keeps the tolerance again; "" outside a safe mode."""
+        """Why every part is verified until fresh evidence keeps the tolerance again; "" outside a
+        safe mode.
+        """
         return self._core.live.newest.safe_mode
 
     def find(self, decision_id: str) -> StoredDecision | None:
-        """Return a decision with its trace, and with its label where it has one; None for an unknown id."""
+        """Return a decision with its trace, and with its label where it has one.
+
+        None for an unknown id.
+        """
         return self._core.outbox.find_decision(as_id(decision_id))
 
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
@@ -550,15 +586,23 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._core.complete_status(status(self.store, last, watching))
 
     def history(self, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
-        """Yield the decisions so far, newest last; arguments and errors as of `history.status.history`."""
+        """Yield the decisions so far, newest last.
+
+        Arguments and errors as of `history.status.history`.
+        """
         return history(self.store, last, **where)
 
     def history_frame(self, last: int | None = None, **where: Any) -> pd.DataFrame:
-        """Return `history` as a DataFrame: a row for each decision by its id, with its label and a datetime."""
+        """Return `history` as a DataFrame: a row for each decision by its id, with its label and a
+        datetime.
+        """
         return as_frame(self.history(last, **where))
 
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
-        """Explain a decision by its nearest references, `neighbours` of them; ReportError for an unknown id."""
+        """Explain a decision by its nearest references, `neighbours` of them.
+
+        ReportError for an unknown id.
+        """
         return explain(self.store, decision_id, neighbours)
 
     def __repr__(self) -> str:

@@ -1,9 +1,10 @@
 """Collects the outcomes of decided parts and turns them into stored labels.
 
-With `Policy(stops="all")` a bad part stops the system before the next decision, so the next decision confirms an accepted
-part: the rule is updated, the trace becomes a reference, and its label, CONFIRMED, is stored with the next report, before
-the next retrain, or when 100 of them wait. A line stop that comes later takes the confirmation back, in the store as a
-correction. With "some" the part counts as unobserved, which is no success.
+With `Policy(stops="all")` a bad part stops the system before the next decision, so the next
+decision confirms an accepted part: the rule is updated, the trace becomes a reference, and its
+label, CONFIRMED, is stored with the next report, before the next retrain, or when 100 of them wait.
+A line stop that comes later takes the confirmation back, in the store as a correction. With "some"
+the part counts as unobserved, which is no success.
 """
 
 import logging
@@ -29,11 +30,16 @@ log = logging.getLogger("dengine")
 MOST_CONFIRMED = 100  # labels of confirmed parts that wait for a report
 RECENT = 50  # decisions that the share of novel ones fades over
 NEARLY_ALL = 0.8  # of them, and somebody should look
-ALL_NOVEL = "nearly every trace is novel: the sensor or the parts have changed, or parts come twice without numbers (part=)"
+ALL_NOVEL = (
+    "nearly every trace is novel: the sensor or the parts have changed, "
+    "or parts come twice without numbers (part=)"
+)
 
 
 class Remedy(Enum):
-    """What must be done, once the store has every label, because something that was learned did not happen."""
+    """What must be done, once the store has every label, because something that was learned did not
+    happen.
+    """
 
     REBUILD_RULE = "rebuild the rule"
     CORRECT = "apply the stored correction, and rebuild the rule"
@@ -53,7 +59,8 @@ class Feedback:
     settings : SettingsInForce
         Whether silence until the next decision confirms an accepted part, and since which version.
     on_safe_mode : callable, optional
-        Called with the reason when a safe mode begins and with "" when it ends, after that was recorded.
+        Called with the reason when a safe mode begins and with "" when it ends, after that was
+        recorded.
 
     Attributes
     ----------
@@ -94,7 +101,7 @@ class Feedback:
         return self._settings.now.recipe.policy.stops == "all"
 
     def resume(self) -> None:
-        """Go on from the store: which checks are pending, and which accepted parts have no outcome."""
+        """Read from the store which checks are pending, and which accepted parts have no outcome."""
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
         for stored in store.pending_decisions(self._settings.now.evidence.since):
@@ -111,7 +118,9 @@ class Feedback:
                 self._unreported[id_] = accepted
 
     def record_decision(self, stored: StoredDecision) -> None:
-        """Note a decision whose outcome is pending, and record an event where nearly every trace is novel."""
+        """Note a decision whose outcome is pending, and record an event where nearly every trace is
+        novel.
+        """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
             self._awaiting_check[decision.id] = stored
@@ -127,7 +136,9 @@ class Feedback:
         self._novelty_reported = self._novel_share > limit
 
     def confirm_silent(self) -> None:
-        """Take accepted parts without an outcome as confirmed or unobserved, because the next trace has come."""
+        """Take accepted parts without an outcome as confirmed or unobserved, because the next trace
+        has come.
+        """
         if not self._unreported:
             return
         while self._unreported:
@@ -140,10 +151,11 @@ class Feedback:
             self.store_pending()
 
     def take_in(self, stored: StoredDecision, success: bool) -> bool:
-        """Learn a reported label and hand it to the outbox, unless the same report was learned before.
+        """Learn a reported label and hand it to the outbox, unless the same report was learned
+        before.
 
-        Returns whether the part counted as confirmed until now and was not. Raises ReportError where another label
-        was reported for it.
+        Returns whether the part counted as confirmed until now and was not. Raises ReportError
+        where another label was reported for it.
         """
         id_ = stored.decision.id
         confirmed_wrongly = False
@@ -157,7 +169,10 @@ class Feedback:
         del self._unsynced[decision_id]
 
     def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
-        """Learn a label and hand it to the outbox; returns whether the part counted as confirmed, and was not."""
+        """Learn a label and hand it to the outbox.
+
+        Returns whether the part counted as confirmed, and was not.
+        """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
         if stored.source is not None:
@@ -184,9 +199,12 @@ class Feedback:
         return confirmed_wrongly
 
     def _learn(self, stored: StoredDecision, success: bool, source: Source) -> NewLabel:
-        """Update the rule and the references with the outcome of a part; returns its label for the store.
+        """Update the rule and the references with the outcome of a part.
 
-        The rule is not updated with a rejected part: which of them come back is somebody's choice, and no sample.
+        Returns its label for the store.
+
+        The rule is not updated with a rejected part: which of them come back is somebody's choice,
+        and no sample.
         """
         decision = stored.decision
         version = self._live.version
@@ -214,7 +232,10 @@ class Feedback:
         return decision.id not in self._unreported and is_of_policy
 
     def store_pending(self) -> bool:
-        """Hand the labels of confirmed parts to the outbox, without waiting; returns whether there were any."""
+        """Hand the labels of confirmed parts to the outbox, without waiting.
+
+        Returns whether there were any.
+        """
         if not self._pending:
             return False
         self._outbox.record_labels(self._pending.values())
@@ -223,7 +244,9 @@ class Feedback:
         return True
 
     def number_labels(self) -> None:
-        """Give labels that the store has numbered to the training window, and count overdue checks as wrong decisions."""
+        """Give labels that the store has numbered to the training window, and count overdue checks
+        as wrong decisions.
+        """
         self._count_overdue()
         for id_, seq in self._outbox.pop_label_numbers():
             learned = self._live.assign_number(id_, seq)
@@ -252,14 +275,18 @@ class Feedback:
         self.remedy = remedy
 
     def begin_policy(self) -> None:
-        """Go on under another policy: parts accepted under the last one and not reported stay without an outcome."""
+        """Go on under another policy: parts accepted under the last one and not reported stay
+        without an outcome.
+        """
         self._unreported.clear()
         self._unobserved = 0
 
     def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
-        """Record that a safe mode began or ended, and call `on_safe_mode`, where it did since the last call.
+        """Record that a safe mode began or ended, and call `on_safe_mode`, where it did since the
+        last call.
 
-        It comes last in every cycle, because either may fail and must cost no label; a failure is logged.
+        It comes last in every cycle, because either may fail and must cost no label; a failure is
+        logged.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

@@ -1,7 +1,7 @@
 """What a cell takes in of its product: the labels of the other cells, and their newest version.
 
-News is asked for between two cycles, never by `decide`. A cell whose connection is lost goes on with what it has.
-`learner.Learner` asks for news in the order that `Learner.take_in_news` shows.
+ProductNews is asked for between two cycles, never by `decide`. A cell whose connection is lost goes on
+with what it has. `learner.Learner` asks for news in the order that `Learner.take_in_news` shows.
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ class Peers:
         return self._clock() - self._asked >= NEWS_SECONDS
 
     def fetch_news(self) -> tuple[ProductNews, bool]:
-        """Return the labels after the window's newest, at most `MOST`, and whether a peer's version is newer.
+        """Return the labels after the window's newest, at most `MOST`, and whether a peer's version
+        is newer.
 
         Raises StoreError where the store gives no answer in time.
         """
@@ -85,7 +86,10 @@ class Peers:
         return news, has_newer_version
 
     def fetch_version(self) -> ModelVersion | None:
-        """Return the newest version of the product; StoreError where the store gives no answer in time."""
+        """Return the newest version of the product.
+
+        StoreError where the store gives no answer in time.
+        """
         return self._outbox.call_store(self._outbox.store.last_version)
 
     def note_loss(self, error: StoreError) -> None:
@@ -112,13 +116,17 @@ class Peers:
             self._labels.admit(trace, int(label), int(hash_), int(seq))
 
     def note_taken(self, n_labels: int) -> None:
-        """Note how many labels were taken in; where more may be waiting, the next cycle asks again at once."""
+        """Note how many labels were taken in.
+
+        Where more may be waiting, the next cycle asks again at once.
+        """
         self._asked = self._clock() if n_labels < MOST else -np.inf
 
     def take_over(self, version: ModelVersion) -> None:
         """Let a peer's version answer, with every label since and this cell's own rule.
 
-        A version that cannot be restored is logged and left alone, and the version before goes on answering.
+        A version that cannot be restored is logged and left alone, and the version before goes on
+        answering.
         """
         store = self._outbox.store
         trained_on = TrainedOn.from_state(version.state)

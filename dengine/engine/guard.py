@@ -1,7 +1,8 @@
-"""The guard of an engine's calls into its model: an exception inside a model is logged and never reaches the cell.
+"""The guard of an engine's calls into its model: an exception inside a model is logged and never
+reaches the cell.
 
-`live_model.LiveModel`, `resume` and the training make these calls. A prediction that fails is guarded where decisions are
-made, because its reason is recorded with the decision.
+`live_model.LiveModel`, `resume` and the training make these calls. A prediction that fails is
+guarded where decisions are made, because its reason is recorded with the decision.
 """
 
 import logging
@@ -38,17 +39,26 @@ class GuardedModel:
         self.model = model
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute in advance what a training on traces (n, channels, samples) begins with; nothing where it fails."""
+        """Compute in advance what a training on traces (n, channels, samples) begins with.
+
+        Nothing where it fails.
+        """
         with logged_failure("computing in advance of a retrain failed"):
             self.model.precompute(X, numbers)
 
     def prepare(self, previous: EngineModel) -> None:
-        """Make the model ready to predict in place of the previous one; where it fails, every prediction will fail."""
+        """Make the model ready to predict in place of the previous one.
+
+        Where it fails, every prediction will fail.
+        """
         with logged_failure("the model that was trained cannot be made ready to predict"):
             self.model.prepare(previous)
 
     def update_rule(self, *outcome: Any) -> None:
-        """Update the rule, arguments as of `EngineModel.update_rule`; where it fails, the model refuses to predict."""
+        """Update the rule, arguments as of `EngineModel.update_rule`.
+
+        Where it fails, the model refuses to predict.
+        """
         with logged_failure(
             "an update of the rule failed; every part is verified until the engine is opened again"
         ):
@@ -63,7 +73,9 @@ class GuardedModel:
         embedding: Embedding | None = None,
         point: NDArray[Any] | None = None,
     ) -> Floats | None:
-        """Make a labelled trace a reference and return its point (d,); None, and no reference, where it fails."""
+        """Make a labelled trace a reference and return its point (d,); None, and no reference,
+        where it fails.
+        """
         with logged_failure(
             "the model cannot take a labelled trace; the next version learns it from the store"
         ):

@@ -1,7 +1,9 @@
-"""How labels enter the training window, and how many came since the last retrain began: for one cell, and for a product.
+"""How labels enter the training window, and how many came since the last retrain began: for one
+cell, and for a product.
 
-`CellLabels` is for a cell that learns alone. `ProductLabels` is for a cell that shares a product with others, whose labels
-have one sequence in the store. `feedback.Feedback` adds labels; `learner.Learner` asks whether a retrain is due.
+`CellLabels` is for a cell that learns alone. `ProductLabels` is for a cell that shares a product
+with others, whose labels have one sequence in the store. `feedback.Feedback` adds labels;
+`learner.Learner` asks whether a retrain is due.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ Trace = NDArray[np.float32]  # (channels, samples)
 
 
 class CellLabels:
-    """Labels of a cell that learns alone: each one counts when it is learned, before the store has numbered it.
+    """Labels of a cell that learns alone: each one counts when it is learned, before the store has
+    numbered it.
 
     Parameters
     ----------
@@ -81,9 +84,11 @@ class CellLabels:
 
 
 class ProductLabels:
-    """Labels of all cells of a product, which enter the window in the order of their sequence in the store.
+    """Labels of all cells of a product, which enter the window in the order of their sequence in
+    the store.
 
-    A label of this cell is a reference at once, and waits for the peers' labels before it until it enters the window.
+    A label of this cell is a reference at once, and waits for the peers' labels before it until it
+    enters the window.
 
     Parameters
     ----------
@@ -103,7 +108,8 @@ class ProductLabels:
         self._updated_to = (
             0  # number of this cell's newest label; the rule was updated with all until there
         )
-        # The references of a version that was taken over hold every label up to this number; the window may not yet.
+        # The references of a version that was taken over hold every label up to this number; the
+        # window may not yet.
         self._references_to = 0
 
     @property
@@ -113,7 +119,10 @@ class ProductLabels:
 
     @property
     def last_to_read(self) -> int:
-        """Number of the last label to read when the window is filled anew; later ones come as the peers' news."""
+        """Number of the last label to read when the window is filled anew.
+
+        Later ones come as the peers' news.
+        """
         return self._window.newest_seq
 
     @property
@@ -130,7 +139,9 @@ class ProductLabels:
         self._updated_to = self._window.newest_seq
 
     def recount(self, counts_from: int) -> None:
-        """Count again after the window was filled anew: forgotten labels count no more, restored ones do."""
+        """Count again after the window was filled anew: forgotten labels count no more, restored
+        ones do.
+        """
         own = {number for number, is_own in self._since if is_own}
         newer = self._window.newer(self._trained_to)
         self._since = [(number, number in own) for number in newer]
@@ -142,14 +153,19 @@ class ProductLabels:
         """Do nothing: a label counts when it enters the window."""
 
     def add(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
-        """Take a label of this cell that the store has numbered; it enters the window when none before it is missing."""
+        """Take a label of this cell that the store has numbered.
+
+        It enters the window when none before it is missing.
+        """
         self._waiting[seq] = trace, label, hash_
         self._updated_to = max(seq, self._updated_to)
         if seq == self._window.newest_seq + 1:
             self.admit(trace, label, hash_, seq)
 
     def admit(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
-        """Add the next label of the product to the window, and a peer's label to the references as well."""
+        """Add the next label of the product to the window, and a peer's label to the references as
+        well.
+        """
         is_own = self._waiting.pop(seq, None) is not None
         self._window.add(trace, label, hash_, seq)
         if seq > self._trained_to:
@@ -161,8 +177,8 @@ class ProductLabels:
     def is_due(self, retrain_every: int) -> bool:
         """Return whether a retrain is this cell's turn.
 
-        It is where the label that makes it due is this cell's own, or where a peer missed its turn and twice as many
-        labels have come.
+        It is where the label that makes it due is this cell's own, or where a peer missed its turn
+        and twice as many labels have come.
         """
         due = self._since[retrain_every - 1 : retrain_every]
         missed = self._since[2 * retrain_every - 1 :]
@@ -177,12 +193,15 @@ class ProductLabels:
         """Do nothing after a dropped retrain: the next one is the turn of whichever cell is due."""
 
     def complete(self, model: EngineModel) -> None:
-        """Add this cell's waiting labels to a version that it trained, which has those of the window only."""
+        """Add this cell's waiting labels to a version that it trained, which has those of the
+        window only.
+        """
         self._references_to = 0
         self._add_waiting(model)
 
     def take_over(self, model: EngineModel, references_to: int, counts_from: int) -> None:
-        """Add this cell's waiting labels to a peer's version, and count from the label that it counts from.
+        """Add this cell's waiting labels to a peer's version, and count from the label that it
+        counts from.
 
         The version's references hold every label up to `references_to` already.
         """
@@ -192,12 +211,16 @@ class ProductLabels:
         self._since = [(number, own) for number, own in self._since if number > counts_from]
 
     def _add_waiting(self, model: EngineModel) -> None:
-        """Make this cell's waiting labels references, but for those that the version's references hold."""
+        """Make this cell's waiting labels references, but for those that the version's references
+        hold.
+        """
         guarded = GuardedModel(model)
         for seq, (trace, label, hash_) in self._waiting.items():
             if seq > self._references_to:
                 guarded.add_reference(trace, label, hash_, seq)
 
     def get_state(self) -> State:
-        """Return, for a stored version, the number up to which this cell's labels have updated the rule."""
+        """Return, for a stored version, the number up to which this cell's labels have updated the
+        rule.
+        """
         return {"rule_last_seq": np.array(self._updated_to)}

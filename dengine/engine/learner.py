@@ -1,8 +1,9 @@
-"""The order of the steps by which an engine learns: store what waits, update the rule, train, swap, take in news.
+"""The order in which an engine learns: store labels, update the rule, train, swap, take in news.
 
-`Learner` is the only object that calls the others in this order. `Feedback` turns outcomes into labels, `LiveModel` learns
-them, `Retrainer` trains a candidate, and `Peers` reads what other cells of the product made; none of them knows the
-learner. `core.EngineCore` calls it once per decision, report and cycle.
+`Learner` is the only object that calls the others in this order. `Feedback` turns outcomes into
+labels, `LiveModel` learns them, `Retrainer` trains a candidate, and `Peers` reads what other cells
+of the product made; none of them knows the learner. `core.EngineCore` calls it once per decision,
+report and cycle.
 """
 
 from __future__ import annotations
@@ -35,9 +36,8 @@ from .trainer import HUNG, Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 
 log = logging.getLogger("dengine")
 STEP = 0.0005  # seconds of catching up in one step: a label or two
-IMPORTED = (
-    500  # labels without any retrain: they were imported, and a first training is worth preparing
-)
+# So many labels without any retrain were imported, and the first training is worth preparing.
+IMPORTED = 500
 
 
 class Learner:
@@ -106,12 +106,17 @@ class Learner:
 
     @property
     def _counts_from(self) -> int:
-        """Number of the newest label that the next retrain does not wait for; 0 before the first retrain."""
+        """Number of the newest label that the next retrain does not wait for.
+
+        0 before the first retrain.
+        """
         trained_on = self.live.trained_on
         return 0 if trained_on is None else trained_on.counts_from
 
     def _precompute(self, labelled: LabelledTraces) -> None:
-        """Begin, in a thread, to compute what a retrain on these labels starts with: opening does not wait for it."""
+        """Begin, in a thread, to compute what a retrain on these labels starts with: opening does
+        not wait for it.
+        """
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
         model = GuardedModel(self.live.newest)
         self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)
@@ -132,7 +137,9 @@ class Learner:
         self._feedback.announce_safe_mode()
 
     def catch_up(self) -> None:
-        """Do what had to wait for the store: number its labels, and put right what was learned and did not happen."""
+        """Do what had to wait for the store: number its labels, and put right what was learned and
+        did not happen.
+        """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
@@ -158,7 +165,10 @@ class Learner:
         self._drain_labels()
 
     def _drain_labels(self) -> None:
-        """Wait until the store has the labels that are in the journal; StoreError where it is away."""
+        """Wait until the store has the labels that are in the journal.
+
+        StoreError where it is away.
+        """
         if self._outbox.request_label_drain():
             self._outbox.drain()
         self.catch_up()
@@ -166,7 +176,10 @@ class Learner:
     # A retrain
 
     def retrain(self) -> RetrainReport:
-        """Train a version and let it answer, in line; one that cannot be stored is dropped and recorded."""
+        """Train a version and let it answer, in line.
+
+        One that cannot be stored is dropped and recorded.
+        """
         self.collect(HUNG)
         self.store_labels()
         begin = self._clock()
@@ -178,7 +191,10 @@ class Learner:
         return self._report or candidate.report  # a stored one may wait for the labels since
 
     def start_retrain(self) -> RetrainReport | None:
-        """Begin to train in the executor, unless it trains already, and return None; retrain in line without one."""
+        """Begin to train in the executor, unless it trains already, and return None.
+
+        Retrain in line without one.
+        """
         self.collect()
         if self.is_busy:
             return None
@@ -190,10 +206,11 @@ class Learner:
         return self.retrain()
 
     def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
-        """Retrain, or begin to, where the recipe says so, there are enough labels, and the store is there.
+        """Retrain, or begin to, where the recipe says so, there are enough labels, and the store is
+        there.
 
-        `once` leaves a training that lacks steps as it is until the report of the last one was taken. Returns the
-        report of a retrain in line; None without one.
+        `once` leaves a training that lacks steps as it is until the report of the last one was
+        taken. Returns the report of a retrain in line; None without one.
         """
         is_due = self._is_due(recipe.retrain_every)
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
@@ -213,28 +230,32 @@ class Learner:
 
     @property
     def _lacks_steps(self) -> bool:
-        """Whether the answering version lacks training steps, as after many labels were imported at once.
+        """Whether the answering version lacks training steps, as after many labels were imported at
+        once.
 
-        Not where the last retrain was dropped: its labels wait for the next one. Nor where cells share a product: each
-        of them would train the same version.
+        Not where the last retrain was dropped: its labels wait for the next one. Nor where cells
+        share a product: each of them would train the same version.
         """
         is_alone = self._peers is None and self.live.answering is not None
         return is_alone and self._was_accepted and self.live.newest.report.n_steps_left > 0
 
     @property
     def is_swapping(self) -> bool:
-        """Whether a trained version is on its way to answering, a step each time that the engine is called."""
+        """Whether a trained version is on its way to answering, a step each time that the engine is
+        called.
+        """
         return self._candidate is not None
 
     @property
     def is_busy(self) -> bool:
-        """Whether a training is under way in the executor, or its version on its way to answering."""
+        """Whether a training is under way in the executor, or its version is being swapped in."""
         return self._retrainer.future is not None or self.is_swapping
 
     def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
         """Bring a version that the executor trained a step further, or to the end.
 
-        `wait` is how many seconds to wait for a training that is not done; then the version is brought to the end.
+        `wait` is how many seconds to wait for a training that is not done; then the version is
+        brought to the end.
         """
         if self._retrainer.future is None and self._candidate is None:
             return
@@ -247,11 +268,15 @@ class Learner:
             self._advance(to_the_end)
 
     def _as_candidate_of(self, trained: Trained) -> Candidate:
-        """Return the outcome of a training as a candidate, prepared to answer in place of the present version."""
+        """Return the outcome of a training as a candidate, prepared to answer in place of the
+        present version.
+        """
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
 
     def _begin_retrain(self) -> None:
-        """Know all that can be known before a training, and count the labels of the next one from here."""
+        """Know all that can be known before a training, and count the labels of the next one from
+        here.
+        """
         if self._precomputed is not None:
             self._precomputed.result()
             self._precomputed = None
@@ -259,7 +284,10 @@ class Learner:
         self.labels.begin_retrain()
 
     def _advance(self, to_the_end: bool) -> None:
-        """Bring the candidate a step further: catch up on labels, store it, swap it in. One not stored is dropped."""
+        """Bring the candidate a step further: catch up on labels, store it, swap it in.
+
+        One not stored is dropped.
+        """
         candidate = self._candidate
         if candidate is None:
             return
@@ -301,7 +329,10 @@ class Learner:
         return True
 
     def _begin_storing(self, candidate: Candidate) -> Future[int]:
-        """Begin to store a candidate, with its model where it has one; the future returns its number."""
+        """Begin to store a candidate, with its model where it has one.
+
+        The future returns its number.
+        """
         report = candidate.accept(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
         state = None
@@ -314,7 +345,9 @@ class Learner:
         return self.live.get_state(model, trained_on) | self.labels.get_state()
 
     def _waits_for_labels(self, candidate: Candidate, to_the_end: bool) -> bool:
-        """Return whether labels are on their way into the store and the cell need not wait for that."""
+        """Return whether labels are on their way into the store and the cell need not wait for
+        that.
+        """
         has_lost_patience = candidate.lose_patience()
         return not to_the_end and not has_lost_patience and self._outbox.request_label_drain()
 
@@ -330,7 +363,10 @@ class Learner:
             self.labels.complete(candidate.model)
 
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
-        """Drop a candidate that could not be stored; its labels count as new, so that the next retrain is soon."""
+        """Drop a candidate that could not be stored.
+
+        Its labels count as new, so that the next retrain is soon.
+        """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
         self._was_accepted = False
@@ -353,10 +389,13 @@ class Learner:
         self._report = None
         return report
 
-    # News of a product
+    # ProductNews of a product
 
     def _is_due(self, retrain_every: int) -> bool:
-        """Return whether a retrain is due; where a product is shared, news is taken in before it is said to be."""
+        """Return whether a retrain is due.
+
+        Where a product is shared, news is taken in before it is said to be.
+        """
         if self._peers is not None and self._peers.is_news_due:
             self._take_in_news(self._peers)
         if not self.labels.is_due(retrain_every):
@@ -365,7 +404,10 @@ class Learner:
         return self.labels.is_due(retrain_every)
 
     def _take_in_all_news(self) -> None:
-        """Take in the peers' news until there is no more, in a few rounds; nothing where no product is shared."""
+        """Take in the peers' news until there is no more, in a few rounds.
+
+        Nothing where no product is shared.
+        """
         peers = self._peers
         if peers is None:
             return
@@ -374,7 +416,10 @@ class Learner:
                 return
 
     def _take_in_news(self, peers: Peers) -> int:
-        """Take in the peers' newest version, labels and corrections; returns how many labels, 0 where the store is away."""
+        """Take in the peers' newest version, labels and corrections.
+
+        Returns how many labels, 0 where the store is away.
+        """
         version = None
         try:
             self._drain_labels()  # one of the news may be a label of this cell
@@ -402,7 +447,9 @@ class Learner:
     # What people put right
 
     def make_ready(self) -> None:
-        """Bring in every version, label and news that is under way; StoreError where that cannot be.
+        """Bring in every version, label and news that is under way.
+
+        StoreError where that cannot be.
 
         A change by a person comes after all that was known before.
         """
@@ -411,7 +458,7 @@ class Learner:
         self._take_in_all_news()
         if self._peers is not None and (self._peers.is_lost or self._has_gaps):
             raise StoreError(
-                f"News of product {self._store.product!r} cannot be had now; try it again."
+                f"ProductNews of product {self._store.product!r} cannot be had now; try it again."
             )
 
     @property
@@ -422,7 +469,8 @@ class Learner:
     def apply_corrections(self, may_retrain: bool = True) -> None:
         """Learn the store's newest corrections: window, references and rule.
 
-        A model that cannot change a reference is trained anew, where `may_retrain`: by the cell that corrected.
+        A model that cannot change a reference is trained anew, where `may_retrain`: by the cell
+        that corrected.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         last = self.labels.last_to_read
@@ -434,9 +482,11 @@ class Learner:
             self.retrain()
 
     def roll_back(self, number: int, event: Change) -> None:
-        """Let an earlier version answer again, as a new one, with the labels that came since among its references.
+        """Let an earlier version answer again, as a new one, with the labels that came since among
+        its references.
 
-        Raises StoreError for a version that is not kept, and where a trace that it was trained on is damaged.
+        Raises StoreError for a version that is not kept, and where a trace that it was trained on
+        is damaged.
         """
         self._outbox.check_integrity()
         begin = self._clock()
@@ -445,7 +495,8 @@ class Learner:
         model = self.live.template.successor()
         trained_on = TrainedOn.from_state(version.state)
         if not model.keeps_references:
-            # A baseline cannot take a label back: it is trained on the same traces as they are labelled now.
+            # A baseline cannot take a label back: it is trained on the same traces as they are
+            # labelled now.
             trained_on = replace(trained_on, corrected_to=self.live.corrected_to)
         if model.needs_refit(state) and not refit(model, self._outbox, trained_on):
             raise StoreError(

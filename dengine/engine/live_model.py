@@ -1,7 +1,8 @@
-"""The model that answers, and what it learns from outcomes: its references, its rule, and their numbers in the store.
+"""The model that answers, and what it learns from outcomes: its references, its rule, and their
+numbers in the store.
 
-`LiveModel` knows the store and the training window below it. Which version answers, and when, is up to
-`learner.Learner`; outcomes come from `feedback.Feedback`.
+`LiveModel` knows the store and the training window below it. Which version answers, and when, is up
+to `learner.Learner`; outcomes come from `feedback.Feedback`.
 """
 
 from __future__ import annotations
@@ -81,8 +82,8 @@ class LiveModel:
         self.corrected_to = 0
         self.overdue: set[str] = set()
         self.overdue_to = 0
-        # Learned labels that the store has not numbered, by decision: the decision, the label, and the provisional
-        # number of the reference; 0 where there is no reference.
+        # Learned labels that the store has not numbered, by decision: the decision, the label, and
+        # the provisional number of the reference; 0 where there is no reference.
         self._unnumbered: dict[str, tuple[StoredDecision, bool, int]] = {}
         self._provisional = itertools.count(-1, -1)
 
@@ -99,7 +100,9 @@ class LiveModel:
     def resume(
         self, version: ModelVersion | None, newest_version: int, within: int, policy_since: int
     ) -> None:
-        """Go on from a stored version, bit for bit; stored reference points are read, not computed again.
+        """Go on from a stored version, bit for bit.
+
+        Stored reference points are read, not computed again.
 
         Parameters
         ----------
@@ -117,10 +120,13 @@ class LiveModel:
         self.newest_version = newest_version
         model = None
         if version is not None:
-            # A later version may be damaged: what an earlier one's rule learned under another policy is left out.
+            # A later version may be damaged: what an earlier one's rule learned under another
+            # policy is left out.
             state = version.state if version.version >= since else without_rule(version.state)
             model = restore_model(self.outbox, self.template, state)
-        past = read_rule_progress(store, None if model is None else version, since, within, policy_since)
+        past = read_rule_progress(
+            store, None if model is None else version, since, within, policy_since
+        )
         self.overdue = set(past.overdue_ids)
         self.overdue_to = past.overdue_to
         if version is None or model is None:
@@ -146,8 +152,9 @@ class LiveModel:
     def learn(self, stored: StoredDecision, success: bool, unobserved: int | None) -> Point | None:
         """Update the rule with an outcome and make the trace a reference.
 
-        `unobserved` is the number of accepted parts without an outcome since the previous update; None leaves the
-        rule as it is. Returns the reference point (d,) to be stored with the label; None where there is none.
+        `unobserved` is the number of accepted parts without an outcome since the previous update;
+        None leaves the rule as it is. Returns the reference point (d,) to be stored with the label;
+        None where there is none.
         """
         decision = stored.decision
         if unobserved is not None and decision.model_version >= self.evidence.since:
@@ -173,7 +180,9 @@ class LiveModel:
         return point if model.keeps_references else None
 
     def unlearn(self, stored: StoredDecision) -> None:
-        """Remove the reference of a label that the store has not numbered, because the part was confirmed wrongly."""
+        """Remove the reference of a label that the store has not numbered, because the part was
+        confirmed wrongly.
+        """
         *_, number = self._unnumbered.pop(stored.decision.id)
         if number:
             self.newest.change_reference(number, stored.content_hash, None)
@@ -181,7 +190,8 @@ class LiveModel:
     def assign_number(self, decision_id: str, seq: int) -> tuple[StoredDecision, bool] | None:
         """Give the reference of a learned label the sequence number that the store assigned.
 
-        Returns the decision and its label, for the training window; None where the decision taught nothing.
+        Returns the decision and its label, for the training window; None where the decision taught
+        nothing.
         """
         if decision_id not in self._unnumbered:
             return None
@@ -191,7 +201,9 @@ class LiveModel:
         return stored, success
 
     def count_overdue(self, decision: Decision) -> None:
-        """Update the rule as if the decision was wrong, whichever it was: its check was not reported in time."""
+        """Update the rule as if the decision was wrong, whichever it was: its check was not
+        reported in time.
+        """
         if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
         for outcome in overdue_outcomes(decision):
@@ -203,14 +215,20 @@ class LiveModel:
         self.overdue_to = max(number, self.overdue_to)
 
     def clear_overdue(self, decision_id: str) -> bool:
-        """Count a decision as overdue no more; returns whether it was counted so, and the rule must be rebuilt."""
+        """Count a decision as overdue no more.
+
+        Returns whether it was counted so, and the rule must be rebuilt.
+        """
         if decision_id not in self.overdue:
             return False
         self.overdue.discard(decision_id)
         return True
 
     def rebuild_rule(self) -> None:
-        """Reset the rule and update it with every stored outcome; StoreError where the store is away."""
+        """Reset the rule and update it with every stored outcome.
+
+        StoreError where the store is away.
+        """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
             lambda: store.outcomes_since(0, self.evidence.since, self.overdue_to)
@@ -220,7 +238,9 @@ class LiveModel:
     def _rebuild_rule_of(
         self, model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]
     ) -> None:
-        """Reset a model's rule to the safe mode of the policy's start and update it with the outcomes."""
+        """Reset a model's rule to the safe mode of the policy's start and update it with the
+        outcomes.
+        """
         model.reset_rule(self.evidence.began_in)
         _update_rule(model, read_outcomes)
 
@@ -230,7 +250,10 @@ class LiveModel:
         return self.outbox.store.outcomes_since(after, self.evidence.since, self.overdue_to)
 
     def apply_corrections(self) -> bool:
-        """Apply the store's newest corrections to the references; False where the model must be trained again."""
+        """Apply the store's newest corrections to the references.
+
+        False where the model must be trained again.
+        """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
         for correction in store.corrections(self.corrected_to):
@@ -242,7 +265,9 @@ class LiveModel:
     def with_policy(
         self, policy: Policy, evidence: EvidenceWindow
     ) -> tuple[EngineModel, EngineModel | None]:
-        """Return the template and the answering model under another policy, with rules that start anew."""
+        """Return the template and the answering model under another policy, with rules that start
+        anew.
+        """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)
         if self.answering is None:
@@ -262,12 +287,17 @@ class LiveModel:
         state["corrected_to"] = np.array(self.corrected_to)
         state["overdue_to"] = np.array(self.overdue_to)
         if self.overdue:
-            state["includes_overdue"] = np.array(True)  # an engine that opens the store rebuilds the rule
+            state["includes_overdue"] = np.array(
+                True
+            )  # an engine that opens the store rebuilds the rule
         return state
 
 
 def _update_rule(model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]) -> None:
-    """Update a model's rule with outcomes in the order of their labels; they are not read for a rule that never learns."""
+    """Update a model's rule with outcomes in the order of their labels.
+
+    They are not read for a rule that never learns.
+    """
     if not model.rule_learns:
         return
     guarded = GuardedModel(model)

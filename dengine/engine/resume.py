@@ -1,7 +1,8 @@
-"""Restoring a stored version bit for bit: its model, the labels and the corrections that came after it was stored.
+"""Restoring a stored version bit for bit: its model, the labels and the corrections that came after
+it was stored.
 
-`live_model.LiveModel` uses these functions when a store is opened, `learner.Learner` for a rollback, and `fleet.Peers` when
-another cell's version is taken over.
+`live_model.LiveModel` uses these functions when a store is opened, `learner.Learner` for a
+rollback, and `fleet.Peers` when another cell's version is taken over.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ if TYPE_CHECKING:
 def restore_model(
     outbox: Outbox, template: EngineModel, state: Mapping[str, NDArray[Any]]
 ) -> EngineModel | None:
-    """Return the model of a stored state; None where it must be trained again and one of its traces is damaged."""
+    """Return the model of a stored state.
+
+    None where it must be trained again and one of its traces is damaged.
+    """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
         return None
@@ -61,27 +65,31 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
 
 def newest_reference(version: ModelVersion) -> int:
     """Return the sequence number of the newest label among the references of a stored version."""
-    # Stored references include the labels that came during the retrain. A baseline has no stored references:
-    # it was trained again, without those labels.
+    # Stored references include the labels that came during the retrain. A baseline has no stored
+    # references: it was trained again, without those labels.
     if "points" in version.state:
         return version.last_seq
     return int(version.state["trained_on"][-1])
 
 
 def newest_correction(version: ModelVersion) -> int:
-    """Return the number of the newest correction that a version's references had when it was stored."""
+    """Return the number of the newest correction that a version's references had when it was
+    stored.
+    """
     return int(version.state.get("corrected_to", 0))
 
 
 def add_labels_since(
     model: EngineModel, store: SqlStore, version: ModelVersion, window: TrainingWindow
 ) -> int:
-    """Add to a version's model the labels and corrections that came after it was stored, in their order.
+    """Add to a version's model the labels and corrections that came after it was stored, in their
+    order.
 
     Returns the number of the newest correction.
     """
     corrected_to = newest_correction(version)
-    # A baseline cannot be corrected afterwards, so it gets each label as it was when the version was stored.
+    # A baseline cannot be corrected afterwards, so it gets each label as it was when the version
+    # was stored.
     as_of = corrected_to if model.keeps_references else None
     # Up to the newest label in the window: what peers stored since then comes as their news.
     since = store.labelled(
@@ -116,7 +124,8 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     """
     if not model.keeps_references:
         return True
-    # The row as it was reported, of whichever cell; no row where the part was quarantined or the trace is damaged.
+    # The row as it was reported, of whichever cell; no row where the part was quarantined or the
+    # trace is damaged.
     data = store.labelled(first=correction.seq, last=correction.seq, corrected_to=0)
     if len(data.seq):
         hash_ = int(data.hashes[0])

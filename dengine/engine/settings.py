@@ -1,4 +1,9 @@
-"""What an engine is, apart from what it has learned: the settings that it was made with, and that its store keeps."""
+"""The settings of an engine: what it was made with, what its store keeps of that, and what is in
+force now.
+
+`DataEngine` makes or reads `EngineSettings` before it opens a cell. `SettingsInForce` holds the
+present ones while it runs. What the engine has learned is not among them.
+"""
 
 import json
 import logging
@@ -22,9 +27,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("dengine")
 
-SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
-# What counts for any model.
-LOOP = (
+MAX_SEED = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
+# Settings that have an effect on any model, a baseline included.
+LOOP_SETTINGS = (
     "seed",
     "trace",
     "retrain_every",
@@ -35,16 +40,19 @@ LOOP = (
     "stops",
     "windows",
 )
-MARKS = (
-    "policy_since",
-    "evidence_since",
-    "began_in",
-)  # of what a change of policy set, as the store has them
 
 
 @dataclass(frozen=True, slots=True)
 class EvidenceWindow:
-    """What the rule in force is told: what was decided from version `since` on; it began at `began_in` of `SAFE_MODES`."""
+    """Which decisions the rule in force is updated with.
+
+    Attributes
+    ----------
+    since : int
+        First model version whose decisions count.
+    began_in : int
+        Safe mode in which the rule started, a position in `SAFE_MODES`.
+    """
 
     since: int = 0
     began_in: int = 0
@@ -52,14 +60,31 @@ class EvidenceWindow:
 
 @dataclass(frozen=True, slots=True)
 class EngineSettings:
-    """An engine's settings.
+    """The settings of an engine.
 
-    recipe : as it is in force.  seed : of the reducer and of the audits' coin, 0 or more.
-    model : what a model that was handed in is called; None: the recipe describes the model.
-    described : the object that was handed in, a model or a reducer without a name, with its settings; None: there is none.
-    trace : the traces' contract; None until the first sound trace.  inferred : whether it was set by that, and not given.
-    policy_since : the first model version under the policy in force; 0: every one.
-    evidence : what the rule in force is told.
+    Attributes
+    ----------
+    recipe : Recipe
+        As it is in force.
+    seed : int
+        Of the reducer, and of the coin that draws audits; 0 or more.
+    model : str or None
+        Name of a baseline that was handed in; None: the recipe describes the model.
+    described : str or None
+        Description, with its settings, of an object that was handed in and has no name in TOML: a
+        baseline or a reducer.
+    trace : TraceSpec or None
+        The trace contract; None until the first sound trace.
+    inferred : bool
+        Whether the first trace set the contract.
+    policy_since : int
+        First model version under the policy in force; 0: every one.
+    evidence : EvidenceWindow
+
+    Raises
+    ------
+    SettingError
+        For a seed that is no seed, and force limits that the traces cannot hold.
     """
 
     recipe: Recipe
@@ -72,184 +97,234 @@ class EngineSettings:
     evidence: EvidenceWindow = EvidenceWindow()
 
     def __post_init__(self) -> None:
-        expect(
-            is_whole(self.seed, 0, SEEDS),
-            f"a seed of 0 or more, an integer of at most {SEEDS}",
-            self.seed,
-        )
-        known = self.trace is None or isinstance(self.trace, TraceSpec)
-        expect(known, "a TraceSpec as trace", self.trace, "TraceSpec(samples=1000) for one")
+        allowed = f"a seed of 0 or more, an integer of at most {MAX_SEED}"
+        expect(is_whole(self.seed, 0, MAX_SEED), allowed, self.seed)
+        is_spec = self.trace is None or isinstance(self.trace, TraceSpec)
+        expect(is_spec, "a TraceSpec as trace", self.trace, "TraceSpec(samples=1000) for one")
         if self.trace is not None:
-            ForceLimitsGate(self.recipe.policy.windows, self.trace)  # refused before it is in force
+            ForceLimitsGate(self.recipe.policy.windows, self.trace)  # raises before it is in force
 
     def to_store(self) -> dict[str, str]:
-        """As `SqlStore.save_settings` takes them."""
-        known = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
-        known |= {
-            name: text
-            for name in ("model", "described")
-            if (text := getattr(self, name)) is not None
-        }
+        """Return the settings as texts by name, as `SqlStore.save_settings` takes them."""
+        texts = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
+        if self.model is not None:
+            texts["model"] = self.model
+        if self.described is not None:
+            texts["described"] = self.described
         if self.trace is not None:
-            known["trace"] = json.dumps(asdict(self.trace))
+            texts["trace"] = json.dumps(asdict(self.trace))
         if self.inferred:
-            known["inferred"] = "true"
-        marks = (self.policy_since, self.evidence.since, self.evidence.began_in)
-        return known | {name: str(value) for name, value in zip(MARKS, marks, strict=True) if value}
+            texts["inferred"] = "true"
+        numbers = {
+            "policy_since": self.policy_since,
+            "evidence_since": self.evidence.since,
+            "began_in": self.evidence.began_in,
+        }
+        return texts | {name: str(number) for name, number in numbers.items() if number}
 
     @classmethod
     def from_store(
         cls,
-        known: Mapping[str, str],
+        texts: Mapping[str, str],
         name: str,
         reducer: Any = None,
         model: Model | None = None,
         allow_import: bool | Collection[str] = False,
     ) -> Self:
-        """What `to_store` gave. name : of the store, for errors.  reducer, model : objects that it cannot bring back.
+        """Return the settings of a used store.
 
-        allow_import : as for `must_allow`, beside what the reducer names.
-        Raises StoreError for an unused store, SettingError for a missing object, or another than it was made with.
+        Parameters
+        ----------
+        texts : mapping of str to str
+            What `to_store` returned.
+        name : str
+            Of the store, for error messages.
+        reducer, model : object, optional
+            Objects that the engine was made with and the store cannot name.
+        allow_import : bool or collection of str
+            As of `check_imports`; a class that `reducer` names is allowed.
+
+        Raises
+        ------
+        StoreError
+            For an unused store.
+        SettingError
+            Where an object is missing, or is another than the engine was made with.
         """
-        if "recipe" not in known:
+        if "recipe" not in texts:
             raise StoreError(
-                f"Expected a store that an engine has used, {name} is empty; make a DataEngine with it."
+                f"Expected a store that an engine has used, {name} is empty; "
+                "make a DataEngine with it."
             )
-        recipe = Recipe.from_store(known, f"the recipe in {name}")
-        made_with = known.get("described")
-        if "model" in known and model is None:
-            raise SettingError(
-                f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...)."
-            )
-        if "model" not in known and model is not None:
-            raise SettingError(
-                f"The engine of {name} has its own model, {recipe.name}; leave model=... out."
-            )
-        if model is not None or recipe.name.startswith(OBJECT_PREFIX):
-            if model is None and (reducer is None or isinstance(reducer, str)):
-                unnamed = f"{recipe.reducer}, has no name in TOML"
-                raise SettingError(
-                    f"The reducer of {name}, {unnamed}: hand it in again, reducer=..."
-                )
-            given = describe_estimator(reducer) if model is None else as_engine_model(model).description
-            if made_with is not None and given != made_with:
-                raise SettingError(
-                    f"{name} was made with {made_with}, got {given}: its labels were counted by that one."
-                )
-            recipe = recipe if model is not None else replace(recipe, reducer=reducer, params={})
-        elif reducer is not None and not isinstance(reducer, str):
-            again = Recipe.from_toml(Recipe(reducer).to_toml())
-            if (again.reducer, again.params) != (recipe.reducer, recipe.params):
-                raise SettingError(
-                    f"Expected reducer {recipe.name} of {name}, got {describe_estimator(reducer)}; leave it out."
-                )
-        must_allow(
-            recipe, name, allow_import is True or {*(allow_import or ()), *classes_of(reducer)}
+        recipe = Recipe.from_store(texts, f"the recipe in {name}")
+        recipe = _with_objects(recipe, texts, name, reducer, model)
+        allowed = allow_import is True or {*(allow_import or ()), *named_classes(reducer)}
+        check_imports(recipe, name, allowed)
+        seed = texts.get("seed", "0")
+        is_seed = seed.isdecimal() and seed.isascii() and len(seed) < 100
+        do = "restore the store from a copy"
+        expect(is_seed, "a seed in the store's settings", seed, do, StoreError)
+        evidence = EvidenceWindow(
+            int(texts.get("evidence_since", "0")), int(texts.get("began_in", "0"))
         )
-        inferred = "inferred" in known
-        seed = known.get("seed", "0")
-        sound = seed.isdecimal() and seed.isascii() and len(seed) < 100
-        expect(
-            sound,
-            "a seed in the store's settings",
-            seed,
-            "restore the store from a copy",
-            StoreError,
-        )
-        policy_since, *evidence = (int(known.get(name, "0")) for name in MARKS)
-        own, trace = known.get("model"), stored_trace_spec(known)
         return cls(
             recipe,
             int(seed),
-            own,
-            made_with,
-            trace,
-            inferred,
-            policy_since,
-            EvidenceWindow(*evidence),
+            texts.get("model"),
+            texts.get("described"),
+            stored_trace_spec(texts),
+            "inferred" in texts,
+            int(texts.get("policy_since", "0")),
+            evidence,
         )
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
-        """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
+        """Return the settings in force and the untrained model: the recipe's, or the one that was
+        handed in.
+        """
         if model is None:
-            own = self.recipe.reducer
-            described_ = None if isinstance(own, str) else describe_estimator(own)
-            return replace(self, described=described_), ModelPrediction.from_recipe(
-                self.recipe, self.seed
-            )
+            reducer = self.recipe.reducer
+            described = None if isinstance(reducer, str) else describe_estimator(reducer)
+            untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
+            return replace(self, described=described), untrained
         template = as_engine_model(model)
-        in_force = template.effective_recipe(
-            self.recipe
-        )  # of our own kind its numbers count, a baseline's are its own affair
-        return replace(
-            self, recipe=in_force, model=template.name, described=template.description
-        ), template
-
-    def must_agree_with(self, asked: Mapping[str, Any]) -> None:
-        """SettingError where what is asked for, as `DataEngine` takes it, is not what is set; None asks for nothing."""
-        given = {name: value for name, value in asked.items() if value is not None}
-        reducer, recipe, policy = (
-            given.pop(name, None) for name in ("reducer", "recipe", "policy")
+        # The numbers of a ModelPrediction count; those of a baseline are its author's affair.
+        settings = replace(
+            self,
+            recipe=template.effective_recipe(self.recipe),
+            model=template.name,
+            described=template.description,
         )
-        have = flat(self.recipe) | {"seed": self.seed, "trace": self.trace or given.get("trace")}
-        unknown = sorted(set(given) - set(have))
+        return settings, template
+
+    def check_request(self, request: Mapping[str, Any]) -> None:
+        """Raise SettingError where settings that a program gives are not the ones that are set.
+
+        `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. The
+        shadow mode and force limits are set by an operator, so that the program need not give them.
+        """
+        given = {name: value for name, value in request.items() if value is not None}
+        reducer = given.pop("reducer", None)
+        recipe = given.pop("recipe", None)
+        policy = given.pop("policy", None)
+        present = flat_settings(self.recipe)
+        present |= {"seed": self.seed, "trace": self.trace or given.get("trace")}
+        unknown = sorted(set(given) - set(present))
         if unknown:
             raise SettingError(
                 f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not."
             )
-        wished = {} if recipe is None else flat(chosen_recipe(reducer, recipe, {}))
-        wished |= given | ({} if policy is None else policy.to_values())
-        wished |= {} if reducer is None else {"reducer": reducer}
-        if not isinstance(
-            wished.get("reducer"), str
-        ):  # an object was compared when the store was opened
-            wished = {
-                name: value for name, value in wished.items() if name not in ("reducer", "params")
-            }
-        # A program's settings are the same in the shadow mode, which a person begins and ends.
-        counts = LOOP if self.model is not None else [name for name in have if name != "shadow"]
-        if wished.get("windows") == NO_WINDOWS:  # these are an operator's, too
-            wished.pop("windows", None)
-        other = sorted(name for name in wished if name in counts and wished[name] != have[name])
-        if other:
-            stored, got = (
-                ", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished)
-            )
-            raise SettingError(
-                f"Expected the store's own settings ({stored}), got {got}; leave them out, or name another store."
-            )
-
-
-def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recipe:
-    """The recipe that was asked for, or the reducer's own, with settings beside it; SettingError where the two differ."""
-    base = Recipe.load(recipe if recipe is not None else "conv" if reducer is None else reducer)
-    if recipe is not None and reducer is not None and reducer != base.reducer:
-        raise SettingError(
-            f"The recipe names its reducer, {base.name}; got reducer {reducer!r} beside it: leave one out."
+        requested = {} if recipe is None else flat_settings(choose_recipe(reducer, recipe, {}))
+        requested |= given
+        if policy is not None:
+            requested |= policy.to_values()
+        if reducer is not None:
+            requested["reducer"] = reducer
+        if not isinstance(requested.get("reducer"), str):
+            # An object was compared when the store was opened.
+            requested.pop("reducer", None)
+            requested.pop("params", None)
+        if requested.get("windows") == NO_WINDOWS:
+            requested.pop("windows")
+        counts = LOOP_SETTINGS if self.model is not None else [*present.keys() - {"shadow"}]
+        different = sorted(
+            name for name in requested if name in counts and requested[name] != present[name]
         )
-    return base.with_settings(**beside)
+        if different:
+            stored = ", ".join(f"{name} {present[name]}" for name in different)
+            got = ", ".join(f"{name} {requested[name]}" for name in different)
+            raise SettingError(
+                f"Expected the store's own settings ({stored}), got {got}; leave them out, "
+                "or name another store."
+            )
 
 
-def classes_of(
+def _with_objects(
+    recipe: Recipe, texts: Mapping[str, str], name: str, reducer: Any, model: Model | None
+) -> Recipe:
+    """Return a stored recipe with the reducer object that was handed in, if any.
+
+    Raises SettingError where an object is missing, not needed, or another than the store was made
+    with.
+    """
+    if "model" in texts and model is None:
+        raise SettingError(
+            f"The engine of {name} drove a {texts['model']}; "
+            "hand it in again: open(url, model=...)."
+        )
+    if "model" not in texts and model is not None:
+        raise SettingError(
+            f"The engine of {name} has its own model, {recipe.name}; leave model=... out."
+        )
+    if model is not None:
+        _check_description(texts, name, as_engine_model(model).description)
+        return recipe
+    if recipe.name.startswith(OBJECT_PREFIX):
+        if reducer is None or isinstance(reducer, str):
+            raise SettingError(
+                f"The reducer of {name}, {recipe.reducer}, has no name in TOML: "
+                "hand it in again, reducer=..."
+            )
+        _check_description(texts, name, describe_estimator(reducer))
+        return replace(recipe, reducer=reducer, params={})
+    if reducer is not None and not isinstance(reducer, str):
+        again = Recipe.from_toml(Recipe(reducer).to_toml())
+        if (again.reducer, again.params) != (recipe.reducer, recipe.params):
+            got = describe_estimator(reducer)
+            raise SettingError(
+                f"Expected reducer {recipe.name} of {name}, got {got}; leave it out."
+            )
+    return recipe
+
+
+def _check_description(texts: Mapping[str, str], name: str, description: str) -> None:
+    """Raise SettingError where an object that is handed in again has other settings than the store
+    was made with.
+    """
+    made_with = texts.get("described")
+    if made_with is not None and description != made_with:
+        raise SettingError(
+            f"{name} was made with {made_with}, got {description}: "
+            "its labels were counted by that one."
+        )
+
+
+def choose_recipe(reducer: Any, recipe: Any, given: Mapping[str, Any]) -> Recipe:
+    """Return the recipe that is asked for, or else the reducer's own, with the given settings in
+    place of its own.
+
+    Raises SettingError where `recipe` names another reducer than `reducer`.
+    """
+    source = recipe
+    if source is None:
+        source = "conv" if reducer is None else reducer
+    chosen = Recipe.load(source)
+    if recipe is not None and reducer is not None and reducer != chosen.reducer:
+        raise SettingError(
+            f"The recipe names its reducer, {chosen.name}; got reducer {reducer!r} beside it: "
+            "leave one out."
+        )
+    return chosen.with_settings(**given)
+
+
+def named_classes(
     reducer: Any = None, recipe: Any = None, policy: Policy | None = None, **others: Any
 ) -> list[str]:
-    """Each `module:Class` that a caller names himself, in settings as `DataEngine` takes them."""
-    said = [Recipe.load(each) for each in (reducer, recipe) if each is not None]
-    return [
-        name for each in (*said, Recipe(policy=policy or Policy())) for name in each.user_classes
-    ]
+    """Return each `module:Class` that a caller names in settings, as `DataEngine` takes them."""
+    recipes = [Recipe.load(source) for source in (reducer, recipe) if source is not None]
+    recipes.append(Recipe(policy=policy or Policy()))
+    return [name for named in recipes for name in named.user_classes]
 
 
-def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
-    """ImportRefusedError where a store's recipe names a class that may not be imported: who writes there would run code.
+def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
+    """Raise ImportRefusedError where a stored recipe names a class that may not be imported.
 
-    allow_import : True: any may; else the names of those that may.
+    Whoever writes to the store could otherwise run code here. `allow_import` True allows any class;
+    else it holds the names of those that are allowed.
     """
-    refused = (
-        []
-        if allow_import is True
-        else [name for name in recipe.user_classes if name not in (allow_import or ())]
-    )
+    if allow_import is True:
+        return
+    refused = [name for name in recipe.user_classes if name not in (allow_import or ())]
     if refused:
         again = "name it again (reducer=, recipe=, policy=; --reducer, --guarantee)"
         allow = "allow it, where you trust the store (allow_import=True; --allow-import)"
@@ -257,73 +332,103 @@ def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str])
         raise ImportRefusedError(f"Expected leave to import {got}: {again}, or {allow}.")
 
 
-def peers_trace(store: "SqlStore") -> TraceSpec | None:
-    """The contract of traces that a product's cells have agreed on; None where there is none, or no product."""
-    return next(filter(None, map(stored_trace_spec, store.peers_settings().values())), None)
+def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
+    """Return the trace contract of a product's other cells.
+
+    None where there is none, or no product.
+    """
+    specs = map(stored_trace_spec, store.peers_settings().values())
+    return next(filter(None, specs), None)
 
 
-def as_peers(
-    asked: Mapping[str, Any], store: "SqlStore", allow_import: bool | Collection[str]
+def fill_from_peers(
+    request: Mapping[str, Any], store: "SqlStore", allow_import: bool | Collection[str]
 ) -> dict[str, Any]:
-    """What a new engine is asked for; what was left open, as a peer has it if there is one, where `must_allow` lets it."""
-    known = next(iter(store.peers_settings().values()), {})
-    filled = dict(asked)
+    """Return settings for a new engine, with seed and recipe from another cell of its product where
+    these are open.
+
+    Raises ImportRefusedError where the peer's recipe names a class that may not be imported.
+    """
+    peer = next(iter(store.peers_settings().values()), {})
+    filled = dict(request)
     if filled.get("seed") is None:
-        filled["seed"] = int(known.get("seed", 0))
-    chosen = any(filled.get(name) is not None for name in ("reducer", "recipe", "model"))
-    if "recipe" in known and not chosen and "described" not in known:  # an object must be handed in
-        filled["recipe"] = Recipe.from_toml(known["recipe"])
-        must_allow(filled["recipe"], "a peer in the store", allow_import)
+        filled["seed"] = int(peer.get("seed", 0))
+    is_chosen = any(filled.get(name) is not None for name in ("reducer", "recipe", "model"))
+    # Where the peer has an object without a name, it must be handed in here as well.
+    if "recipe" in peer and not is_chosen and "described" not in peer:
+        filled["recipe"] = Recipe.from_toml(peer["recipe"])
+        check_imports(filled["recipe"], "a peer in the store", allow_import)
     return filled
 
 
-def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
-    """SettingError for settings beside a model that was handed in and decides by its own: they would have no effect."""
-    idle = [name for name in ("radius", "folds") if beside.get(name) is not None]
-    idle += [] if reducer is None else ["reducer"]
-    policy = beside.get("policy")
-    counting = {"audit_rate": 0.0, "stops": "some", "shadow": False, "windows": ()}
-    idle += [] if policy is None or replace(policy, **counting) == Policy() else ["policy"]
+def check_model_settings(reducer: Any, given: Mapping[str, Any]) -> None:
+    """Raise SettingError for settings beside a baseline, or another model, on which they would have
+    no effect.
+    """
+    idle = [name for name in ("radius", "folds") if given.get(name) is not None]
+    if reducer is not None:
+        idle.append("reducer")
+    policy = given.get("policy")
+    effective = {"audit_rate": 0.0, "stops": "some", "shadow": False, "windows": ()}
+    if policy is not None and replace(policy, **effective) != Policy():
+        idle.append("policy")
     if idle:
-        do = "set it on the model, or leave it out (of a policy audit_rate, stops, shadow and windows alone count)"
-        what = f"so {', '.join(idle)} would have no effect"
-        raise SettingError(f"A model that is handed in decides by its own rule, {what}; {do}.")
+        effect = f"so {', '.join(idle)} would have no effect"
+        do = (
+            "set it on the model, or leave it out "
+            "(of a policy audit_rate, stops, shadow and windows alone count)"
+        )
+        raise SettingError(f"A model that is handed in decides by its own rule, {effect}; {do}.")
 
 
-def flat(recipe: Recipe) -> dict[str, Any]:
-    """Every setting of a recipe by its name, the policy's among them."""
-    return {
-        f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name != "policy"
-    } | recipe.policy.to_values()
+def flat_settings(recipe: Recipe) -> dict[str, Any]:
+    """Return every setting of a recipe by its name, those of its policy included."""
+    settings = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
+    del settings["policy"]
+    return settings | recipe.policy.to_values()
 
 
 class SettingsInForce:
     """The settings in force, and the store's copy of them.
 
-    now : they themselves.  audited_share : of certain decisions that are verified all the same.
-    conditions : what decisions depend on; None before the first sound trace.
-    waiting : whether the store lacks them, and `save` is to be called again.
+    Parameters
+    ----------
+    settings : EngineSettings
+    outbox : Outbox
+
+    Attributes
+    ----------
+    now : EngineSettings
+    audited_share : float
+        Share of the certain decisions that are verified as audits.
+    conditions : DecisionConditions or None
+        What a decision depends on beside the model; None before the first sound trace.
+    is_unsaved : bool
+        Whether the store lacks the present settings, so that `save` must be called again.
     """
 
     def __init__(self, settings: EngineSettings, outbox: Outbox) -> None:
         self.change(settings)
-        self.waiting = False
+        self.is_unsaved = False
         self._outbox = outbox
 
     def change(self, settings: EngineSettings) -> None:
-        """Go on under others."""
-        policy, trace = settings.recipe.policy, settings.trace
-        self.now, self.audited_share = settings, policy.audited_share
-        self.conditions = None
-        if trace is not None:
-            share = policy.audited_share
-            self.conditions = DecisionConditions(trace, policy.limits, share, settings.seed)
+        """Use other settings from now on; the store is not changed."""
+        policy = settings.recipe.policy
+        self.now = settings
+        self.audited_share = policy.audited_share
+        self.conditions: DecisionConditions | None = None
+        if settings.trace is not None:
+            self.conditions = DecisionConditions(
+                settings.trace, policy.limits, policy.audited_share, settings.seed
+            )
 
     def save(self) -> None:
-        """Store them; where the store is away, they wait."""
+        """Store the settings; where the store is away, note that they are unsaved."""
+        texts = self.now.to_store()
         try:
-            self._outbox.call_store(lambda: self._outbox.store.save_settings(self.now.to_store()))
-            self.waiting = False
+            self._outbox.call_store(lambda: self._outbox.store.save_settings(texts))
+            self.is_unsaved = False
         except StoreError:
-            self.waiting = True
+            self.is_unsaved = True
             log.exception("the settings are stored later")

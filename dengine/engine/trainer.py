@@ -1,7 +1,9 @@
-"""Training of a new version within its time budget, in line or in an executor; no failure of either stops the cell.
+"""Training of a new version within its time budget, in line or in an executor.
 
-`TrainingWindow` holds the newest labelled traces in memory. `Retrainer` trains a successor of the present model on a
-snapshot of it; `learner.Learner` decides when, and what becomes of the result.
+No failure of either stops the cell.
+
+`TrainingWindow` holds the newest labelled traces in memory. `Retrainer` trains a successor of the
+present model on a snapshot of it; `learner.Learner` decides when, and what becomes of the result.
 """
 
 import logging
@@ -22,18 +24,22 @@ from ..store.records import LabelledTraces
 
 log = logging.getLogger("dengine")
 HUNG = 60.0  # seconds after which work in the executor is given up
-STEPS = 0.7  # of the budget, after which no step begins: each costs little, and a model that lacks some decides less
+# Share of the budget after which no step begins; a model that lacks a few steps decides a little
+# less often.
+STEPS = 0.7
 LATE = "ended by the clock, before its last step"
 
 Clock = Callable[[], float]
 
 
 class TrainingWindow:
-    """The newest labelled traces, in memory, up to a capacity. Work on it does not grow with the store.
+    """The newest labelled traces, in memory, up to a capacity.
 
-    The traces lie in one block that is filled from its front and never overwritten, so a snapshot is a view of it. When
-    the block is full, the window goes on in another, half as long again, and the old one stays with those who hold a
-    snapshot.
+    Work on it does not grow with the store.
+
+    The traces lie in one block that is filled from its front and never overwritten, so a snapshot
+    is a view of it. When the block is full, the window goes on in another, half as long again, and
+    the old one stays with those who hold a snapshot.
 
     Parameters
     ----------
@@ -69,7 +75,9 @@ class TrainingWindow:
         self._first = max(self._first, self._end - self.capacity)
 
     def _enlarge(self, trace_shape: tuple[int, ...]) -> None:
-        """Copy the window to the front of a new block, half as long again, for traces of this shape."""
+        """Copy the window to the front of a new block, half as long again, for traces of this
+        shape.
+        """
         n = len(self)
         columns = [column[self._first :] for column in self._block]
         room = n + max(n // 2, 64)
@@ -84,13 +92,18 @@ class TrainingWindow:
         self._end = n
 
     def refill(self, labelled: LabelledTraces) -> None:
-        """Hold the newest of these labelled traces, which are ordered by number, in place of all others."""
+        """Hold the newest of these labelled traces, which are ordered by number, in place of all
+        others.
+        """
         self._block = [labelled.seq, labelled.traces, labelled.labels, labelled.hashes]
         self._end = len(labelled.seq)
         self._first = max(0, self._end - self.capacity)
 
     def snapshot(self) -> LabelledTraces:
-        """Return the labelled traces, oldest first; the arrays never change, and are not to be written to."""
+        """Return the labelled traces, oldest first.
+
+        The arrays never change, and are not to be written to.
+        """
         return LabelledTraces(*(column[self._first : self._end] for column in self._block))
 
     def newer(self, seq: int) -> list[int]:
@@ -215,13 +228,18 @@ class Retrainer:
         self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
 
     def train(self, current: EngineModel, begin: float) -> Trained:
-        """Train a successor of the current model in line; `begin` is when work on the retrain began."""
+        """Train a successor of the current model in line; `begin` is when work on the retrain
+        began.
+        """
         data = self.window.snapshot()
         trained = train_candidate(current.successor(), data, self.limits, self.clock)
         return replace(trained, begin=begin)
 
     def start(self, current: EngineModel) -> bool:
-        """Begin to train a successor in the executor; returns False without an executor that takes work."""
+        """Begin to train a successor in the executor.
+
+        Returns False without an executor that takes work.
+        """
         if self.executor is None:
             return False
         data = self.window.snapshot()
@@ -242,10 +260,12 @@ class Retrainer:
         return self.future is not None
 
     def collect(self, wait: float = 0.0) -> Trained | None:
-        """Return the outcome of the training in the executor, once; None where there is none or it is not done.
+        """Return the outcome of the training in the executor, once.
 
-        With `wait` above 0 a training that is not done after so many seconds is given up, and its outcome is dropped.
-        So is one that takes longer than `HUNG`.
+        None where there is none or it is not done.
+
+        With `wait` above 0 a training that is not done after so many seconds is given up, and its
+        outcome is dropped. So is one that takes longer than `HUNG`.
         """
         future = self.future
         left = self._began + HUNG - time.monotonic()
@@ -278,8 +298,8 @@ def train_candidate(
 ) -> Trained:
     """Train a successor on labelled traces; any exception becomes a dropped outcome.
 
-    A plain function, so that any executor can run it. Whether the model is accepted depends on no label: with a gate on
-    held-out loss, the labels of fold k would choose encoder k.
+    A plain function, so that any executor can run it. Whether the model is accepted depends on no
+    label: with a gate on held-out loss, the labels of fold k would choose encoder k.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
     begin = clock()

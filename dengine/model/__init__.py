@@ -1,4 +1,6 @@
-"""What the engine drives: the contracts, our own prediction by reducer and radius neighbours, and a baseline's adapter."""
+"""What the engine drives: the contracts, our own prediction by reducer and radius neighbours, and a
+baseline's adapter.
+"""
 
 import lazy_loader
 

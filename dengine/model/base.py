@@ -1,7 +1,8 @@
-"""The two contracts of a model: `Model`, which a baseline method implements, and `EngineModel`, which the engine drives.
+"""The two contracts of a model: `Model`, which a baseline method implements, and `EngineModel`,
+which the engine drives.
 
-`BaselineAdapter` makes an `EngineModel` of a baseline. dengine's own `neighbours.ModelPrediction` implements both. Calls
-that must not raise into the cell go through `engine.guard.GuardedModel`.
+`BaselineAdapter` makes an `EngineModel` of a baseline. dengine's own `neighbours.ModelPrediction`
+implements both. Calls that must not raise into the cell go through `engine.guard.GuardedModel`.
 """
 
 from __future__ import annotations
@@ -42,7 +43,10 @@ class Prediction(NamedTuple):
 
 @runtime_checkable
 class Model(Protocol):
-    """What a baseline method must give, and no more. X is (n, C, T) float32, y (n,) of 1 = success and 0 = failure."""
+    """What a baseline method must give, and no more.
+
+    X is (n, C, T) float32, y (n,) of 1 = success and 0 = failure.
+    """
 
     def fit(self, X: Any, y: Any) -> Any:
         """Train anew on labelled traces."""
@@ -61,10 +65,12 @@ class Model(Protocol):
 
 
 class EngineModel(ABC):
-    """The model that the engine drives: it predicts, takes references, trains a successor, and is stored.
+    """The model that the engine drives: it predicts, takes references, trains a successor, and is
+    stored.
 
-    A subclass implements `train`, `predict_one`, `add_reference` and `successor`; every other method has a default
-    that fits a model without a rule, without a safe mode and without a stored state.
+    A subclass implements `train`, `predict_one`, `add_reference` and `successor`; every other
+    method has a default that fits a model without a rule, without a safe mode and without a stored
+    state.
 
     Attributes
     ----------
@@ -73,14 +79,16 @@ class EngineModel(ABC):
     name : str
         Shown in a status or a table.
     description : str
-        The model and its numbers, the same at every start: a store compares it with the model that made it.
+        The model and its numbers, the same at every start: a store compares it with the model that
+        made it.
     rule_is_stale : bool
-        An update of the rule failed, so the model raises instead of predicting until the engine is opened again.
+        An update of the rule failed, so the model raises instead of predicting until the engine is
+        opened again.
     rule_learns : bool
         Whether outcomes change the rule at all.
     keeps_references : bool
-        Whether `get_state`, and the points that are stored with labels, restore the references. Otherwise the model
-        is trained again on the traces of its version.
+        Whether `get_state`, and the points that are stored with labels, restore the references.
+        Otherwise the model is trained again on the traces of its version.
     min_traces : int
         Number of labelled traces that the first training waits for.
     is_compiled : bool
@@ -100,7 +108,9 @@ class EngineModel(ABC):
     _conditions: DecisionConditions | None = None
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with this model's own settings in place of those that have no effect on it."""
+        """Return the recipe with this model's own settings in place of those that have no effect on
+        it.
+        """
         return recipe
 
     @abstractmethod
@@ -135,7 +145,9 @@ class EngineModel(ABC):
         """Load the libraries that the first training needs; called in a thread of its own."""
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default
-        """Compute in advance, and keep, what a training on these traces (n, channels, samples) begins with."""
+        """Compute in advance, and keep, what a training on these traces (n, channels, samples)
+        begins with.
+        """
 
     @abstractmethod
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
@@ -196,7 +208,8 @@ class EngineModel(ABC):
         Returns
         -------
         array of float32, shape (d,)
-            The reference point, which is stored with the label so that it need not be computed again.
+            The reference point, which is stored with the label so that it need not be computed
+            again.
         """
 
     def renumber_reference(self, old: int, new: int) -> None:  # noqa: B027  # a default
@@ -205,12 +218,15 @@ class EngineModel(ABC):
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
         """Relabel the reference of this number, or remove it where `y` is None.
 
-        Returns False, and changes nothing, where the reference has another hash, or the model cannot change one.
+        Returns False, and changes nothing, where the reference has another hash, or the model
+        cannot change one.
         """
         return False
 
     def with_policy(self, policy: Policy) -> Self:
-        """Return a model under another policy that shares the references and whose rule has learned nothing yet."""
+        """Return a model under another policy that shares the references and whose rule has learned
+        nothing yet.
+        """
         return self
 
     def update_rule(  # noqa: B027  # a default: no rule that learns
@@ -242,14 +258,19 @@ class EngineModel(ABC):
         """
 
     def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
-        """Make the rule forget every outcome and start in a safe mode, a position in `SAFE_MODES`; 0 is none."""
+        """Make the rule forget every outcome and start in a safe mode, a position in `SAFE_MODES`.
+
+        0 is none.
+        """
 
     @abstractmethod
     def successor(self) -> EngineModel:
-        """Return a model to train next, starting from this one, that shares nothing which training changes."""
+        """Return a model to train next, starting from this one, that shares nothing which training
+        changes.
+        """
 
     def prepare(self, previous: EngineModel) -> None:  # noqa: B027  # a default: nothing to prepare
-        """Take over the rule of the previous model, stale or not, and be ready to predict at once."""
+        """Take over the previous model's rule, stale or not, and be ready to predict at once."""
 
     @property
     def safe_mode(self) -> str:
@@ -257,7 +278,9 @@ class EngineModel(ABC):
         return ""
 
     def defect(self) -> str:
-        """Return why the trained model must not answer, for reasons that read no label; "" where there is none."""
+        """Return why the trained model must not answer, for reasons that read no label; "" where
+        there is none.
+        """
         return ""
 
     @property
@@ -274,13 +297,16 @@ class EngineModel(ABC):
         return self
 
     def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
-        """Return whether the model must be trained on the very traces of that state before `set_state`."""
+        """Return whether the model must be trained on the very traces of that state before
+        `set_state`.
+        """
         return True
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
         """Return what an exporter starts from; raises ExportError where nothing can be exported."""
         raise ExportError(
-            f"{self.name} is a baseline and stays in Python; only dengine's own model can be exported."
+            f"{self.name} is a baseline and stays in Python; "
+            "only dengine's own model can be exported."
         )
 
 
@@ -311,7 +337,10 @@ class PythonPredictor(nn.Module):
 
 
 def as_engine_model(model: Model) -> EngineModel:
-    """A model as the engine drives it: our own as it is, a baseline adapted. SettingError for what is no model."""
+    """A model as the engine drives it: our own as it is, a baseline adapted.
+
+    SettingError for what is no model.
+    """
     if isinstance(model, EngineModel):
         return model
     if isinstance(model, type) or not isinstance(model, Model):
@@ -322,7 +351,10 @@ def as_engine_model(model: Model) -> EngineModel:
 
 
 class BaselineAdapter(EngineModel):
-    """Makes an `EngineModel` of a baseline. It decides by its own rule, and it is trained on a deep copy."""
+    """Makes an `EngineModel` of a baseline.
+
+    It decides by its own rule, and it is trained on a deep copy.
+    """
 
     keeps_references = False
 
@@ -340,7 +372,10 @@ class BaselineAdapter(EngineModel):
         return self
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """The baseline's own decision on one trace (C, T), with its evidence; it knows nothing of parts."""
+        """The baseline's own decision on one trace (C, T), with its evidence.
+
+        It knows nothing of parts.
+        """
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)
         (n_success,), (n_failure,) = self.model.count(X)
@@ -349,7 +384,8 @@ class BaselineAdapter(EngineModel):
         counts = int(n_success), int(n_failure)
         if counts != (n_success, n_failure) or not all(0 <= n < 2**63 for n in counts):
             raise ValueError(
-                f"Expected whole numbers of labels below 2**63, got {shortened((n_success, n_failure))}."
+                "Expected whole numbers of labels below 2**63, "
+                f"got {shortened((n_success, n_failure))}."
             )
         return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
@@ -363,7 +399,10 @@ class BaselineAdapter(EngineModel):
         embedding: Embedding | None = None,
         point: Floats | None = None,
     ) -> Floats:
-        """Let the baseline take in the labelled trace; returns the trace, which serves as its reference point."""
+        """Let the baseline take in the labelled trace.
+
+        Returns the trace, which serves as its reference point.
+        """
         self.model.add(x, y)
         return x
 
@@ -376,9 +415,10 @@ class Exportable:
     """What an exporter starts from.
 
     model : fitted.  trace : the contract of its traces.  audit_rate, seed : of the audits' coin.
-    windows : an operator's, as they act.  stops_all : whether silence until the next decision confirms an accepted part.
-    model_version, recipe : what the file says of the engine; 0 and "" without one.
-    note : takes what is to be remembered of the export, a kind and a text, as `SqlStore.put_event`; None: nobody remembers.
+    windows : an operator's, as they act.  stops_all : whether silence until the next decision
+    confirms an accepted part. model_version, recipe : what the file says of the engine; 0 and ""
+    without one. note : takes what is to be remembered of the export, a kind and a text, as
+    `SqlStore.put_event`; None: nobody remembers.
     """
 
     model: Any

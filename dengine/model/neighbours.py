@@ -1,10 +1,13 @@
-"""The model prediction: reducer, references and rule together, with honest counting; and the module that answers.
+"""The model prediction: reducer, references and rule together, with honest counting.
 
-A label may be counted for a query only in an embedding that never saw that label. So the reducer spans K spaces, fold k's
-references live in space k, a query is embedded in all K, and its counts are summed.
+And the module that answers.
 
-`Predictor` is what the engine asks, and what export saves: `export.decision` puts the trace gate before it and the audits'
-coin behind it.
+A label may be counted for a query only in an embedding that never saw that label. So the reducer
+spans K spaces, fold k's references live in space k, a query is embedded in all K, and its counts
+are summed.
+
+`Predictor` is what the engine asks, and what export saves: `export.decision` puts the trace gate
+before it and the audits' coin behind it.
 """
 
 import copy
@@ -54,8 +57,11 @@ from .base import Embedding, EngineModel, Exportable, Prediction
 log = logging.getLogger("dengine")
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
 NEIGHBOURS = 10
-NEAR = 0.12  # of the distance to the tenth neighbour; of parts of their own about one in two hundred is as near
-SUSPICIOUS = 25  # such traces: up to 15 were counted among 100 to 500 insertions of parts of their own, at any number
+# A nearest neighbour within this share of the distance to the tenth one is a near repeat; of distinct
+# parts about one in two hundred is as near.
+NEAR = 0.12
+# More near repeats are reported; among 100 to 500 insertions of distinct parts up to 15 were counted.
+SUSPICIOUS = 25
 NOVEL = REASONS.index(Reason.NOVEL)
 KINDS = 16  # compiled modules that a process keeps
 
@@ -147,9 +153,11 @@ def template_of(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
 
 
 def structure_of(eager: nn.Module) -> tuple[Any, ...]:
-    """Everything that scripting compiles into a module: classes, attributes and shapes, but not the tensors' values.
+    """Everything that scripting compiles into a module: classes, attributes and shapes, but not the
+    tensors' values.
 
-    The classes themselves are part of it, not their names: a notebook cell that is run again defines another class.
+    The classes themselves are part of it, not their names: a notebook cell that is run again
+    defines another class.
     """
     return tuple(
         (
@@ -170,7 +178,9 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
 
 
 def is_compiled_in(name: str, value: object) -> bool:
-    """Whether scripting compiles an attribute into the code, as it does with plain values and functions."""
+    """Whether scripting compiles an attribute into the code, as it does with plain values and
+    functions.
+    """
     return not name.startswith("_") and isinstance(value, CONSTANTS)
 
 
@@ -180,7 +190,10 @@ def _as_key(value: object) -> object:
 
 
 def _compiles(*modules: nn.Module) -> bool:
-    """Whether TorchScript compiles these as they are now; what it compiled before it was changed answers in Python."""
+    """Whether TorchScript compiles these as they are now.
+
+    What it compiled before it was changed answers in Python.
+    """
     changed = [type(module).__name__ for module in modules if is_code_changed(module)]
     if changed:
         do = "start Python anew to have it compiled"
@@ -208,16 +221,18 @@ def compiled(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
 class ModelPrediction(EngineModel):
     """Reducer + references + rule, from traces.
 
-    reducer : a name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned, never fitted itself.
-    classifier : a `WilsonRadiusClassifier` holding radius and policy; it is cloned, never fitted itself.
+    reducer : a name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned,
+    never fitted itself. classifier : a `WilsonRadiusClassifier` holding radius and policy; it is
+    cloned, never fitted itself.
         None: of the reducer's own radius.
     folds : K, for a label-using transformer that does not cross-fit by itself.
     rule : what turns counts into an action; None: the classifier's policy.
     novelty : how far beyond its references a trace may lie, as in `Recipe`; 0: anywhere.
 
-    Embeddings are scaled space by space to a root mean square radius of 1, so that one `radius` means the same in every
-    reducer; the scale of space k comes from fold k's traces, whose labels that space never saw. One whose axis has a
-    unit of its own (`Reducer.own_unit`) is left as it is: where probabilities hardly differ, they are not to be spread.
+    Embeddings are scaled space by space to a root mean square radius of 1, so that one `radius`
+    means the same in every reducer; the scale of space k comes from fold k's traces, whose labels
+    that space never saw. One whose axis has a unit of its own (`Reducer.own_unit`) is left as it
+    is: where probabilities hardly differ, they are not to be spread.
     """
 
     def __init__(
@@ -258,7 +273,7 @@ class ModelPrediction(EngineModel):
         return f"{own}, {self.folds} folds, {type(self.rule).__name__}"
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with the classifier's numbers, the folds and the novelty of this model."""
+        """Return the recipe with this model's classifier settings, folds and novelty."""
         own = self.classifier
         policy = replace(
             recipe.policy, alpha=own.alpha, lower_bound=own.lower_bound, interval=own.interval
@@ -283,8 +298,9 @@ class ModelPrediction(EngineModel):
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
         """Train the reducer afresh, and make every trace a reference.
 
-        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.trace_hash` of each, or None: of
-        their content. Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
+        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.trace_hash`
+        of each, or None: of their content. Raises SettingError where the reducer cannot be trained
+        on this (one class only, too few traces).
         """
         X, y = as_traces(X), as_labels(y)
         self.spaces = as_reducer(clone(self.reducer), self.folds)
@@ -325,7 +341,10 @@ class ModelPrediction(EngineModel):
         self.spaces.warm_up()
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Let the reducer compute in advance; before the first training also compile the predictor's template."""
+        """Let the reducer compute in advance.
+
+        Before the first training also compile the predictor's template.
+        """
         X = clip_extremes(X)
         blank = self.spaces.untrained_module(X)
         with ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,)) as pool:
@@ -349,7 +368,9 @@ class ModelPrediction(EngineModel):
             ahead.result()
 
     def prepare(self, previous: EngineModel) -> None:
-        """Take over the rule of the previous model, stale or not, and compile the predictor unless that is done."""
+        """Take over the rule of the previous model, stale or not, and compile the predictor unless
+        that is done.
+        """
         if not isinstance(previous, ModelPrediction):
             return
         compiled_with_rule = self._decider is not None and self.rule is previous.rule
@@ -421,7 +442,10 @@ class ModelPrediction(EngineModel):
         embedding: Embedding | None = None,
         point: Floats | None = None,
     ) -> Floats:
-        """Add one labelled trace (channels, samples) to the index, in the space of its fold; returns its point (d,)."""
+        """Add one labelled trace (channels, samples) to the index, in the space of its fold.
+
+        Returns its point (d,).
+        """
         if point is None:
             point = self._reference_point(x, hash_, embedding)
         self.index.add_one(
@@ -430,7 +454,9 @@ class ModelPrediction(EngineModel):
         return point
 
     def _reference_point(self, x: Floats, hash_: int, embedding: Embedding | None) -> Floats:
-        """Return the scaled point (d,) of a trace in the space of its fold, computed where `embedding` is None."""
+        """Return the scaled point (d,) of a trace in the space of its fold, computed where
+        `embedding` is None.
+        """
         if embedding is not None:
             return np.array(embedding[self._fold(hash_)], dtype=np.float32)
         with torch.inference_mode():
@@ -455,14 +481,18 @@ class ModelPrediction(EngineModel):
         predicted: int = 0,
         inclusion_probability: float = 1.0,
     ) -> None:
-        """Update the rule in place with the outcome of one part; an update that fails leaves `rule_is_stale` set."""
+        """Update the rule in place with the outcome of one part.
+
+        An update that fails leaves `rule_is_stale` set.
+        """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
         before = dict(self.rule.state_dict())
         self.rule.observe(unobserved, novel)
         self.rule.update(lower, upper, success, predicted, inclusion_probability)
         for name, value in self.rule.state_dict().items():
-            # The compiled module reads the tensor that it shares, so a tensor that was bound anew is copied into it.
+            # The compiled module reads the tensor that it shares, so a tensor that was bound anew
+            # is copied into it.
             if value.data_ptr() != before[name].data_ptr():
                 before[name].copy_(value)
                 path, _, leaf = name.rpartition(".")
@@ -470,7 +500,9 @@ class ModelPrediction(EngineModel):
         self.rule_is_stale = was_stale
 
     def reset_rule(self, safe_mode: int) -> None:
-        """Reset the rule in place, because the compiled module shares its tensors, and start it in a safe mode."""
+        """Reset the rule in place, because the compiled module shares its tensors, and start it in
+        a safe mode.
+        """
         self.rule.load_state_dict(self.rule.clone().state_dict())
         self.rule.start_in_safe_mode(safe_mode)
 
@@ -493,7 +525,10 @@ class ModelPrediction(EngineModel):
         return SAFE_MODES[self.rule.safe_mode()]
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """The whole prediction on one trace (C, T); the part with this hash, if it is known, has no vote."""
+        """The whole prediction on one trace (C, T).
+
+        The part with this hash, if it is known, has no vote.
+        """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
         self._check_rule()
@@ -522,7 +557,9 @@ class ModelPrediction(EngineModel):
         return [self.predict_one(x) for x in as_traces(X)]
 
     def count(self, X: ArrayLike) -> Counts:
-        """(n_success, n_failure), each (n,): labels in the balls around each trace, summed over the K spaces."""
+        """(n_success, n_failure), each (n,): labels in the balls around each trace, summed over the
+        K spaces.
+        """
         found = self.predict_many(X)
         return np.array([p.n_success for p in found], dtype=np.int64), np.array(
             [p.n_failure for p in found], np.int64
@@ -538,7 +575,10 @@ class ModelPrediction(EngineModel):
         return np.array([p.action for p in self.predict_many(X)], dtype=object)
 
     def successor(self) -> "ModelPrediction":
-        """A model to train next, warm from this one; all but the rule is its own, so this one goes on answering."""
+        """A model to train next, warm from this one.
+
+        All but the rule is its own, so this one goes on answering.
+        """
         new = copy.copy(self)
         new.spaces, new._decider, new._note = copy.deepcopy(self.spaces), None, ""
         return new
@@ -551,7 +591,10 @@ class ModelPrediction(EngineModel):
         )
 
     def get_state(self) -> State:
-        """Plain arrays: references always; the reducer's and the rule's own where they have any ("reducer.", "rule.")."""
+        """Plain arrays: references always.
+
+        The reducer's and the rule's own where they have any ("reducer.", "rule.").
+        """
         state = {
             "trace_shape": np.array(self.trace_shape),
             "scale": self.scale,
@@ -613,8 +656,9 @@ class ModelPrediction(EngineModel):
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     """How many of the newest traces (n, C, T) nearly repeat one of another part; parts (n,) hashes.
 
-    Labels are counted as independent trials, so a part that is inserted again must be known as such (`part=`). This notices
-    the plain cases where it is not; it changes no decision. More repeats than `NEIGHBOURS` are not seen.
+    Labels are counted as independent trials, so a part that is inserted again must be known as such
+    (`part=`). This notices the plain cases where it is not; it changes no decision. More repeats
+    than `NEIGHBOURS` are not seen.
     """
     x, own = traces[-NEWEST:], parts[-NEWEST:]
     if len(x) < 100:
@@ -640,4 +684,7 @@ def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
     n, looked_at = near_repeats(traces, parts), min(len(traces), NEWEST)
     if n <= SUSPICIOUS:
         return ""
-    return f"{n} of the newest {looked_at} traces nearly repeat another: if parts come twice, give their numbers (part=)"
+    return (
+        f"{n} of the newest {looked_at} traces nearly repeat another: "
+        "if parts come twice, give their numbers (part=)"
+    )
