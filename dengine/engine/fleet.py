@@ -1,6 +1,6 @@
 """What a cell takes in of its product: the labels of the other cells, and their newest version.
 
-ProductNews is asked for between two cycles, never by `decide`. A cell whose connection is lost goes on
+News is asked for between two cycles, never by `decide`. A cell whose connection is lost goes on
 with what it has. `learner.Learner` asks for news in the order that `Learner.take_in_news` shows.
 """
 

@@ -389,7 +389,7 @@ class Learner:
         self._report = None
         return report
 
-    # ProductNews of a product
+    # News of a product
 
     def _is_due(self, retrain_every: int) -> bool:
         """Return whether a retrain is due.
@@ -458,7 +458,7 @@ class Learner:
         self._take_in_all_news()
         if self._peers is not None and (self._peers.is_lost or self._has_gaps):
             raise StoreError(
-                f"ProductNews of product {self._store.product!r} cannot be had now; try it again."
+                f"News of product {self._store.product!r} cannot be had now; try it again."
             )
 
     @property
