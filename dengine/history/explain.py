@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
 MAX_LABELS = 100_000  # read after a version at most, for a cell that never retrains again
-# accepted where lower >= the first, rejected where 1 - upper >= the second
+# Accepted where lower >= the first, rejected where 1 - upper >= the second.
 Thresholds = tuple[float, float]
 
 
@@ -174,7 +174,7 @@ def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
     None if the state has none, has another rule than the policy's, or was stored while stale.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
-        # nothing is imported because a store names it; a running engine has imported it
+        # Nothing is imported because a store names it; a running engine has imported it.
         return None
     rule = policy.rule()
     try:
@@ -349,7 +349,7 @@ def _find_excesses(excess: NDArray[np.float64], rate_hz: float) -> Iterator[Exce
     """Yield the pieces in which the signed excess (C, T) has one sign, channel by channel."""
     for channel, row in enumerate(excess):
         side = np.sign(row)
-        # where a piece begins or ends
+        # Where a piece begins or ends.
         edges = np.flatnonzero(np.diff(side, prepend=0.0, append=0.0))
         for first, end in pairwise(edges.tolist()):
             if side[first]:

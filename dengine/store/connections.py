@@ -174,7 +174,7 @@ def _connect(
 
 def _is_unwritable(error: Exception) -> bool:
     """Return whether an SQLite error says that a file cannot be written, or created beside it."""
-    # an extended code has more in its higher bits
+    # An extended code has more in its higher bits
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     return code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN)
 
@@ -184,7 +184,7 @@ def _set_pragmas(connection: Any, record: Any) -> None:
     connection.isolation_level = None  # `_begin` starts transactions, not the driver
     try:
         tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
-        # another program's file is left as it is
+        # Another program's file is left as it is.
         if not tables or {"setting", "decision"} <= tables:
             connection.execute("PRAGMA journal_mode = WAL")
     except sqlite3.OperationalError as error:
@@ -192,7 +192,7 @@ def _set_pragmas(connection: Any, record: Any) -> None:
             raise
     except UnicodeDecodeError as error:  # SQLite's error quotes a damaged table name
         raise sqlite3.DatabaseError("the database is malformed") from error
-    # a returned commit survives lost power; NORMAL would not
+    # A returned commit survives a power failure; with NORMAL it would not.
     connection.execute("PRAGMA synchronous = FULL")
 
 
@@ -257,7 +257,7 @@ def reading(url: str) -> Iterator[sa.Connection]:
     options = {} if sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
     try:
         file = str(engine.url.database)
-        # the latter is a URI of SQLite's own
+        # A `file:` name is a URI of SQLite's own.
         if sqlite and not (Path(file).is_file() or file.startswith("file:")):
             do = "make a DataEngine with it, or let `dengine train` or `dengine run` make one"
             raise StoreError(
@@ -483,7 +483,7 @@ class Database:
 
         The lock lasts as long as the connection. Raises StoreError if another engine has it.
         """
-        # shown to an engine that finds the cell locked
+        # The name is shown to an engine that finds the cell locked.
         options = TIMEOUTS | {"application_name": f"dengine {describe_process()}"[:63]}
         self._writer = sa.create_engine(
             self.url, pool_pre_ping=True, pool_size=1, max_overflow=0, connect_args=options
@@ -577,9 +577,20 @@ class Database:
     def insert(
         self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]
     ) -> range:
-        """Insert rows of this cell into the table of a column, which numbers them.
+        """Insert rows of this cell into a table, and number them.
 
-        Return the numbers.
+        Parameters
+        ----------
+        connection : sqlalchemy.Connection
+            In a write transaction.
+        column : sqlalchemy.Column
+            The table's column that takes the numbers; they continue those of its rows.
+        rows : sequence of mapping
+
+        Returns
+        -------
+        range
+            The numbers.
         """
         if not rows:
             return range(0)

@@ -31,9 +31,9 @@ from ..records import Decision
 from .owned_file import OwnedFile, open_plain
 from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
-# of a record's JSON text, before it; the samples of a trace or point follow it
+# Length of a record's JSON text, before it; the samples of a trace or point follow it.
 LENGTH = struct.Struct("<I")
-# bytes: 1,800 traces of 1000 samples, or 2.5 hours of a cell that verifies every part
+# Bytes: 1,800 traces of 1000 samples, or 2.5 hours of a cell that verifies every part.
 RESERVE = 8 << 20
 HEADER = 256  # bytes of the header; the first record begins there
 MAGIC = b"dengine journal 2\n"
@@ -190,7 +190,7 @@ class Journal:
                 begin += FRAME.size + len(record)
                 yield offset, begin, record
                 continue
-            # the next record stands behind the damaged one
+            # The next record stands behind the damaged one.
             block = self._file.read(1 << 20, begin + 1)
             mark = block.find(MARK)
             if mark < 0 and len(block) < 1 << 20:
@@ -283,7 +283,7 @@ class Journal:
             self.drained_to, self.newest_entry, _ = _parse_header(header)
         except (ValueError, KeyError, TypeError):  # all of it is drained again, which is harmless
             self.damaged += 1
-        # the first record is not checked: those before it may be gone
+        # The first record is not checked: those before it may be gone.
         previous: bytes | None = None
         self.drained_to = min(max(self.drained_to, HEADER), size)
         begin = self.drained_to

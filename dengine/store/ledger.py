@@ -68,7 +68,7 @@ def row_sum(table: str, row: Mapping[str, Any]) -> bytes:
         if kind is int or kind is bool:
             pieces.append(b"%bi%d;" % (begin, value))
         elif kind is str:
-            # never raises; two texts never share their bytes
+            # This never raises, and two texts never share their bytes.
             data = value.encode("utf-8", "surrogatepass")
             pieces += (b"%bs%d:" % (begin, len(data)), data)
         elif kind is float:

@@ -30,7 +30,7 @@ def _lock_of_system() -> Callable[[int], object]:
         import msvcrt
 
         return _lock_of_windows(msvcrt)
-    # of a Python that was built without either
+    # For a Python that was built without either module.
     flock_of_c = ctypes.CDLL(None, use_errno=True).flock
 
     def lock(descriptor: int) -> None:

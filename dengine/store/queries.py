@@ -109,7 +109,7 @@ def cells_of(product: str) -> sa.Select[Any]:
     )
 
 
-# of a few products and columns: building the statement takes longer than running it
+# For a few products and columns: building the statement takes longer than running it.
 @lru_cache(maxsize=100)
 def newest_of(
     product: str, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]

@@ -47,7 +47,7 @@ CHUNK = 500  # rows sent or fetched at a time
 KEEP = 5  # newest versions that keep their states
 # Prefixes of the arrays in a version's state that its own cell's outcomes taught its rule.
 RULE = ("rule.", "rule_is_stale", "rule_last_seq", "includes_overdue", "overdue_to")
-# columns of `StoredDecision`, beside those of `Decision`
+# Columns of `StoredDecision` in the table `decision`, beside those of `Decision`.
 OF_DECISION = ("content_hash", "quarantined", "time")
 
 

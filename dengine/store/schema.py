@@ -18,10 +18,10 @@ SCHEMA = "1"
 # Keys of rows of `setting` that the store itself keeps.
 SCHEMA_KEY = "schema_version"  # for every cell
 PRODUCT_KEY = "product"  # for every cell that shares what it learns
-# for every cell whose ledger is keyed: a tag by which the key is recognized
+# For every cell whose ledger is keyed: a tag by which the key is recognized.
 LEDGER_KEY = "ledger_key"
 RESERVED = (SCHEMA_KEY, PRODUCT_KEY, LEDGER_KEY)
-# kinds of locks; numbers that no other program uses
+# Kinds of locks, as numbers that no other program uses.
 TABLES, PRODUCT, CELL = range(7236482514, 7236482517)
 
 METADATA = sa.MetaData()
@@ -87,7 +87,7 @@ TRACE = _table(  # apart from `decision`, so that counting decisions does not re
     sa.Column("decision_id", sa.String, primary_key=True),
     sa.Column("channels", sa.Integer, nullable=False),
     sa.Column("samples", sa.Integer, nullable=False),
-    # float32, little-endian, (channels, samples)
+    # Float32, little-endian, (channels, samples).
     sa.Column("data", sa.LargeBinary, nullable=False),
 )
 LABEL = _table(
@@ -132,7 +132,7 @@ LEDGER = sa.Table(  # an entry for every transaction that added rows or changed 
     # JSON: the chain over all rows so far of each table in IN_FORCE
     sa.Column("chains", sa.Text, nullable=False),
     sa.Column("settings", sa.Text),  # JSON: all settings, if they changed
-    # over the entry before and this one: `entry_digest`
+    # Over the entry before and this one: `entry_digest`.
     sa.Column("digest", sa.LargeBinary, nullable=False),
 )
 
@@ -210,7 +210,7 @@ def check_schema(connection: sa.Connection, name: str) -> None:
             f"tables of another program: {', '.join(sorted(tables))}" if tables else "no tables"
         )
     else:
-        # the one query over all cells
+        # The one query over all cells.
         query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()
         description = "schema " + (
             ", ".join(sorted(connection.execute(query).scalars())) or "unknown"

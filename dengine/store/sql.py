@@ -88,9 +88,9 @@ from .schema import (
 from .views import LABELS, DecisionGroup, HistoryFilter, PastLabel, Stretch, Tally
 
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
-# of the environment: other seconds for all stores that are given none
+# Of the environment: seconds for all stores that are given none.
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"
-# of a store in memory, about 0.5 MB each; a replay of 1,503 parts has fewer
+# For a store in memory, about 0.5 MB each; a replay of 1,503 parts has fewer.
 MAX_UNWRITTEN_VERSIONS = 40
 
 
@@ -471,14 +471,36 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return outcomes
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
-        """Return the ids of accepted decisions without a label, oldest first, none quarantined."""
+        """Return the ids of accepted decisions without a label, oldest first.
+
+        Parameters
+        ----------
+        since_version : int, default 0
+            Only decisions by this version or a later one.
+
+        Returns
+        -------
+        list of str
+            Those of quarantined traces are left out.
+        """
         return [
             row.id
             for row in self._read(self._unlabelled(Action.ACCEPT, since_version, DECISION.c.id))
         ]
 
     def pending_decisions(self, since_version: int = 0) -> list[StoredDecision]:
-        """Return the decisions that asked for a check and have no label, oldest first."""
+        """Return the decisions that asked for a check and have no label, oldest first.
+
+        Parameters
+        ----------
+        since_version : int, default 0
+            Only decisions by this version or a later one.
+
+        Returns
+        -------
+        list of StoredDecision
+            Without their traces; those of quarantined traces are left out.
+        """
         return [
             read_decision(row)
             for row in self._read(self._unlabelled(Action.VERIFY, since_version, *DECISION.c))
@@ -522,9 +544,17 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
 
     def silent_total(self, since_version: int = 0) -> int:
-        """Return the sum of `silent` over all labels: accepted parts without a report.
+        """Return how many accepted parts went on without a report, as the labels count them.
 
-        Labels of quarantined traces, and by versions before `since_version`, are left out.
+        Parameters
+        ----------
+        since_version : int, default 0
+            Only labels that came under this version or a later one.
+
+        Returns
+        -------
+        int
+            The sum of `silent`; labels of quarantined traces are left out.
         """
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
         is_counted = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
@@ -657,9 +687,14 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return query.order_by(VERSION.c.retrain.desc())
 
     def last_version(self) -> ModelVersion | None:
-        """Return the newest accepted version, None before the first.
+        """Return the newest accepted version.
 
         For a damaged one an event is recorded, and the one before it is returned.
+
+        Returns
+        -------
+        ModelVersion or None
+            None before the first. A peer's version is returned without the state of its rule.
         """
         for i, row in enumerate(self._read(self._accepted())):
             if not row.kept and i > 0:
@@ -671,7 +706,16 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return None
 
     def load_version(self, version: int) -> ModelVersion:
-        """Return an accepted version by its number.
+        """Return an accepted version.
+
+        Parameters
+        ----------
+        version : int
+
+        Returns
+        -------
+        ModelVersion
+            A peer's version is returned without the state of its rule.
 
         Raises
         ------
@@ -712,7 +756,17 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return ModelVersion(row.version, row.last_seq, state)
 
     def versions(self, cell_only: bool = False) -> list[StoredVersion]:
-        """Return every retrain, oldest first; of the whole product unless `cell_only`."""
+        """Return every retrain, dropped ones included, oldest first.
+
+        Parameters
+        ----------
+        cell_only : bool, default False
+            Leave out those of the product's other cells.
+
+        Returns
+        -------
+        list of StoredVersion
+        """
         kept = VERSION.c.state.is_not(None).label("kept")
         n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")
         columns = (column for column in VERSION.c if column.name != "state")
@@ -733,7 +787,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def put_event(
         self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = ""
     ) -> None:
-        """Commit an event; the parameters are the fields of `Event`."""
+        """Commit an event.
+
+        Parameters
+        ----------
+        kind, text, data, author
+            As in `Event`.
+        """
         self.apply_change(Change(kind, text, data, author))
 
     def _note(self, kind: str, text: str) -> None:
@@ -744,7 +804,17 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             self.put_event(kind, text)
 
     def events(self, limit: int | None = None) -> list[Event]:
-        """Return the newest `limit` events, or all, oldest first."""
+        """Return the newest events, oldest first.
+
+        Parameters
+        ----------
+        limit : int or None
+            Number of events; None: all.
+
+        Returns
+        -------
+        list of Event
+        """
         query = (
             sa.select(EVENT)
             .where(EVENT.c.cell_id == self.cell_id)
@@ -756,7 +826,14 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def policy_change_after(self, decision_id: str) -> Event | None:
         """Return the event of the first change of the policy after a decision.
 
-        The order is the ledger's, whatever the clock said. None if there was no change.
+        Parameters
+        ----------
+        decision_id : str
+
+        Returns
+        -------
+        Event or None
+            None if there was no change. The order is the ledger's, whatever the clock said.
         """
         is_decision = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.id == decision_id)
         decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()
@@ -821,7 +898,18 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.database.insert_corrections(connection, rows)
 
     def corrections(self, after: int = 0) -> list[Correction]:
-        """Return the corrections after number `after`, oldest first."""
+        """Return corrections of labels, oldest first.
+
+        Parameters
+        ----------
+        after : int, default 0
+            Only those after this number.
+
+        Returns
+        -------
+        list of Correction
+            Of all cells of the product.
+        """
         is_of_label = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (
             LABEL.c.decision_id == CORRECTION.c.decision_id
         )
@@ -889,9 +977,21 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
     def past_labels(self, after: int, upto: int | None = None) -> list[PastLabel]:
-        """Return the labels after number `after`, up to `upto`, as recorded, oldest first.
+        """Return this cell's labels as they were recorded, oldest first.
 
-        One that is not as it was stored is left out, and an event names its decision.
+        A label that is not as it was stored is left out, and an event names its decision.
+
+        Parameters
+        ----------
+        after : int
+            Only labels after this number.
+        upto : int or None
+            Number of the last label; None: all.
+
+        Returns
+        -------
+        list of PastLabel
+            Corrections are not applied.
         """
         query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
         query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
@@ -985,9 +1085,17 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     # The one engine that owns the cell
 
     def claim_cell(self) -> Journal | None:
-        """Claim the cell for this engine; return its open journal, None for a store in memory.
+        """Claim the cell for this engine, and open its journal.
 
-        Raises StoreError if another engine owns the cell.
+        Returns
+        -------
+        Journal or None
+            None for a store in memory.
+
+        Raises
+        ------
+        StoreError
+            If another engine owns the cell, or the store cannot be written.
         """
         if self.wait is None:
             return None

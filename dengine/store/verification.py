@@ -46,7 +46,7 @@ KEY = {
 # A row in memory: its ledger entry, its sum as stored, and its sum as computed now.
 ROW_SUMS = struct.Struct("<q32s32s")
 SUMS = np.dtype([("entry", "<i8"), ("stored", "V32"), ("now", "V32")])  # the same
-# a row of the first needs one of the second
+# A row of the first table needs one of the second.
 REQUIRED = ((DECISION, TRACE), (TRACE, DECISION), (LABEL, DECISION))
 SHOWN = 20  # missing entries that are named one by one
 
@@ -282,7 +282,7 @@ class CellCheck:
 
     def _read_raw(self, table: str) -> Iterator[dict[str, Any]]:
         """Yield the cell's rows of a table as the driver returns them, without conversion."""
-        # no type is known, none is converted
+        # SQLAlchemy knows no types here, so it converts none.
         query = sa.text(f'SELECT * FROM "{table}" WHERE cell_id = :cell')
         for row in self.connection.execute(
             query.execution_options(yield_per=CHUNK), {"cell": self.cell_id}
