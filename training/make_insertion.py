@@ -19,7 +19,7 @@ from sklearn.ensemble import RandomForestClassifier
 from sklearn.model_selection import StratifiedKFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 
-from dengine.cells.simulation.cell import CAUSES, Insertion
+from dengine.cells.simulation.cell import CAUSES, SimulatedInsertion
 from dengine.cells.simulation.conditions import RATE_HZ, SCENARIOS, CellParameters
 from dengine.cells.simulation.generate import save_insertions, simulate
 from dengine.cells.simulation.world import TIME_STEP_S
@@ -36,7 +36,7 @@ CONTACT_N = 3.0
 COLOURS = {1: "tab:blue", 0: "tab:red"}
 
 
-def first_of_each(insertions: Iterable[Insertion], successes: int, failures: int) -> list[Insertion]:
+def first_of_each(insertions: Iterable[SimulatedInsertion], successes: int, failures: int) -> list[SimulatedInsertion]:
     """So many insertions of each label, the first ones, in their order; ValueError where there are fewer."""
     wanted, kept = {True: successes, False: failures}, []
     for each in insertions:
@@ -87,7 +87,7 @@ def draw_scenarios(path: Path, n: int = 160, seed: int = 1, n_jobs: int = -1) ->
     figure.savefig(path, dpi=70)
 
 
-def draw_scenario(axes: Any, insertions: list[Insertion], scenario: str) -> None:
+def draw_scenario(axes: Any, insertions: list[SimulatedInsertion], scenario: str) -> None:
     """One scenario: first quarter dotted, last quarter solid, successes blue, failures red."""
     X, y = np.stack([each.trace for each in insertions]), np.array([each.success for each in insertions])
     n, time_s, cycle = len(y), np.arange(X.shape[1]) / RATE_HZ, np.arange(len(y))

@@ -1,4 +1,4 @@
-"""What the engine drives: a cell that inserts, verifies, proceeds and rejects."""
+"""`Cell`, the protocol of everything that `DataEngine.run` can drive, and its check."""
 
 from inspect import getattr_static
 from typing import Any, Protocol, runtime_checkable
@@ -14,27 +14,31 @@ METHODS = ("insert", "verify", "proceed", "reject")
 
 @runtime_checkable
 class Cell(Protocol):
-    """A robot cell as the engine sees it. After each `insert`, exactly one of the other three is called, once."""
+    """A robot cell. After each `insert` the engine calls exactly one of the other three, once."""
 
     def insert(self) -> NDArray[np.floating]:
-        """Pick a part, insert it, return the recorded trace: (T,) or (channels, T)."""
+        """Pick a part and insert it; return the recorded trace, (T,) or (channels, T)."""
 
     def verify(self) -> bool:
-        """Run the expensive verification of what was just inserted: True for a success."""
+        """Run the expensive verification of the inserted part; return whether it is good."""
 
     def proceed(self) -> Outcome:
-        """Go on without the verification; say what became of the part, where that is known."""
+        """Go on without the verification; return what became known of the part."""
 
     def reject(self) -> None:
         """Send the part back to the bin."""
 
 
-def must_be_cell(cell: Any) -> None:
-    """SettingError for what lacks a method of a `Cell`: it would fail in the middle of a run."""
-    # Looked up statically: a cell may count what is asked of it.
-    lacks = [
-        name for name in METHODS if getattr_static(cell, name, None) is None and not callable(getattr(cell, name, None))
+def check_cell(cell: Any) -> None:
+    """Raise SettingError for an object without a method of `Cell`, before a run and not in it."""
+    # Static look-up first: a cell may react to the reading of its attributes.
+    missing = [
+        name
+        for name in METHODS
+        if getattr_static(cell, name, None) is None and not callable(getattr(cell, name, None))
     ]
-    if lacks:
-        got = f"{type(cell).__name__} without {' and '.join(lacks)}"
-        raise SettingError(f"Expected a cell with the methods {', '.join(METHODS)}, got {got}; give it what it lacks.")
+    if missing:
+        raise SettingError(
+            f"Expected a cell with the methods {', '.join(METHODS)}, "
+            f"got {type(cell).__name__} without {' and '.join(missing)}; add them."
+        )

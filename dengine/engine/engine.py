@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from numpy.typing import ArrayLike
 
-from ..cells.base import Cell, must_be_cell
+from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import NotTakenError, StoreError
@@ -447,7 +447,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         SettingError
             Before the first part, for a cell that lacks one of its four methods.
         """
-        must_be_cell(cell)
+        check_cell(cell)
         return self._run(cell, cycles)
 
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:

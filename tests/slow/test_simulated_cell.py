@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from dengine.cells.simulation.cell import Insertion, SimulatedCell, insert_once
+from dengine.cells.simulation.cell import SimulatedInsertion, SimulatedCell, insert_once
 from dengine.cells.simulation.conditions import SCENARIOS, CellParameters, Conditions, draw_conditions, find_scenario
 from dengine.cells.simulation.generate import save_insertions, simulate
 from dengine.cells.simulation.world import push
@@ -36,7 +36,7 @@ def test_a_well_aligned_part_meets_the_bottom_late_and_one_beside_the_hole_rests
     assert beside.force[-50:].mean() == pytest.approx(40.0, abs=2.0)
 
 
-def traces(insertions: list[Insertion]) -> np.ndarray:
+def traces(insertions: list[SimulatedInsertion]) -> np.ndarray:
     return np.stack([each.trace for each in insertions])
 
 

@@ -1,9 +1,10 @@
-"""A simulated robot cell that a `DataEngine` can drive: bin, gripper, fixture and height check in MuJoCo.
+"""`SimulatedCell`, a robot cell in MuJoCo that a `DataEngine` can drive.
 
     cell = SimulatedCell(seed=0)
     for cycle in DataEngine().run(cell, cycles=600): ...
 
-Nothing waits: the cell's clock counts the seconds that production would have taken.
+It simulates the gripper, the part, the fixture, the force sensor and the height check. It runs as
+fast as the computer can; `SimulatedCell.clock` counts the seconds that production would take.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -18,13 +19,16 @@ from .conditions import RATE_HZ, CellParameters, Conditions, draw_conditions, fi
 from .world import DEPTH_MM, TIME_STEP_S, Push, push
 
 CAUSES = ("none", "missed_grasp", "rim_contact", "wedging", "stuck", "slip", "debris", "wrong_part")
-STUCK_MM = 4.0  # a part that came this close to its seat is stuck above it, one further up is wedged
+STUCK_MM = 4.0  # a part that stopped at most this far above its seat is "stuck", else "wedging"
 SLIP_MM = 1.0  # a part that moved this far in the gripper has slipped
 
 
 @dataclass(frozen=True, slots=True)
 class SensorFaults:
-    """One trace's draw, in this order. All in newtons, but for `ripple_hz` and `dropped_share`."""
+    """Faults of the force sensor in one trace, drawn in the order of the fields.
+
+    All are in newtons but `ripple_hz` (Hz) and `dropped_share` (share of the samples).
+    """
 
     noise_n: float
     ripple_n: float
@@ -36,33 +40,65 @@ class SensorFaults:
 
 
 def read_sensor(
-    force: NDArray[np.float64], faults: SensorFaults, parameters: CellParameters, rng: np.random.Generator
+    force: NDArray[np.float64],
+    faults: SensorFaults,
+    parameters: CellParameters,
+    rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """What the sensor reports of a true z-force (samples,) in newtons, as float32."""
+    """Return what the sensor reports of a true force: low-pass, faults, quantisation, lost samples.
+
+    Parameters
+    ----------
+    force : array of float64, shape (samples,)
+        True force along z in newtons, at 500 Hz.
+    faults : SensorFaults
+    parameters : CellParameters
+    rng : numpy.random.Generator
+        Source of the noise.
+
+    Returns
+    -------
+    array of float32, shape (samples,)
+        In newtons.
+    """
     keep = float(np.exp(-2 * np.pi * parameters.bandwidth_hz / RATE_HZ))
-    true: NDArray[np.float64] = lfilter([1 - keep], [1, -keep], force)  # the first-order low-pass in the sensor
+    true: NDArray[np.float64] = lfilter(
+        [1 - keep], [1, -keep], force
+    )  # the first-order low-pass in the sensor
     samples = len(true)
     time_s = np.arange(samples) / RATE_HZ
-    # The bundled traces were made with this draw, and with the other five of what is drawn in sixes.
+    # Six of each are drawn and one is used, so that the bundled traces can be made again.
     rng.integers(2, size=6)
     phase = rng.uniform(0, 2 * np.pi, size=6)[2]
     slow = faults.bias_n + faults.drift_n * time_s / time_s[-1]
     ripple = faults.ripple_n * np.sin(2 * np.pi * faults.ripple_hz * time_s + phase)
     noise = faults.noise_n * rng.standard_normal((6, samples))[2]
     steps = np.round((true + slow + ripple + noise) / faults.step_n) * faults.step_n
-    arrived = np.where(rng.random(samples) < faults.dropped_share, 0, np.arange(samples))
-    return np.asarray(steps[np.maximum.accumulate(arrived)], dtype=np.float32)  # a dropped sample: the last that arrived
+    is_dropped = rng.random(samples) < faults.dropped_share
+    newest = np.maximum.accumulate(np.where(is_dropped, 0, np.arange(samples)))  # not dropped
+    return np.asarray(steps[newest], dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
-class Insertion:
-    """One simulated insertion and its truth.
+class SimulatedInsertion:
+    """One simulated insertion with its label.
 
-    trace : (1000,) float32, the z-force in newtons.
-    success : whether the final height is within the tolerance; nothing else enters the label.
-    cause : of a failure, one of `CAUSES`; `"none"` for a success.
-    height_mm : of the part's top over its nominal seated height.
-    cycle : of the cell.  conditions, sensor : what was drawn.
+    Attributes
+    ----------
+    trace : array of float32, shape (1000,)
+        Force along z in newtons, 500 Hz.
+    success : bool
+        Whether the final height is within the tolerance. Nothing else enters the label.
+    cause : str
+        Cause of a failure, one of `CAUSES`; "none" for a success.
+    height_mm : float
+        Height of the part's top above its nominal seated height.
+    cycle : int
+        Number of the cell's cycle, from 0.
+    conditions : Conditions
+        Physical conditions that were drawn.
+    sensor : SensorFaults
+        Faults of the sensor that were drawn.
     """
 
     trace: NDArray[np.float32]
@@ -74,19 +110,23 @@ class Insertion:
     sensor: SensorFaults
 
 
-def insert_once(parameters: CellParameters, seed: int, cycle: int, time_step_s: float = TIME_STEP_S) -> Insertion:
-    """Simulate one cycle. The same `parameters`, `seed` and `cycle` give the same insertion, in any order or process.
+def insert_once(
+    parameters: CellParameters, seed: int, cycle: int, time_step_s: float = TIME_STEP_S
+) -> SimulatedInsertion:
+    """Simulate one cycle.
 
-    time_step_s : of the physics.
+    The same `parameters`, `seed` and `cycle` give the same insertion, in any order and process.
+    `time_step_s` is the step of the physics in seconds.
     """
     world_rng, sensor_rng, _ = _streams(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
     pushed = push(conditions, time_step_s)
-    # The sensor's faults have a stream of their own: nothing but the force itself can tell the outcome.
-    faults = SensorFaults(*(float(sensor_rng.uniform(*getattr(parameters, each.name))) for each in fields(SensorFaults)))
+    # The sensor's faults have a random stream of their own, so that they tell nothing of the outcome.
+    ranges = [getattr(parameters, field.name) for field in fields(SensorFaults)]
+    faults = SensorFaults(*(float(sensor_rng.uniform(*limits)) for limits in ranges))
     faults = replace(faults, bias_n=faults.bias_n + parameters.bias_offset_n)
     success = abs(pushed.height_mm) <= parameters.height_tolerance_mm
-    return Insertion(
+    return SimulatedInsertion(
         trace=read_sensor(pushed.force, faults, parameters, sensor_rng),
         success=success,
         cause="none" if success else _cause(conditions, pushed),
@@ -98,8 +138,13 @@ def insert_once(parameters: CellParameters, seed: int, cycle: int, time_step_s: 
 
 
 def _cause(conditions: Conditions, pushed: Push) -> str:
-    """Name the cause of a failure: the fault that was drawn if it took effect, else where the part came to rest."""
-    tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip over the seat
+    """Return the cause of a failure, one of `CAUSES`.
+
+    It is the fault that was drawn, if it had an effect, else follows from where the part stopped.
+    """
+    tip_mm = (
+        pushed.height_mm - conditions.extra_length_mm
+    )  # height of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):
         return conditions.fault
     if tip_mm >= DEPTH_MM - conditions.chamfer_mm:
@@ -111,59 +156,88 @@ def _cause(conditions: Conditions, pushed: Push) -> str:
     return "stuck" if tip_mm <= STUCK_MM else "wedging"
 
 
-def _streams(seed: int, cycle: int) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
-    """Independent streams of one cycle: for the world, for the sensor, and for what the line notices afterwards."""
+def _streams(
+    seed: int, cycle: int
+) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
+    """Return independent generators of one cycle: for the world, the sensor, and the line after it."""
     world, sensor, line = np.random.SeedSequence(entropy=seed, spawn_key=(cycle,)).spawn(3)
     return np.random.default_rng(world), np.random.default_rng(sensor), np.random.default_rng(line)
 
 
 class SimulatedCell:
-    """A `Cell` whose parts, forces and heights come from physics, and whose clock is simulated.
+    """A simulated `Cell`.
 
-    parameters : every physical setting, see `CellParameters`.
-    scenario : what changes while it runs, a name in `SCENARIOS`.
-    seed : the same seed gives the same insertions, whatever is decided about them.
-    cycles : length of the run a scenario is laid over; "half way" is half of it. The cell goes on after it.
+    Parameters
+    ----------
+    parameters : CellParameters, optional
+        Physical settings.
+    scenario : str, default "nominal"
+        What changes during the run, a name in `SCENARIOS`.
+    seed : int, default 0
+        The same seed gives the same insertions, whatever is decided about them.
+    cycles : int, default 600
+        Length of the scenario; a change "half way" comes after half of it. The cell can go on
+        after it.
+
+    Attributes
+    ----------
+    clock : float
+        Seconds of production so far.
+    last : SimulatedInsertion or None
+        The newest insertion with its label, for reports; an engine does not read it.
     """
 
     def __init__(
-        self, parameters: CellParameters | None = None, scenario: str = "nominal", seed: int = 0, cycles: int = 600
+        self,
+        parameters: CellParameters | None = None,
+        scenario: str = "nominal",
+        seed: int = 0,
+        cycles: int = 600,
     ) -> None:
         expect(cycles >= 1, "cycles of at least 1", cycles, "give the length of the run")
         self.parameters = parameters or CellParameters()
-        self.scenario, self.seed, self.cycles = scenario, seed, cycles
+        self.scenario = scenario
+        self.seed = seed
+        self.cycles = cycles
         self.clock = 0.0
-        self.last: Insertion | None = None  # the truth about the part in the cell: for reports, never for an engine
+        self.last: SimulatedInsertion | None = None
         self._change = find_scenario(scenario)
         self._waiting = False
         self._done = 0
 
     @property
     def truth(self) -> bool:
-        """Whether the part just inserted is good."""
+        """Return whether the newest part is good."""
         return self.last is not None and self.last.success
 
     def insert(self) -> NDArray[np.float32]:
-        """Pick a part, push it into the fixture, return the force: newtons at 500 Hz for 2 s."""
+        """Pick a part, push it into the fixture; return the force in newtons, 2 s at 500 Hz."""
         if self._waiting:
-            raise DengineError("Expected verify(), proceed() or reject() after insert(), got insert(); call one.")
+            raise DengineError(
+                "Expected verify(), proceed() or reject() after insert(), got insert(); call one."
+            )
         changed = self._change(self.parameters, self._done, self.cycles)
         insertion = insert_once(changed, self.seed, self._done)
-        self.last, self._waiting = insertion, True
+        self.last = insertion
+        self._waiting = True
         self.clock += self.parameters.cycle_s
         self._done += 1
         return insertion.trace
 
     def verify(self) -> bool:
-        """Check the height; a good part goes on, a bad one back to the bin."""
+        """Check the height; return whether the part is good. A bad one goes back to the bin."""
         success = self._take("verify").success
         self.clock += self.parameters.verify_s
         return success
 
     def proceed(self) -> Outcome:
-        """Pass the part on unverified. A bad one stops the system, but for its silent share."""
+        """Pass the part on without a check; return what became known of it.
+
+        A bad part stops the line, except for a share `CellParameters.silent_share`, of which
+        nothing becomes known. Of good parts a share `confirm_share` is confirmed.
+        """
         success = self._take("proceed").success
-        chance = float(_streams(self.seed, self._done - 1)[2].random())  # of this part, whatever was decided before
+        chance = float(_streams(self.seed, self._done - 1)[2].random())  # depends on the part alone
         if success:
             return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN
         if chance < self.parameters.silent_share:
@@ -172,11 +246,14 @@ class SimulatedCell:
         return Outcome.STOPPED
 
     def reject(self) -> None:
-        """Send the part back to the bin unverified; a good one has to be picked and inserted once more."""
+        """Send the part back to the bin without a check."""
         self._take("reject")
 
-    def _take(self, call: str) -> Insertion:
+    def _take(self, call: str) -> SimulatedInsertion:
+        """Return the waiting insertion, which waits no more; DengineError if none waits."""
         if self.last is None or not self._waiting:
-            raise DengineError(f"Expected insert() before {call}(), got {call}() with no part waiting; insert one.")
+            raise DengineError(
+                f"Expected insert() before {call}(), got {call}() with no part waiting; insert one."
+            )
         self._waiting = False
         return self.last

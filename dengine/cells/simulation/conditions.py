@@ -105,7 +105,12 @@ class CellParameters:
             expect(low <= high, f"{name} as (low, high) with low <= high", value, "swap them")
             probable = name not in _PROBABILITIES or 0 <= low <= 1
             expect(probable, f"{name} as a probability from 0 to 1", value, "give a share of 1")
-            expect(name in _SIGNED or low >= 0, f"{name} to be at least 0", value, "the unit is in its name")
+            expect(
+                name in _SIGNED or low >= 0,
+                f"{name} to be at least 0",
+                value,
+                "the unit is in its name",
+            )
         faults = self.missed_grasp + self.weak_grip + self.debris + self.wrong_part
         expect(faults <= 1, "fault probabilities that sum to at most 1", faults, "lower one")
 
@@ -167,7 +172,9 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
         return float(rng.uniform(*value) if isinstance(value, tuple) else rng.normal(0.0, value))
 
     usual = {"fault": "none", "extra_width_mm": 0.0, "debris_mm": 0.0}
-    names = [each.name for each in fields(Conditions) if each.name not in usual]  # in the order in which they are drawn
+    names = [
+        each.name for each in fields(Conditions) if each.name not in usual
+    ]  # in the order in which they are drawn
     right = Conditions(**usual, **{name: drawn(_DRAWN_BY.get(name, name)) for name in names})  # type: ignore[arg-type]
     weak_grip_n, debris_mm = drawn("weak_grip_n"), drawn("debris_mm")
     extra_length_mm = drawn("extra_length_mm") * float(rng.choice((-1, 1)))
@@ -203,15 +210,29 @@ def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
     if cycle < cycles // 2:
         return parameters
     low, high = parameters.part_mass_kg
-    return replace(parameters, part_mass_kg=(2.5 * low, 2.5 * high), clearance_mm=(0.04, 0.16), chamfer_mm=(0.5, 1.0))
+    return replace(
+        parameters,
+        part_mass_kg=(2.5 * low, 2.5 * high),
+        clearance_mm=(0.04, 0.16),
+        chamfer_mm=(0.5, 1.0),
+    )
 
 
 def bias_jump(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
     """Half way the force sensor's offset jumps by 8 N and stays; the world is as it was."""
-    return parameters if cycle < cycles // 2 else replace(parameters, bias_offset_n=parameters.bias_offset_n + 8.0)
+    return (
+        parameters
+        if cycle < cycles // 2
+        else replace(parameters, bias_offset_n=parameters.bias_offset_n + 8.0)
+    )
 
 
-SCENARIOS: dict[str, Scenario] = {"nominal": nominal, "wear": wear, "variant": variant, "bias_jump": bias_jump}
+SCENARIOS: dict[str, Scenario] = {
+    "nominal": nominal,
+    "wear": wear,
+    "variant": variant,
+    "bias_jump": bias_jump,
+}
 
 
 def find_scenario(name: str) -> Scenario:

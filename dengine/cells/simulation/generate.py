@@ -1,6 +1,8 @@
-"""Simulated insertions in quantity: the same for a seed, however many processes make them.
+"""Simulate many insertions in parallel and save them as a data set.
 
-As in `save_insertions("traces.npz", simulate(100, seed=0), seed=0)`.
+    save_insertions("traces.npz", simulate(100, seed=0), seed=0)
+
+A seed gives the same insertions for any number of processes.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +14,7 @@ import numpy as np
 
 from ...errors import expect
 from ...files import write_output
-from .cell import Insertion, insert_once
+from .cell import SimulatedInsertion, insert_once
 from .conditions import RATE_HZ, CellParameters, find_scenario
 from .world import TIME_STEP_S
 
@@ -24,19 +26,38 @@ def simulate(
     n_jobs: int = -1,
     progress: Callable[[int], object] = lambda n: None,
     time_step_s: float = TIME_STEP_S,
-) -> list[Insertion]:
-    """The first n cycles of a cell, in their order.
+) -> list[SimulatedInsertion]:
+    """Simulate the first n cycles of a cell.
 
-    In the nominal scenario insertion i depends on (seed, i) alone; in the others on its place among the n as well.
-    n_jobs : processes, as joblib counts them; the backend is the caller's, by `joblib.parallel_config`.
-    progress : called with 1 as each insertion comes in.
+    In the nominal scenario insertion i depends on (seed, i) alone; in the others also on i / n.
+
+    Parameters
+    ----------
+    n : int
+    seed : int, default 0
+    scenario : str, default "nominal"
+        A name in `SCENARIOS`.
+    n_jobs : int, default -1
+        Processes, as in joblib; `joblib.parallel_config` chooses the backend.
+    progress : callable, optional
+        Called with 1 after each insertion.
+    time_step_s : float
+        Step of the physics in seconds.
+
+    Returns
+    -------
+    list of SimulatedInsertion
+        In the order of the cycles.
     """
     from joblib import Parallel, delayed
 
     expect(n >= 1, "at least 1 trace to simulate", n, "raise n")
-    base, change = CellParameters(), find_scenario(scenario)
-    tasks = (delayed(insert_once)(change(base, cycle, n), seed, cycle, time_step_s) for cycle in range(n))
-    insertions: list[Insertion] = []
+    base = CellParameters()
+    change = find_scenario(scenario)
+    tasks = (
+        delayed(insert_once)(change(base, cycle, n), seed, cycle, time_step_s) for cycle in range(n)
+    )
+    insertions: list[SimulatedInsertion] = []
     for insertion in Parallel(n_jobs=n_jobs, return_as="generator")(tasks):
         insertions.append(insertion)
         progress(1)
@@ -44,26 +65,36 @@ def simulate(
 
 
 def save_insertions(
-    path: str | Path, insertions: Sequence[Insertion], seed: int, scenario: str = "nominal", force: bool = False
+    path: str | Path,
+    insertions: Sequence[SimulatedInsertion],
+    seed: int,
+    scenario: str = "nominal",
+    force: bool = False,
 ) -> Path:
-    """Write insertions as a compressed npz that loads with `allow_pickle=False`, and by `load_dataset`.
+    """Write insertions as a compressed .npz file that `load_dataset` reads; return its path.
 
-    Keys: X int16 with `scale` (X * scale is in `unit`), y int8, cause str, height_mm float32, cycle int32, the draws
-    as `conditions` (n, m) float32 with their names `condition_names`, and rate_hz, unit, seed, scenario, simulated.
-    OutputError where a file is there, without `force`.
+    The arrays are X int16 (n, 1000) with `scale`, so that X * scale is in `unit`; y int8 (n,);
+    cause str; height_mm float32; cycle int32; `conditions` float32 (n, m), all values that were
+    drawn, with their names `condition_names`; and rate_hz, unit, seed, scenario, simulated.
+
+    Raises
+    ------
+    OutputError
+        If the file exists, without `force`.
     """
-    buffer, X = BytesIO(), np.stack([each.trace for each in insertions])
-    scale = max(0.01, float(np.abs(X).max()) / 32000)  # newtons of one integer step, more where the largest sample needs it
-    rows = [asdict(each.conditions) | asdict(each.sensor) for each in insertions]
+    buffer = BytesIO()
+    X = np.stack([insertion.trace for insertion in insertions])
+    scale = max(0.01, float(np.abs(X).max()) / 32000)  # newtons per integer step
+    rows = [asdict(insertion.conditions) | asdict(insertion.sensor) for insertion in insertions]
     names = [name for name in rows[0] if name != "fault"]
     np.savez_compressed(
         buffer,
         X=np.round(X / scale).astype(np.int16),
         scale=np.float32(scale),
-        y=np.array([each.success for each in insertions], dtype=np.int8),
-        cause=np.array([each.cause for each in insertions]),
-        height_mm=np.array([each.height_mm for each in insertions], dtype=np.float32),
-        cycle=np.array([each.cycle for each in insertions], dtype=np.int32),
+        y=np.array([insertion.success for insertion in insertions], dtype=np.int8),
+        cause=np.array([insertion.cause for insertion in insertions]),
+        height_mm=np.array([insertion.height_mm for insertion in insertions], dtype=np.float32),
+        cycle=np.array([insertion.cycle for insertion in insertions], dtype=np.int32),
         conditions=np.array([[row[name] for name in names] for row in rows], dtype=np.float32),
         condition_names=np.array(names),
         rate_hz=np.float32(RATE_HZ),

@@ -1,10 +1,12 @@
-"""The simulated world: gripper, part and fixture in MuJoCo, and one force-limited push.
+"""The physics of one insertion: `push` builds gripper, part and fixture in MuJoCo and pushes once.
 
-    push(conditions).force
+Lengths inside MuJoCo are metres. The rim of the fixture is at z = 0 and its seat at z = -DEPTH_MM.
+The hole is built from boxes, because MuJoCo replaces colliding meshes by their convex hulls, which
+would close it.
 
-Lengths inside MuJoCo are metres. The rim of the fixture is z = 0 and its seat z = -DEPTH_MM. The hole is built from
-boxes, because MuJoCo turns colliding meshes into their convex hulls and would close it.
-Source: Todorov, Erez and Tassa (2012), MuJoCo: A physics engine for model-based control, IROS.
+References
+----------
+Todorov, Erez and Tassa (2012), MuJoCo: A physics engine for model-based control, IROS.
 """
 
 import math
@@ -19,9 +21,9 @@ from .conditions import RATE_HZ, SAMPLES, Conditions
 
 TIME_STEP_S = 0.0005
 DEPTH_MM = 12.0
-WIDTH_MM = 16.0  # of a right part, square
+WIDTH_MM = 16.0  # side of a correct part, which is square
 LENGTH_MM = 40.0
-PROTRUSION_MM = 30.0  # how far a right part sticks out of the gripper, nominally
+PROTRUSION_MM = 30.0  # a correct part nominally sticks out of the gripper by this much
 _WALL_MM = 14.0
 _BAND_N = 8.0  # the push slows down over the last newtons before its limit
 _SETTLE_SAMPLES = 40
@@ -29,11 +31,16 @@ _SETTLE_SAMPLES = 40
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """What one push left behind.
+    """Result of one push.
 
-    force : (1000,) float64 newtons along z, what the sensor would read without its faults; pushing is positive.
-    height_mm : of the part's top over its nominal seated height; of the bare floor where there was no part.
-    slip_mm : how far the part slid up in the gripper.
+    Attributes
+    ----------
+    force : array of float64, shape (1000,)
+        Force along z in newtons that a sensor without faults would read; pushing is positive.
+    height_mm : float
+        Height of the part's top above its nominal seated height; of the floor if there is no part.
+    slip_mm : float
+        How far the part slid up in the gripper.
     """
 
     force: NDArray[np.float64]
@@ -42,13 +49,30 @@ class Push:
 
 
 def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
-    """Lower the gripper at its speed until the target or the force limit holds it; record at 500 Hz for 2 s."""
-    with instead(DengineError, "Expected MuJoCo for the simulated cell", ImportError, do="pip install dengine[sim]"):
+    """Lower the gripper until its target or its force limit; record the force for 2 s at 500 Hz.
+
+    Raises DengineError without MuJoCo, and SettingError for sizes that MuJoCo refuses.
+    """
+    with instead(
+        DengineError,
+        "Expected MuJoCo for the simulated cell",
+        ImportError,
+        do="pip install dengine[sim]",
+    ):
         import mujoco
     steps = round(1 / RATE_HZ / time_step_s)
     divides = math.isclose(steps * time_step_s, 1 / RATE_HZ)
-    expect(divides, "a time step in seconds that divides 2 ms", time_step_s, "take 0.0005 or half of it")
-    with instead(SettingError, "Expected sizes, masses and springs above zero, MuJoCo refuses these", ValueError):
+    expect(
+        divides,
+        "a time step in seconds that divides 2 ms",
+        time_step_s,
+        "take 0.0005 or half of it",
+    )
+    with instead(
+        SettingError,
+        "Expected sizes, masses and springs above zero, MuJoCo refuses these",
+        ValueError,
+    ):
         model = mujoco.MjModel.from_xml_string(fixture_xml(conditions, time_step_s))
     data = mujoco.MjData(model)
     force = _drive(mujoco, model, data, conditions, steps)
@@ -59,14 +83,23 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     return Push(force, height_mm=top_mm - (LENGTH_MM - DEPTH_MM), slip_mm=slip_mm)
 
 
-def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int) -> NDArray[np.float64]:
-    """Run the push under its controller; the reading is zeroed before the motion, with the part in hand."""
+def _drive(
+    mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int
+) -> NDArray[np.float64]:
+    """Run the controller of the push; return the force (1000,) in newtons.
+
+    The force is zeroed before the motion, with the part in the gripper.
+    """
     for _ in range(_SETTLE_SAMPLES):
         mujoco.mj_step(model, data, steps)
     settled = float(data.sensordata[2])
-    travel_m = (conditions.gap_mm + conditions.protrusion_mm + DEPTH_MM + conditions.overtravel_mm) / 1000
-    period_s, delay_samples = 1 / RATE_HZ, conditions.delay_s * RATE_HZ
-    target_m, force = 0.0, np.empty(SAMPLES)
+    travel_m = (
+        conditions.gap_mm + conditions.protrusion_mm + DEPTH_MM + conditions.overtravel_mm
+    ) / 1000
+    period_s = 1 / RATE_HZ
+    delay_samples = conditions.delay_s * RATE_HZ
+    target_m = 0.0
+    force = np.empty(SAMPLES)
     for sample in range(SAMPLES):
         if sample >= delay_samples:
             room = (conditions.force_limit_n - force[sample - 1]) / _BAND_N if sample else 1.0
@@ -78,7 +111,7 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
 
 
 def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
-    """MJCF of the cell under these conditions."""
+    """Return the MuJoCo model (MJCF) of the cell under these conditions."""
     c = conditions
     tool_z = (c.gap_mm + c.protrusion_mm + PROTRUSION_MM) / 1000 + 0.06
     k_lateral, k_axial, k_angular = 1000 * c.lateral_n_mm, 1000 * c.axial_n_mm, c.angular_nm_rad
@@ -116,12 +149,15 @@ def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str
 
 
 def _damping(stiffness: float, inertia: float, ratio: float = 0.6) -> float:
-    """Viscous damping of a spring at this share of the critical one."""
+    """Return the viscous damping of a spring; `ratio` is the share of critical damping."""
     return 2 * ratio * math.sqrt(stiffness * inertia)
 
 
 def _part(c: Conditions) -> str:
-    """The part in the gripper: dry friction holds it until the push exceeds the grip."""
+    """Return the MJCF of the part in the gripper; "" if the grasp missed it.
+
+    Dry friction holds the part until the push exceeds the grip.
+    """
     if c.fault == "missed_grasp":
         return ""
     half = (WIDTH_MM + c.extra_width_mm) / 2000
@@ -138,19 +174,27 @@ def _part(c: Conditions) -> str:
 
 
 def _fixture(c: Conditions) -> str:
-    """Four walls with a 45 degree chamfer, a floor, and a chip that may lie on it, more or less soft."""
-    half, depth = (WIDTH_MM + c.clearance_mm) / 2000, DEPTH_MM / 1000
-    chamfer, chip = c.chamfer_mm / 1000, c.debris_mm / 2000
+    """Return the MJCF of the fixture: four walls with a chamfer of 45 degrees, a floor, and debris."""
+    half = (WIDTH_MM + c.clearance_mm) / 2000
+    depth = DEPTH_MM / 1000
+    chamfer = c.chamfer_mm / 1000
+    chip = c.debris_mm / 2000
     parts = [_wall(side, half, chamfer, depth) for side in range(4)]
     parts.append(f'<geom type="box" size="0.03 0.03 0.005" pos="0 0 {-depth - 0.005}"/>')
     if c.debris_mm > 0:
-        position, soft = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + chip}", f"{c.debris_softness_s} 1"
-        parts.append(f'<geom type="box" size="0.003 0.003 {chip}" pos="{position}" solref="{soft}" priority="1"/>')
+        position = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + chip}"
+        soft = f"{c.debris_softness_s} 1"
+        parts.append(
+            f'<geom type="box" size="0.003 0.003 {chip}" pos="{position}" solref="{soft}" priority="1"/>'
+        )
     return "\n".join(parts)
 
 
 def _wall(side: int, half: float, chamfer: float, depth: float) -> str:
-    """One side of the hole, drawn for +x and turned about z by quarter turns."""
+    """Return the MJCF of wall `side` (0 to 3): the wall at +x, turned by quarter turns about z.
+
+    Half width, chamfer and depth of the hole are in metres.
+    """
     wall = _WALL_MM / 1000
     reach = half + chamfer + wall
     face = chamfer / math.sqrt(2)  # half the length of the sloping face
