@@ -258,7 +258,7 @@ _TIME = (
     "recordings."
 )
 _HERTZ = "Samples a second.  [default: what timestamps tell; live: 500]"
-_UNIT = "Of the samples; recordings whose header says another, kN for N, are converted.  [default: the header's, else N]"
+_UNIT = "Of the samples; those whose own unit is another, kN for N, are converted.  [default: the header's, else N]"
 _COLUMNS = "The names of the columns of text files without a header, as in time,fx,fz."
 _DECIMAL = "The decimal mark in text files, . or ,  [default: as each file's cells tell]"
 _THOUSANDS = "What groups thousands in text files, as the point in 1.043,5.  [default: as each file's cells tell]"

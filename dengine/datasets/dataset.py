@@ -722,7 +722,7 @@ def _select_channels(data: Dataset, channels: tuple[str, ...]) -> Dataset:
 def _convert_unit(data: Dataset, unit: str) -> Dataset:
     """Return a data set whose samples are converted to a unit, or to one for each channel.
 
-    Raises DataError if no factor is known.
+    A note says so for each channel that changes. Raises DataError if no factor is known.
     """
     n = 1 if data.X.ndim == 2 else data.X.shape[1]
     sources = split_unit(data.unit, n)
@@ -732,10 +732,16 @@ def _convert_unit(data: Dataset, unit: str) -> Dataset:
     if len(scales) < n:
         do = "leave unit out, or convert the samples first"
         raise DataError(f"Expected {data.name} in {unit}, its unit is {data.unit}; {do}.")
-    if set(scales) != {1.0}:
-        X = data.X * np.array(scales).reshape(-1, 1)  # in float64
-        data = replace(data, X=X.astype(np.float32))
-    return replace(data, unit=unit)
+    if set(scales) == {1.0}:
+        return replace(data, unit=unit)
+    names = data.channels or [f"channel {c + 1}" for c in range(n)]
+    notes = [
+        f"{name} is converted from {source} to {target}, times {scale:g}."
+        for name, source, target, scale in zip(names, sources, targets, scales, strict=True)
+        if scale != 1.0
+    ]
+    X = data.X * np.array(scales).reshape(-1, 1)  # in float64
+    return replace(data, X=X.astype(np.float32), unit=unit, notes=(*data.notes, *notes))
 
 
 def _fit_array(x: NDArray[np.float32], samples: int, fit: str) -> NDArray[np.float32]:
