@@ -28,16 +28,18 @@ from dengine import (
 from dengine.decision.scripting import script
 from dengine.errors import SettingError, StoreError
 from dengine.reducers.base import StopRule
-from dengine.reducers.umap import (
-    CLOSING_EPOCHS,
-    Edges,
+from dengine.reducers.umap_graph import (
     Neighbors,
-    attraction,
-    find_ab_params,
     frames_for,
     fuzzy_simplicial_set,
-    learning_rates,
     membership_strengths,
+)
+from dengine.reducers.umap_layout import (
+    CLOSING_EPOCHS,
+    Edges,
+    attraction,
+    find_ab_params,
+    learning_rates,
     negative_samples,
     repulsion,
 )
@@ -124,7 +126,7 @@ def test_the_places_are_as_trustworthy_as_those_of_umap_learn(
 ) -> None:
     X, y = insertion
     other = UmapLearnReducer().fit(X).umap_.embedding_
-    own = fitted.places_.numpy()
+    own = fitted.embedding_.numpy()
     rows = X[:, 0]
     trust = [trustworthiness(rows, places, n_neighbors=15) for places in (own, other)]
     assert trust[0] == pytest.approx(trust[1], abs=0.01)
@@ -139,9 +141,9 @@ def test_places_that_were_trained_warm_are_as_good_as_those_of_one_fit(
     warm = UmapReducer()
     for n in range(50, N + 1, 50):
         places = train(warm, X, NUMBERS[:n])
-    trust = [trustworthiness(X[:, 0], each, n_neighbors=15) for each in (places, fitted.places_)]
+    trust = [trustworthiness(X[:, 0], each, n_neighbors=15) for each in (places, fitted.embedding_)]
     assert trust[0] > trust[1] - 0.01
-    assert label_agreement(places, y) > label_agreement(fitted.places_.numpy(), y) - 0.02
+    assert label_agreement(places, y) > label_agreement(fitted.embedding_.numpy(), y) - 0.02
 
 
 def test_frames_keep_the_neighbours_of_whole_traces(insertion: Traces, fitted: UmapReducer) -> None:
@@ -238,7 +240,7 @@ def test_places_repeat_exactly_with_a_random_state_and_differ_between_two(
     insertion: Traces,
 ) -> None:
     X, _ = insertion
-    one, same, other = (UmapReducer(random_state=seed).fit(X[:100]).places_ for seed in (1, 1, 2))
+    one, same, other = (UmapReducer(random_state=seed).fit(X[:100]).embedding_ for seed in (1, 1, 2))
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
 
@@ -276,7 +278,7 @@ def test_empty_slots_of_the_module_attract_nothing(insertion: Traces, n: int) ->
     reducer = UmapReducer(n_epochs=5).fit(X[:n])
     assert len(reducer.module().references) in (256, 512)
     far = 1e4 * np.random.default_rng(0).normal(size=(50, 1, 1000)).astype(np.float32)
-    low, high = reducer.places_.numpy().min(0), reducer.places_.numpy().max(0)
+    low, high = reducer.embedding_.numpy().min(0), reducer.embedding_.numpy().max(0)
     for places in (reducer.transform(X), reducer.transform(far)):
         assert (places >= low - 1e-3).all()
         assert (places <= high + 1e-3).all()
@@ -310,9 +312,9 @@ def test_both_exports_decide_as_the_model_does(
 def test_the_embedding_has_as_many_components_as_asked(n_components: int) -> None:
     X, _ = toy_traces(120)
     reducer = UmapReducer(n_components=n_components).fit(X)
-    assert reducer.places_.shape == reducer.transform(X).shape == (120, n_components)
+    assert reducer.embedding_.shape == reducer.transform(X).shape == (120, n_components)
     assert reducer.module().dim == n_components
-    assert trustworthiness(X[:, 0], reducer.places_.numpy(), n_neighbors=15) > 0.8
+    assert trustworthiness(X[:, 0], reducer.embedding_.numpy(), n_neighbors=15) > 0.8
 
 
 @pytest.mark.parametrize(
@@ -342,7 +344,7 @@ def test_too_few_traces_or_a_parameter_out_of_range_is_a_setting_error(
 def test_traces_that_are_all_the_same_have_finite_places() -> None:
     X = np.ones((60, 1, 50), dtype=np.float32)
     reducer = UmapReducer().fit(X)
-    assert np.isfinite(reducer.places_.numpy()).all()
+    assert np.isfinite(reducer.embedding_.numpy()).all()
     assert np.isfinite(reducer.transform(X)).all()
 
 
@@ -351,7 +353,7 @@ def test_the_unit_of_the_traces_does_not_matter(insertion: Traces, unit: float) 
     X = insertion[0][:200]
     plain, scaled = UmapReducer().fit(X), UmapReducer().fit((unit * X).astype(np.float32))
     np.testing.assert_array_equal(scaled.neighbors_.indices, plain.neighbors_.indices)
-    assert trustworthiness(X[:, 0], scaled.places_.numpy()) > 0.97
+    assert trustworthiness(X[:, 0], scaled.embedding_.numpy()) > 0.97
 
 
 def test_a_cluster_apart_is_laid_out_as_well_as_the_others() -> None:
@@ -361,7 +363,7 @@ def test_a_cluster_apart_is_laid_out_as_well_as_the_others() -> None:
     X[:80] += 1000.0
     reducer = UmapReducer().fit(X.astype(np.float32))
     for rows in (slice(0, 80), slice(80, 200)):
-        assert trustworthiness(X[rows, 0], reducer.places_[rows].numpy(), n_neighbors=10) > 0.95
+        assert trustworthiness(X[rows, 0], reducer.embedding_[rows].numpy(), n_neighbors=10) > 0.95
 
 
 class Ticking:
@@ -398,7 +400,7 @@ def test_a_clock_that_ends_a_layout_leaves_no_high_rate(insertion: Traces) -> No
     train(reducer, insertion[0], NUMBERS[:200], deadline=20.0, clock=Ticking())
     assert reducer.report.n_steps == 29
     assert reducer.report.n_steps_left == 171
-    trust = trustworthiness(insertion[0][:200, 0], reducer.places_.numpy(), n_neighbors=15)
+    trust = trustworthiness(insertion[0][:200, 0], reducer.embedding_.numpy(), n_neighbors=15)
     assert trust > 0.95
 
 
