@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dengine import Dataset
-from dengine.cli.output import heading, written
+from dengine.cli.output import format_value, heading
 from dengine.experiments.tables import write_csv
 from dengine.traces import as_traces
 
@@ -75,7 +75,7 @@ def tell(rows: Sequence[Mapping[str, Any]], title: str, path: Path | None = None
     for name, value in rows[0].items():
         table.add_column(heading(name), justify="left" if isinstance(value, str) else "right")
     for row in rows:
-        table.add_row(*(written(name, value) for name, value in row.items()))
+        table.add_row(*(format_value(name, value) for name, value in row.items()))
     Console(width=width).print(table)
 
 

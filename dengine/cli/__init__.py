@@ -1,8 +1,9 @@
-"""The `dengine` command: each verb parses, calls one function and prints.
+"""The `dengine` command: each verb parses its options, calls one function and prints the result.
 
     dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3
 
-Only click is imported before a verb is known, so that `--help` answers at once.
+A verb is a function in one of this folder's modules and a name in the list below. Verbs import what
+they need when they run, so that `--help` answers at once.
 """
 
 import sys
@@ -17,17 +18,31 @@ from ..errors import DengineError, ImportRefusedError, as_options, without_passw
 from .data import data, simulate, train
 from .export import export
 from .history import explain, history
-from .options import ends_in
-from .output import end_interrupted
+from .options import example_epilog
+from .output import exit_interrupted
 from .replay import compare, costs, replay
 from .run import run
 from .serve import serve
 from .status import status
-from .store import backup, correct, forget, import_labels, policy, report, retrain, rollback, verify
+from .store import (
+    backup,
+    correct,
+    forget,
+    import_labels,
+    policy,
+    report,
+    retrain,
+    rollback,
+    verify,
+)
 
 
 class Verbs(click.Group):
-    """A group whose foreseen failures are one line on stderr and exit code 1; 2 where an option would do."""
+    """A group of verbs that prints an expected error as one line on stderr.
+
+    The exit code is then 1, or 2 for an error that another option avoids. Any other exception
+    passes with its traceback.
+    """
 
     def main(self, *args: Any, **options: Any) -> Any:
         """Run a verb; a character that the screen's encoding lacks becomes a question mark."""
@@ -37,39 +52,46 @@ class Verbs(click.Group):
         return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
-        if (here := str(Path.cwd())) not in sys.path:  # where `module:Class` is looked for, last: it shadows nothing
-            sys.path.append(here)
+        """Run a verb and turn its expected errors into click's, with passwords masked."""
+        folder = str(Path.cwd())
+        if folder not in sys.path:
+            # `module:Class` is also searched in the current folder; last, so it shadows nothing.
+            sys.path.append(folder)
         try:
             return super().invoke(ctx)
         except BrokenPipeError:  # `dengine status x.db | head`: click ends quietly
             raise
-        except (DengineError, OSError, UnicodeError) as error:  # the last of a name that no file system has
-            kind = click.UsageError if isinstance(error, ImportRefusedError) else click.ClickException
-            raise kind(as_options(without_password(" ".join(str(error).split())))) from error
+        # UnicodeError: a file name that no file system can have.
+        except (DengineError, OSError, UnicodeError) as error:
+            kind = click.ClickException
+            if isinstance(error, ImportRefusedError):
+                kind = click.UsageError
+            text = " ".join(str(error).split())
+            raise kind(as_options(without_password(text))) from error
         except click.ClickException as error:
             # click repeats the words that it was called with.
-            error.message = without_password(error.message)  # type: ignore[misc]  # final for click, not for us
+            error.message = without_password(error.message)  # type: ignore[misc]  # final for click
             raise
         except KeyboardInterrupt:
-            end_interrupted("Interrupted.")
+            exit_interrupted("Interrupted.")
 
 
 @click.group(
     cls=Verbs,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=ends_in("dengine replay --data insertion --reducer conv --repeats 3"),
+    epilog=example_epilog("dengine replay --data insertion --reducer conv --repeats 3"),
 )
 @click.version_option(__version__, prog_name="dengine", message="%(prog)s %(version)s")
 def main() -> None:
-    """Let a robot cell start on its slow check, and earn its way off it.
+    """Let a robot cell start with a slow check on every part, and need it less as it learns.
 
-    Exit codes: 0 done; 1 it failed, and one line says why; 2 a wrong call; 130 interrupted by Ctrl-C, what was done
-    until then is kept and shown.
+    Exit codes: 0 success; 1 failure, with one line that says why; 2 wrong usage; 130 interrupted by
+    Ctrl-C, and what was done until then is kept and shown.
     """
 
 
-for verb in (
+for command in (
     *(data, replay, compare, costs, train, run, serve, simulate, status, history, explain, verify),
     *(report, correct, forget, rollback, policy, retrain, backup, export, import_labels),
 ):
-    main.add_command(verb)
+    main.add_command(command)

@@ -1,4 +1,8 @@
-"""`dengine history`: the decisions of a store, and what happened between them; `dengine explain`: why one came out so."""
+"""The verbs `dengine history` and `dengine explain`.
+
+`history` lists the decisions of a store with the retrains and events between them; `explain` says
+why one decision came out as it did.
+"""
 
 from __future__ import annotations
 
@@ -14,31 +18,44 @@ import click
 
 from ..errors import percent
 from . import options
-from .options import Known, verb
-from .output import Out, duration, facts, listed, tell, when
+from .options import NameChoice, verb
+from .output import (
+    Out,
+    format_duration,
+    format_time,
+    print_result,
+    table_of_records,
+    table_of_rows,
+)
 
 if TYPE_CHECKING:
     from ..history.explain import Explanation
     from ..store.records import Event, StoredDecision, StoredVersion
 
-AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
-WIDEST = 120  # columns
-SHORTEST = 10  # characters of a part's number that are shown, its last
-SHORT = "%Y-%m-%d %H:%M:%S"
-MOST = 5  # excesses that are named
-NEIGHBOUR = ("decision_id", "part", "success", "source", "distance", "space", "inside")
+SECONDS_OF = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+TABLE_WIDTH = 120  # columns
+PART_LENGTH = 10  # characters of a part's number that are shown, its last
+SHORT_TIME = "%Y-%m-%d %H:%M:%S"
+MOST_EXCESSES = 5  # that are listed
+NEIGHBOUR_FIELDS = ("decision_id", "part", "success", "source", "distance", "space", "inside")
 
 
 class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generic in 8.3
-    """A time: how long ago (90s, 30m, 12h, 7d), or when (2026-03-01, 2026-03-01T14:30), in UTC if it does not say."""
+    """The type of an option that takes a time.
+
+    How long ago it was (90s, 30m, 12h, 7d), or a date (2026-03-01, 2026-03-01T14:30), in UTC unless
+    it has an offset.
+    """
 
     name = "TIME"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Seconds since 1970."""
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Return the time in seconds since 1970; a usage error for what is no time."""
         ago = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value)
         if ago:
-            return time.time() - float(ago[1]) * AGO[ago[2]]
+            return time.time() - float(ago[1]) * SECONDS_OF[ago[2]]
         try:
             moment = datetime.fromisoformat(value)
         except ValueError:
@@ -46,103 +63,145 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-MODEL = "Only what the model alone would have done so, as in an audit or in the shadow mode."
+_LAST = "How many of the newest decisions are shown."
+_ACTION = "Only decisions with this action."
+_MODEL = (
+    "Only decisions where the model alone would have done this, as in an audit or in shadow mode."
+)
+_LABEL = "Only decisions with this label, or without a reported one."
+_SINCE = "Only decisions since then: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC."
 
 
 @verb("dengine history engine.db --last 20 --events")
 @options.store_argument
-@click.option("--last", type=options.COUNT, default=50, show_default=True, help="The newest so many that are meant.")
-@click.option("--action", type=Known("action"), help="Only what was decided so.")
-@click.option("--model", "predicted", type=Known("action"), help=MODEL)
-@click.option("--reason", type=Known("reason"), help="Only what was decided for this one.")
-@click.option("--label", type=Known("label"), help="Only what turned out so, or was never reported.")
-@click.option("--part", metavar="NUMBER", help="Only of the part with this number.")
-@click.option("--since", type=Moment(), help="Only from then on: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.")
-@click.option("--until", type=Moment(), help="Only before then, likewise.")
-@click.option("--events", is_flag=True, help="With the retrains and events that happened meanwhile.")
-def history(store: str, events: bool, **asked: Any) -> None:
+@click.option("--last", type=options.COUNT, default=50, show_default=True, help=_LAST)
+@click.option("--action", type=NameChoice("action"), help=_ACTION)
+@click.option("--model", "predicted", type=NameChoice("action"), help=_MODEL)
+@click.option("--reason", type=NameChoice("reason"), help="Only decisions with this reason.")
+@click.option("--label", type=NameChoice("label"), help=_LABEL)
+@click.option("--part", metavar="NUMBER", help="Only decisions on the part with this number.")
+@click.option("--since", type=Moment(), help=_SINCE)
+@click.option("--until", type=Moment(), help="Only decisions before then, given as for --since.")
+@click.option("--events", is_flag=True, help="Show the retrains and events between them too.")
+def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
-    STORE is the file or URL that an engine remembers in. In the table good and bad are the labels that were counted, bound
-    is what they say of the success rate, v the model's version, and label what the part turned out to be. `dengine explain`
-    says more of one.
+    STORE is the file or URL of an engine's store. In the table good and bad are the labels that
+    were counted, bound is the interval of the success rate that follows from them, v is the version
+    of the model, and label is what the part turned out to be. `dengine explain` tells more about
+    one decision.
     """
-    from ..history.status import history as read
     from ..history.status import read_retrains_and_events
+    from ..history.status import history as read_history
     from ..representation import to_jsonable
     from ..store.opening import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
-        found = list(read(opened, **asked))
-        since = asked["since"] if asked["since"] is not None or not found else found[0].time
-        others = read_retrains_and_events(opened, since, asked["until"]) if events else {}
-    record = {"store": store, "decisions": [to_jsonable(past) | {"label": past.label} for past in found]} | others
-    tell(record, _table(merge(*others.values(), found, key=lambda each: each.time)))
+        decisions = list(read_history(opened, **criteria))
+        since = criteria["since"]
+        if since is None and decisions:
+            since = decisions[0].time
+        others = read_retrains_and_events(opened, since, criteria["until"]) if events else {}
+    rows = [to_jsonable(decision) | {"label": decision.label} for decision in decisions]
+    record = {"store": store, "decisions": rows} | others
+    in_order = merge(*others.values(), decisions, key=lambda item: item.time)
+    print_result(record, _history_table(in_order))
 
 
-def _label(past: StoredDecision) -> str:
-    source = "" if past.source is None else f" {past.source.value}".replace("verification", "verified")
-    return "-" if past.success is None else f"{past.label}{source}"
+def _label_text(stored: StoredDecision) -> str:
+    """Return a decision's label with its source: `good verified`, `bad stop`, "-" without one."""
+    if stored.success is None:
+        return "-"
+    source = "" if stored.source is None else stored.source.value
+    return f"{stored.label} {source.replace('verification', 'verified')}".rstrip()
 
 
-COLUMNS: dict[str, Callable[[StoredDecision], str]] = {  # "<" or ">": to which side; and the title
-    "<time (UTC)": lambda past: when(past.time, SHORT),
-    "<decision": lambda past: past.decision.id,
-    "<part": lambda past: (past.decision.part or "-")[-SHORTEST:],
-    "<action": lambda past: past.decision.action.value,
-    "<model": lambda past: "" if past.decision.predicted is past.decision.action else past.decision.predicted.value,
-    "<bound": lambda past: f"{past.decision.lower:.2f}-{past.decision.upper:.2f}".replace("nan-nan", "-"),
-    ">good": lambda past: str(past.decision.n_success),
-    ">bad": lambda past: str(past.decision.n_failure),
-    "<reason": lambda past: past.decision.reason.value,
-    ">v": lambda past: str(past.decision.model_version),
-    "<label": _label,
+def _model_text(stored: StoredDecision) -> str:
+    """Return what the model alone would have done, "" where that was done."""
+    predicted = stored.decision.predicted
+    return "" if predicted is stored.decision.action else predicted.value
+
+
+def _bound_text(stored: StoredDecision) -> str:
+    """Return the interval of the success rate, "-" where there is none."""
+    text = f"{stored.decision.lower:.2f}-{stored.decision.upper:.2f}"
+    return text.replace("nan-nan", "-")
+
+
+# Alignment ("<" or ">") and title of a column -> its text.
+COLUMNS: dict[str, Callable[[StoredDecision], str]] = {
+    "<time (UTC)": lambda stored: format_time(stored.time, SHORT_TIME),
+    "<decision": lambda stored: stored.decision.id,
+    "<part": lambda stored: (stored.decision.part or "-")[-PART_LENGTH:],
+    "<action": lambda stored: stored.decision.action.value,
+    "<model": _model_text,
+    "<bound": _bound_text,
+    ">good": lambda stored: str(stored.decision.n_success),
+    ">bad": lambda stored: str(stored.decision.n_failure),
+    "<reason": lambda stored: stored.decision.reason.value,
+    ">v": lambda stored: str(stored.decision.model_version),
+    "<label": _label_text,
 }
 
 
-def _table(happened: Iterable[StoredDecision | StoredVersion | Event]) -> str:
-    """A table; retrains and events are lines of their own among the decisions."""
+def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> str:
+    """Return a table of decisions as text; retrains and events are lines between its rows."""
     from ..store.records import StoredDecision
 
-    rows = [
-        [cell(each) for cell in COLUMNS.values()] if isinstance(each, StoredDecision) else _told(each)[: WIDEST - 1]
-        for each in happened
-    ]
-    if not rows:
+    lines: list[str | list[str]] = []
+    for item in items:
+        if isinstance(item, StoredDecision):
+            lines.append([cell(item) for cell in COLUMNS.values()])
+        else:
+            lines.append(_event_line(item)[: TABLE_WIDTH - 1])
+    if not lines:
         return "No decision of that kind."
     titles = [name[1:] for name in COLUMNS]
-    widths = [max(map(len, column)) for column in zip(titles, *(row for row in rows if isinstance(row, list)), strict=True)]
-    sides = "  ".join(f"{{:{name[0]}{width}}}" for name, width in zip(COLUMNS, widths, strict=True))
-    lines = [titles, ["-" * width for width in widths], *rows]
-    return "\n".join(line if isinstance(line, str) else sides.format(*line).rstrip() for line in lines)
+    rows = [titles, *(line for line in lines if isinstance(line, list))]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    cells = [f"{{:{name[0]}{width}}}" for name, width in zip(COLUMNS, widths, strict=True)]
+    row_format = "  ".join(cells)
+    lines = [titles, ["-" * width for width in widths], *lines]
+    return "\n".join(
+        line if isinstance(line, str) else row_format.format(*line).rstrip() for line in lines
+    )
 
 
-def _told(each: StoredVersion | Event) -> str:
+def _event_line(item: StoredVersion | Event) -> str:
+    """Return the line of an event or a retrain: its time, what happened, and why."""
     from ..store.records import Event
 
-    if isinstance(each, Event):
-        return f"{when(each.time, SHORT)}  * {each.kind}: {' '.join(each.text.split())}"
-    report = each.report
-    what = f"retrain to version {report.version}" if report.accepted else f"retrain {each.number}"
-    return f"{when(each.time, SHORT)}  * {what}, {report.n_traces} traces, {duration(report.seconds)}: {report.reason}"
+    time_text = format_time(item.time, SHORT_TIME)
+    if isinstance(item, Event):
+        return f"{time_text}  * {item.kind}: {' '.join(item.text.split())}"
+    report = item.report
+    title = f"retrain to version {report.version}" if report.accepted else f"retrain {item.number}"
+    duration = format_duration(report.seconds)
+    return f"{time_text}  * {title}, {report.n_traces} traces, {duration}: {report.reason}"
 
 
 @verb("dengine explain engine.db last --out why.png")
 @options.store_argument
 @click.argument("decision", metavar="PART|ID")
-@click.option("--neighbours", type=click.IntRange(0), default=10, show_default=True, help="Nearest references, shown.")
+@click.option(
+    "--neighbours",
+    type=click.IntRange(0),
+    default=10,
+    show_default=True,
+    help="How many of the nearest references are shown.",
+)
 @options.picture_option
 def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None:
-    """Say why a decision came out as it did.
+    """Explain why a decision came out as it did.
 
-    It is named by its id, as `dengine history STORE` lists it, by its part's number, or by the word last. Counts,
-    bound and action are shown as they were recorded; neighbours are found again by the version that answered, where the
-    store keeps it.
-    The picture shows the trace with its neighbours and with the band that 95 % of the known successes lie in.
+    The decision is named by its id, as `dengine history STORE` lists it, by its part's number, or
+    by the word last. Counts, bound and action are shown as they were recorded. Neighbours are
+    searched again with the version that decided, if the store still has it. The picture shows the
+    trace with its neighbours and with the band that holds 95 % of the known successes.
     """
     from ..errors import ReportError
     from ..experiments.figures import explained_picture
-    from ..history.explain import explain as explained
+    from ..history.explain import explain as explain_decision
     from ..history.status import history
     from ..representation import to_jsonable
     from ..store.opening import open_store
@@ -151,39 +210,69 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
         if decision == "last":
             newest = next(history(opened, last=1), None)
             if newest is None:
-                raise ReportError(f"Expected a decision in {store}, there is none yet; let an engine decide first.")
+                raise ReportError(
+                    f"Expected a decision in {store}, there is none yet; let an engine decide "
+                    "first."
+                )
             decision = newest.decision.id
-        found = explained(opened, decision, neighbours)
-    record, past = {"store": store} | to_jsonable(found), found.decision
-    tables = [facts(f"{past.decision.id}: {past.decision.action.value}, {past.decision.reason.value}", _rows(found))]
-    if found.envelope is not None and found.envelope.excesses:
+        explanation = explain_decision(opened, decision, neighbours)
+    explained = explanation.decision.decision
+    title = f"{explained.id}: {explained.action.value}, {explained.reason.value}"
+    tables = [table_of_rows(title, _explanation_rows(explanation))]
+    if explanation.envelope is not None and explanation.envelope.excesses:
+        title = "Where it leaves the band, the farthest first"
         columns = ("", "from", "to", "in widths")
-        tables.append(facts("Where it leaves the band, the farthest first", _excesses(found), columns))
-    if found.neighbours:
-        title = f"Nearest references of version {past.decision.model_version}; the ball's radius is {found.radius:.3g}"
-        tables.append(listed(title, found.neighbours, *NEIGHBOUR))
-    tell(record, *tables, out=out, made=lambda: {"": explained_picture(found)})
+        tables.append(table_of_rows(title, _excess_rows(explanation), columns))
+    if explanation.neighbours:
+        title = (
+            f"Nearest references of version {explained.model_version}; the radius of the "
+            f"neighbourhood is {explanation.radius:.3g}"
+        )
+        tables.append(table_of_records(title, explanation.neighbours, *NEIGHBOUR_FIELDS))
+    print_result(
+        {"store": store} | to_jsonable(explanation),
+        *tables,
+        out=out,
+        make_files=lambda: {"": explained_picture(explanation)},
+    )
 
 
-def _rows(found: Explanation) -> Iterator[tuple[str, str]]:
-    past, band = found.decision, found.envelope
-    version = past.decision.model_version
-    yield "decided", f"{when(past.time)}, by " + (f"version {version}" if version else "no model")
-    if past.decision.part is not None:
-        yield "part", past.decision.part
-    yield from (("" if i else "why", sentence) for i, sentence in enumerate(found.sentences))
-    yield from (("" if i else "found again", note) for i, note in enumerate(found.notes))
-    if band is None:
+def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
+    """Yield (title, text) rows: who decided, why, what was found again, and the envelope."""
+    decision = explanation.decision.decision
+    version = decision.model_version
+    decider = f"version {version}" if version else "no model"
+    yield "decided", f"{format_time(explanation.decision.time)}, by {decider}"
+    if decision.part is not None:
+        yield "part", decision.part
+    for i, sentence in enumerate(explanation.sentences):
+        yield "" if i else "why", sentence
+    for i, sentence in enumerate(explanation.notes):
+        yield "" if i else "found again", sentence
+    envelope = explanation.envelope
+    if envelope is None:
         yield "envelope", "too few successes of this shape are known yet"
         return
-    usual = f"of 95 % of them fewer than {percent(band.usual, '.0f')} do"
-    yield "envelope", f"{percent(band.outside, '.0f')} of its samples leave the band of {band.n:,} successes; {usual}"
-    if band.not_finite:
-        yield "", f"{band.not_finite} samples are NaN or infinite"
+    yield (
+        "envelope",
+        f"{percent(envelope.outside, '.0f')} of its samples leave the band of {envelope.n:,} "
+        f"successes; of 95 % of them fewer than {percent(envelope.usual, '.0f')} do",
+    )
+    if envelope.not_finite:
+        yield "", f"{envelope.not_finite} samples are NaN or infinite"
 
 
-def _excesses(found: Explanation) -> Iterator[tuple[str, ...]]:
-    names = found.spec.columns or [f"channel {i + 1}" for i in range(found.spec.channels)]
-    for each in found.envelope.excesses[:MOST] if found.envelope else ():
-        times = (f"{each.from_s:.3f} s", f"{each.to_s:.3f} s")
-        yield names[each.channel], *times, f"{each.widths:.1f} {'above' if each.above else 'below'}"
+def _excess_rows(explanation: Explanation) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of a table of where the trace leaves the envelope, the farthest first."""
+    spec = explanation.spec
+    names = spec.columns or [f"channel {i + 1}" for i in range(spec.channels)]
+    if explanation.envelope is None:
+        return
+    for excess in explanation.envelope.excesses[:MOST_EXCESSES]:
+        side = "above" if excess.above else "below"
+        yield (
+            names[excess.channel],
+            f"{excess.from_s:.3f} s",
+            f"{excess.to_s:.3f} s",
+            f"{excess.widths:.1f} {side}",
+        )

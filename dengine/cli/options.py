@@ -1,4 +1,8 @@
-"""Options that several verbs share, and the records that verbs get of them."""
+"""Options that several verbs share, their types, and the records that verbs receive for them.
+
+Options that belong together reach a verb as one argument: `RecipeChoice` (which recipe, with which
+settings), `DataChoice` (which data set, read how), a store's address, or an `Out`.
+"""
 
 from __future__ import annotations
 
@@ -27,21 +31,32 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(1)
 ALPHA = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
 LOWER_BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
-RULE, OWN = "module:Class", "FILE.toml|module:Class"
+# What may be given instead of a name.
+OWN_RULE = "module:Class"
+OWN_RECIPE = "FILE.toml|module:Class"
 
 
-def ends_in(example: str) -> str:
-    """The end of a help."""
+def example_epilog(example: str) -> str:
+    """Return the end of a help text, which shows one command that works."""
     return f"\b\nExample:\n  {example}"
 
 
 def verb(example: str) -> Callable[[Command], click.Command]:
-    """A command that speaks JSON, and whose help ends in an example."""
-    return lambda command: click.command(epilog=ends_in(example))(json_option(command))
+    """Make a function a verb of `dengine`, with `--json` and a help that ends in an example."""
+    return lambda command: click.command(epilog=example_epilog(example))(json_option(command))
 
 
 def names_of(kind: str) -> tuple[str, ...]:
-    """What can be said where this is asked for: the keys of the package's own tables, read when they are needed."""
+    """Return the names that an option of this kind accepts.
+
+    They are the keys of the package's own tables, imported only when they are needed.
+
+    Parameters
+    ----------
+    kind : str
+        guarantee, interval, stops, recipe, baseline, method (recipes and baselines), fit, label,
+        action or reason.
+    """
     from ..decision.intervals import INTERVALS
     from ..decision.policy import RULES, Stops
     from ..experiments.baselines import BASELINES
@@ -49,63 +64,101 @@ def names_of(kind: str) -> tuple[str, ...]:
     from ..records import FITS, Action, Reason
     from ..store.views import LABELS
 
-    known: dict[str, Iterable[str]] = {"guarantee": RULES, "interval": INTERVALS, "stops": get_args(Stops)}
-    known |= {"recipe": RECIPES, "baseline": BASELINES, "method": [*RECIPES, *BASELINES], "fit": FITS, "label": LABELS}
-    known |= {"action": [each.value for each in Action], "reason": [each.value for each in Reason]}
-    return tuple(known[kind])
+    names: dict[str, Iterable[str]] = {
+        "guarantee": RULES,
+        "interval": INTERVALS,
+        "stops": get_args(Stops),
+        "recipe": RECIPES,
+        "baseline": BASELINES,
+        "method": [*RECIPES, *BASELINES],
+        "fit": FITS,
+        "label": LABELS,
+        "action": [action.value for action in Action],
+        "reason": [reason.value for reason in Reason],
+    }
+    return tuple(names[kind])
 
 
-class Known(click.ParamType[Any]):
-    """A name of a kind, see `names_of`; own : what else may be given, which has a dot, colon or slash in it."""
+class NameChoice(click.ParamType[Any]):
+    """The type of an option that takes one of the names of a kind, see `names_of`.
+
+    Parameters
+    ----------
+    kind : str
+    custom : str, default ""
+        How the user's own object may be given instead, for the help. Such a value has a dot, colon
+        or slash in it. "" accepts the names only.
+    """
 
     name = "name"
 
-    def __init__(self, kind: str, own: str = "") -> None:
-        self.kind, self.own = kind, own
+    def __init__(self, kind: str, custom: str = "") -> None:
+        self.kind = kind
+        self.custom = custom
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        return f"[{'|'.join(filter(None, [*names_of(self.kind), self.own]))}]"
+        return f"[{'|'.join(filter(None, [*names_of(self.kind), self.custom]))}]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The name; what is in no table is a usage error."""
+        """Return the name; a usage error for any other value."""
         names = names_of(self.kind)
-        if value not in names and not (self.own and {".", ":", "/"} & set(value)):
-            own = f", or {self.own} of your own" if self.own else ""
-            self.fail(f"{value!r} is not one of {', '.join(map(repr, names))}{own}.", param, ctx)
+        if value not in names and not (self.custom and {".", ":", "/"} & set(value)):
+            custom = f", or {self.custom} of your own" if self.custom else ""
+            self.fail(f"{value!r} is not one of {', '.join(map(repr, names))}{custom}.", param, ctx)
         return str(value)
 
 
-class Listed(click.ParamType[Any]):
-    """Values with commas between, as a tuple; each is what another type says."""
+class CommaList(click.ParamType[Any]):
+    """The type of an option that takes values with commas between: "0.5,0.1" -> (0.5, 0.1).
+
+    Parameters
+    ----------
+    item_type : click.ParamType
+        Converts each value.
+    """
 
     name = "list"
 
-    def __init__(self, of: click.ParamType[Any]) -> None:
-        self.of = of
+    def __init__(self, item_type: click.ParamType[Any]) -> None:
+        self.item_type = item_type
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
-        return f"{self.of.get_metavar(param, ctx)},..." if isinstance(self.of, Known) else "LIST"
+        if isinstance(self.item_type, NameChoice):
+            return f"{self.item_type.get_metavar(param, ctx)},..."
+        return "LIST"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
-        """'0.5,0.1' -> (0.5, 0.1); a wrong one among them is a usage error."""
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[Any, ...]:
+        """Return the values as a tuple; a usage error if there is none or one is wrong."""
         if isinstance(value, tuple):
             return value
-        parts = [part.strip() for part in str(value).split(",") if part.strip()]
-        if not parts:
+        items = [item.strip() for item in str(value).split(",") if item.strip()]
+        if not items:
             self.fail("expected at least one value, with commas between.", param, ctx)
-        return tuple(self.of.convert(part, param, ctx) for part in parts)
+        return tuple(self.item_type.convert(item, param, ctx) for item in items)
 
 
-def gathered(into: str, make: Callable[..., Any], options: Mapping[str, Option]) -> Option:
-    """Options, by the names of their values, which `make` takes; what it makes is handed on as `into`."""
+def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Option]) -> Option:
+    """Return a decorator that adds several options and hands them to the verb as one argument.
+
+    Parameters
+    ----------
+    into : str
+        Name of the verb's argument.
+    make : callable
+        Takes the options' values by their names, and returns that argument.
+    options : mapping of str to option
+        By the names of their values.
+    """
 
     def decorate(command: Command) -> Command:
         @wraps(command)
-        def with_one(**given: Any) -> Any:
-            mine = {name: given.pop(name) for name in options}
-            return command(**{into: make(**mine)}, **given)
+        def bundled(**values: Any) -> Any:
+            taken = {name: values.pop(name) for name in options}
+            return command(**{into: make(**taken)}, **values)
 
-        decorated: Command = with_one
+        decorated: Command = bundled
         for option in reversed(list(options.values())):
             decorated = option(decorated)
         return decorated
@@ -113,173 +166,299 @@ def gathered(into: str, make: Callable[..., Any], options: Mapping[str, Option])
     return decorate
 
 
-def given(**options: Any) -> dict[str, Any]:
-    """Those that were given."""
-    return {name: value for name, value in options.items() if value is not None}
+def drop_none(**values: Any) -> dict[str, Any]:
+    """Return the options that were given, by name: those whose value is not None."""
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _address(store: str | None, cell_id: str | None, product: str | None = None) -> str | None:
+    """Return a store's address with its cell and product; None without a store."""
     from ..store.records import address
 
     if store is None and (cell_id or product):
-        raise click.UsageError("A cell and its product are known to a store: name it, --store FILE|URL.")
+        raise click.UsageError(
+            "--cell-id and --product need a store; give one with --store FILE|URL."
+        )
     return None if store is None else address(store, cell_id, product)
 
 
-_WHOSE = "Whose rows of the store, where it holds several cells; `dengine status` lists them.  [default: cell]"
-_PRODUCT = "What the cell makes: cells of one product share labels and versions.  [default: as the store says]"
+_CELL_ID = "The cell, where the store holds several; `dengine status` lists them.  [default: cell]"
+_PRODUCT = (
+    "What the cell makes: cells of one product share labels and versions.  "
+    "[default: as the store says]"
+)
 
 
-def a_store(store: Option) -> Option:
-    """A store that is there, and whose rows of it are meant."""
-    whose = click.option("--cell", "--cell-id", "cell_id", metavar="NAME", help=_WHOSE)
-    return gathered("store", _address, {"store": store, "cell_id": whose})
+def existing_store(store: Option) -> Option:
+    """Return `store` together with `--cell`, handed on as one address."""
+    cell = click.option("--cell", "--cell-id", "cell_id", metavar="NAME", help=_CELL_ID)
+    return bundle_options("store", _address, {"store": store, "cell_id": cell})
 
 
-store_argument = a_store(click.argument("store", metavar="STORE"))
+store_argument = existing_store(click.argument("store", metavar="STORE"))
 
 
-def store_option(text: str, *cell: str, required: bool = False) -> Option:
-    """`--store`, which may be made, with its cell's id, by `--cell-id` and other names, and product."""
+def store_option(text: str, *names: str, required: bool = False) -> Option:
+    """Return `--store`, which may not exist yet, `--cell-id` and `--product`, as one address.
+
+    Parameters
+    ----------
+    text : str
+        Help of `--store`.
+    *names : str
+        Further names of `--cell-id`.
+    required : bool, default False
+    """
     options: dict[str, Option] = {
         "store": click.option("--store", required=required, metavar="FILE|URL", help=text),
-        "cell_id": click.option(*cell, "--cell-id", "cell_id", metavar="NAME", help=_WHOSE),
+        "cell_id": click.option(*names, "--cell-id", "cell_id", metavar="NAME", help=_CELL_ID),
         "product": click.option("--product", metavar="NAME", help=_PRODUCT),
     }
-    return gathered("store", _address, options)
+    return bundle_options("store", _address, options)
 
 
 def short_name(name: str) -> str:
-    """What to call a recipe in tables and file names: `folder/often.toml` is often, `module:Class` is Class."""
+    """Return a recipe's name for tables and files: folder/often.toml -> often, m:Class -> Class."""
     return Path(name.rpartition(":")[2]).stem
 
 
 @dataclass(frozen=True)
 class RecipeChoice:
-    """Which recipe was asked for, if any; settings : those that were given, of a policy or `novelty`."""
+    """The recipe that the user asked for.
 
-    asked: str | None
+    Parameters
+    ----------
+    name : str or None
+        As given to `--reducer`; None if it was not given.
+    settings : mapping
+        The settings of a policy, and `novelty`, that were given beside it.
+    """
+
+    name: str | None
     settings: Mapping[str, Any]
 
     def load(self, base: Any = "conv") -> Recipe:
-        """The recipe with these settings, or `base` with them. SettingError where its reducer cannot be found."""
+        """Return the recipe, or `base`, with the given settings.
+
+        Raises
+        ------
+        SettingError
+            The recipe or its reducer is not found. This is checked here, before a store is created.
+        """
         from ..recipe import Recipe
         from ..reducers import REDUCERS, reducer_class
 
         policy = {name: value for name, value in self.settings.items() if name != "novelty"}
-        recipe = Recipe.load(self.asked or base).with_policy(**policy)
+        recipe = Recipe.load(self.name or base).with_policy(**policy)
         recipe = recipe.with_settings(novelty=self.settings.get("novelty"))
         if recipe.reducer not in REDUCERS:
-            reducer_class(recipe.reducer)  # now, and not when a store was made for it
+            reducer_class(recipe.reducer)
         return recipe
 
-    def if_asked(self) -> Recipe | None:
-        """The recipe, where any of it was given; else the store's counts."""
-        return self.load() if self.asked or self.settings else None
+    def load_if_given(self) -> Recipe | None:
+        """Return the recipe if a name or a setting was given; None means the store's own recipe."""
+        return self.load() if self.name or self.settings else None
 
-    def contender(self) -> Contender:
-        """Who plays by it: dengine, or the baseline of that name in the same loop."""
+    def make_contender(self) -> Contender:
+        """Return who plays in a replay: dengine by this recipe, or the baseline of this name."""
         from ..experiments.replay import Contender
 
-        if self.asked in names_of("baseline"):
-            baseline = Contender.load(self.asked)
-            return replace(baseline, recipe=RecipeChoice(None, self.settings).load(baseline.recipe))
-        return Contender(short_name(self.asked or "conv"), self.load())
+        if self.name in names_of("baseline"):
+            baseline = Contender.load(self.name)
+            recipe = RecipeChoice(None, self.settings).load(baseline.recipe)
+            return replace(baseline, recipe=recipe)
+        return Contender(short_name(self.name or "conv"), self.load())
 
 
-# What a policy is by default is the recipe's affair, or the store's.
+# No option of a policy has a default here: the recipe, or the store, has it.
 _ALPHA = "Two-sided error level of the confidence bound, a probability.  [default: the recipe's]"
-_LB = "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]"
-_GUARANTEE = (
-    "What keeps to LB: the ball around each part, at one look (local); all its members together (pooled); or a rule of "
-    "your own. With cost, what is expected to be cheaper than a check passes, by --prices."
+_LB = (
+    "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  "
+    "[default: the recipe's]"
 )
-_PRICES = "Of a check, a bad part accepted and a good one rejected, in one unit, under cost.  [default: 5,120,47.5]"
-_STOPS = "Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good."
-_AUDITS = "Share of what the model is certain of that is verified all the same; rejects are known by it alone."
-_NOVELTY = "Verify a trace so many times less like the learned ones than these are like each other; 0: off."
-_WINDOWS = "Verify what leaves limits between two times, in s; LOW or HIGH may be empty; :reject rejects; '' for none."
+_GUARANTEE = (
+    "What must keep to LB: the neighbourhood of each part, at one look (local), or all accepted "
+    "parts together (pooled). With cost, a part passes where that is expected to be cheaper than a "
+    "check, by --prices. Or a rule of your own."
+)
+_PRICES = (
+    "Under cost, in one unit: of a check, of a bad part accepted and of a good part rejected.  "
+    "[default: 5,120,47.5]"
+)
+_STOPS = (
+    "Which bad accepted parts stop the system: some, or all. With all, an accepted part that no "
+    "stop follows counts as good."
+)
+_AUDITS = (
+    "Share of the parts that the model is certain of and that are verified all the same; without "
+    "audits nothing is known of rejected parts."
+)
+_NOVELTY = (
+    "Verify a trace that is this many times less like the learned traces than they are like each "
+    "other; 0: off."
+)
+_WINDOWS = (
+    "Verify a part whose force leaves limits between two times, in seconds. LOW or HIGH may be "
+    "empty; :reject rejects the part; '' removes all windows."
+)
 _WINDOW = "START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]"
 _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
-_windows: Callable[..., Any] = lambda context, option, said: tuple(filter(None, said)) if said else None  # noqa: E731
+
+
+def _windows(
+    context: click.Context, option: click.Parameter, values: tuple[str, ...]
+) -> tuple[str, ...] | None:
+    """Return the windows that were given, without empty ones; None if none was given."""
+    return tuple(filter(None, values)) if values else None
+
+
 POLICY = {
     "alpha": click.option("--alpha", type=ALPHA, help=_ALPHA),
     "lower_bound": click.option("--lower-bound", type=LOWER_BOUND, help=_LB),
-    "guarantee": click.option("--guarantee", type=Known("guarantee", RULE), help=_GUARANTEE),
-    "stops": click.option("--stops", type=Known("stops"), help=_STOPS),
+    "guarantee": click.option(
+        "--guarantee", type=NameChoice("guarantee", OWN_RULE), help=_GUARANTEE
+    ),
+    "stops": click.option("--stops", type=NameChoice("stops"), help=_STOPS),
     "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
-    "prices": click.option("--prices", type=Listed(click.FloatRange(0.0)), help=_PRICES),
-    "windows": click.option("--window", "windows", metavar=_WINDOW, multiple=True, callback=_windows, help=_WINDOWS),
+    "prices": click.option("--prices", type=CommaList(click.FloatRange(0.0)), help=_PRICES),
+    "windows": click.option(
+        "--window", "windows", metavar=_WINDOW, multiple=True, callback=_windows, help=_WINDOWS
+    ),
 }
-SETTINGS = POLICY | {"novelty": click.option("--novelty", type=click.FloatRange(0.0), metavar="FACTOR", help=_NOVELTY)}
-_REDUCER = "Every setting: by a reducer's name, from a TOML file, or with a reducer of your own.  [default: conv]"
-RECIPE = {"asked": click.option("--reducer", "--recipe", "asked", type=Known("recipe", OWN), help=_REDUCER)}
+SETTINGS = POLICY | {
+    "novelty": click.option(
+        "--novelty", type=click.FloatRange(0.0), metavar="FACTOR", help=_NOVELTY
+    )
+}
+_RECIPE = (
+    "All settings: by a reducer's name, from a TOML file, or with a reducer of your own.  "
+    "[default: conv]"
+)
+RECIPE = {
+    "name": click.option(
+        "--reducer", "--recipe", "name", type=NameChoice("recipe", OWN_RECIPE), help=_RECIPE
+    )
+}
 
 
-policy_options = gathered("settings", given, SETTINGS)
-recipe_options = gathered("choice", lambda asked, **settings: RecipeChoice(asked, given(**settings)), RECIPE | SETTINGS)
+def _recipe_choice(name: str | None, **settings: Any) -> RecipeChoice:
+    """Return the choice of a recipe from the values of `--reducer` and of a policy's options."""
+    return RecipeChoice(name, drop_none(**settings))
+
+
+policy_options = bundle_options("settings", drop_none, SETTINGS)
+recipe_options = bundle_options("choice", _recipe_choice, RECIPE | SETTINGS)
 
 
 @dataclass(frozen=True)
 class DataChoice:
-    """Which data set was asked for; how : what was given of the ways to read it, as `load_dataset` calls them."""
+    """The data set that the user asked for.
+
+    Parameters
+    ----------
+    data : str
+        A name, file or folder, as `load_dataset` takes it.
+    options : mapping
+        The options of `load_dataset` that were given.
+    """
 
     data: str
-    how: Mapping[str, Any]
+    options: Mapping[str, Any]
 
     def load(self) -> Dataset:
-        """The data set; what was left out of it is said on stderr. DataError for what cannot be read."""
+        """Return the data set; print its notes and what was left out of it to stderr.
+
+        Raises
+        ------
+        DataError
+            It cannot be read.
+        """
         from ..datasets import load_dataset
 
-        data = load_dataset(self.data, **self.how)
-        for line in [] if as_json() else (*map(as_options, data.notes), *left_out(data, 3)):
-            click.echo(line, err=True)
+        data = load_dataset(self.data, **self.options)
+        if not as_json():
+            for line in (*map(as_options, data.notes), *fault_lines(data, 3)):
+                click.echo(line, err=True)
         return data
 
 
-def left_out(data: Dataset, most: int) -> list[str]:
-    """What could not be read, a line each for the first few; none where all could."""
-    n = len(data.faults)
-    rest = [f"- and {n - most} more"] if n > most else []
-    title = f"Left out {n} of {n + len(data) + data.unlabelled} recordings of {data.name}:"
-    return [title, *(f"- {as_options(str(fault))}" for fault in data.faults[:most]), *rest] if n else []
+def fault_lines(data: Dataset, most: int) -> list[str]:
+    """Return lines that name the recordings that could not be read, at most `most` of them.
+
+    The list is empty if every recording could be read.
+    """
+    n_faults = len(data.faults)
+    if not n_faults:
+        return []
+    n_recordings = n_faults + len(data) + data.unlabelled
+    lines = [f"Left out {n_faults} of {n_recordings} recordings of {data.name}:"]
+    lines += [f"- {as_options(str(fault))}" for fault in data.faults[:most]]
+    if n_faults > most:
+        lines.append(f"- and {n_faults - most} more")
+    return lines
 
 
-_SAMPLES = "Of a trace: of recordings only the first so many, which decides earlier, on less.  [default: all]"
+_SAMPLES = (
+    "Samples of a trace; of recordings only the first so many are used, which decides earlier.  "
+    "[default: all]"
+)
 _CHANNELS = "FZ_Base, or several with commas between.  [default: FZ_Base, or the only one]"
 _LABEL = (
-    "In a folder a regular expression whose group is the label, as in '_(OK|NOK)_', or a column of its files; in a table "
-    "its column, of .npz its array.  [default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
+    "For a folder a regular expression whose group is the label, as in '_(OK|NOK)_', or a column "
+    "of its files; for a table its column, for .npz its array.  "
+    "[default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
 )
-_LABELS = "A CSV file of labels: of a folder's files, of a long table's parts, or of an .npz file's traces in their order."
-_LABEL_MAP = "What other words mean, as in 'heil=good,Riss=bad'; 1=good,0=bad where a file's name ends in the label."
+_LABELS = (
+    "A CSV file of labels: of a folder's files, of a long table's parts, or of an .npz file's "
+    "traces in their order."
+)
+_LABEL_MAP = (
+    "What other words mean, as in 'heil=good,Riss=bad'; 1=good,0=bad where a file's name ends in "
+    "the label."
+)
 _TIME = (
-    "The column of times: of a long table, a row a sample, whose --part tells the insertions, it needs both; or of "
-    "recordings."
+    "The column of times: of recordings, or of a long table, which has a row for each sample and "
+    "needs --part too."
 )
-_HERTZ = "Samples a second.  [default: what timestamps tell; live: 500]"
-_UNIT = "Of the samples; those whose own unit is another, kN for N, are converted.  [default: the header's, else N]"
+_HERTZ = "Samples per second.  [default: from the timestamps; live: 500]"
+_UNIT = (
+    "Unit of the samples; recordings whose header names another one, kN for N, are converted.  "
+    "[default: the header's, else N]"
+)
 _COLUMNS = "The names of the columns of text files without a header, as in time,fx,fz."
-_DECIMAL = "The decimal mark in text files, . or ,  [default: as each file's cells tell]"
-_THOUSANDS = "What groups thousands in text files, as the point in 1.043,5.  [default: as each file's cells tell]"
-_FIT = "What becomes of traces of another length.  [default: strict where all are alike, else pad; live: strict]"
-_NAMES = Listed(click.STRING)
+_DECIMAL = "The decimal mark in text files, . or ,  [default: detected in each file]"
+_THOUSANDS = (
+    "What groups thousands in text files, as the point in 1.043,5.  "
+    "[default: detected in each file]"
+)
+_FIT = (
+    "What to do with traces of another length.  [default: strict where all have one length, else "
+    "pad; live: strict]"
+)
+_NAMES = CommaList(click.STRING)
 _RATE = click.FloatRange(0.0, min_open=True)
 _TRIGGER = (
-    "When an insertion begins in an .mcap file, or on a robot: contact=5 (newtons), register@NAME (not zero), bit=0 (a "
-    "digital output), motion=0.01 (m/s)."
+    "When an insertion begins, in an .mcap file or on a robot: contact=5 (newtons), register@NAME "
+    "(not zero), bit=0 (a digital output), motion=0.01 (m/s)."
 )
-_PART = "The array or column of parts' numbers, if any: a part that comes again has one vote.  [default: part]"
+_TOPIC = "The topic of the wrench in an .mcap file.  [default: the only one]"
+_PART = (
+    "The array or column of part numbers, if any: a part that comes again counts once.  "
+    "[default: part]"
+)
 _DATA = (
-    "The bundled set, insertion; a folder of CSV files, one an insertion, its label in its name; a .csv or .parquet, wide "
-    "or long; .npz: X (traces, samples) and y (1 success, 0 failure); .mcap by --trigger; or a store's .db."
+    "The bundled set, insertion; a folder of CSV files, one for each insertion, with the label in "
+    "its name; a .csv or .parquet file, wide or long; .npz with X (traces, samples) and y (1 "
+    "success, 0 failure); .mcap with --trigger; or a store's .db."
 )
 TRACE = {
     "samples": click.option("--samples", type=COUNT, help=_SAMPLES),
     "rate_hz": click.option("--rate-hz", type=_RATE, metavar="HZ", help=_HERTZ),
     "unit": click.option("--unit", metavar="TEXT", help=_UNIT),
-    "channel": click.option("--channels", "--channel", "channel", type=_NAMES, metavar="NAMES", help=_CHANNELS),
-    "fit": click.option("--fit", type=Known("fit"), help=_FIT),
+    "channel": click.option(
+        "--channels", "--channel", "channel", type=_NAMES, metavar="NAMES", help=_CHANNELS
+    ),
+    "fit": click.option("--fit", type=NameChoice("fit"), help=_FIT),
 }
 DATA = TRACE | {
     "label": click.option("--label", metavar="PATTERN", help=_LABEL),
@@ -290,67 +469,133 @@ DATA = TRACE | {
     "thousands": click.option("--thousands", metavar="MARK", help=_THOUSANDS),
     "time": click.option("--time", metavar="COLUMN", help=_TIME),
     "trigger": click.option("--trigger", metavar="TEXT", help=_TRIGGER),
-    "topic": click.option("--topic", metavar="NAME", help="Of the wrench in an .mcap file.  [default: the only one]"),
+    "topic": click.option("--topic", metavar="NAME", help=_TOPIC),
     "part": click.option("--part", metavar="KEY", help=_PART),
 }
 
 
+def _data_choice(data: str, **options: Any) -> DataChoice:
+    """Return the choice of a data set from the values of `--data` and of the options in `DATA`."""
+    return DataChoice(data, drop_none(**options))
+
+
 def data_options(default: str | None = "insertion", argument: bool = False) -> Option:
-    """`--data`, or DATA, and how it is read, handed on as one `DataChoice`, `source`."""
-    metavar, shown = "NAME|FILE|FOLDER", {"default": default, "show_default": True}
-    option = click.option("--data", metavar=metavar, help=_DATA, **({"required": True} if default is None else shown))
-    named = click.argument("data", metavar=metavar) if argument else option
-    return gathered("source", lambda data, **how: DataChoice(data, given(**how)), {"data": named} | DATA)
+    """Return `--data` with the options of how it is read, handed on as one `DataChoice`, `source`.
+
+    Parameters
+    ----------
+    default : str or None, default "insertion"
+        None makes `--data` required.
+    argument : bool, default False
+        The data set is the verb's argument DATA instead of an option.
+    """
+    metavar = "NAME|FILE|FOLDER"
+    if argument:
+        data = click.argument("data", metavar=metavar)
+    elif default is None:
+        data = click.option("--data", metavar=metavar, help=_DATA, required=True)
+    else:
+        data = click.option(
+            "--data", metavar=metavar, help=_DATA, default=default, show_default=True
+        )
+    return bundle_options("source", _data_choice, {"data": data} | DATA)
 
 
-def recorded_as(how: Mapping[str, Any]) -> dict[str, Any]:
-    """What a robot's recorder is told of TRACE, under its names."""
+def recorder_settings(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of the options in `TRACE` that a robot's recorder takes, under its names."""
     names = {"samples": "samples", "rate_hz": "rate_hz", "channel": "channels"}
-    return {name: how[option] for option, name in names.items() if option in how}
+    return {name: options[option] for option, name in names.items() if option in options}
 
 
-def trace_of(how: Mapping[str, Any]) -> TraceSpec | None:
-    """The contract of live traces by those of TRACE that were given; None: the first trace sets it."""
+def trace_spec_from(options: Mapping[str, Any]) -> TraceSpec | None:
+    """Return the contract of live traces from those of the options in `TRACE` that were given.
+
+    Returns
+    -------
+    trace_spec : TraceSpec or None
+        None if no option was given: then the first trace sets the contract.
+
+    Raises
+    ------
+    click.UsageError
+        Options were given without `--samples`.
+    """
     from ..records import TraceSpec
 
-    asked = {name: how[name] for name in TRACE if name in how}
-    names = asked.pop("channel", ())
-    n = int(names[0]) if len(names) == 1 and names[0].isdecimal() else len(names) or 1
-    if (asked or names) and "samples" not in asked:
-        raise click.UsageError("--samples, too, is needed for a contract of traces; without it the first one sets it all.")
-    return TraceSpec(**asked, channels=n, columns=names if names != (str(n),) else ()) if asked else None
+    settings = {name: options[name] for name in TRACE if name in options}
+    names = settings.pop("channel", ())
+    if not settings and not names:
+        return None
+    if "samples" not in settings:
+        raise click.UsageError(
+            "A contract of traces needs --samples too; without these options the first trace sets "
+            "it."
+        )
+    # `--channels 3` is a number of channels, not the name of one.
+    n_channels = int(names[0]) if len(names) == 1 and names[0].isdecimal() else len(names) or 1
+    columns = names if names != (str(n_channels),) else ()
+    return TraceSpec(**settings, channels=n_channels, columns=columns)
 
 
 def n_jobs_option(default: int, text: str) -> Option:
-    """`--n-jobs`, processes as joblib counts them; 0, which it does not know, is one a core too."""
-    one_a_core = lambda context, option, n_jobs: n_jobs or -1  # noqa: E731
-    return click.option("--n-jobs", type=int, default=default, show_default=True, callback=one_a_core, help=text)
+    """Return `--n-jobs`, a number of processes as joblib counts them; 0 is taken for -1."""
+
+    def all_cores_for_0(context: click.Context, option: click.Parameter, n_jobs: int) -> int:
+        return n_jobs or -1
+
+    return click.option(
+        "--n-jobs",
+        type=int,
+        default=default,
+        show_default=True,
+        callback=all_cores_for_0,
+        help=text,
+    )
 
 
-def must_have(what: str, extra: str, *needed: str) -> None:
-    """SettingError where a module is missing; asked before anything is made or begun."""
-    if missing := ", ".join(name for name in needed if find_spec(name) is None):
-        raise SettingError(f'Expected {missing} for {what}, not installed: pip install "dengine[{extra}]".')
+def require_modules(purpose: str, extra: str, *modules: str) -> None:
+    """Raise SettingError if a module is not installed; the error names the extra that has it."""
+    if missing := ", ".join(name for name in modules if find_spec(name) is None):
+        raise SettingError(
+            f'Expected {missing} for {purpose}, not installed: pip install "dengine[{extra}]".'
+        )
 
 
-_SCENARIO = "What changes while the simulated cell runs: nominal (nothing), wear, variant or bias_jump."
-_SEED = "An integer; the same seed, the same run."
-_NEW_SEED = "An integer, of a new store's engine.  [default: 0]"
-_ALLOW = "Import the reducer and the rule of one's own, module:Class, that STORE names: only of a store that you trust."
+_SCENARIO = "What changes in the simulated cell: nominal (nothing), wear, variant or bias_jump."
+_SEED = "An integer; the same seed gives the same run."
+_NEW_SEED = "An integer; seed of a new store's engine.  [default: 0]"
+_ALLOW = (
+    "Import your own reducer and rule, module:Class, that STORE names. Only for a store that you "
+    "trust."
+)
 allow_import_option = click.option("--allow-import", is_flag=True, help=_ALLOW)
-force_option = click.option("--force", is_flag=True, help="Replace the files that are there; a store never is.")
+force_option = click.option(
+    "--force", is_flag=True, help="Replace files that exist; a store is never replaced."
+)
 
 
 def _out_option(kind: click.Path, text: str) -> Option:
+    """Return `--out` and `--force`, handed on as one `Out`, or None if `--out` is not given."""
     options = {"out": click.option("--out", type=kind, help=text), "force": force_option}
-    return gathered("out", lambda out, force: None if out is None else Out(out, force), options)
+    return bundle_options(
+        "out", lambda out, force: None if out is None else Out(out, force), options
+    )
 
 
-out_option = _out_option(FOLDER, "Folder for the CSV and the pictures; made if need be.")
-picture_option = _out_option(FILE, "A picture, .png, .pdf or .svg, drawn into this file.")
-seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help=_SEED)
+out_option = _out_option(FOLDER, "Folder for the CSV and the pictures; created if it is missing.")
+picture_option = _out_option(FILE, "Draw a picture into this file, .png, .pdf or .svg.")
+seed_option = click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help=_SEED
+)
 new_seed_option = click.option("--seed", type=click.IntRange(0), help=_NEW_SEED)
 _CHECK = click.FloatRange(0.0, 3600.0, min_open=True)
-_CHECKED = "That a verification takes in your cell, for every figure of time saved."
-check_option = click.option("--check-seconds", type=_CHECK, default=5.0, show_default=True, metavar="S", help=_CHECKED)
+_CHECK_SECONDS = "How long a verification takes in your cell; every figure of time saved uses it."
+check_option = click.option(
+    "--check-seconds",
+    type=_CHECK,
+    default=5.0,
+    show_default=True,
+    metavar="S",
+    help=_CHECK_SECONDS,
+)
 scenario_option = click.option("--scenario", default="nominal", show_default=True, help=_SCENARIO)

@@ -1,4 +1,9 @@
-"""What a verb shows: one JSON document, or lines and tables on stdout, a progress bar on stderr; its files; and Ctrl-C."""
+"""What the verbs of `dengine` print and write.
+
+A verb calls `print_result` once: it prints one JSON document (`--json`), or tables and lines for
+people, and writes the files of `--out`. Besides: tables of records, values as people read them,
+progress bars on stderr, and what Ctrl-C does.
+"""
 
 import json
 import math
@@ -23,100 +28,171 @@ if TYPE_CHECKING:
 
     from ..decision.certificate import Certificate
 
-WIDE = 80  # columns where no terminal says otherwise; every table fits them
+SCREEN_WIDTH = 80  # columns where no terminal says otherwise; every table fits them
 INTERRUPTED = 130  # exit code, as shells have it: 128 + SIGINT
-JSON, EXPLAIN = "--json", "--explain"  # in click's context too: whether they were given
+# The names of two flags, and the keys in click's context that hold whether they were given.
+JSON = "--json"
+EXPLAIN = "--explain"
 
 
-def _flag(name: str, text: str) -> Callable[[Any], Any]:
-    keep: Callable[..., None] = lambda context, option, given: context.meta.update({name: given})  # noqa: E731
+def _context_flag(name: str, text: str) -> Callable[[Any], Any]:
+    """Return a flag that is kept in click's context instead of being handed to the verb."""
+
+    def keep(context: click.Context, option: click.Parameter, value: bool) -> None:
+        context.meta[name] = value
+
     return click.option(name, is_flag=True, expose_value=False, callback=keep, help=text)
 
 
-json_option = _flag(JSON, "Print one JSON document and nothing else.")
-explain_option = _flag(EXPLAIN, "Say below the table what its columns mean.")
+json_option = _context_flag(JSON, "Print one JSON document and nothing else.")
+explain_option = _context_flag(EXPLAIN, "Explain the columns below the table.")
 
 
-def explained(legend: str) -> str:
-    """What a table's columns mean, where the verb that runs was asked for it; else how to ask."""
-    return legend if click.get_current_context().meta.get(EXPLAIN) else "--explain says what the columns mean."
+def legend_or_hint(legend: str) -> str:
+    """Return the legend of a table where `--explain` was given, else a line that names the flag."""
+    if click.get_current_context().meta.get(EXPLAIN):
+        return legend
+    return "--explain says what the columns mean."
 
 
 def as_json() -> bool:
-    """Whether the verb that runs was asked for JSON: nothing else is printed then."""
+    """Return whether the running verb was given `--json`; then it prints nothing else."""
     context = click.get_current_context(silent=True)
     return context is not None and bool(context.meta.get(JSON))
 
 
 @dataclass(frozen=True)
 class Out:
-    """Where a verb writes: a folder, or the file of its only picture. force : replace the files that are there."""
+    """Where a verb writes its files, as `--out` and `--force` say.
+
+    Parameters
+    ----------
+    path : Path
+        A folder, or the file of the verb's only picture.
+    force : bool, default False
+        Replace files that exist.
+    """
 
     path: Path
     force: bool = False
 
-    def write(self, made: Mapping[str, Any]) -> list[Path]:
-        """Write tables as CSV, texts and figures by their names, and a manifest; one without a name is the file itself."""
+    def write(self, contents: Mapping[str, Any]) -> list[Path]:
+        """Write files, and a manifest of them unless the only one is `path` itself.
+
+        Parameters
+        ----------
+        contents : mapping of str to DataFrame, Figure or str
+            File name -> a table (written as CSV), a figure or a text. The name "" is `path` itself.
+
+        Returns
+        -------
+        paths : list of Path
+            Of the files that were written.
+
+        Raises
+        ------
+        OutputError
+            A file exists and `force` is not set, or it cannot be written.
+        """
         from matplotlib.figure import Figure
 
         from ..experiments.figures import save
         from ..experiments.tables import write_csv
         from ..files import write_manifest, write_output
 
-        files = []
-        for name, each in made.items():
-            if isinstance(each, Figure):
-                files.append(save(each, self.path / name, force=self.force))
-            elif isinstance(each, str):
-                files.append(write_output(self.path / name, each.encode("utf-8"), self.force, make_folder=True))
+        paths = []
+        for name, content in contents.items():
+            path = self.path / name
+            if isinstance(content, Figure):
+                paths.append(save(content, path, force=self.force))
+            elif isinstance(content, str):
+                text = content.encode("utf-8")
+                paths.append(write_output(path, text, self.force, make_folder=True))
             else:
-                files.append(write_csv(each, self.path / name, self.force))
-        return files if "" in made else [*files, write_manifest(self.path, files, self.force)]
+                paths.append(write_csv(content, path, self.force))
+        if "" not in contents:
+            paths.append(write_manifest(self.path, paths, self.force))
+        return paths
 
 
-def tell(
-    record: Mapping[str, Any], *parts: Any, out: Out | None = None, made: Callable[[], Mapping[str, Any]] | None = None
+def print_result(
+    record: Mapping[str, Any],
+    *parts: Any,
+    out: Out | None = None,
+    make_files: Callable[[], Mapping[str, Any]] | None = None,
 ) -> None:
-    """Print what a verb found: its record as one JSON document, or for people these tables and lines.
+    """Print a verb's result, after writing its files.
 
-    made : gives what is written to `out`. A refusal to write is raised once what was computed has been shown.
+    Parameters
+    ----------
+    record : mapping
+        The JSON document, which `--json` prints alone. The verb's name and the paths of the files
+        are added to it.
+    *parts : str or rich.Table
+        What people see instead.
+    out : Out or None
+        Where the files go. None writes none.
+    make_files : callable or None
+        Returns the files' contents, as `Out.write` takes them. Called only if `out` is given.
+
+    Raises
+    ------
+    DengineError
+        The files could not be written. Raised after the result was printed, so that what was
+        computed is not lost.
     """
     files: list[Path] = []
     refusal: DengineError | None = None
-    if out is not None and made is not None:
+    if out is not None and make_files is not None:
         try:
-            files = out.write(made())
+            files = out.write(make_files())
         except DengineError as error:
             refusal = error
     if as_json():
         from ..representation import to_jsonable
 
-        named = {"verb": click.get_current_context().info_name} | dict(record)
-        written = named if made is None else named | {"files": files}
-        click.echo(json.dumps(to_jsonable(written), indent=2, allow_nan=False))  # NaN, which JSON has not, is null by now
+        document = {"verb": click.get_current_context().info_name} | dict(record)
+        if make_files is not None:
+            document["files"] = files
+        # `to_jsonable` has turned NaN, which JSON lacks, into None.
+        click.echo(json.dumps(to_jsonable(document), indent=2, allow_nan=False))
     else:
-        show(*parts, *(f"Wrote {path}" for path in files))
+        print_parts(*parts, *(f"Wrote {path}" for path in files))
     if refusal is not None:
         raise refusal
 
 
-def show(*parts: Any) -> None:
-    """Print tables and text to stdout; passwords are masked.
+def print_parts(*parts: Any) -> None:
+    """Print tables and texts to stdout, with the passwords of database URLs masked.
 
-    A line is broken between words, a long path never; text of several lines stays as it is.
+    A text of one line is wrapped between words, which keeps long paths whole. A text of several
+    lines is printed as it is.
     """
     from rich.console import Console
 
-    screen = Console() if sys.stdout.isatty() else Console(width=WIDE)
+    screen = Console() if sys.stdout.isatty() else Console(width=SCREEN_WIDTH)
     for part in parts:
-        if isinstance(part, str):
+        is_text = isinstance(part, str)
+        if is_text:
             part = without_password(part)
-            part = part if "\n" in part else fill(part, screen.width, break_long_words=False, break_on_hyphens=False)
-        screen.print(part, highlight=False, markup=False, soft_wrap=isinstance(part, str))
+            if "\n" not in part:
+                part = fill(part, screen.width, break_long_words=False, break_on_hyphens=False)
+        screen.print(part, highlight=False, markup=False, soft_wrap=is_text)
 
 
-def facts(title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")) -> "Table":
-    """A table of named facts, a row each: its name, and its values under `columns`; passwords are masked."""
+def table_of_rows(
+    title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")
+) -> "Table":
+    """Return a table whose first column is bold; passwords are masked.
+
+    Parameters
+    ----------
+    title : str
+    rows : iterable of sequences of str
+        The cells of each row.
+    columns : sequence of str
+        Titles; a table of empty titles has no header.
+    """
     from rich.table import Table
 
     table = Table(title=without_password(title), show_header=any(columns), title_justify="left")
@@ -127,139 +203,198 @@ def facts(title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("
     return table
 
 
-def rows_of(record: Any, *left_out: str) -> Iterator[tuple[str, str]]:
-    """A record's fields, each by its name and as `written`; None and empty ones are left out."""
-    for each in fields(record):
-        value = getattr(record, each.name)
-        if each.name not in left_out and value is not None and not (isinstance(value, Sized) and not value):
-            yield heading(each.name), written(each.name, value)
+def table_of_records(title: str, records: Iterable[Any], *names: str) -> "Table":
+    """Return a table with a row for each record and a column for each of the named fields."""
+    rows = [[format_value(name, getattr(record, name)) for name in names] for record in records]
+    return table_of_rows(title, rows, [heading(name) for name in names])
 
 
-def listed(title: str, records: Iterable[Any], *names: str) -> "Table":
-    """A table of records, a row each, of these fields."""
-    rows = [[written(name, getattr(one, name)) for name in names] for one in records]
-    return facts(title, rows, list(map(heading, names)))
+def field_rows(record: Any, *left_out: str) -> Iterator[tuple[str, str]]:
+    """Yield (heading, formatted value) for each field of a dataclass.
+
+    Fields that are None or empty, and those named in `left_out`, are skipped.
+    """
+    for field in fields(record):
+        value = getattr(record, field.name)
+        is_empty = value is None or (isinstance(value, Sized) and not value)
+        if field.name not in left_out and not is_empty:
+            yield heading(field.name), format_value(field.name, value)
 
 
 def heading(name: str) -> str:
-    """A field's name without its unit: `retrain_max_s` is retrain max."""
+    """Return a field's name as people read it, without its unit: retrain_max_s -> retrain max."""
     return re.sub("_(s|bytes|hz)$", "", name).replace("_", " ")
 
 
-def written(name: str, value: Any) -> str:
-    """A field's value as a person reads it, with the unit that its name ends in."""
+def format_value(name: str, value: Any) -> str:
+    """Return a field's value as people read it.
+
+    Parameters
+    ----------
+    name : str
+        The field's name. Its ending tells the unit, see `FORMATTERS`: `_s`, `_bytes`, `share` ...
+    value : object
+        A number, a text, a dataclass, or a mapping or sequence of these. "-" stands for None, for
+        NaN and for "".
+    """
     if isinstance(value, str) or value is None:
         return without_password(value) if value else "-"
     if is_dataclass(value) and "__str__" in vars(type(value)):
         return str(value)
     if is_dataclass(value):
-        return ", ".join(f"{part} {said}" for part, said in rows_of(value))
+        return ", ".join(f"{title} {text}" for title, text in field_rows(value))
     if isinstance(value, Mapping):
-        return ", ".join(f"{part} {written(part, each)}" for part, each in value.items() if each != 0) or "none"
+        counts = [f"{key} {format_value(key, item)}" for key, item in value.items() if item != 0]
+        return ", ".join(counts) or "none"
     if isinstance(value, list | tuple):
-        titles = PLACES.get(name, ("",) * len(value))
-        return ", ".join(f"{title} {written(name, each)}".strip() for title, each in zip(titles, value, strict=True))
+        titles = TUPLE_TITLES.get(name, ("",) * len(value))
+        pairs = zip(titles, value, strict=True)
+        return ", ".join(f"{title} {format_value(name, item)}".strip() for title, item in pairs)
     if isinstance(value, bool):
         return "yes" if value else "no"
     if math.isnan(value):
         return "-"
-    for ending, write in UNITS.items():
+    for ending, formatter in FORMATTERS.items():
         if name.endswith(ending):
-            return write(value)
+            return formatter(value)
     return f"{value:,.0f}" if float(value).is_integer() else f"{value:,.4g}"
 
 
-def duration(seconds: float) -> str:
-    """A time as a person writes it: 180 µs, 35 ms, 4.6 s, 240 s."""
+def format_duration(seconds: float) -> str:
+    """Return a duration as people write it: 180 µs, 35 ms, 4.6 s, 240 s."""
     if seconds < 0.9995e-3:
         return f"{1e6 * seconds:.0f} µs"
+    if seconds < 9.95e-3:
+        return f"{1e3 * seconds:.1f} ms"
     if seconds < 0.9995:
-        return f"{1e3 * seconds:.1f} ms" if seconds < 9.95e-3 else f"{1e3 * seconds:.0f} ms"
+        return f"{1e3 * seconds:.0f} ms"
     return f"{seconds:.1f} s" if seconds < 99.95 else f"{seconds:.0f} s"
 
 
-def when(seconds: float | None, form: str = "%Y-%m-%d %H:%M:%S UTC") -> str:
-    """A moment, in UTC; seconds since 1970."""
+def format_time(seconds: float | None, form: str = "%Y-%m-%d %H:%M:%S UTC") -> str:
+    """Return a time, given in seconds since 1970, in UTC; "-" for None."""
     return "-" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime(form)
 
 
-def size(n_bytes: float) -> str:
-    """A size as a person writes it: 812 bytes, 296.0 kB, 1.4 MB."""
+def format_size(n_bytes: float) -> str:
+    """Return a size as people write it: 812 bytes, 296.0 kB, 1.4 MB."""
     from rich.filesize import decimal
 
     return decimal(int(n_bytes))
 
 
-PLACES = {"prices": ("check", "escape", "false reject")}  # of a field that is a tuple: what stands at each place
-UNITS: dict[str, Callable[[float], str]] = {  # by the ending of a field's name
-    **dict.fromkeys(("_s", "seconds", "budget"), duration),
-    **dict.fromkeys(("_time", "last_seen"), when),
+# By the name of a field that is a tuple: the title of each of its places.
+TUPLE_TITLES = {"prices": ("check", "escape", "false reject")}
+# By the ending of a field's name.
+FORMATTERS: dict[str, Callable[[float], str]] = {
+    **dict.fromkeys(("_s", "seconds", "budget"), format_duration),
+    **dict.fromkeys(("_time", "last_seen"), format_time),
     **dict.fromkeys(("share", "rate", "tolerance"), percent),
-    "_bytes": size,
+    "_bytes": format_size,
     "_hz": lambda hertz: f"{hertz:g} Hz",
 }
 
 
 def certificate_record(certificate: "Certificate") -> dict[str, Any]:
-    """A certificate as JSON has it: its numbers, and what they say in words."""
-    said = {name: getattr(certificate, name) for name in ("kept", "sentence", "sentence_on_rejects")}
-    return asdict(certificate) | said
+    """Return a certificate for JSON: its numbers, its verdict and its sentences."""
+    sentences = ("kept", "sentence", "sentence_on_rejects")
+    return asdict(certificate) | {name: getattr(certificate, name) for name in sentences}
 
 
 @contextmanager
-def progress(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr that goes when done, none beside JSON; the function it gives advances it by so many.
+def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar on stderr while the block runs; none beside `--json`.
 
-    total : None where how many there are is not known.
+    Parameters
+    ----------
+    label : str
+    total : int or None
+        Number of steps; None if it is not known.
+
+    Yields
+    ------
+    advance : callable
+        `advance(n)` moves the bar by n steps.
     """
     if as_json():
-        yield lambda step: None
+        yield lambda n: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(without_password(label), total=total)
-        yield lambda step: bar.advance(task, step)
+        yield lambda n: bar.advance(task, n)
 
 
-class EndAskedError(Exception):
-    """Raised between two steps to leave a loop that belongs to somebody else; its argument: the steps that were done."""
+class StepInterruptedError(Exception):
+    """Raised between two steps to end a loop after Ctrl-C; its argument is the number of steps."""
 
 
 @contextmanager
-def steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar whose next step ends the work with EndAskedError where Ctrl-C or SIGTERM asked for that; a second at once."""
-    asked, done = False, 0
-    ending = [each for each in signal.Signals if each.name in ("SIGINT", "SIGTERM", "SIGBREAK")]
-    before = {number: signal.getsignal(number) for number in ending}
+def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar, and let Ctrl-C or SIGTERM end the work between two steps.
 
-    def ask(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
-        signal.signal(number, before[signal.Signals(number)])
+    The first signal makes the next call of `count` raise StepInterruptedError. A second one acts at
+    once, as it would have without this block.
 
-    with progress(label, total) as advance:
+    Parameters
+    ----------
+    label : str
+    total : int
+        Number of steps.
+
+    Yields
+    ------
+    count : callable
+        `count(n)` records n finished steps, moves the bar, and raises StepInterruptedError if a
+        signal has arrived.
+    """
+    interrupted = False
+    n_done = 0
+    names = ("SIGINT", "SIGTERM", "SIGBREAK")
+    signals = [number for number in signal.Signals if number.name in names]
+    previous = {number: signal.getsignal(number) for number in signals}
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal interrupted
+        interrupted = True
+        signal.signal(number, previous[signal.Signals(number)])
+
+    with progress_bar(label, total) as advance:
 
         def count(n: int) -> None:
-            nonlocal done
-            done += n
+            nonlocal n_done
+            n_done += n
             advance(n)
-            if asked:
-                raise EndAskedError(done)
+            if interrupted:
+                raise StepInterruptedError(n_done)
 
-        for number in before:
-            signal.signal(number, ask)
+        for number in previous:
+            signal.signal(number, interrupt)
         try:
             yield count
         finally:
-            for number, handler in before.items():
+            for number, handler in previous.items():
                 signal.signal(number, handler)
 
 
-def end_interrupted(*lines: str) -> NoReturn:
-    """Say on stderr what was kept, and end with exit code 130."""
+def exit_interrupted(*lines: str) -> NoReturn:
+    """Print lines to stderr that say what was kept, and end the process with exit code 130."""
     for line in lines:
         click.echo(without_password(line), err=True)
     click.get_current_context().exit(INTERRUPTED)

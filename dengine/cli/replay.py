@@ -1,6 +1,7 @@
-"""`dengine replay`, `compare` and `costs`: recorded streams through fresh engines.
+"""The verbs `dengine replay`, `compare` and `costs`: recorded streams through fresh engines.
 
-Ctrl-C keeps what was finished.
+All three play replays with the same options (`stream_options`). Ctrl-C keeps and shows the replays
+that were finished.
 """
 
 from __future__ import annotations
@@ -18,8 +19,28 @@ from click.core import ParameterSource
 
 from ..errors import percent
 from . import options
-from .options import ALPHA, COUNT, LOWER_BOUND, OWN, RULE, DataChoice, Known, Listed, RecipeChoice, short_name, verb
-from .output import Out, end_interrupted, explain_option, explained, progress, tell, written
+from .options import (
+    ALPHA,
+    COUNT,
+    LOWER_BOUND,
+    OWN_RECIPE,
+    OWN_RULE,
+    CommaList,
+    DataChoice,
+    NameChoice,
+    RecipeChoice,
+    short_name,
+    verb,
+)
+from .output import (
+    Out,
+    exit_interrupted,
+    explain_option,
+    format_value,
+    legend_or_hint,
+    print_result,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,15 +51,22 @@ if TYPE_CHECKING:
     from ..experiments.metrics import ErrorRate
     from ..experiments.replay import Contender, Replay
 
-FEEDBACKS = {"stops": False, "confirmed": True}
-VARIED = ("interval", "alpha", "lower_bound")  # in a grid, as the paper's
+CONFIRM_BY_FEEDBACK = {"stops": False, "confirmed": True}
+GRID_COLUMNS = ("interval", "alpha", "lower_bound")  # what the paper's grid varies
 
 
 @dataclass(frozen=True)
 class Stream:
-    """How streams are played, and what a check takes.
+    """How the recorded stream is played.
 
-    seeds, cycles, shuffle : as in `grid_tasks`.  n_jobs, keep : as in `iterate_replays`.
+    Parameters
+    ----------
+    seeds, cycles, shuffle
+        As in `grid_tasks`.
+    n_jobs, keep
+        As in `iterate_replays`.
+    check_seconds : float, default 5.0
+        How long a verification takes.
     """
 
     seeds: range
@@ -49,10 +77,18 @@ class Stream:
     check_seconds: float = 5.0
 
 
-class Finished(NamedTuple):
-    """The replays that were finished, in their tasks' order.  interrupted : how many, where some are missing.
+class PlayedTasks(NamedTuple):
+    """The replays that were finished.
 
-    costs : wall time and one core's, in seconds; and how many had been kept from an earlier run.
+    Attributes
+    ----------
+    replays : list of Replay
+        In the order of their tasks.
+    interrupted : str
+        A sentence that says how many were finished, if Ctrl-C left some out; else "".
+    costs : dict of str to float
+        seconds : wall time. core_seconds : of one core, over all replays. kept : how many replays
+        had been kept by an earlier run.
     """
 
     replays: list[Replay]
@@ -60,66 +96,111 @@ class Finished(NamedTuple):
     costs: dict[str, float]
 
 
-def _played(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Finished:
-    """Play every task; on Ctrl-C what was finished until then."""
+def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> PlayedTasks:
+    """Play the tasks with a progress bar; on Ctrl-C return those that were finished."""
     from ..experiments.grid import iterate_replays
 
-    done: dict[int, Replay] = {}
-    found, begin = 0, time.perf_counter()
-    with progress(f"replaying {dataset.name}", len(tasks) * (stream.cycles or len(dataset))) as advance:
-        # A callback cannot travel to other processes: there the bar moves a replay at a time.
+    replays: dict[int, Replay] = {}
+    n_kept = 0
+    begin = time.perf_counter()
+    n_cycles = len(tasks) * (stream.cycles or len(dataset))
+    with progress_bar(f"replaying {dataset.name}", n_cycles) as advance:
+        # A callback cannot travel to other processes: there the bar moves by whole replays.
         on_cycle = (lambda cycle: advance(1)) if stream.n_jobs == 1 else None
-        with suppress(KeyboardInterrupt):  # what is missing says so
-            for i, one, kept in iterate_replays(dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle):
-                done[i], found = one, found + kept
-                advance(len(one) if on_cycle is None or kept else 0)
-    some = f"Interrupted: {len(done)} of {len(tasks)} replays were finished" if len(done) < len(tasks) else ""
-    core = sum(each.seconds for each in done.values())
-    costs = {"seconds": time.perf_counter() - begin, "core_seconds": core, "found": found}
-    return Finished([done[i] for i in sorted(done)], some, costs)
+        with suppress(KeyboardInterrupt):
+            for i, replay, kept in iterate_replays(
+                dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle
+            ):
+                replays[i] = replay
+                n_kept += kept
+                advance(len(replay) if on_cycle is None or kept else 0)
+    interrupted = ""
+    if len(replays) < len(tasks):
+        interrupted = f"Interrupted: {len(replays)} of {len(tasks)} replays were finished"
+    costs = {
+        "seconds": time.perf_counter() - begin,
+        "core_seconds": sum(replay.seconds for replay in replays.values()),
+        "kept": n_kept,
+    }
+    return PlayedTasks([replays[i] for i in sorted(replays)], interrupted, costs)
+
+
+_CYCLES = "Only this many parts of each stream.  [default: all]"
+_IN_ORDER = "Play the stream once, in its recorded order, drift included."
+_N_JOBS = "Number of replays at a time; -1: one for each core. Timings are right with 1 only."
+_KEEP = (
+    "Folder of finished replays, which are not played again: an interrupted run continues, and "
+    "other costs are computed at once."
+)
+_SHUFFLES = "Number of shuffled replays of each recipe."
 
 
 def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
-    """How streams are played, handed on as one `Stream`."""
+    """Return the options of how streams are played, handed on as one `Stream`, `stream`.
 
-    def stream(repeats: int, in_order: bool, seed: int, **how: Any) -> Stream:
-        if in_order and click.get_current_context().get_parameter_source("repeats") is not ParameterSource.DEFAULT:
-            raise click.UsageError("--in-order plays the one stream once; leave --repeats out.")
-        return Stream(range(seed, seed + (1 if in_order else repeats)), shuffle=not in_order, **how)
+    Parameters
+    ----------
+    repeats, n_jobs : int
+        Defaults of `--repeats` and `--n-jobs`.
+    least : int
+        Smallest number of repeats.
+    text : str
+        Help of `--repeats`.
+    """
 
-    shuffles = click.option("--repeats", type=click.IntRange(least), default=repeats, show_default=True, help=text)
-    return options.gathered(
+    def make_stream(repeats: int, in_order: bool, seed: int, **settings: Any) -> Stream:
+        if in_order:
+            source = click.get_current_context().get_parameter_source("repeats")
+            if source is not ParameterSource.DEFAULT:
+                raise click.UsageError("--in-order plays the one stream once; leave --repeats out.")
+            repeats = 1
+        return Stream(range(seed, seed + repeats), shuffle=not in_order, **settings)
+
+    return options.bundle_options(
         "stream",
-        stream,
+        make_stream,
         {
-            "repeats": shuffles,
+            "repeats": click.option(
+                "--repeats",
+                type=click.IntRange(least),
+                default=repeats,
+                show_default=True,
+                help=text,
+            ),
             "seed": options.seed_option,
-            "cycles": click.option("--cycles", type=COUNT, help="Only so many parts of each stream.  [default: all]"),
-            "in_order": click.option("--in-order", is_flag=True, help="Play the stream once, as recorded, drift and all."),
-            "n_jobs": options.n_jobs_option(n_jobs, "Replays at a time; -1: one a core. Timings are honest with 1 only."),
-            "keep": click.option("--keep", type=options.FOLDER, metavar="FOLDER", help=KEEP),
+            "cycles": click.option("--cycles", type=COUNT, help=_CYCLES),
+            "in_order": click.option("--in-order", is_flag=True, help=_IN_ORDER),
+            "n_jobs": options.n_jobs_option(n_jobs, _N_JOBS),
+            "keep": click.option("--keep", type=options.FOLDER, metavar="FOLDER", help=_KEEP),
             "check_seconds": options.check_option,
         },
     )
 
 
-KEEP = "Finished replays are kept here, and not played again: an interrupted run goes on, other costs come at once."
-SHUFFLES = "Shuffled replays of each recipe."
-LISTS = {
-    "alphas": click.option("--alphas", type=Listed(ALPHA), help="To be tried, as in 0.5,0.1,0.05."),
-    "lower_bounds": click.option("--lower-bounds", type=Listed(LOWER_BOUND), help="To be tried, as in 0.8,0.9,0.95."),
+GRID_LISTS = {
+    "alphas": click.option("--alphas", type=CommaList(ALPHA), help="To try, as in 0.5,0.1,0.05."),
+    "lower_bounds": click.option(
+        "--lower-bounds", type=CommaList(LOWER_BOUND), help="To try, as in 0.8,0.9,0.95."
+    ),
 }
-POLICIES = LISTS | {
-    "intervals": click.option("--intervals", type=Listed(Known("interval")), help="To be tried."),
-    "guarantees": click.option("--guarantees", type=Listed(Known("guarantee", RULE)), help="To be tried."),
+POLICY_LISTS = GRID_LISTS | {
+    "intervals": click.option(
+        "--intervals", type=CommaList(NameChoice("interval")), help="To try."
+    ),
+    "guarantees": click.option(
+        "--guarantees", type=CommaList(NameChoice("guarantee", OWN_RULE)), help="To try."
+    ),
 }
 
 
-@verb("dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3 --out out/")
+@verb(
+    "dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3 "
+    "--out out/"
+)
 @options.data_options()
 @options.recipe_options
-@click.option("--confirm", is_flag=True, help="Accepted good parts are known to be fine afterwards.")
-@stream_options(30, 1, 1, SHUFFLES)
+@click.option("--confirm", is_flag=True, help="Accepted good parts are confirmed afterwards.")
+@stream_options(30, 1, 1, _SHUFFLES)
 @explain_option
 @options.out_option
 def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
@@ -127,35 +208,43 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
 
     Ctrl-C shows the replays that were finished.
     """
-    _replay([choice.contender()], {"confirms": [confirm]}, **played)
+    _replay_and_print([choice.make_contender()], {"confirms": [confirm]}, **played)
+
+
+_REDUCERS = "With commas between; names that are no reducers of dengine are baselines."
+_PAPER = "The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals."
+_FEEDBACK = (
+    f"What the engine learns about accepted parts, of {','.join(CONFIRM_BY_FEEDBACK)}: only their "
+    f"stops, or also which are good."
+)
 
 
 @verb("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/")
 @options.data_options()
 @click.option(
     "--reducers",
-    "asked",
+    "names",
     default="conv,umap,pca",
     show_default=True,
-    type=Listed(Known("method", OWN)),
-    help="With commas between; those that are not dengine's are baselines in the same loop.",
+    type=CommaList(NameChoice("method", OWN_RECIPE)),
+    help=_REDUCERS,
 )
 @options.policy_options
-@click.option("--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals.")
-@options.gathered("lists", options.given, POLICIES)
+@click.option("--paper", is_flag=True, help=_PAPER)
+@options.bundle_options("lists", options.drop_none, POLICY_LISTS)
 @click.option(
     "--feedback",
-    type=Listed(click.Choice(list(FEEDBACKS))),
+    type=CommaList(click.Choice(list(CONFIRM_BY_FEEDBACK))),
     default="stops",
     show_default=True,
     metavar="LIST",
-    help=f"What is known of accepted parts, of {','.join(FEEDBACKS)}: their stops alone, or of good ones too.",
+    help=_FEEDBACK,
 )
-@stream_options(30, 1, 1, SHUFFLES)
+@stream_options(30, 1, 1, _SHUFFLES)
 @explain_option
 @options.out_option
 def compare(
-    asked: Sequence[str],
+    names: Sequence[str],
     settings: Mapping[str, Any],
     paper: bool,
     lists: Mapping[str, Any],
@@ -164,192 +253,300 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Reducers and baselines, under one policy or a grid of them. umap-learn takes much longer than the others. Ctrl-C
-    shows the replays that were finished.
+    Methods are reducers and baselines, under one policy or a grid of policies. umap-learn takes
+    much longer than the others. Ctrl-C shows the replays that were finished.
     """
-    if len({short_name(one) for one in asked}) < len(asked):
-        raise click.UsageError(f"--reducers needs a name of its own for each, got {', '.join(map(short_name, asked))}.")
+    short_names = [short_name(name) for name in names]
+    if len(set(short_names)) < len(short_names):
+        raise click.UsageError(
+            f"--reducers needs a different name for each method, got {', '.join(short_names)}."
+        )
     from ..experiments.paper import GRID
 
     grid: dict[str, Any] = {**(GRID if paper else {}), **lists}
-    _must_be_listed(settings, grid)
-    who = [RecipeChoice(one, settings).contender() for one in asked]
-    _replay(who, grid | {"confirms": [FEEDBACKS[name] for name in feedback]}, **played)
+    _refuse_value_beside_list(settings, grid)
+    grid["confirms"] = [CONFIRM_BY_FEEDBACK[name] for name in feedback]
+    contenders = [RecipeChoice(name, settings).make_contender() for name in names]
+    _replay_and_print(contenders, grid, **played)
 
 
-def _must_be_listed(settings: Mapping[str, Any], lists: Iterable[str]) -> None:
-    """UsageError for one value of a setting of which a list is tried."""
+def _refuse_value_beside_list(settings: Mapping[str, Any], lists: Iterable[str]) -> None:
+    """Raise UsageError if one value was given for a setting of which a list is tried."""
     for name in settings:
         if f"{name}s" in lists:
-            flag = name.replace("_", "-")
-            raise click.UsageError(f"--{flag} names one value, here it is asked for: name those to be tried, --{flag}s.")
+            flag = f"--{name.replace('_', '-')}"
+            raise click.UsageError(
+                f"{flag} gives one value, but a list is tried here: use {flag}s."
+            )
 
 
-def _replay(who: Sequence[Contender], grid: Mapping[str, Any], source: DataChoice, stream: Stream, out: Out | None) -> None:
-    """Play, and tell what was finished: tables, or one JSON document; CSV, tables and pictures in `out`."""
+def _replay_and_print(
+    contenders: Sequence[Contender],
+    grid: Mapping[str, Any],
+    source: DataChoice,
+    stream: Stream,
+    out: Out | None,
+) -> None:
+    """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
+
+    Exits with code 130 after Ctrl-C.
+    """
     from ..experiments import tables
     from ..experiments.grid import grid_tasks
     from ..experiments.paper import findings
 
     dataset = source.load()
-    tasks = grid_tasks(who, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid)
-    finished = _played(dataset, tasks, stream)
-    if not (replays := finished.replays):
-        end_interrupted(f"{finished.interrupted}; there is nothing to show.")
+    tasks = grid_tasks(
+        contenders, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid
+    )
+    replays, interrupted, costs = _play_tasks(dataset, tasks, stream)
+    if not replays:
+        exit_interrupted(f"{interrupted}; there is nothing to show.")
     frame = tables.frame_of(replays, stream.check_seconds)
     rows = tables.pool(frame, replays)
-    by_name = _grouped(replays, lambda each: each.name)
+    by_name = _group_replays(replays, lambda replay: replay.name)
     title = _title(dataset.name, by_name, not stream.shuffle)
-    # The paper's findings are of a grid under one guarantee and one feedback.
-    found = findings(frame) if _varies(frame, *VARIED) and not _varies(frame, "guarantee", "stops", "confirm") else []
-    record = {"data": dataset.name, "in_order": not stream.shuffle, "faults": dataset.faults, "rows": rows}
-    record |= {"interrupted": bool(finished.interrupted), "findings": found, "costs": finished.costs}
-    lines = [tables.pooled_table(rows, title, explained(tables.LEGEND)), *tables.promise_lines(rows)]
-    for name, some in by_name.items():
-        retrains = [each for one in some for each in one.retrains]
-        lines.append(f"{name}: {tables.retrain_line(retrains)}")
-    took, core, kept = (written(name, finished.costs[name]) for name in ("seconds", "core_seconds", "found"))
-    again = f"; {kept} of them were kept from before" if finished.costs["found"] else ""
-    lines += [*found, f"{len(replays)} replay{'' if len(replays) == 1 else 's'} in {took}, {core} of one core{again}."]
-    tell(record, *lines, out=out, made=lambda: dict(_made(frame, replays, title)))
-    if finished.interrupted:
-        end_interrupted(f"{finished.interrupted}; the table shows those.")
+    # The paper's findings are about a grid under one guarantee and one feedback.
+    is_paper_grid = _varies(frame, *GRID_COLUMNS)
+    is_paper_grid = is_paper_grid and not _varies(frame, "guarantee", "stops", "confirm")
+    finding_lines = findings(frame) if is_paper_grid else []
+    record = {
+        "data": dataset.name,
+        "in_order": not stream.shuffle,
+        "faults": dataset.faults,
+        "rows": rows,
+        "interrupted": bool(interrupted),
+        "findings": finding_lines,
+        "costs": costs,
+    }
+    legend = legend_or_hint(tables.LEGEND)
+    parts = [tables.pooled_table(rows, title, legend), *tables.promise_lines(rows)]
+    for name, group in by_name.items():
+        retrains = [retrain for replay in group for retrain in replay.retrains]
+        parts.append(f"{name}: {tables.retrain_line(retrains)}")
+    parts += [*finding_lines, _costs_line(len(replays), costs)]
+    print_result(
+        record, *parts, out=out, make_files=lambda: dict(_replay_files(frame, replays, title))
+    )
+    if interrupted:
+        exit_interrupted(f"{interrupted}; the table shows those.")
 
 
-def _grouped(replays: Sequence[Replay], key: Callable[[Replay], str]) -> dict[str, list[Replay]]:
+def _costs_line(n_replays: int, costs: Mapping[str, float]) -> str:
+    """Return a sentence that says how many replays were played, in what time."""
+    seconds = format_value("seconds", costs["seconds"])
+    core_seconds = format_value("core_seconds", costs["core_seconds"])
+    kept = f"; {costs['kept']} of them were kept from before" if costs["kept"] else ""
+    plural = "" if n_replays == 1 else "s"
+    return f"{n_replays} replay{plural} in {seconds}, {core_seconds} of one core{kept}."
+
+
+def _group_replays(
+    replays: Sequence[Replay], key: Callable[[Replay], str]
+) -> dict[str, list[Replay]]:
+    """Return the replays by their key, in the order of first appearance."""
     groups: dict[str, list[Replay]] = {}
-    for each in replays:
-        groups.setdefault(key(each), []).append(each)
+    for replay in replays:
+        groups.setdefault(key(replay), []).append(replay)
     return groups
 
 
 def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> str:
-    each = sorted({len({replay.seed for replay in replays}) for replays in by_name.values()})
-    cycles, order = len(next(iter(by_name.values()))[0]), "in recorded order" if in_order else "shuffled"
-    how = f"{order}, {' or '.join(map(str, each))} replay{'s' if each[-1] > 1 else ''} of {cycles} cycles"
-    return f"{', '.join(by_name)} on {'simulated insertions' if data == 'insertion' else data}, {how}"
+    """Return the title of tables and pictures: who played what, how often, and how many cycles."""
+    counts = sorted({len({replay.seed for replay in group}) for group in by_name.values()})
+    n_cycles = len(next(iter(by_name.values()))[0])
+    order = "in recorded order" if in_order else "shuffled"
+    dataset = "simulated insertions" if data == "insertion" else data
+    plural = "s" if counts[-1] > 1 else ""
+    repeats = f"{' or '.join(map(str, counts))} replay{plural} of {n_cycles} cycles"
+    return f"{', '.join(by_name)} on {dataset}, {order}, {repeats}"
 
 
 def _varies(frame: pd.DataFrame, *names: str) -> bool:
+    """Return whether any of these columns holds more than one value."""
     return any(len(frame[name].unique()) > 1 for name in names)
 
 
-def _made(frame: pd.DataFrame, replays: Sequence[Replay], title: str) -> Iterator[tuple[str, Any]]:
+def _replay_files(
+    frame: pd.DataFrame, replays: Sequence[Replay], title: str
+) -> Iterator[tuple[str, Any]]:
+    """Yield (file name, content): the CSV, curves or the grid with its tables, and the maps."""
     import numpy as np
 
     from ..experiments.figures import curves, embedding_map, grid_figure
     from ..experiments.paper import grid_lines
 
     yield "replays.csv", frame
-    if _varies(frame, *VARIED):
+    if _varies(frame, *GRID_COLUMNS):
         yield "tables.md", "\n".join(grid_lines(frame)) + "\n"
-        for name, some in _grouped(replays, lambda each: _row_name(each, frame, "interval")).items():
-            yield _file_name(f"grid_{name}"), grid_figure(some, name)
+        groups = _group_replays(replays, lambda replay: _row_name(replay, frame, "interval"))
+        for name, group in groups.items():
+            yield _file_name(f"grid_{name}"), grid_figure(group, name)
     else:
-        yield "curves.png", curves(_grouped(replays, lambda each: _row_name(each, frame)), title)
-    for name, (one, *_) in _grouped(replays, lambda each: each.name).items():
-        if not np.isnan(one.position).all():  # baselines embed nothing
-            said = f"{name}, newest parts of one replay (seed {one.seed})"
-            yield _file_name(f"map_{name}"), embedding_map(one, title=said)
+        groups = _group_replays(replays, lambda replay: _row_name(replay, frame))
+        yield "curves.png", curves(groups, title)
+    for name, (first, *_) in _group_replays(replays, lambda replay: replay.name).items():
+        if not np.isnan(first.position).all():  # baselines embed nothing
+            map_title = f"{name}, newest parts of one replay (seed {first.seed})"
+            yield _file_name(f"map_{name}"), embedding_map(first, title=map_title)
 
 
 def _file_name(title: str) -> str:
+    """Return the name of a picture, in characters that every file system takes."""
     return re.sub(r"[^\w.=-]+", "_", title) + ".png"
 
 
-def _row_name(replay: Replay, frame: pd.DataFrame, *more: str) -> str:
-    """The contender, and in which of the columns that vary it differs from its other rows."""
+def _row_name(replay: Replay, frame: pd.DataFrame, *always: str) -> str:
+    """Return a name that tells a replay's row from others.
+
+    It is the contender's, with the settings that vary in the frame and those named in `always`.
+    """
     policy = replay.recipe.policy
-    known = "good ones confirmed" if replay.confirm else "stops alone"
-    said = {"guarantee": policy.guarantee, "stops": policy.stops, "confirm": known, "interval": policy.interval}
-    return ", ".join([replay.name, *(word for name, word in said.items() if name in more or _varies(frame, name))])
+    settings = {
+        "guarantee": policy.guarantee,
+        "stops": policy.stops,
+        "confirm": "good ones confirmed" if replay.confirm else "stops alone",
+        "interval": policy.interval,
+    }
+    shown = [text for name, text in settings.items() if name in always or _varies(frame, name)]
+    return ", ".join([replay.name, *shown])
 
 
 CAPTION = (
-    "cost: of a part, the mean over shuffles of {cycles} parts, {reporting} of them; below it what it would be with the "
-    "errors at the ends of their 95 % intervals. LB all: everything is verified. late: over the last third of a shuffle, "
-    "once something was learned. verified: share of the parts that were checked. bad of accepted, good of rejected: over "
-    "these shuffles; below them their intervals. The choice, >, was the cheapest in the other half of the shuffles, so its "
-    "figures here are not those that it was picked for. All shuffles play the same parts: parts that were recorded later "
-    "are the clean test."
+    "cost: of a part, the mean over shuffles of {cycles} parts, {reporting} of them; below it the "
+    "cost with the errors at the ends of their 95 % intervals. LB all: everything is verified. "
+    "late: over the last third of a shuffle, when something has been learned. verified: share of "
+    "the parts that were checked. bad of accepted, good of rejected: over these shuffles, with "
+    "their intervals below. The choice, >, was the cheapest in the other half of the shuffles, so "
+    "its figures here are not those that it was picked for. All shuffles play the same parts: only "
+    "parts that are recorded later are a clean test."
 )
 COLUMNS = ("", "alpha", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
-SAID = ("recipe", "verdict", "policy", "sentence", "costs", "cycles", "choosing", "reporting")
+CURVE_FIELDS = (
+    "recipe",
+    "verdict",
+    "policy",
+    "sentence",
+    "costs",
+    "cycles",
+    "choosing",
+    "reporting",
+)
 _COST = click.FloatRange(0.0)
-_ESCAPE = "What a bad part costs that is accepted: a stop, or worse."
+_ESCAPE = "Cost of a bad part that is accepted: a line stop, or worse."
+_FALSE_REJECT = "Cost of a good part that is rejected."
 PRICES = {
-    "check": click.option("--check", type=_COST, default=5.0, show_default=True, help="What one verification costs."),
+    "check": click.option(
+        "--check", type=_COST, default=5.0, show_default=True, help="Cost of one verification."
+    ),
     "escape": click.option("--escape", type=_COST, required=True, help=_ESCAPE),
-    "false_reject": click.option("--false-reject", type=_COST, required=True, help="What a good part costs, sent back."),
+    "false_reject": click.option("--false-reject", type=_COST, required=True, help=_FALSE_REJECT),
 }
 
 
-@verb("dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30")
+@verb(
+    "dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 "
+    "--false-reject 30"
+)
 @options.data_options()
-@options.gathered("paid", dict, PRICES)
-@click.option("--cost-unit", default="s", show_default=True, help="Of these costs, for people: s, EUR, ...")
+@options.bundle_options("part_prices", dict, PRICES)
+@click.option(
+    "--cost-unit", default="s", show_default=True, help="Unit of these costs: s, EUR, ..."
+)
 @options.recipe_options
-@options.gathered("lists", options.given, LISTS)
-@stream_options(10, 2, -1, "Shuffles of each policy; half choose.")
+@options.bundle_options("lists", options.drop_none, GRID_LISTS)
+@stream_options(10, 2, -1, "Number of shuffles of each policy; half of them choose.")
 @explain_option
 @options.out_option
 def costs(
     choice: RecipeChoice,
-    paid: dict[str, float],
+    part_prices: dict[str, float],
     cost_unit: str,
     lists: Mapping[str, Any],
     source: DataChoice,
     stream: Stream,
     out: Out | None,
 ) -> None:
-    """Say which alpha and LB pay.
+    """Find the alpha and LB that pay.
 
-    What a part of your recordings costs under each, where everything is verified, and, with --stops all or audits, where
-    parts pass by these costs (--guarantee cost). All costs are in one unit, as seconds of production or money. Ctrl-C shows
-    the curve of the shuffles that every policy has finished.
+    Shows what a part of your recordings costs under each alpha and LB, where everything is
+    verified, and, with --stops all or audits, where parts pass by these costs (--guarantee cost).
+    All costs are in one unit, such as seconds of production or money. Ctrl-C shows the curve of the
+    shuffles that every policy has finished.
     """
-    _must_be_listed(choice.settings, ("alphas", "lower_bounds"))
+    _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import ALPHAS, LOWER_BOUNDS, curve_of, priced_tasks
     from ..experiments.figures import cost_picture
     from ..experiments.metrics import Costs
-    from ..experiments.tables import figures
+    from ..experiments.tables import table_of_numbers
 
-    priced, tried = Costs(**paid), {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | dict(lists)
-    tasks = priced_tasks(choice.contender(), priced, **tried, seeds=stream.seeds, cycles=stream.cycles)
-    finished = _played(source.load(), tasks, stream)
-    seeds = [each.seed for each in finished.replays]
-    if finished.interrupted and sum(seeds.count(seed) == len(tasks) / len(stream.seeds) for seed in set(seeds)) < 2:
-        end_interrupted("Interrupted: fewer than two shuffles were finished under every policy; there is nothing to show.")
-    curve = curve_of(finished.replays, priced)
-    frame, every = curve.to_frame(), f"{curve.costs.check:.3g}"
-    first = ("" if curve.policy else ">", "-", "all", every, every, "100 %", "-", "-")
-    cells = [first, *(_cells(row, row.policy == curve.policy) for row in curve.rows)]
-    tell(
-        {"data": curve.dataset, "unit": cost_unit, "interrupted": bool(finished.interrupted)}
-        | {name: getattr(curve, name) for name in SAID}
-        | {"rows": frame.to_dict("records")},
-        figures(
-            f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}, by alpha and LB",
-            [dict(zip(COLUMNS, each, strict=True)) for each in cells],
-            explained(CAPTION.format(reporting=curve.reporting, cycles=curve.cycles)),
+    part_costs = Costs(**part_prices)
+    grid = {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | dict(lists)
+    contender = choice.make_contender()
+    tasks = priced_tasks(contender, part_costs, **grid, seeds=stream.seeds, cycles=stream.cycles)
+    replays, interrupted, _ = _play_tasks(source.load(), tasks, stream)
+    if interrupted and _n_complete(replays, len(tasks) // len(stream.seeds)) < 2:
+        exit_interrupted(
+            "Interrupted: fewer than two shuffles were finished under every policy; there is "
+            "nothing to show."
+        )
+    curve = curve_of(replays, part_costs)
+    frame = curve.to_frame()
+    check = f"{part_costs.check:.3g}"
+    verify_all = ("" if curve.policy else ">", "-", "all", check, check, "100 %", "-", "-")
+    cells = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
+    record = {"data": curve.dataset, "unit": cost_unit, "interrupted": bool(interrupted)}
+    record |= {name: getattr(curve, name) for name in CURVE_FIELDS}
+    print_result(
+        record | {"rows": frame.to_dict("records")},
+        table_of_numbers(
+            f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}, by alpha and "
+            "LB",
+            [dict(zip(COLUMNS, row, strict=True)) for row in cells],
+            legend_or_hint(CAPTION.format(reporting=curve.reporting, cycles=curve.cycles)),
         ),
         curve.sentence,
         out=out,
-        made=lambda: {"costs.csv": frame, "costs.png": cost_picture(curve, unit=cost_unit)},
+        make_files=lambda: {
+            "costs.csv": frame,
+            "costs.png": cost_picture(curve, unit=cost_unit),
+        },
     )
-    if finished.interrupted:
-        end_interrupted(f"{finished.interrupted}; the shuffles that all have are shown.")
+    if interrupted:
+        exit_interrupted(f"{interrupted}; the shuffles that all policies finished are shown.")
 
 
-def _cells(row: PolicyCost, chosen: bool) -> tuple[str, ...]:
-    numbers = (f"{row.policy.alpha:g}", percent(row.policy.lower_bound, "g"))
-    numbers = ("by cost", "-") if row.policy.guarantee == "cost" else numbers
-    cost = f"{row.cost:.3g}" + (f"\n{row.lower:.3g} to {row.upper:.3g}" if row.certain else "")
-    shares = (percent(row.verified, ".0f"), _wrong(row.bad), _wrong(row.good))
-    return (">" if chosen else "", *numbers, cost, f"{row.late:.3g}", *shares)
+def _n_complete(replays: Sequence[Replay], n_policies: int) -> int:
+    """Return the number of shuffles that every policy has played."""
+    seeds = [replay.seed for replay in replays]
+    return sum(seeds.count(seed) == n_policies for seed in set(seeds))
 
 
-def _wrong(error: ErrorRate) -> str:
+def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
+    """Return the cells of a policy's row, under the titles in `COLUMNS`."""
+    alpha = f"{row.policy.alpha:g}"
+    bound = percent(row.policy.lower_bound, "g")
+    if row.policy.guarantee == "cost":
+        alpha = "by cost"
+        bound = "-"
+    cost = f"{row.cost:.3g}"
+    if row.certain:
+        cost += f"\n{row.lower:.3g} to {row.upper:.3g}"
+    return (
+        ">" if is_chosen else "",
+        alpha,
+        bound,
+        cost,
+        f"{row.late:.3g}",
+        percent(row.verified, ".0f"),
+        _error_cell(row.bad),
+        _error_cell(row.good),
+    )
+
+
+def _error_cell(error: ErrorRate) -> str:
+    """Return `wrong of decided` with the interval of the share below it; "-" without decisions."""
     if not error.decided:
         return "-"
-    return f"{error.wrong} of {error.decided}\n{100 * error.lower:.2g} to {percent(error.upper, '.2g')}"
+    interval = f"{100 * error.lower:.2g} to {percent(error.upper, '.2g')}"
+    return f"{error.wrong} of {error.decided}\n{interval}"

@@ -1,19 +1,36 @@
-"""`dengine run`: an engine drives a cell, and goes on where its store left off."""
+"""The verb `dengine run`: an engine drives a cell, and continues where its store ended.
+
+`CELLS` has a function for each kind of cell: the parts of a recording, the simulated cell, or a
+Universal Robots controller.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zlib import crc32
 
 import click
 
 from ..errors import CellError, SettingError, expect, percent
-from . import options, output
+from . import options
 from .options import DataChoice, RecipeChoice, short_name, verb
-from .output import EndAskedError, Out, as_json, certificate_record, end_interrupted, facts, rows_of, steps, tell, written
+from .output import (
+    Out,
+    StepInterruptedError,
+    as_json,
+    certificate_record,
+    exit_interrupted,
+    explain_option,
+    field_rows,
+    format_value,
+    interruptible_steps,
+    legend_or_hint,
+    print_result,
+    table_of_rows,
+)
 
 if TYPE_CHECKING:
     from ..cells.base import Cell
@@ -22,26 +39,64 @@ if TYPE_CHECKING:
     from ..records import TraceSpec
     from ..store.sql import SqlStore
 
-Driven = tuple["Cell", str, "TraceSpec | None"]  # what is driven, what it is called, and the form of its traces
-STRETCHES = 6
-KINDS = "replay: the parts of --data, in their order. simulated: physics in MuJoCo. ur: a Universal Robots controller."
+STRETCHES = 6  # rows of the table
+
+
+class CellToDrive(NamedTuple):
+    """A cell, its name for people, and the contract of its traces, if it is known beforehand."""
+
+    cell: Cell
+    name: str
+    trace_spec: TraceSpec | None
+
+
+class DrivenRun(NamedTuple):
+    """What was done in a run.
+
+    Attributes
+    ----------
+    replay : Replay
+        The finished cycles.
+    safe_mode_changes : list of dict
+        `cycle` after which safe mode began or ended, and its `reason`, "" where it ended.
+    failure : CellError or None
+        What ended the run, if the cell failed.
+    """
+
+    replay: Replay
+    safe_mode_changes: list[dict[str, Any]]
+    failure: CellError | None
+
+
+_CELL = (
+    "replay: the parts of --data, in their order. simulated: physics in MuJoCo. ur: a Universal "
+    "Robots controller."
+)
+_CYCLES = "Number of parts to insert, one in each cycle."
+_STORE = "Keeps everything; without a store the run is forgotten."
+_SHADOW = "Verify every part; what the model would have done is only recorded."
 
 
 @verb("dengine run --cell replay --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9")
 @click.option(
-    "--cell", "kind", type=click.Choice(("replay", "simulated", "ur")), default="replay", show_default=True, help=KINDS
+    "--cell",
+    "kind",
+    type=click.Choice(("replay", "simulated", "ur")),
+    default="replay",
+    show_default=True,
+    help=_CELL,
 )
 @click.option("--host", metavar="HOST[:PORT]", help="The robot's address, for --cell ur.")
 @options.data_options()
 @options.scenario_option
 @options.check_option
-@click.option("--cycles", type=options.COUNT, default=300, show_default=True, help="Parts to insert, one a cycle.")
-@options.store_option("Remembers everything; without one the run is forgotten.")
+@click.option("--cycles", type=options.COUNT, default=300, show_default=True, help=_CYCLES)
+@options.store_option(_STORE)
 @options.recipe_options
 @options.new_seed_option
 @options.allow_import_option
-@click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
-@output.explain_option
+@click.option("--shadow", is_flag=True, help=_SHADOW)
+@explain_option
 @options.out_option
 def run(
     choice: RecipeChoice,
@@ -53,122 +108,189 @@ def run(
     allow_import: bool,
     check_seconds: float,
     out: Out | None,
-    **cell_of: Any,
+    **cell_settings: Any,
 ) -> None:
     """Drive a cell: verify, learn, and verify less.
 
-    With a store that exists the engine goes on where it was. The simulated cell then makes new parts, and a recording goes
-    on after its last part that was labelled or accepted: no part is learned from twice. A robot runs
-    training/ur_cell.script, or a program of the same handshake; --trigger and --samples say what is recorded of it.
-    Where too much goes wrong, or looks like nothing known, everything is verified until fresh evidence says otherwise: the
-    safe mode. Ctrl-C or SIGTERM ends the run after the cycle that is under way and shows what was done; twice, at once.
+    With a store that exists the engine continues where it was. The simulated cell then makes new
+    parts, and a recording continues after its last part that was labelled or accepted: no part is
+    learned from twice. A robot runs training/ur_cell.script, or a program with the same handshake;
+    --trigger and --samples say what is recorded of it. If too much goes wrong, or if traces look
+    like nothing known, every part is verified until fresh evidence shows otherwise: safe mode.
+    Ctrl-C or SIGTERM ends the run after the current cycle and shows what was done; a second one
+    ends it at once.
     """
     if kind == "simulated":
-        options.must_have("the simulated cell", "sim", "mujoco")
+        options.require_modules("the simulated cell", "sim", "mujoco")
     from ..engine.engine import DataEngine, core_of
 
-    used = DataEngine.open_or_create(store, seed, recipe=choice.if_asked(), allow_import=allow_import)
-    with ExitStack() as opened, used as engine:
+    opened = DataEngine.open_or_create(
+        store, seed, recipe=choice.load_if_given(), allow_import=allow_import
+    )
+    with ExitStack() as stack, opened as engine:
         if shadow:
             engine.set_shadow(True)
-        cell_of |= {"store": engine.store, "seed": engine.seed, "cycles": cycles, "check_s": check_seconds}
-        cell, name, form = CELLS[kind](**cell_of)
-        if form is not None:
-            core_of(engine).set_trace_spec(form)
-        opened.callback(getattr(cell, "close", lambda: None))
-        log, changes, failure = _drive(engine, cell, cycles, name)
-        said: dict[str, Any] = {"check_seconds": check_seconds, "safe_mode": engine.safe_mode, "safe_mode_changes": changes}
-        certificate = engine.certificate()
-    title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
-    if len(log):
-        said |= {"title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
-        _report(log, said | {"certificate": certificate_record(certificate)}, cell, out)
-    left = cycles - len(log)
-    kept = f"Everything up to cycle {len(log)} is in {store}; the same command with --cycles {left} goes on there."
-    if store is None:
-        kept = "Nothing was stored: --store FILE keeps a run, and goes on with it."
-    if failure is not None:
-        raise CellError(f"{failure} {len(log)} of {cycles} cycles were done. {kept}") from failure
-    if left:
-        shown = "the table shows those" if len(log) else "there is nothing to show"
-        end_interrupted(f"Interrupted: {len(log)} of {cycles} cycles were done; {shown}.", kept)
+        cell, name, trace_spec = CELLS[kind](
+            store=engine.store,
+            seed=engine.seed,
+            cycles=cycles,
+            check_seconds=check_seconds,
+            **cell_settings,
+        )
+        if trace_spec is not None:
+            core_of(engine).set_trace_spec(trace_spec)
+        stack.callback(getattr(cell, "close", lambda: None))
+        driven = _drive(engine, cell, cycles, name)
+        record: dict[str, Any] = {
+            "check_seconds": check_seconds,
+            "safe_mode": engine.safe_mode,
+            "safe_mode_changes": driven.safe_mode_changes,
+            "certificate": certificate_record(engine.certificate()),
+        }
+    n_done = len(driven.replay)
+    if n_done:
+        resumed = ", resumed" if engine.resumed else ""
+        record |= {
+            "title": f"{name}, {short_name(engine.recipe.name)}{resumed}",
+            "simulated": kind == "simulated",
+            "interrupted": n_done < cycles,
+        }
+        _print_run(driven.replay, record, cell, out)
+    n_left = cycles - n_done
+    kept = "Nothing was stored: --store FILE keeps a run, so that it can be continued."
+    if store is not None:
+        kept = (
+            f"Everything up to cycle {n_done} is in {store}; the same command with --cycles "
+            f"{n_left} continues there."
+        )
+    if driven.failure is not None:
+        text = f"{driven.failure} {n_done} of {cycles} cycles were done. {kept}"
+        raise CellError(text) from driven.failure
+    if n_left:
+        shown = "the table shows those" if n_done else "there is nothing to show"
+        exit_interrupted(f"Interrupted: {n_done} of {cycles} cycles were done; {shown}.", kept)
 
 
-def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> tuple[Replay, list[dict[str, Any]], CellError | None]:
-    """What was done, when the safe mode began or ended, and what ended the run, where the cell failed."""
-    from ..experiments.replay import Seen, follow, gather
+def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
+    """Let the engine drive the cell with a progress bar, until Ctrl-C or until the cell fails."""
+    from ..experiments.replay import ObservedCycle, observe_cycles, to_replay
 
-    seen, changes, mode, failure = list[Seen](), list[dict[str, Any]](), engine.safe_mode, None
+    observed = list[ObservedCycle]()
+    changes = list[dict[str, Any]]()
+    reason = engine.safe_mode
+    failure = None
     try:
-        # Pressed twice, Ctrl-C ends even a cycle that does not end; what was done before it is known.
-        with suppress(EndAskedError, KeyboardInterrupt), steps(name, cycles) as count:
-            for each in follow(engine, cell, cycles):
-                seen.append(each)
-                if each.cycle.safe_mode != mode:
-                    mode = each.cycle.safe_mode
-                    changes.append({"cycle": each.cycle.index + 1, "reason": mode})
+        # A second Ctrl-C ends even a cycle that does not end; the cycles before it are known.
+        with (
+            suppress(StepInterruptedError, KeyboardInterrupt),
+            interruptible_steps(name, cycles) as count,
+        ):
+            for item in observe_cycles(engine, cell, cycles):
+                observed.append(item)
+                if item.cycle.safe_mode != reason:
+                    reason = item.cycle.safe_mode
+                    changes.append({"cycle": item.cycle.index + 1, "reason": reason})
                     if not as_json():
-                        click.echo(_mode_line(changes[-1]), err=True)
-                count(1)  # which may end the run, between two cycles: no part is left half dealt with
+                        click.echo(_safe_mode_line(changes[-1]), err=True)
+                count(1)  # may end the run here, between two cycles
     except CellError as error:
         failure = error
-    return gather(seen, engine.recipe), changes, failure
+    return DrivenRun(to_replay(observed, engine.recipe), changes, failure)
 
 
-def _mode_line(change: Mapping[str, Any]) -> str:
-    """After which cycle the safe mode began, for a reason; or ended, for none."""
-    what = f"safe mode, every part is verified: {change['reason']}" if change["reason"] else "safe mode ended"
-    return f"After cycle {change['cycle']}: {what}."
+def _safe_mode_line(change: Mapping[str, Any]) -> str:
+    """Return a sentence: after which cycle safe mode began, and why, or that it ended."""
+    event = "safe mode ended"
+    if change["reason"]:
+        event = f"safe mode, every part is verified: {change['reason']}"
+    return f"After cycle {change['cycle']}: {event}."
 
 
-def _simulated(
-    store: SqlStore, seed: int, scenario: str, cycles: int, check_s: float, source: DataChoice, **others: Any
-) -> Driven:
+def _make_simulated_cell(
+    store: SqlStore,
+    seed: int,
+    scenario: str,
+    cycles: int,
+    check_seconds: float,
+    source: DataChoice,
+    **others: Any,
+) -> CellToDrive:
+    """Return the simulated cell, with a seed that gives parts which the store has not seen."""
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters
 
     # Another seed for a resumed run: the same parts again would be counted twice.
     seed += store.status()["decisions"]
-    if store.product is not None:  # peers have one seed, and parts of their own all the same
+    if store.product is not None:
+        # The cells of one product have one seed, but each makes other parts.
         seed += crc32(store.cell_id.encode())
-    cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles, parameters=CellParameters(verify_s=check_s))
-    return cell, f"simulated cell, {scenario}", options.trace_of(source.how)
+    parameters = CellParameters(verify_s=check_seconds)
+    cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles, parameters=parameters)
+    name = f"simulated cell, {scenario}"
+    return CellToDrive(cell, name, options.trace_spec_from(source.options))
 
 
-def _recorded(store: SqlStore, source: DataChoice, cycles: int, **others: Any) -> Driven:
+def _make_replay_cell(
+    store: SqlStore, source: DataChoice, cycles: int, **others: Any
+) -> CellToDrive:
+    """Return a cell that plays a recording from the first part on that the store does not know.
+
+    Raises
+    ------
+    SettingError
+        Fewer parts than `cycles` are left.
+    """
     import numpy as np
 
     from ..cells.replay import ReplayCell
     from ..folds import content_hash
 
     dataset = source.load()
-    # By content: of a part that comes twice the store's own hash would name both.
-    played = store.labelled(cell_only=True)
-    hashes = content_hash(played.traces)
+    # By the content of the traces: the store's own hash is one number for a part that comes twice.
+    hashes = content_hash(store.labelled(cell_only=True).traces)
     for id_ in store.unreported_accepts()[-1:]:
         newest = store.get_decision(id_)
-        hashes = hashes if newest is None else np.append(hashes, content_hash(newest.trace[None]))
-    known = np.flatnonzero(np.isin(content_hash(dataset.X), hashes))
-    first = int(known[-1]) + 1 if len(known) else 0
-    left = len(dataset) - first
-    expect(cycles <= left, f"at most {left} cycles", cycles, f"{first} of {len(dataset)} parts were played before")
+        if newest is not None:
+            hashes = np.append(hashes, content_hash(newest.trace[None]))
+    played = np.flatnonzero(np.isin(content_hash(dataset.X), hashes))
+    first = int(played[-1]) + 1 if len(played) else 0
+    n_left = len(dataset) - first
+    advice = f"{first} of {len(dataset)} parts were played before"
+    expect(cycles <= n_left, f"at most {n_left} cycles", cycles, advice)
     cell = ReplayCell(dataset, np.arange(first, len(dataset)))
-    return cell, f"recording {dataset.name} from part {first + 1}", dataset.spec
+    return CellToDrive(cell, f"recording {dataset.name} from part {first + 1}", dataset.spec)
 
 
-def _robot(source: DataChoice, host: str | None, **others: Any) -> Driven:
+def _make_robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
+    """Return the cell of a Universal Robots controller, connected, with its traces' contract.
+
+    Raises
+    ------
+    SettingError
+        No host, or a port that is none.
+    """
     from ..cells.ur.cell import UrCell
 
     if not host:
-        raise SettingError("Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none.")
-    how = options.recorded_as(source.how) | options.given(trigger=source.how.get("trigger"))
+        raise SettingError(
+            "Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none."
+        )
+    settings = options.recorder_settings(source.options)
+    settings |= options.drop_none(trigger=source.options.get("trigger"))
     name, port = host_and_port(host)
-    cell, said = UrCell(name, port=port, **how), {each: source.how[each] for each in ("unit", "fit") if each in source.how}
-    return cell, f"robot at {host}", replace(cell.recorder.spec, **said)
+    cell = UrCell(name, port=port, **settings)
+    form = {key: source.options[key] for key in ("unit", "fit") if key in source.options}
+    return CellToDrive(cell, f"robot at {host}", replace(cell.recorder.spec, **form))
 
 
 def host_and_port(address: str) -> tuple[str, int]:
-    """A controller's host, and its port, RTDE's where none is named; SettingError for what is no port."""
+    """Split HOST[:PORT] of a robot controller; the default is RTDE's port.
+
+    Raises
+    ------
+    SettingError
+        The port is not a number.
+    """
     from ..cells.ur.protocol import PORT
 
     host, _, port = address.partition(":")
@@ -176,44 +298,92 @@ def host_and_port(address: str) -> tuple[str, int]:
     return host, int(port) if port else PORT
 
 
-CELLS: dict[str, Callable[..., Driven]] = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
+CELLS: dict[str, Callable[..., CellToDrive]] = {
+    "simulated": _make_simulated_cell,
+    "replay": _make_replay_cell,
+    "ur": _make_robot_cell,
+}
 CAPTION = (
-    "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
-    "cell tells the truth about parts that were not verified. novel: parts verified for being unlike all known ones; safe: "
-    "cycles of safe mode; outside: parts that left a window, verified or rejected; good/h: good parts passed on an hour."
+    "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts "
+    "rejected. FP and FN count as far as the cell tells the truth about parts that were not "
+    "verified. novel: parts verified because they are unlike all known ones; safe: cycles of safe "
+    "mode; outside: parts that left a window, verified or rejected; good/h: good parts passed on "
+    "per hour."
 )
-COLUMNS = {"accepted": "accepted", "FP": "false_positive", "stops": "stops", "rejected": "rejected"}
-COLUMNS |= {"FN": "false_negative", "novel": "novel", "safe": "safe_mode", "outside": "outside"}
+COLUMNS = {  # title -> count of a stretch
+    "accepted": "accepted",
+    "FP": "false_positive",
+    "stops": "stops",
+    "rejected": "rejected",
+    "FN": "false_negative",
+    "novel": "novel",
+    "safe": "safe_mode",
+    "outside": "outside",
+}
 
 
-def _report(log: Replay, said: dict[str, Any], cell: Any, out: Out | None) -> None:
-    """Tell what a run did, and what a robot's cell says of its recordings."""
+def _print_run(replay: Replay, record: dict[str, Any], cell: Any, out: Out | None) -> None:
+    """Print the result of a run: a table of stretches, what was saved, and the cell's own report.
+
+    Adds the counts to `record`, and writes run.csv and run.png to `out`.
+    """
     from ..experiments.figures import run_picture
     from ..experiments.metrics import Costs
-    from ..experiments.tables import figures, retrain_line
+    from ..experiments.tables import retrain_line, table_of_numbers
 
-    total, stretches = log.stretch(), log.stretches(STRETCHES)
-    about = cell.report() if hasattr(cell, "report") else None
-    rows = []
-    for row in (*stretches, total):
-        between = f"{row['first_cycle']} to {row['last_cycle']}"
-        cells = {"cycles": between, "verified": percent(row["verified_share"], ".0f")}
-        cells |= {title: str(row[name]) for title, name in COLUMNS.items() if name != "outside" or total[name]}
-        if total["parts_per_hour"] is not None:
-            cells["good/h"] = written("", row["parts_per_hour"])
-        rows.append(cells)
-    lines: list[Any] = [] if about is None else [facts("What the cell says of it", rows_of(about))]
-    certain, costs = total["accepted"] + total["rejected"], Costs(said["check_seconds"])
-    net = costs.saved(certain, total["stops"], total["false_negative"])
-    lost = f"{costs.escape:g} s a stop and {costs.false_reject:g} s a good part sent back"
-    lines += [f"{certain} checks of {costs.check:g} s were left out; less {lost} that saved {net:,.0f} s."]
-    lines += [retrain_line(log.retrains), *map(_mode_line, said["safe_mode_changes"]), said["certificate"]["sentence"]]
-    worst = max((each.seconds for each in log.retrains), default=None)
-    said |= {"total": total | {"net_s": net}, "stretches": stretches, "cell": about}
-    tell(
-        said | {"retrains": log.retrains, "retrain_max_s": worst},
-        figures(said["title"], rows, output.explained(CAPTION), total=True),
-        *lines,
+    total = replay.stretch()
+    stretches = replay.stretches(STRETCHES)
+    cell_report = cell.report() if hasattr(cell, "report") else None
+    parts: list[Any] = [
+        table_of_numbers(
+            record["title"],
+            [_stretch_cells(stretch, total) for stretch in (*stretches, total)],
+            legend_or_hint(CAPTION),
+            total=True,
+        )
+    ]
+    if cell_report is not None:
+        parts.append(table_of_rows("What the cell reports", field_rows(cell_report)))
+    n_certain = total["accepted"] + total["rejected"]
+    costs = Costs(record["check_seconds"])
+    net = costs.saved(n_certain, total["stops"], total["false_negative"])
+    parts += [
+        f"{n_certain} checks of {costs.check:g} s were left out; less {costs.escape:g} s a stop "
+        f"and {costs.false_reject:g} s a good part sent back that saved {net:,.0f} s.",
+        retrain_line(replay.retrains),
+        *map(_safe_mode_line, record["safe_mode_changes"]),
+        record["certificate"]["sentence"],
+    ]
+    record |= {
+        "total": total | {"net_s": net},
+        "stretches": stretches,
+        "cell": cell_report,
+        "retrains": replay.retrains,
+        "retrain_max_s": max((retrain.seconds for retrain in replay.retrains), default=None),
+    }
+    print_result(
+        record,
+        *parts,
         out=out,
-        made=lambda: {"run.csv": log.to_frame().reset_index(), "run.png": run_picture(log, said["title"])},
+        make_files=lambda: {
+            "run.csv": replay.to_frame().reset_index(),
+            "run.png": run_picture(replay, record["title"]),
+        },
     )
+
+
+def _stretch_cells(stretch: Mapping[str, Any], total: Mapping[str, Any]) -> dict[str, str]:
+    """Return the cells of a stretch of cycles by their titles.
+
+    Columns that say nothing in the whole run, of windows or of parts per hour, are left out.
+    """
+    cells = {
+        "cycles": f"{stretch['first_cycle']} to {stretch['last_cycle']}",
+        "verified": percent(stretch["verified_share"], ".0f"),
+    }
+    for title, name in COLUMNS.items():
+        if name != "outside" or total[name]:
+            cells[title] = str(stretch[name])
+    if total["parts_per_hour"] is not None:
+        cells["good/h"] = format_value("", stretch["parts_per_hour"])
+    return cells

@@ -1,4 +1,4 @@
-"""`dengine status`: how an engine is doing by its store, what the store holds, and who shares it."""
+"""The verb `dengine status`: how an engine is doing, as far as its store tells."""
 
 from contextlib import closing
 from dataclasses import asdict, fields, replace
@@ -9,95 +9,163 @@ import click
 from ..errors import percent
 from . import options
 from .options import verb
-from .output import certificate_record, duration, facts, heading, listed, rows_of, tell, when, written
+from .output import (
+    certificate_record,
+    field_rows,
+    format_duration,
+    format_time,
+    format_value,
+    heading,
+    print_result,
+    table_of_records,
+    table_of_rows,
+)
 
 if TYPE_CHECKING:
     from ..history.status import ErrorEstimate, Span, Status
 
-WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
-# Parts of the shadow mode are no audits, though they have their reason.
+VERDICTS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
+# In shadow mode every part is verified: those are no audits, though they share the reason.
 TITLES = {"false_accepts": "accepted, and bad", "audits": "certain but checked"}
-APART = ("newest", "ever", "recipe", "trace", "certificate", "retrains", "events", "settings", "last")
-ELSEWHERE = ("retraining", "store_lag")  # of an engine that runs
-LAST = "The newest so many decisions, looked at apart."
+# Fields of a status that have lines or tables of their own.
+SHOWN_ELSEWHERE = (
+    "newest",
+    "ever",
+    "recipe",
+    "trace",
+    "certificate",
+    "retrains",
+    "events",
+    "settings",
+    "last",
+)
+ONLY_WHILE_RUNNING = ("retraining", "store_lag")
+_LAST = "How many of the newest decisions have a column of their own."
 
 
 @verb("dengine status engine.db --last 500")
 @options.store_argument
-@click.option("--last", type=options.COUNT, default=500, show_default=True, help=LAST)
+@click.option("--last", type=options.COUNT, default=500, show_default=True, help=_LAST)
 @options.check_option
 def status(store: str, last: int, check_seconds: float) -> None:
-    """Say how an engine is doing, and what its store holds.
+    """Show how an engine is doing, and what its store holds.
 
-    STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`. Where it holds
-    several cells and none is named, they are listed; cells of one product share labels and versions. The interval of bad
-    accepted parts is of one look; what is certified holds however often one looks.
+    STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`. If
+    it holds several cells and none is named, they are listed; cells of one product share labels and
+    versions. The interval of bad accepted parts holds for one look; the certificate holds however
+    often one looks.
     """
-    from ..history.status import status as status_of
+    from ..history.status import status as read_status
     from ..representation import to_jsonable
     from ..store.opening import open_store
     from ..store.peers import list_cells
     from ..store.records import CellAddress, address
 
     if not isinstance(store, CellAddress):
-        first, *others = cells = list_cells(store)
-        if others:
-            said = "Name one of them, --cell NAME, and how it is doing is shown."
-            tell({"store": store, "cells": cells}, listed(store, cells, *asdict(first)), said)
+        cells = list_cells(store)
+        if len(cells) > 1:
+            print_result(
+                {"store": store, "cells": cells},
+                table_of_records(store, cells, *asdict(cells[0])),
+                "Name one of them, --cell NAME, to see how it is doing.",
+            )
             return
-        store = address(store, first.cell_id)
+        store = address(store, cells[0].cell_id)
     with closing(open_store(store, must_exist=True)) as opened:
-        found = status_of(opened, last, watching=True)
-    n, checked = found.ever.would_accept.n + found.ever.would_reject.n, found.ever.verified
-    saved = f"{duration(n * check_seconds)} of checks at {duration(check_seconds)}"
-    would = [f"It would have decided {n:,} of the {checked:,} parts that were verified: {saved}."] if n else []
-    record = {"store": store} | to_jsonable(found) | {"certificate": certificate_record(found.certificate)}
-    tell(record, *_tables(store, found), *would)
+        report = read_status(opened, last, watching=True)
+    record = {"store": store} | to_jsonable(report)
+    record["certificate"] = certificate_record(report.certificate)
+    parts = [_overview_table(store, report), table_of_rows("What it is", _present_rows(report))]
+    n_certain = report.ever.would_accept.n + report.ever.would_reject.n
+    if n_certain:
+        seconds = format_duration(n_certain * check_seconds)
+        parts.append(
+            f"It would have decided {n_certain:,} of the {report.ever.verified:,} parts that were "
+            f"verified: {seconds} of checks at {format_duration(check_seconds)}."
+        )
+    print_result(record, *parts)
 
 
-def _tables(store: str, found: "Status") -> list[Any]:
-    """A column each for the newest decisions and for all; and what is of now."""
-    columns, both = ("", f"last {found.newest.decisions:,}", "since birth"), (found.newest, found.ever)
-    # what is bad comes first
-    names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "false_accepts")
-    spans = [[TITLES.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
-    now = [("look at", found.alarm)] if found.alarm else []
-    shown = found
-    if not found.recipe.policy.audit_rate:
-        shown = replace(found, reasons=_without_audits(found.reasons), sources=_without_audits(found.sources))
-    now += [("cell", found.cell), *rows_of(shown, "cell", *APART, *ELSEWHERE)]
-    if found.model is None:  # of one that was handed in the recipe has no effect: to show it would be a lie
-        now += rows_of(found.recipe)
-    now += [("trace", "none yet: the first trace sets it" if found.trace is None else written("", found.trace))]
-    now += [("accepted", found.certificate.sentence), ("rejected", found.certificate.sentence_on_rejects)]
-    if reports := [each.report for each in found.retrains]:
-        now += [("last retrain", written("", reports[-1]))]
-        now += [("worst retrain", written("", max(reports, key=lambda each: each.seconds)))]
-    now += [("newest events", f"{when(each.time)} {each.kind}: {each.text}") for each in reversed(found.events)]
-    return [facts(f"{store}: overview", spans, columns), facts("What it is", now)]
+def _overview_table(store: str, report: "Status") -> Any:
+    """Return a table of counts, with a column for the newest decisions and one for all."""
+    spans = (report.newest, report.ever)
+    names = [field.name for field in fields(report.ever)]
+    names.sort(key=lambda name: name != "false_accepts")  # what is bad comes first
+    rows = [
+        [TITLES.get(name, heading(name)), *(_span_cell(name, span) for span in spans)]
+        for name in names
+    ]
+    columns = ("", f"last {report.newest.decisions:,}", "since birth")
+    return table_of_rows(f"{store}: overview", rows, columns)
+
+
+def _present_rows(report: "Status") -> list[tuple[str, str]]:
+    """Return (title, text) rows of what holds now: settings, certificate, retrains and events."""
+    rows = []
+    if report.alarm:
+        rows.append(("look at", report.alarm))
+    rows.append(("cell", report.cell))
+    shown = report
+    if not report.recipe.policy.audit_rate:
+        reasons = _without_audits(report.reasons)
+        shown = replace(report, reasons=reasons, sources=_without_audits(report.sources))
+    rows += field_rows(shown, "cell", *SHOWN_ELSEWHERE, *ONLY_WHILE_RUNNING)
+    if report.model is None:
+        # The recipe has no effect on a model that was handed in.
+        rows += field_rows(report.recipe)
+    trace_text = "none yet: the first trace sets it"
+    if report.trace is not None:
+        trace_text = format_value("", report.trace)
+    rows.append(("trace", trace_text))
+    rows.append(("accepted", report.certificate.sentence))
+    rows.append(("rejected", report.certificate.sentence_on_rejects))
+    retrains = [version.report for version in report.retrains]
+    if retrains:
+        slowest = max(retrains, key=lambda retrain: retrain.seconds)
+        rows.append(("last retrain", format_value("", retrains[-1])))
+        rows.append(("worst retrain", format_value("", slowest)))
+    for event in reversed(report.events):
+        rows.append(("newest events", f"{format_time(event.time)} {event.kind}: {event.text}"))
+    return rows
 
 
 def _without_audits(counts: dict[str, int]) -> dict[str, int]:
+    """Return counts with another title for "audit", for a policy that has no audits."""
     return {TITLES["audits"] if name == "audit" else name: n for name, n in counts.items()}
 
 
-def _of_span(name: str, span: "Span") -> str:
+def _span_cell(name: str, span: "Span") -> str:
+    """Return the cell of one field of a span of decisions."""
     value = getattr(span, name)
     if name in ("first", "last"):
-        return when(value)
+        return format_time(value)
     if name == "bad_accepts" and not span.accepted:
         return "none was accepted"
     if name == "would_accept" and value.n_known and span.bad_accepts.basis == value.basis:
         return "as bad accepts, below"  # the same parts
-    stops = span.false_accepts if name == "bad_accepts" else 0
-    return _held(value, stops) if hasattr(value, "verdict") else written(name, value)
+    if not hasattr(value, "verdict"):
+        return format_value(name, value)
+    return _judged_cell(value, span.false_accepts if name == "bad_accepts" else 0)
 
 
-def _held(said: "ErrorEstimate", stops: int) -> str:
-    """An interval of the share of wrong ones, held against what is tolerated; first the stops that no share tells."""
-    first = f"{stops:,} stop{'s' * (stops > 1)}; " if stops and said.basis != "every outcome" else ""
-    if not said.n_known and said.verdict == "open":
-        return first + ("else unknown" if stops else "none is known")
-    between = f"{100 * said.lower:.1f} to {percent(said.upper)}"
-    by = f"{said.n_wrong:,} of {said.n_known:,} by {said.basis}: " if said.n_known else ""
-    return f"{first}{by}{between}, {WORDS[said.verdict]} {percent(said.tolerance, 'g')}"
+def _judged_cell(judged: "Judged", n_stops: int) -> str:
+    """Return how the share of wrong decisions compares with the tolerance, after the line stops.
+
+    Parameters
+    ----------
+    judged : Judged
+        The interval of the share, and what it rests on.
+    n_stops : int
+        Line stops, which are named first where the share does not include them.
+    """
+    stops = ""
+    if n_stops and judged.by != "every outcome":
+        stops = f"{n_stops:,} stop{'s' * (n_stops > 1)}; "
+    if not judged.known and judged.verdict == "open":
+        return stops + ("else unknown" if n_stops else "none is known")
+    basis = ""
+    if judged.known:
+        basis = f"{judged.wrong:,} of {judged.known:,} by {judged.by}: "
+    interval = f"{100 * judged.lower:.1f} to {percent(judged.upper)}"
+    verdict = f"{VERDICTS[judged.verdict]} {percent(judged.tolerance, 'g')}"
+    return f"{stops}{basis}{interval}, {verdict}"

@@ -1,9 +1,10 @@
-"""Baseline methods for the same loop, by name; each decides by its own rule, on the same traces and the same feedback.
+"""Methods that dengine is compared with, in the same loop; each decides by its own rule.
 
->>> DataEngine(recipe="conv", model=make_baseline("knn", Policy(alpha=0.1, lower_bound=0.9), seed=0))
+>>> DataEngine(model=make_baseline("knn", Policy(alpha=0.1, lower_bound=0.9), seed=0))
 
-Without a bound: always, never, k neighbours that agree. With one of their own: kernel densities, a Gaussian process, and
-thresholds with a guaranteed risk. A baseline's settings are the keyword-only fields of its class.
+Without a bound: always verify, never verify, and k neighbours that agree. With a bound of their
+own: kernel densities, a Gaussian process, and thresholds with a guaranteed risk. `BASELINES` has
+them by name; the settings of a baseline are the keyword-only fields of its class.
 """
 
 import math
@@ -28,14 +29,23 @@ Counts = NDArray[np.int64]
 Labels = NDArray[np.bool_]
 Traces = NDArray[np.float32]
 
-BANDWIDTHS = (0.03, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8)  # to choose among, in deviations of a component
+# Bandwidths to choose among, in standard deviations of a component.
+BANDWIDTHS = (0.03, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8)
 MOST_CHOOSING = 1000  # traces that the bandwidth is chosen on: the work grows with their square
 DIMENSIONS = 2
 MOST_TRAINED = 500  # traces to train a Gaussian process on: the work grows with their cube
 
 
-class Judgement(NamedTuple):
-    """What a baseline says of n traces; (n,) each, as in `Decision`; 0 where a method counts nothing."""
+class BaselinePrediction(NamedTuple):
+    """What a baseline says of n traces, as in `Decision`; the counts are 0 if it counts nothing.
+
+    Attributes
+    ----------
+    lower, upper : array of float64, shape (n,)
+        Interval of the success probability.
+    n_success, n_failure : array of int64, shape (n,), or 0
+        Labels behind it.
+    """
 
     lower: Floats
     upper: Floats
@@ -45,109 +55,147 @@ class Judgement(NamedTuple):
 
 @dataclass(eq=False)
 class Baseline(ABC):
-    """A method of somebody else's behind the five methods of `Model`.
+    """A published method behind the five methods of `Model`.
 
-    policy : its alpha and lower_bound are numbers of the baseline here, and it says what it makes of them.
-    seed : of all that it draws; the same seed and the same labels give the same decisions.
+    A subclass implements `_fit` and `_predict`, and `_add` if it learns between two trainings.
+    Until a training succeeds, on enough labels of both classes, every part is verified.
 
-    A subclass gives `_learn` and `_judge`, and `_take` where it learns between two trainings. Where a training cannot be
-    done, on labels of one class or on too few, every part is verified until the next one.
+    Parameters
+    ----------
+    policy : Policy
+        Its alpha and lower_bound; the class says what it makes of them.
+    seed : int, default 0
+        Of everything drawn; the same seed and the same labels give the same decisions.
 
-    limits : from which lower bound on it accepts, and up to which upper one it rejects; None: LB and 1 - LB.
-
-    title : for a table.  needs : the library beyond what dengine needs.
-    bound : what bound its decisions keep; "" where it has none, and its threshold is swept.
-    tries : four sets of parameters, as many as ours, to choose among on other seeds than those reported.  chosen : which.
+    Attributes
+    ----------
+    thresholds : (float, float) or None
+        Lower bound from which on a part is accepted, and upper bound up to which it is rejected.
+        None: LB and 1 - LB.
+    is_trained : bool
+    title : str
+        For tables.
+    bound : str
+        Which bound the decisions keep. "": none, and the method's threshold is swept.
+    library : str
+        What it needs beyond dengine's dependencies.
+    candidates : tuple of four mappings
+        Settings to choose among, on other seeds than those reported; ours have four sets too.
+    chosen : int
+        Index of the chosen ones.
     """
 
     title: ClassVar[str]
     bound: ClassVar[str] = ""
-    needs: ClassVar[str] = ""
-    tries: ClassVar[tuple[Mapping[str, Any], ...]] = ({},) * 4
+    library: ClassVar[str] = ""
+    candidates: ClassVar[tuple[Mapping[str, Any], ...]] = ({},) * 4
     chosen: ClassVar[int] = 0
 
     policy: Policy
     seed: int = 0
-    limits: tuple[float, float] | None = field(default=None, init=False)
-    ready: bool = field(default=False, init=False)
-    _last: tuple[bytes, Judgement] | None = field(default=None, init=False)  # the engine asks thrice about one trace
+    thresholds: tuple[float, float] | None = field(default=None, init=False)
+    is_trained: bool = field(default=False, init=False)
+    # The engine asks three times about the same trace: its bytes, and the prediction.
+    _last: tuple[bytes, BaselinePrediction] | None = field(default=None, init=False)
+
+    @classmethod
+    def chosen_params(cls) -> Mapping[str, Any]:
+        """Return the settings that were chosen among the candidates."""
+        return cls.candidates[cls.chosen]
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Train anew on labelled traces X (n, C, T), y (n,) of 1 = success and 0 = failure."""
-        traces, good = as_traces(X), np.asarray(y) == 1
+        """Train from scratch.
+
+        Parameters
+        ----------
+        X : array, shape (n, C, T)
+            Traces.
+        y : array, shape (n,)
+            1 = success, 0 = failure.
+        """
+        traces = as_traces(X)
+        good = np.asarray(y) == 1
         self._last = None
-        self.ready = bool(good.any() and not good.all()) and self._learn(traces, good)
+        self.is_trained = bool(good.any() and not good.all()) and self._fit(traces, good)
         return self
 
     def add(self, x: ArrayLike, y: Any) -> Self:
-        """Take in one labelled trace (C, T), where the method learns between two trainings and has been trained."""
+        """Learn one labelled trace (C, T), if the method learns between two trainings."""
         self._last = None
-        if self.ready:
-            self._take(as_traces(np.asarray(x)[None]), bool(y == 1))
+        if self.is_trained:
+            self._add(as_traces(np.asarray(x)[None]), bool(y == 1))
         return self
 
     def count(self, X: ArrayLike) -> tuple[Counts, Counts]:
-        """(n_success, n_failure), each (n,), behind each prediction; zeros of a method that counts nothing."""
-        found = self.judge(X)
-        none = np.zeros(len(found.lower), dtype=np.int64)
-        return none + found.n_success, none + found.n_failure
+        """Return (n_success, n_failure), each (n,): the labels behind each prediction."""
+        prediction = self.predict(X)
+        zeros = np.zeros(len(prediction.lower), dtype=np.int64)
+        return zeros + prediction.n_success, zeros + prediction.n_failure
 
     def predict_interval(self, X: ArrayLike) -> tuple[Floats, Floats]:
-        """(lower, upper), each (n,), of the success probability; the same number twice where there is only a point."""
-        found = self.judge(X)
-        return found.lower, found.upper
+        """Return (lower, upper), each (n,), of the success probability.
+
+        They are equal if the method has no interval.
+        """
+        prediction = self.predict(X)
+        return prediction.lower, prediction.upper
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:
-        """(n,) an `Action` for each trace of X (n, C, T)."""
+        """Return an `Action` for each trace of X (n, C, T)."""
         from ..decision.rule import action_of
 
-        lower, upper, *_ = self.judge(X)
-        accept_threshold, reject_threshold = self.limits or (self.policy.lower_bound, 1.0 - self.policy.lower_bound)
-        found = (
-            action_of(float(a), float(b), accept_threshold, reject_threshold) for a, b in zip(lower, upper, strict=True)
+        default = (self.policy.lower_bound, 1.0 - self.policy.lower_bound)
+        accept_threshold, reject_threshold = self.thresholds or default
+        lower, upper, *_ = self.predict(X)
+        numbers = (
+            action_of(float(low), float(high), accept_threshold, reject_threshold)
+            for low, high in zip(lower, upper, strict=True)
         )
-        return np.array([ACTIONS[i] for i in found], dtype=object)
+        return np.array([ACTIONS[number] for number in numbers], dtype=object)
 
-    def judge(self, X: ArrayLike) -> Judgement:
-        """All that it says of the traces X (n, C, T), computed once for the same traces."""
+    def predict(self, X: ArrayLike) -> BaselinePrediction:
+        """Return the prediction for traces X (n, C, T), computed once for the same traces."""
         traces = as_traces(X)
         key = traces.tobytes()
         if self._last is None or self._last[0] != key:
-            unknown = Judgement(np.zeros(len(traces)), np.ones(len(traces)))
-            self._last = key, self._judge(traces) if self.ready else unknown
+            prediction = BaselinePrediction(np.zeros(len(traces)), np.ones(len(traces)))
+            if self.is_trained:
+                prediction = self._predict(traces)
+            self._last = (key, prediction)
         return self._last[1]
 
     @abstractmethod
-    def _learn(self, X: Traces, good: Labels) -> bool:
-        """Train on traces (n, C, T) and labels (n,) of both classes; False where they are too few."""
+    def _fit(self, X: Traces, good: Labels) -> bool:
+        """Train on traces (n, C, T), labels (n,) of both classes; return False if too few."""
 
     @abstractmethod
-    def _judge(self, X: Traces) -> Judgement:
-        """What is said of traces (n, C, T), after a training."""
+    def _predict(self, X: Traces) -> BaselinePrediction:
+        """Return the prediction for traces (n, C, T), after a training."""
 
-    def _take(self, X: Traces, good: bool) -> None:  # noqa: B027  # a default: the next training learns it
-        """Learn one trace (1, C, T)."""
+    def _add(self, X: Traces, good: bool) -> None:  # noqa: B027  # default: nothing
+        """Learn one trace (1, C, T) between two trainings."""
 
 
 class Constant(Baseline):
-    """The same for every part; before the first retrain every part is verified all the same."""
+    """The same prediction for every part, after the first retrain."""
 
     lower: ClassVar[float]
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Nothing to learn: labels of one class are as good as any."""
-        self._last, self.ready = None, True
+        """Learn nothing; labels of one class are enough."""
+        self._last = None
+        self.is_trained = True
         return self
 
-    def _learn(self, X: Traces, good: Labels) -> bool:
+    def _fit(self, X: Traces, good: Labels) -> bool:
         return True
 
-    def _judge(self, X: Traces) -> Judgement:
-        return Judgement(np.full(len(X), self.lower), np.ones(len(X)))
+    def _predict(self, X: Traces) -> BaselinePrediction:
+        return BaselinePrediction(np.full(len(X), self.lower), np.ones(len(X)))
 
 
 class AlwaysVerify(Constant):
-    """The cell as it is: no error, and nothing saved."""
+    """Verify every part: the cell without dengine. No error, and nothing saved."""
 
     title = "always verify"
     bound = "no error: every part is verified"
@@ -155,25 +203,26 @@ class AlwaysVerify(Constant):
 
 
 class NeverVerify(Constant):
-    """All is saved, and every bad part stops the system."""
+    """Accept every part: every check is saved, and every bad part stops the line."""
 
     title = "never verify"
     lower = 1.0
 
 
 @dataclass
-class References:
-    """Labelled points (n, d), to which more can be added."""
+class LabelledPoints:
+    """Points (n, d) with labels (n,), to which more can be added."""
 
     points: Floats
     good: Labels
 
     def add(self, point: Floats, good: bool) -> None:
-        """One more point (1, d)."""
-        self.points, self.good = np.concatenate([self.points, point]), np.append(self.good, good)
+        """Append one point (1, d) with its label."""
+        self.points = np.concatenate([self.points, point])
+        self.good = np.append(self.good, good)
 
     def squared_distances(self, Z: Floats) -> Floats:
-        """(n, d) -> (n, references)."""
+        """Return the squared Euclidean distances (n, m) from Z (n, d) to the m points."""
         from scipy.spatial.distance import cdist
 
         return np.asarray(cdist(Z, self.points, "sqeuclidean"))
@@ -181,65 +230,88 @@ class References:
 
 @dataclass(eq=False, kw_only=True)
 class AgreeingNeighbours(Baseline):
-    """Accept where all k nearest labelled traces are successes, reject where all are failures, verify otherwise.
+    """Accept if all k nearest labelled traces are successes, reject if all are failures.
 
-    Distances are Euclidean between the traces as they are, all channels in a row. alpha and LB have no effect: k takes the
-    place of a threshold. Every label counts from the next part on. `predict_interval` gives the share of successes twice.
-    Source: Duan et al. (2025), as the paper's section "Related Work" describes it.
+    Distances are Euclidean between the raw traces, with all channels in one row. alpha and LB have
+    no effect: k takes the place of a threshold. Every label counts from the next part on.
+    `predict_interval` gives the share of successes twice.
+
+    Parameters
+    ----------
+    k : int, default 10
+
+    References
+    ----------
+    Duan et al. (2025), as the paper's section "Related Work" describes it.
     """
 
     title = "k-NN, all k agree"
-    tries = ({"k": 5}, {"k": 10}, {"k": 20}, {"k": 40})
+    candidates = ({"k": 5}, {"k": 10}, {"k": 20}, {"k": 40})
 
     k: int = 10
 
     def __post_init__(self) -> None:
         expect(is_whole(self.k, 1, 2**31), "k to be an integer of at least 1", self.k)
-        self.limits = (1.0, 0.0)
+        self.thresholds = (1.0, 0.0)
 
-    def _learn(self, X: Traces, good: Labels) -> bool:
-        self._references = References(_rows(X), good)
+    def _fit(self, X: Traces, good: Labels) -> bool:
+        self._references = LabelledPoints(_rows(X), good)
         return len(good) >= self.k
 
-    def _take(self, X: Traces, good: bool) -> None:
+    def _add(self, X: Traces, good: bool) -> None:
         self._references.add(_rows(X), good)
 
-    def _judge(self, X: Traces) -> Judgement:
+    def _predict(self, X: Traces) -> BaselinePrediction:
+        """Return the share of successes among the k nearest, and their counts."""
         distances = self._references.squared_distances(_rows(X))
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]
         n_success = self._references.good[nearest].sum(axis=1)
         share = n_success / self.k
-        return Judgement(share, share, n_success, self.k - n_success)
+        return BaselinePrediction(share, share, n_success, self.k - n_success)
 
 
 def _rows(X: Traces) -> Floats:
+    """Return traces (n, C, T) as rows (n, C * T) of float64."""
     return X.reshape(len(X), -1).astype(np.float64)
 
 
-class Components:
+class ScaledComponents:
     """The first principal components of traces, scaled.
 
-    whiten : each to unit variance; otherwise all by the first one's deviation, so that they keep their proportions.
+    Parameters
+    ----------
+    n_components : int
+    whiten : bool
+        Scale each component to unit variance. False divides all by the standard deviation of the
+        first one, so that they keep their proportions.
+    seed : int
     """
 
     def __init__(self, n_components: int, *, whiten: bool, seed: int) -> None:
         from ..reducers.pca import PcaReducer
 
-        self.whiten, self._pca = whiten, PcaReducer(n_components=n_components, random_state=seed)
+        self.whiten = whiten
+        self._pca = PcaReducer(n_components=n_components, random_state=seed)
 
     def fit(self, X: Traces) -> Floats | None:
-        """Find the components of traces (n, C, T); returns these traces as (n, d), None where they are too few."""
+        """Find the components of traces (n, C, T).
+
+        Returns
+        -------
+        Z : array, shape (n, d), or None
+            The scaled components of these traces; None if there are too few traces.
+        """
         try:
-            placed = np.asarray(self._pca.fit(X).transform(X), dtype=np.float64)
+            components = np.asarray(self._pca.fit(X).transform(X), dtype=np.float64)
         except SettingError:
             return None
-        deviation = placed.std(axis=0)
+        deviation = components.std(axis=0)
         scale = deviation if self.whiten else np.full_like(deviation, deviation[0])
         self._scale = np.where(scale > 0.0, scale, 1.0)
-        return np.asarray(placed / self._scale)
+        return np.asarray(components / self._scale)
 
     def transform(self, X: Traces) -> Floats:
-        """(n, C, T) -> (n, d)."""
+        """Return the scaled components (n, d) of traces (n, C, T)."""
         return np.asarray(self._pca.transform(X) / self._scale, dtype=np.float64)
 
 
@@ -247,86 +319,124 @@ class Components:
 class WilsonKernelDensity(Baseline):
     """Kernel-weighted counts of successes and failures, Wilson's interval, and the paper's rule.
 
-    bandwidth : h, in deviations of each principal component; None: chosen at each training, among `BANDWIDTHS`, by the
-        leave-one-out likelihood of the labels.
+    With weights w_i = exp(-|z - z_i|^2 / (2 h^2)) the success rate is m = sum w_i y_i / sum w_i,
+    and the number of trials n = sum K_H(z - z_i) |H| / R(K), where K is the normal density and
+    R(K) = (4 pi)^(-d/2): here 2 sum w_i. n is no count: a kernel wider than the data counts every
+    label twice. So the bound holds only where the kernel is narrow and many labels lie within it.
 
-    With weights w_i = exp(-|z - z_i|^2 / (2 h^2)) the success rate is m = sum w_i y_i / sum w_i, and the number of trials
-    n = sum K_H(z - z_i) |H| / R(K), K the normal density, R(K) = (4 pi)^(-d/2): here 2 sum w_i. It is no count: a kernel
-    wider than the data counts every label twice. So the bound holds only where it is narrow and many labels lie within.
+    Our reading of the source: two principal components, and the likelihood of Wilson's centre,
+    which one wrong neighbour does not send to 0.
 
-    Source: Iversen, Duan and Hagelskjær (2026), "Estimation of Confidence Bounds in Binary Classification using Wilson
-    Score Kernel Density Estimation", arXiv:2602.20947; n and H as in github.com/SDU-Robotics/wilson-score-kde. Our reading:
-    two principal components, and the likelihood of Wilson's centre, which no lone wrong neighbour sends to 0.
+    Parameters
+    ----------
+    bandwidth : float or None, default None
+        h, in standard deviations of each principal component. None chooses among `BANDWIDTHS` at
+        each training, by the leave-one-out likelihood of the labels.
+
+    References
+    ----------
+    Iversen, Duan and Hagelskjær (2026), "Estimation of Confidence Bounds in Binary Classification
+    using Wilson Score Kernel Density Estimation", arXiv:2602.20947; n and H as in
+    github.com/SDU-Robotics/wilson-score-kde.
     """
 
     title = "Wilson-score kernel density"
     bound = "Wilson interval of kernel-weighted counts, at one look"
-    tries = ({"bandwidth": None}, {"bandwidth": 0.1}, {"bandwidth": 0.2}, {"bandwidth": 0.4})
+    candidates = ({"bandwidth": None}, {"bandwidth": 0.1}, {"bandwidth": 0.2}, {"bandwidth": 0.4})
 
     bandwidth: float | None = None
 
     def __post_init__(self) -> None:
-        known = self.bandwidth is None or (is_number(self.bandwidth) and 0.0 < self.bandwidth < math.inf)
-        expect(known, "bandwidth to be a number above 0", self.bandwidth)
-        self._components = Components(DIMENSIONS, whiten=True, seed=self.seed)
+        value = self.bandwidth
+        is_valid = value is None or (is_number(value) and 0.0 < value < math.inf)
+        expect(is_valid, "bandwidth to be a number above 0", value)
+        self._components = ScaledComponents(DIMENSIONS, whiten=True, seed=self.seed)
 
-    def _learn(self, X: Traces, good: Labels) -> bool:
-        if (Z := self._components.fit(X)) is None:
+    def _fit(self, X: Traces, good: Labels) -> bool:
+        """Find the components and the bandwidth; return False if there are too few traces."""
+        Z = self._components.fit(X)
+        if Z is None:
             return False
-        self._references = References(Z, good)
-        some = References(Z[-MOST_CHOOSING:], good[-MOST_CHOOSING:])
-        self.bandwidth_ = self.bandwidth or chosen_bandwidth(some, self.policy.alpha)
+        self._references = LabelledPoints(Z, good)
+        newest = LabelledPoints(Z[-MOST_CHOOSING:], good[-MOST_CHOOSING:])
+        self.bandwidth_ = self.bandwidth or choose_bandwidth(newest, self.policy.alpha)
         return True
 
-    def _take(self, X: Traces, good: bool) -> None:
+    def _add(self, X: Traces, good: bool) -> None:
         self._references.add(self._components.transform(X), good)
 
-    def _judge(self, X: Traces) -> Judgement:
+    def _predict(self, X: Traces) -> BaselinePrediction:
+        """Return Wilson's interval of the kernel-weighted counts, and these counts, rounded."""
         distances = self._references.squared_distances(self._components.transform(X))
-        n_success, n_failure = kernel_counts(distances, self._references.good, self.bandwidth_)
-        lower, upper = wilson_interval(n_success, n_failure, self.policy.alpha)
-        whole_numbers = (np.rint(n).astype(np.int64) for n in (n_success, n_failure))
-        return Judgement(lower, upper, *whole_numbers)
+        counts = kernel_counts(distances, self._references.good, self.bandwidth_)
+        lower, upper = wilson_interval(*counts, self.policy.alpha)
+        rounded = (np.rint(count).astype(np.int64) for count in counts)
+        return BaselinePrediction(lower, upper, *rounded)
 
 
 def kernel_counts(distances: Floats, good: Labels, bandwidth: float) -> tuple[Floats, Floats]:
-    """(n_success, n_failure), each (n,), no whole numbers: from squared distances (n, m) in two dimensions, labels (m,)."""
+    """Sum the kernel weights of successes and of failures, in two dimensions.
+
+    Parameters
+    ----------
+    distances : array, shape (n, m)
+        Squared distances to m references.
+    good : array of bool, shape (m,)
+    bandwidth : float
+
+    Returns
+    -------
+    n_success, n_failure : array of float, shape (n,)
+        Not whole numbers.
+    """
     weights = np.exp(-0.5 * distances / bandwidth**2) * 2.0 ** (DIMENSIONS / 2)
     return weights @ good, weights @ ~good
 
 
-def chosen_bandwidth(known: References, alpha: float) -> float:
-    """The bandwidth among `BANDWIDTHS` under which the references' labels are most likely, each left out in turn."""
-    distances, z = known.squared_distances(known.points), normal_quantile(alpha)
+def choose_bandwidth(references: LabelledPoints, alpha: float) -> float:
+    """Return the bandwidth of `BANDWIDTHS` under which the labels are most likely.
+
+    Each label is left out in turn when its likelihood is computed.
+    """
+    z = normal_quantile(alpha)
+    distances = references.squared_distances(references.points)
     np.fill_diagonal(distances, np.inf)
 
     def log_likelihood(bandwidth: float) -> float:
-        n_success, n_failure = kernel_counts(distances, known.good, bandwidth)
+        n_success, n_failure = kernel_counts(distances, references.good, bandwidth)
         rate = (n_success + z * z / 2.0) / (n_success + n_failure + z * z)
-        return float(np.log(np.where(known.good, rate, 1.0 - rate)).sum())
+        return float(np.log(np.where(references.good, rate, 1.0 - rate)).sum())
 
     return max(BANDWIDTHS, key=log_likelihood)
 
 
 @dataclass(eq=False, kw_only=True)
 class GaussianProcess(Baseline):
-    """scikit-learn's Gaussian-process classifier on principal components; the paper's rule on its credible interval.
+    """scikit-learn's Gaussian-process classifier on principal components, and the paper's rule.
 
-    n_components : principal components, which keep their proportions.
-    amplitude : the largest deviation that the prior of the latent function may have, above 1, in logits; 3 is a success
-        rate of 5 to 95 %. The marginal likelihood drives it up where classes part well; then the interval stays wide even
-        amid hundreds of successes.
+    The latent function f at a trace has mean m and variance v under Laplace's approximation; the
+    interval of the success probability is sigmoid(m -+ z sqrt(v)), with z the 1 - alpha/2 normal
+    quantile. It is a credible interval: it holds under the prior, a scaled squared exponential of
+    one length scale. The method is trained on the newest 500 labels only, because of its cost. It
+    needs scikit-learn 1.7, which gives the latent mean and variance.
 
-    The latent function f at a trace has mean m and variance v under Laplace's approximation; the interval of the success
-    probability is sigmoid(m -+ z sqrt(v)), z the 1 - alpha/2 normal quantile. It is a credible interval: it holds under the
-    prior, a scaled squared exponential of one length scale. Trained on the newest 500 labels only, because of its cost.
-    It needs scikit-learn 1.7, which tells the latent mean and variance.
-    Source: Rasmussen and Williams (2006), "Gaussian Processes for Machine Learning", Algorithms 3.1 and 3.2.
+    Parameters
+    ----------
+    n_components : int, default 2
+        Principal components, which keep their proportions.
+    amplitude : float, default 3.0
+        Largest standard deviation that the prior of the latent function may have, above 1, in
+        logits; 3 is a success rate of 5 to 95 %. The marginal likelihood drives it up where classes
+        part well; then the interval stays wide even amid hundreds of successes.
+
+    References
+    ----------
+    Rasmussen and Williams (2006), "Gaussian Processes for Machine Learning", Algorithms 3.1, 3.2.
     """
 
     title = "Gaussian process"
     bound = "credible interval under the prior, at one look"
-    tries = (
+    candidates = (
         {"n_components": 2, "amplitude": 2.0},
         {"n_components": 2, "amplitude": 3.0},
         {"n_components": 5, "amplitude": 3.0},
@@ -338,36 +448,48 @@ class GaussianProcess(Baseline):
     amplitude: float = 3.0
 
     def __post_init__(self) -> None:
-        expect(is_number(self.amplitude) and 1.0 < self.amplitude < math.inf, "amplitude above 1", self.amplitude)
-        self._components = Components(self.n_components, whiten=False, seed=self.seed)
+        is_valid = is_number(self.amplitude) and 1.0 < self.amplitude < math.inf
+        expect(is_valid, "amplitude above 1", self.amplitude)
+        self._components = ScaledComponents(self.n_components, whiten=False, seed=self.seed)
 
-    def _learn(self, X: Traces, good: Labels) -> bool:
+    def _fit(self, X: Traces, good: Labels) -> bool:
+        """Train on the newest labels; return False if they are of one class or too few."""
         from sklearn.gaussian_process import GaussianProcessClassifier
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-        newest, labels = X[-MOST_TRAINED:], good[-MOST_TRAINED:]
-        if len(np.unique(labels)) < 2 or (Z := self._components.fit(newest)) is None:
+        labels = good[-MOST_TRAINED:]
+        if len(np.unique(labels)) < 2:
+            return False
+        Z = self._components.fit(X[-MOST_TRAINED:])
+        if Z is None:
             return False
         kernel = ConstantKernel(1.0, (0.1, self.amplitude**2)) * RBF(0.5, (0.01, 10.0))
         classifier = GaussianProcessClassifier(kernel, random_state=self.seed)
-        with warnings.catch_warnings():  # it warns of an optimum at a limit, and the limit is meant
+        with warnings.catch_warnings():
+            # It warns of an optimum at the limit of the amplitude, which is there on purpose.
             warnings.filterwarnings("ignore", message="The optimal value found")
             self._classifier = classifier.fit(Z, labels)
         return True
 
-    def _judge(self, X: Traces) -> Judgement:
+    def _predict(self, X: Traces) -> BaselinePrediction:
+        """Return the credible interval of the success probability."""
         from scipy.special import expit
 
-        mean, variance = self._classifier.latent_mean_and_variance(self._components.transform(X))
+        Z = self._components.transform(X)
+        mean, variance = self._classifier.latent_mean_and_variance(Z)
         half = normal_quantile(self.policy.alpha) * np.sqrt(np.maximum(variance, 0.0))
-        return Judgement(np.asarray(expit(mean - half)), np.asarray(expit(mean + half)))
+        return BaselinePrediction(np.asarray(expit(mean - half)), np.asarray(expit(mean + half)))
 
 
 def risk_bound(n_wrong: int, n: int, delta: float) -> float:
-    """The largest risk under which n_wrong or fewer errors in n have a probability of at least delta.
+    """Return the largest risk at which n_wrong errors or fewer in n have probability delta.
 
-    The paper's B*, the inversion of the binomial tail. 1 where nothing was seen.
-    Source: Geifman and El-Yaniv (2017), "Selective classification for deep neural networks", NIPS 30, Algorithm 1.
+    The paper's B*, the inversion of the binomial tail; 1 if nothing was seen.
+
+    References
+    ----------
+    Geifman and El-Yaniv (2017), "Selective classification for deep neural networks", NIPS 30,
+    Algorithm 1.
     """
     from scipy.special import betaincinv
 
@@ -375,47 +497,79 @@ def risk_bound(n_wrong: int, n: int, delta: float) -> float:
 
 
 def guaranteed_threshold(confidence: Floats, wrong: Labels, risk: float, delta: float) -> float:
-    """The confidence from which on a classifier errs with at most `risk`; infinity where no threshold can be vouched for.
+    """Find the confidence from which on a classifier errs with at most the given risk.
 
-    confidence, wrong : (m,) of traces that the classifier was not trained on, and whether it errs on each.
-    With probability 1 - delta over these traces the risk beyond the threshold is at most `risk`, if they are independent
-    draws from what will be decided: ceil(log2 m) thresholds are looked at, each with its share of delta.
+    With probability 1 - delta over these traces the risk beyond the threshold is at most `risk`, if
+    they are independent draws from what will be decided: ceil(log2 m) thresholds are tried by
+    bisection, each with its share of delta.
+
+    Parameters
+    ----------
+    confidence : array of float, shape (m,)
+        Of traces that the classifier was not trained on.
+    wrong : array of bool, shape (m,)
+        Whether it errs on each.
+    risk, delta : float
+
+    Returns
+    -------
+    threshold : float
+        Infinity if no threshold can be guaranteed.
     """
+    if not len(confidence):
+        return math.inf
     ordered = np.sort(confidence)
-    m, found = len(ordered), math.inf
-    looks = max(1, math.ceil(math.log2(max(m, 1))))
-    low, high = 1, m  # ranks, as in the paper
-    for _ in range(looks if m else 0):
+    threshold = math.inf
+    n_looks = max(1, math.ceil(math.log2(len(ordered))))
+    # Ranks, as in the paper.
+    low = 1
+    high = len(ordered)
+    for _ in range(n_looks):
         rank = math.ceil((low + high) / 2)
         beyond = confidence >= ordered[rank - 1]
-        if risk_bound(int(wrong[beyond].sum()), int(beyond.sum()), delta / looks) < risk:
-            high, found = rank, float(ordered[rank - 1])
+        if risk_bound(int(wrong[beyond].sum()), int(beyond.sum()), delta / n_looks) < risk:
+            high = rank
+            threshold = float(ordered[rank - 1])
         else:
             low = rank
-    return found
+    return threshold
 
 
 @dataclass(eq=False, kw_only=True)
 class RocketSelective(Baseline):
     """MiniRocket (aeon), logistic regression, and SGR's threshold on each side, with delta = alpha.
 
-    n_kernels : of MiniRocket, 84 at least; aeon's default.
-    holdout : share of the labels that choose the thresholds and train nothing; drawn anew at each training.
-    C : inverse strength of the logistic regression's penalty, as in scikit-learn; features are standardised.
-
-    For each training and each side by itself: with probability 1 - alpha over the held-out labels at most 1 - LB of what is
-    decided on that side is wrong, for parts like those that were held out. In the loop these were verified or stopped:
-    of good parts beyond the threshold that are not confirmed only the bad ones return, which errs on the safe side for
-    accepting; of rejected parts nothing returns. Nothing is learned between two trainings, and `predict_interval` gives the
+    For each training and each side by itself: with probability 1 - alpha over the held-out labels
+    at most 1 - LB of what is decided on that side is wrong, for parts like those that were held
+    out. In the loop these were verified or stopped. Of good parts beyond the threshold that are not
+    confirmed only the bad ones return, which errs on the safe side for accepting; of rejected parts
+    nothing returns. Nothing is learned between two trainings, and `predict_interval` gives the
     classifier's probability twice.
-    Sources: Dempster, Schmidt and Webb (2021), "MiniRocket", KDD; Geifman and El-Yaniv (2017), NIPS 30, Algorithm 1.
+
+    Parameters
+    ----------
+    n_kernels : int, default 10000
+        Of MiniRocket, 84 at least.
+    holdout : float, default 0.5
+        Share of the labels that choose the thresholds and train nothing; drawn again at each
+        training.
+    C : float, default 0.001
+        Inverse strength of the logistic regression's penalty, as in scikit-learn; features are
+        standardised.
+
+    References
+    ----------
+    Dempster, Schmidt and Webb (2021), "MiniRocket", KDD; Geifman and El-Yaniv (2017), NIPS 30,
+    Algorithm 1.
     """
 
     title = "MiniRocket, logistic, SGR"
     bound = "SGR risk bound, each side and each training by itself"
-    tries = tuple({"C": C, "holdout": holdout} for holdout in (0.5, 0.3) for C in (0.001, 0.01))
+    candidates = tuple(
+        {"C": C, "holdout": holdout} for holdout in (0.5, 0.3) for C in (0.001, 0.01)
+    )
     chosen = 1
-    needs = "aeon"
+    library = "aeon"
 
     n_kernels: int = 10_000
     holdout: float = 0.5
@@ -427,34 +581,51 @@ class RocketSelective(Baseline):
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler
 
-        known = is_number(self.holdout) and 0.0 < self.holdout < 1.0
-        expect(known, "holdout to be a number above 0 and below 1", self.holdout)
-        expect(is_whole(self.n_kernels, 84, 2**31), "n_kernels to be an integer of at least 84", self.n_kernels)
+        is_share = is_number(self.holdout) and 0.0 < self.holdout < 1.0
+        expect(is_share, "holdout to be a number above 0 and below 1", self.holdout)
+        is_count = is_whole(self.n_kernels, 84, 2**31)
+        expect(is_count, "n_kernels to be an integer of at least 84", self.n_kernels)
         features = MiniRocket(n_kernels=self.n_kernels, random_state=self.seed)
-        features.fit_transform(np.eye(20, dtype=np.float32)[:, None, :])  # compiled here
-        self._classifier: Any = make_pipeline(features, StandardScaler(), LogisticRegression(C=self.C, max_iter=1000))
+        # Compiles the features here, so that no training is timed with that.
+        features.fit_transform(np.eye(20, dtype=np.float32)[:, None, :])
+        regression = LogisticRegression(C=self.C, max_iter=1000)
+        self._classifier: Any = make_pipeline(features, StandardScaler(), regression)
 
-    def _learn(self, X: Traces, good: Labels) -> bool:
-        order, size = np.random.default_rng(self.seed).permutation(len(X)), round(self.holdout * len(X))
-        train, rest = np.sort(order[size:]), np.sort(order[:size])  # at random, and blind to labels
-        if len(np.unique(good[train])) < 2 or not len(rest):
+    def _fit(self, X: Traces, good: Labels) -> bool:
+        """Train on some labels, choose both thresholds on the others; return False if too few."""
+        order = np.random.default_rng(self.seed).permutation(len(X))
+        n_held_out = round(self.holdout * len(X))
+        train = np.sort(order[n_held_out:])
+        held_out = np.sort(order[:n_held_out])
+        if len(np.unique(good[train])) < 2 or not len(held_out):
             return False
         self._classifier.fit(X[train], good[train])
-        p = self._judge(X[rest]).lower
-        self.limits = (self._threshold(p, good[rest]), 1.0 - self._threshold(1.0 - p, ~good[rest]))
+        p = self._predict(X[held_out]).lower
+        labels = good[held_out]
+        self.thresholds = (self._threshold(p, labels), 1.0 - self._threshold(1.0 - p, ~labels))
         return True
 
-    def _judge(self, X: Traces) -> Judgement:
+    def _predict(self, X: Traces) -> BaselinePrediction:
         p = np.asarray(self._classifier.predict_proba(X)[:, 1], dtype=np.float64)
-        return Judgement(p, p)
+        return BaselinePrediction(p, p)
 
     def _threshold(self, p: Floats, right: Labels) -> float:
-        """From which p (m,) on a side is decided, with `right` (m,); infinity where nothing can be vouched for."""
+        """Return from which probability on one side is decided; infinity if none is guaranteed.
+
+        Parameters
+        ----------
+        p : array, shape (m,)
+            Probability of that side, of traces that were held out.
+        right : array of bool, shape (m,)
+            Whether that side is right.
+        """
         called = p > 0.5
-        return guaranteed_threshold(p[called], ~right[called], 1.0 - self.policy.lower_bound, self.policy.alpha)
+        risk = 1.0 - self.policy.lower_bound
+        return guaranteed_threshold(p[called], ~right[called], risk, self.policy.alpha)
 
 
-BASELINES: dict[str, type[Baseline]] = {  # their libraries are imported where they are made
+# The library of a baseline is imported when it is made.
+BASELINES: dict[str, type[Baseline]] = {
     "knn": AgreeingNeighbours,
     "wskde": WilsonKernelDensity,
     "gp": GaussianProcess,
@@ -465,23 +636,42 @@ BASELINES: dict[str, type[Baseline]] = {  # their libraries are imported where t
 
 
 def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Baseline:
-    """A baseline by its name in `BASELINES`, untrained, for `DataEngine(model=...)`.
+    """Make an untrained baseline for `DataEngine(model=...)`.
 
-    policy : its alpha and lower_bound are the baseline's; what it has beside them belongs to the engine.
-    seed : of all that it draws.  params : its own settings; those left out have the class's defaults.
-    Its library is imported and compiled here, so that no training is timed with that: aeon takes a minute at first.
-    SettingError for an unknown name, an unknown parameter, a value out of range, or a library that is missing.
+    Its library is imported and compiled here, so that no training is timed with that; aeon takes a
+    minute the first time.
+
+    Parameters
+    ----------
+    name : str
+        A name in `BASELINES`.
+    policy : Policy
+        Its alpha and lower_bound are the baseline's; the rest belongs to the engine.
+    seed : int, default 0
+        Of everything drawn.
+    **params
+        The baseline's own settings; those left out have the defaults of its class.
+
+    Raises
+    ------
+    SettingError
+        An unknown name or parameter, a value out of range, or a library that is not installed.
     """
-    require(name)
-    known = [each.name for each in fields(BASELINES[name]) if each.kw_only]
-    if unknown := ", ".join(sorted(set(params) - set(known))):
-        raise SettingError(f"The baseline {name} has no parameter {unknown}; it has {', '.join(known) or 'none'}.")
-    return BASELINES[name](policy, seed, **params)
+    require_baseline(name)
+    kind = BASELINES[name]
+    names = [item.name for item in fields(kind) if item.kw_only]
+    if unknown := ", ".join(sorted(set(params) - set(names))):
+        parameters = ", ".join(names) or "none"
+        raise SettingError(f"The baseline {name} has no parameter {unknown}; it has {parameters}.")
+    return kind(policy, seed, **params)
 
 
-def require(name: str) -> None:
-    """SettingError where there is no baseline of this name, or the library that it is made with is missing."""
+def require_baseline(name: str) -> None:
+    """Raise SettingError if there is no baseline of this name, or its library is not installed."""
     expect(name in BASELINES, f"a baseline among {', '.join(BASELINES)}", name)
-    needs = BASELINES[name].needs
-    if needs and find_spec(needs) is None:
-        raise SettingError(f'The baseline {name} needs {needs}, which is missing; pip install "dengine[baselines]".')
+    library = BASELINES[name].library
+    if library and find_spec(library) is None:
+        raise SettingError(
+            f"The baseline {name} needs {library}, which is missing; "
+            'pip install "dengine[baselines]".'
+        )

@@ -4,13 +4,15 @@
     print(curve.sentence)
     curve.policy, curve.to_frame()
 
-A part's mean cost, in one unit of the user's, is check x verified + escape x accepted and bad + false_reject x rejected and
-good, over all parts of a replay, its beginning included. Verifying everything costs `check` a part.
+A part's mean cost is check x verified + escape x (accepted and bad) + false_reject x (rejected and
+good), in one unit of the user's, over all parts of a replay, its beginning included. Verifying
+everything costs `check` per part.
 
-The cheapest of many candidates is partly the luckiest: it is chosen on one half of the shuffles, with half an error added
-to each count of them, and reported on the other. That takes the luck of the order out, not that of the recordings: every
-shuffle plays the same parts. The interval is a little too narrow for a policy picked among many; only parts recorded later
-are a clean test.
+The cheapest of many candidates is partly the luckiest. So the policy is chosen on one half of the
+shuffles, with half an error added to each count of errors, and reported on the other half. That
+takes the luck of the order out, not that of the recordings: every shuffle plays the same parts. The
+interval is a little too narrow for a policy picked among many; only parts recorded later are a
+clean test.
 """
 
 from collections.abc import Sequence
@@ -33,23 +35,34 @@ if TYPE_CHECKING:
 ALPHAS = (0.2, 0.1, 0.05)
 LOWER_BOUNDS = (0.8, 0.9, 0.95, 0.98, 0.99)
 REPEATS = 10  # shuffles, half of them to choose by
-LEVEL = 0.05  # of the intervals
+ERROR_LEVEL = 0.05  # of the intervals
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyCost:
-    """What a part costs under one policy; all but `chosen_by` over the shuffles that report.
+    """What a part costs under one policy, over the shuffles that report.
 
-    chosen_by : expected cost a part over the shuffles that choose: every share of wrong decisions with half an error added.
-    cost : mean cost a part.
-    lower, upper : the cost with both shares of wrong decisions at the ends of their intervals, together 95 %.
-    late : mean cost a part over the last third of each shuffle, once something was learned.
-    verified, certain : shares of all parts, checked or not.
-    bad : bad parts among the accepted.  good : good ones among the rejected.
+    Attributes
+    ----------
+    policy : Policy
+    expected_cost : float
+        Per part over the shuffles that choose, with half an error added to each share of wrong
+        decisions. The cheapest policy is chosen by it.
+    cost : float
+        Mean per part.
+    lower, upper : float
+        The cost with both shares of wrong decisions at the ends of their intervals, which hold
+        together at 95 %.
+    late : float
+        Mean cost per part over the last third of each shuffle, when something has been learned.
+    verified, certain : float
+        Shares of the parts that were checked, and that were not.
+    bad, good : ErrorRate
+        Bad parts among the accepted ones, good parts among the rejected ones.
     """
 
     policy: Policy
-    chosen_by: float
+    expected_cost: float
     cost: float
     lower: float
     upper: float
@@ -62,11 +75,19 @@ class PolicyCost:
 
 @dataclass(frozen=True, slots=True)
 class CostCurve:
-    """What a part costs under each policy that was tried, in recordings of `dataset`.
+    """What a part costs under each policy that was tried.
 
-    rows : by alpha, from the largest, then LB; last the guarantee of costs, where it was tried.
-    recipe : its name.  cycles : of each shuffle.
-    choosing, reporting : how many shuffles did what.
+    Attributes
+    ----------
+    costs : Costs
+    rows : tuple of PolicyCost
+        By alpha, from the largest, then by LB; last the guarantee of costs, if it was tried.
+    dataset, recipe : str
+        Their names.
+    cycles : int
+        Parts of each shuffle.
+    choosing, reporting : int
+        Number of shuffles that chose, and that report.
     """
 
     costs: Costs
@@ -79,52 +100,80 @@ class CostCurve:
 
     @property
     def cheapest(self) -> PolicyCost:
-        """Cheapest in the shuffles that choose, of those that decided anything; of equal ones the strictest."""
-        decided = [row for row in self.rows if row.certain] or self.rows
-        return min(decided, key=lambda row: (row.chosen_by, -row.policy.lower_bound, row.policy.alpha))
+        """The policy with the lowest expected cost among those that decided anything.
+
+        Of equal ones the strictest.
+        """
+        deciding = [row for row in self.rows if row.certain] or self.rows
+
+        def key(row: PolicyCost) -> tuple[float, float, float]:
+            return row.expected_cost, -row.policy.lower_bound, row.policy.alpha
+
+        return min(deciding, key=key)
 
     @property
     def verdict(self) -> str:
-        """Of the cheapest policy: "pays" (its whole interval is below verifying everything), "may pay" (its mean is), or
-        "does not pay".
+        """Whether the cheapest policy costs less than verifying everything.
+
+        "pays" if its whole interval is below that, "may pay" if its mean is, else "does not pay".
         """
         row = self.cheapest
-        if max(row.chosen_by, row.cost) >= self.costs.check:
+        if max(row.expected_cost, row.cost) >= self.costs.check:
             return "does not pay"
         return "pays" if row.upper < self.costs.check else "may pay"
 
     @property
     def policy(self) -> Policy | None:
-        """The policy that pays, or may: try it in the shadow mode first. None where none does: verify everything."""
+        """The policy that pays, or may pay; None if none does.
+
+        Try it in shadow mode first.
+        """
         return None if self.verdict == "does not pay" else self.cheapest.policy
 
     @property
     def sentence(self) -> str:
-        """The result, for people."""
-        row, every = self.cheapest, f"verifying everything costs {self.costs.check:g} a part"
-        who = f"alpha {row.policy.alpha:g}, LB {100 * row.policy.lower_bound:g} %"
-        who = "the cost guarantee" if row.policy.guarantee == "cost" else who
-        between = f"with the errors at the ends of their 95 % intervals {row.lower:.3g} to {row.upper:.3g}"
-        if not any(each.certain for each in self.rows):
-            return f"Nothing pays yet: {every}, and under each policy that was tried everything was verified. Record more."
+        """The result for people."""
+        row = self.cheapest
+        verify_all = f"verifying everything costs {self.costs.check:g} a part"
+        if not any(item.certain for item in self.rows):
+            return (
+                f"Nothing pays yet: {verify_all}, and under each policy that was tried everything "
+                f"was verified. Record more."
+            )
+        name = f"alpha {row.policy.alpha:g}, LB {100 * row.policy.lower_bound:g} %"
+        if row.policy.guarantee == "cost":
+            name = "the cost guarantee"
+        ends = f"{row.lower:.3g} to {row.upper:.3g}"
+        interval = f"with the errors at the ends of their 95 % intervals {ends}"
         if self.policy is None:
-            seen = f"is expected to cost {row.chosen_by:.3g} and cost {row.cost:.3g} in other shuffles, {between}"
-            return f"Nothing pays: {every}; the cheapest policy, {who}, {seen}. Go on verifying, or record more."
-        said = f"{who} {self.verdict}: {row.cost:.3g} a part, {between}; {every}."
+            return (
+                f"Nothing pays: {verify_all}; the cheapest policy, {name}, is expected to cost "
+                f"{row.expected_cost:.3g} and cost {row.cost:.3g} in other shuffles, {interval}. "
+                "Go on verifying, or record more."
+            )
+        result = f"{name} {self.verdict}: {row.cost:.3g} a part, {interval}; {verify_all}."
         if self.verdict == "pays":
-            return said
-        bad, worst = (percent(share, ".3g") for share in (row.bad.upper, self.costs.worst_accept))
-        but = f"of the accepted parts up to {bad} may be bad, and accepting pays up to {worst}"
-        return f"{said} Not certainly: {but}. More recordings narrow that; in production audits and stops do."
+            return result
+        bad = percent(row.bad.upper, ".3g")
+        worst = percent(self.costs.worst_accept, ".3g")
+        return (
+            f"{result} Not certainly: of the accepted parts up to {bad} may be bad, and accepting "
+            f"pays up to {worst}. More recordings narrow that; in production audits and stops do."
+        )
 
     def to_frame(self) -> "pd.DataFrame":
-        """A row a policy; shares from 0 to 1, costs in the user's unit."""
+        """Return a table with a row for each policy, and whether it was chosen.
+
+        Shares are from 0 to 1, costs in the user's unit.
+        """
         import pandas as pd
 
-        frame = pd.json_normalize([asdict(row) for row in self.rows], sep="_")  # policy_alpha, bad_rate …
-        own = [name for name in frame if not name.startswith("policy_")]
-        two = {f"policy_{name}": name for name in ("guarantee", "alpha", "lower_bound")}
-        return frame[[*two, *own]].rename(columns=two).assign(chosen=[row.policy == self.policy for row in self.rows])
+        # Its columns are policy_alpha, bad_rate and so on.
+        frame = pd.json_normalize([asdict(row) for row in self.rows], sep="_")
+        names = {f"policy_{name}": name for name in ("guarantee", "alpha", "lower_bound")}
+        others = [name for name in frame if not name.startswith("policy_")]
+        frame = frame[[*names, *others]].rename(columns=names)
+        return frame.assign(chosen=[row.policy == self.policy for row in self.rows])
 
 
 def cost_curve(
@@ -142,88 +191,152 @@ def cost_curve(
     n_jobs: int = 1,
     keep: Folder | None = None,
 ) -> CostCurve:
-    """Replay recordings under every alpha and lower bound, and by the costs themselves, and say what a part cost.
+    """Compute what a part costs under every alpha and LB, and under the guarantee of costs.
 
-    dataset : anything `load_dataset` takes, such as a folder of recordings.
-    check, escape, false_reject : as in `Costs`, in one unit.
-    recipe : anything `Recipe.load` takes; of its policy alpha and lower_bound are replaced, the rest is kept.
-    repeats : shuffles of each policy, 2 or more: the first half of them chooses, the other reports.  seed : of the first.
-    cycles : parts of each shuffle; None: all.  n_jobs, keep : as in `run_grid`.
-    SettingError for a cost, a policy or a number of repeats that is none.
+    Parameters
+    ----------
+    dataset : object
+        Anything `load_dataset` takes, such as a folder of recordings.
+    check, escape, false_reject : float
+        As in `Costs`, in one unit.
+    recipe : object, default "conv"
+        Anything `Recipe.load` takes. Its policy's alpha and lower_bound are replaced.
+    alphas, lower_bounds : sequence of float
+        To try.
+    repeats : int, default 10
+        Shuffles of each policy, 2 or more: the first half chooses, the other half reports.
+    seed : int, default 0
+        Of the first shuffle.
+    cycles : int or None, default None
+        Parts of each shuffle; None plays all.
+    n_jobs, keep
+        As in `run_grid`.
+
+    Returns
+    -------
+    curve : CostCurve
+
+    Raises
+    ------
+    SettingError
+        A cost, a policy or a number of repeats out of range.
     """
     costs = Costs(check, escape, false_reject)
     expect(repeats >= 2, "2 or more repeats", repeats, "one half chooses, the other one reports")
-    tasks = priced_tasks(recipe, costs, alphas, lower_bounds, range(seed, seed + repeats), cycles)
+    seeds = range(seed, seed + repeats)
+    tasks = priced_tasks(recipe, costs, alphas, lower_bounds, seeds, cycles)
     return curve_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep), costs)
 
 
 def priced_tasks(
-    who: Any,
+    recipe: Any,
     costs: Costs,
     alphas: Sequence[float],
     lower_bounds: Sequence[float],
     seeds: Sequence[int],
     cycles: int | None = None,
 ) -> list[Task]:
-    """Every alpha and lower bound; then dengine's guarantee of costs, where it takes them and outcomes are heard of."""
-    one, tasks = Contender.load(who), grid_tasks([who], alphas, lower_bounds, seeds=seeds, cycles=cycles)
-    if one.baseline is None:
-        with suppress(SettingError):  # of costs that are no prices, or of outcomes that nobody hears of
-            tasks += grid_tasks([one.with_policy(guarantee="cost", prices=astuple(costs))], seeds=seeds, cycles=cycles)
+    """Return the replays of a cost curve as tasks.
+
+    There is one for every alpha, lower bound and seed, and one for every seed under the guarantee
+    of costs, unless the contender is a baseline or that guarantee refuses these costs or the
+    policy's feedback.
+    """
+    contender = Contender.load(recipe)
+    tasks = grid_tasks([contender], alphas, lower_bounds, seeds=seeds, cycles=cycles)
+    if contender.baseline is None:
+        with suppress(SettingError):
+            priced = contender.with_policy(guarantee="cost", prices=astuple(costs))
+            tasks += grid_tasks([priced], seeds=seeds, cycles=cycles)
     return tasks
 
 
 def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
-    """The curve of finished replays, of one recipe; those of shuffles that not every policy has played are left out.
+    """Return the cost curve of finished replays of one recipe.
 
-    SettingError where fewer than two shuffles are complete.
+    Shuffles that not every policy has played are left out.
+
+    Raises
+    ------
+    SettingError
+        Fewer than two shuffles are complete.
     """
-    policies = list(dict.fromkeys(each.recipe.policy for each in replays))
-    of = {(each.recipe.policy, each.seed): each for each in replays}
-    seeds = [seed for seed in sorted({each.seed for each in replays}) if all((one, seed) in of for one in policies)]
+    policies = list(dict.fromkeys(replay.recipe.policy for replay in replays))
+    policies.sort(
+        key=lambda policy: (policy.guarantee == "cost", -policy.alpha, policy.lower_bound)
+    )
+    by_key = {(replay.recipe.policy, replay.seed): replay for replay in replays}
+    seeds = [
+        seed
+        for seed in sorted({replay.seed for replay in replays})
+        if all((policy, seed) in by_key for policy in policies)
+    ]
     expect(len(seeds) >= 2, "2 or more shuffles that every policy has played", len(seeds))
     half = len(seeds) // 2
-    rows = [
-        _row(policy, [of[policy, seed] for seed in seeds[:half]], [of[policy, seed] for seed in seeds[half:]], costs)
-        for policy in sorted(policies, key=lambda each: (each.guarantee == "cost", -each.alpha, each.lower_bound))
+    rows = []
+    for policy in policies:
+        complete = [by_key[policy, seed] for seed in seeds]
+        rows.append(_policy_cost(policy, complete[:half], complete[half:], costs))
+    first = replays[0]
+    return CostCurve(
+        costs=costs,
+        rows=tuple(rows),
+        dataset=first.dataset,
+        recipe=first.name,
+        cycles=len(first),
+        choosing=half,
+        reporting=len(seeds) - half,
+    )
+
+
+def _policy_cost(
+    policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay], costs: Costs
+) -> PolicyCost:
+    """Return the row of one policy from the shuffles that choose and those that report."""
+    accepted = float(np.mean([replay.accepted for replay in reporting]))
+    rejected = float(np.mean([replay.rejected for replay in reporting]))
+    certain = accepted + rejected
+    # Each at half the error level: together they hold at ERROR_LEVEL.
+    bad = pooled_error(reporting, "accepted", ERROR_LEVEL / 2)
+    good = pooled_error(reporting, "rejected", ERROR_LEVEL / 2)
+    late_costs = [
+        cost_per_part(replay, costs, slice(2 * len(replay) // 3, None)) for replay in reporting
     ]
-    one = replays[0]
-    return CostCurve(costs, tuple(rows), one.dataset, one.name, len(one), half, len(seeds) - half)
-
-
-def _row(policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay], costs: Costs) -> PolicyCost:
-    accepted, rejected = (float(np.mean([getattr(r, side) for r in reporting])) for side in ("accepted", "rejected"))
-    # Each at half the level: together they hold at LEVEL.
-    bad, good = (pooled_error(reporting, side, LEVEL / 2) for side in ("accepted", "rejected"))
-    ends = ((bad.lower, good.lower), (bad.upper, good.upper))
-    lower, upper = (costs.check - costs.saved(accepted + rejected, accepted * fp, rejected * fn) for fp, fn in ends)
     return PolicyCost(
         policy=policy,
-        chosen_by=_expected_cost(choosing, costs),
-        cost=float(np.mean([cost_a_part(each, costs) for each in reporting])),
-        lower=lower,
-        upper=upper,
-        late=float(np.mean([cost_a_part(each, costs, slice(2 * len(each) // 3, None)) for each in reporting])),
+        expected_cost=_expected_cost(choosing, costs),
+        cost=float(np.mean([cost_per_part(replay, costs) for replay in reporting])),
+        lower=costs.check - costs.saved(certain, accepted * bad.lower, rejected * good.lower),
+        upper=costs.check - costs.saved(certain, accepted * bad.upper, rejected * good.upper),
+        late=float(np.mean(late_costs)),
         verified=1.0 - accepted - rejected,
-        certain=accepted + rejected,
+        certain=certain,
         bad=bad,
         good=good,
     )
 
 
 def _expected_cost(replays: Sequence[Replay], costs: Costs) -> float:
-    """Cost a part with each share of wrong decisions at its Jeffreys mean, (wrong + 1/2) / (decided + 1) in one shuffle.
+    """Return the cost per part with each share of wrong decisions at its Jeffreys mean.
 
-    No error among 25 accepted parts is not no error ever: by the plain mean the few would look free, whatever one costs.
+    That is (wrong + 1/2) / (decided + 1) in one shuffle. No error among 25 accepted parts does not
+    mean that there is never one: by the plain mean a few decisions would look free at any price.
     """
-    counts, names = [each.stretch() for each in replays], ("accepted", "false_positive", "rejected", "false_negative")
-    accepted, bad, rejected, good = (float(np.mean([each[name] for each in counts])) for name in names)
-    wrong = (accepted * (bad + 0.5) / (accepted + 1.0), rejected * (good + 0.5) / (rejected + 1.0))
-    return costs.check - costs.saved(accepted + rejected, *wrong) / len(replays[0])
+    counts = [replay.stretch() for replay in replays]
+    accepted = float(np.mean([count["accepted"] for count in counts]))
+    bad = float(np.mean([count["false_positive"] for count in counts]))
+    rejected = float(np.mean([count["rejected"] for count in counts]))
+    good = float(np.mean([count["false_negative"] for count in counts]))
+    expected_bad = accepted * (bad + 0.5) / (accepted + 1.0)
+    expected_good = rejected * (good + 0.5) / (rejected + 1.0)
+    saved = costs.saved(accepted + rejected, expected_bad, expected_good)
+    return costs.check - saved / len(replays[0])
 
 
-def cost_a_part(replay: Replay, costs: Costs, part: slice = slice(None)) -> float:
-    """Mean cost a part over some cycles of a replay."""
+def cost_per_part(replay: Replay, costs: Costs, part: slice = slice(None)) -> float:
+    """Return the mean cost per part over some cycles of a replay."""
     counts = replay.stretch(part)
-    saved = costs.saved(counts["accepted"] + counts["rejected"], counts["false_positive"], counts["false_negative"])
-    return float(costs.check - saved / (counts["last_cycle"] - counts["first_cycle"] + 1))
+    n_certain = counts["accepted"] + counts["rejected"]
+    saved = costs.saved(n_certain, counts["false_positive"], counts["false_negative"])
+    n_cycles = counts["last_cycle"] - counts["first_cycle"] + 1
+    return float(costs.check - saved / n_cycles)

@@ -1,9 +1,9 @@
-"""Pictures as matplotlib figures, without pyplot, whose global state leaks into notebooks: of replays, grids and costs;
-of a run, a data set, and one decision among its neighbours.
+"""Pictures as matplotlib figures: of replays, grids, costs, runs, data sets and single decisions.
 
     save(curves({"conv": replays}), "out/curves.png")
 
-Colours: Okabe and Ito (2008), distinct to all eyes.
+They are made without pyplot, whose global state leaks into notebooks. The colours are those of
+Okabe and Ito (2008), which colour-blind readers can tell apart.
 """
 
 from __future__ import annotations
@@ -24,41 +24,64 @@ from ..history.explain import Bound, Explanation
 from ..records import Action
 from ..reducers import has_own_unit
 from ..traces import as_traces
-from .costs import CostCurve
+from .costs import CostCurve, PolicyCost
 from .replay import Replay
-from .survey import levels
+from .survey import channel_means
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
-Look = dict[str, Any]
+Style = dict[str, Any]  # keywords of matplotlib's drawing functions
 
-BLUE, RED, GREEN, PINK, SKY, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
-GREY, BLACK = "#6E6E6E", "#000000"
-GOOD, BAD, VERIFIED = BLUE, RED, GREY  # of parts, and of the decisions that call them so
-RECIPES = (GREEN, PINK, ORANGE, SKY, BLUE, RED)  # first those that mean nothing else
-LIMIT: Look = {"color": BLACK, "linestyle": ":", "linewidth": 1.2}  # a bound, or a moment, that is given
+BLUE = "#0072B2"
+RED = "#D55E00"
+GREEN = "#009E73"
+PINK = "#CC79A7"
+SKY = "#56B4E9"
+ORANGE = "#E69F00"
+GREY = "#6E6E6E"
+BLACK = "#000000"
+# Of parts, and of the decisions that call them so.
+GOOD = BLUE
+BAD = RED
+VERIFIED = GREY
+RECIPES = (GREEN, PINK, ORANGE, SKY, BLUE, RED)  # first the colours that mean nothing else
+LIMIT: Style = {"color": BLACK, "linestyle": ":", "linewidth": 1.2}  # a bound that is given
 SMALL = 9  # points: legends and notes
 WINDOW = 300  # cycles of a sliding window, and parts of a map: the paper's
-ERRORS = (("false_positive", "accepted", "bad", "-"), ("false_negative", "rejected", "good", "--"))
-GRID_LINES = ("certain, of all cycles", "precision, of accepted", "LB", "bad of accepted", "good of rejected", "100 - LB")
-KINDS = ((True, "good", GOOD, "-", "o"), (False, "bad", BAD, "--", "X"))
+# Wrong decisions, what they are counted among, their name in the legend, and their line.
+ERRORS = (
+    ("false_positive", "accepted", "bad", "-"),
+    ("false_negative", "rejected", "good", "--"),
+)
+GRID_LINES = (
+    "certain, of all cycles",
+    "precision, of accepted",
+    "LB",
+    "bad of accepted",
+    "good of rejected",
+    "100 - LB",
+)
+# Label, name, colour, line and marker of parts.
+LABEL_STYLES = ((True, "good", GOOD, "-", "o"), (False, "bad", BAD, "--", "X"))
 CLEAR = 0.1  # band widths below which leaving the band is not marked
-FEWEST = 20  # parts: a share of fewer jumps by more than five in a hundred with each, and is not drawn
-ACTION_MARKS: dict[Any, tuple[str, Look]] = {  # drawn in this order, so that the few certain ones lie on top
+FEWEST = 20  # a share of fewer parts jumps by more than 5 % with each part, and is not drawn
+# Drawn in this order, so that the few certain ones lie on top.
+ACTION_MARKS: dict[Any, tuple[str, Style]] = {
     Action.VERIFY: ("verify", {"color": VERIFIED, "marker": "o", "s": 9}),
     Action.ACCEPT: ("accept", {"color": GOOD, "marker": "o", "s": 26}),
     Action.REJECT: ("reject", {"color": BAD, "marker": "X", "s": 30}),
 }
-TRUTH_MARKS: dict[Any, tuple[str, Look]] = {
-    good: (f"{name} part", {"color": colour, "marker": marker, "s": 24}) for good, name, colour, _, marker in KINDS
+TRUTH_MARKS: dict[Any, tuple[str, Style]] = {
+    label: (f"{name} part", {"color": colour, "marker": marker, "s": 24})
+    for label, name, colour, _, marker in LABEL_STYLES
 }
 
 
 def sliding_sum(values: NDArray[Any], window: int) -> Floats:
-    """(..., n) -> (..., n): sum over the last `window` values, over all so far where there are fewer."""
+    """Return the sum of the last `window` values, (..., n), or of all if there are fewer."""
     total = np.cumsum(np.asarray(values, dtype=np.float64), axis=-1)
     out = total.copy()
     out[..., window:] -= total[..., :-window]
@@ -66,17 +89,17 @@ def sliding_sum(values: NDArray[Any], window: int) -> Floats:
 
 
 def sliding_mean(values: NDArray[Any], window: int) -> Floats:
-    """(..., n) -> (..., n): mean over the last `window` values, over all so far where there are fewer."""
+    """Return the mean of the last `window` values, (..., n), or of all if there are fewer."""
     return sliding_sum(values, window) / sliding_sum(np.ones(values.shape[-1]), window)
 
 
-def fitting(window: int, replays: Sequence[Replay]) -> int:
-    """The window, or a third of the longest replay where that is less."""
+def fit_window(window: int, replays: Sequence[Replay]) -> int:
+    """Return the window, or a third of the longest replay if that is less."""
     return min(window, max(1, max(map(len, replays)) // 3))
 
 
 def blank(width: float, height: float, title: str = "") -> Figure:
-    """An empty figure, inches."""
+    """Return an empty figure; width and height in inches."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
@@ -85,90 +108,164 @@ def blank(width: float, height: float, title: str = "") -> Figure:
 
 
 def finish(axes: Axes, legend: int = 3, **settings: Any) -> None:
-    """A light grid and no box; the legend above, in so many columns: inside, it would lie on one curve or another.
+    """Give axes a light grid, no box, and a legend above them, where it hides no curve.
 
-    legend : 0 for none.  settings : as `Axes.set` takes them.
+    Parameters
+    ----------
+    axes : Axes
+    legend : int, default 3
+        Columns of the legend; 0 draws none.
+    **settings
+        As `Axes.set` takes them.
     """
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set(**settings)
     if legend:
-        look: Look = {"ncols": legend, "frameon": False, "fontsize": SMALL, "borderaxespad": 0.2}
-        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), **look)
+        axes.legend(
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=legend,
+            frameon=False,
+            fontsize=SMALL,
+            borderaxespad=0.2,
+        )
 
 
 def note(axes: Axes, text: str, colour: str = BLACK) -> None:
-    """Words in the middle, where there is nothing to draw."""
+    """Write a text into the middle of axes that have nothing to show."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=colour)
 
 
 def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) -> Path:
-    """Write a figure as its suffix says; makes the folder. OutputError where a file is there, without `force`."""
+    """Write a figure in the format that the file's suffix names, creating the folder.
+
+    Returns
+    -------
+    path : Path
+
+    Raises
+    ------
+    OutputError
+        The file exists and `force` is not set, or the suffix names no format.
+    """
+    path = Path(path)
     buffer = BytesIO()
     with instead(OutputError, f"Cannot draw {path}", ValueError, do="name it .png, .pdf or .svg"):
-        figure.savefig(buffer, dpi=dpi, format=Path(path).suffix.removeprefix(".") or "png")
+        figure.savefig(buffer, dpi=dpi, format=path.suffix.removeprefix(".") or "png")
     return write_output(path, buffer.getvalue(), force, make_folder=True)
 
 
 def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure:
-    """Where the newest parts of a replay lie, by what they were and by what was decided; each retrain moves the map.
+    """Draw where the newest parts of a replay lie: left by their label, right by their decision.
 
-    The first two dimensions are drawn, the mean over the spaces. The circle is the ball around the newest part, where the
-    recipe fixes its radius. Units are equal on both axes, unless the first is a probability: then the second is for the
-    eye, and the ball is cut off above and below.
+    Each retrain moves the map. The first two dimensions are drawn, the mean over the spaces. The
+    circle is the neighbourhood of the newest part, with the recipe's radius. Units are equal on
+    both axes, unless the first dimension is a probability: then the second is only for the eye, and
+    the circle is cut off above and below.
+
+    Parameters
+    ----------
+    replay : Replay
+    last : int, default 300
+        How many parts are drawn.
+    title : str, default ""
+
+    Returns
+    -------
+    figure : Figure
     """
-    figure, recipe = blank(10.0, 6.2, title), replay.recipe
+    figure = blank(10.0, 6.2, title)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     positions = replay.position[-last:]
-    z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]  # zeros where a reducer has but one dimension
-    known, probability = np.isfinite(z).all(axis=1), has_own_unit(recipe.reducer)
-    first, second = (f"embedding {i} [root mean square radius = 1]" for i in (1, 2))
-    if probability:
-        first, second = "predicted probability of success", "embedding 2 [for the eye, small against the radius]"
-    truth, action = (left, "what the parts were", replay.truth), (right, "what was decided", replay.action)
-    for (axes, name, kinds), marks in ((truth, TRUTH_MARKS), (action, ACTION_MARKS)):
-        for kind, (word, look) in marks.items():
-            points = z[known & (kinds[-last:] == kind)]
-            axes.scatter(*points.T, label=f"{word} ({len(points)})", alpha=0.7, linewidths=0, **look)
-        if not known.any():
+    # Zeros where a reducer has but one dimension.
+    z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]
+    embedded = np.isfinite(z).all(axis=1)
+    is_probability = has_own_unit(replay.recipe.reducer)
+    x_label = "embedding 1 [root mean square radius = 1]"
+    y_label = "embedding 2 [root mean square radius = 1]"
+    if is_probability:
+        x_label = "predicted probability of success"
+        y_label = "embedding 2 [for the eye, small against the radius]"
+    panels = (
+        (left, "what the parts were", replay.truth, TRUTH_MARKS),
+        (right, "what was decided", replay.action, ACTION_MARKS),
+    )
+    for axes, name, values, marks in panels:
+        for value, (word, style) in marks.items():
+            points = z[embedded & (values[-last:] == value)]
+            label = f"{word} ({len(points)})"
+            axes.scatter(*points.T, label=label, alpha=0.7, linewidths=0, **style)
+        if not embedded.any():
             note(axes, "no trace was embedded yet")
-        finish(axes, xlabel=first)
+        finish(axes, xlabel=x_label)
         axes.set_title(name, pad=24)
-    left.set(ylabel=second)
-    if known.any():
-        low, high = z[known].min(axis=0), z[known].max(axis=0)
-        half = 0.56 * (high - low) + 1e-9
-        half = half if probability else np.full(2, half.max())
-        (x0, y0), (x1, y1) = (low + high) / 2 - half, (low + high) / 2 + half
-        left.set(xlim=(-0.06, 1.06) if probability else (x0, x1), ylim=(y0, y1))
-        cut = ", cut off above and below" if probability else ""
-        _draw_balls(figure, z[known][-1], recipe.radius, f"ball around the newest part, radius {recipe.radius:g}{cut}")
-    for axes in () if probability else (left, right):
-        axes.set_aspect("equal")
+    left.set(ylabel=y_label)
+    if embedded.any():
+        _set_map_limits(left, z[embedded], is_probability)
+        cut = ", cut off above and below" if is_probability else ""
+        radius = replay.recipe.radius
+        label = f"neighbourhood of the newest part, radius {radius:g}{cut}"
+        _draw_neighbourhood(figure, z[embedded][-1], radius, label)
+    if not is_probability:
+        left.set_aspect("equal")
+        right.set_aspect("equal")
     return figure
 
 
-def _draw_balls(figure: Figure, centre: Floats, radius: float, label: str) -> None:
+def _set_map_limits(axes: Axes, z: Floats, is_probability: bool) -> None:
+    """Set the limits of a map around points (n, 2): a square, or 0 to 1 for a probability."""
+    low = z.min(axis=0)
+    high = z.max(axis=0)
+    half = 0.56 * (high - low) + 1e-9
+    if not is_probability:
+        half = np.full(2, half.max())
+    x_low, y_low = (low + high) / 2 - half
+    x_high, y_high = (low + high) / 2 + half
+    axes.set(xlim=(-0.06, 1.06) if is_probability else (x_low, x_high), ylim=(y_low, y_high))
+
+
+def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, label: str) -> None:
+    """Draw a circle and its centre (2,) into all axes, and the label below them."""
     from matplotlib.patches import Circle
 
     for axes in figure.axes:
-        axes.add_patch(Circle((centre[0], centre[1]), radius, fill=False, edgecolor=BLACK, linewidth=1.4))
+        circle = Circle((centre[0], centre[1]), radius, fill=False, edgecolor=BLACK, linewidth=1.4)
+        axes.add_patch(circle)
         (mark,) = axes.plot(*centre, "+", color=BLACK, markersize=9, label=label)
     figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=SMALL)
 
 
-def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int = 1) -> dict[str, Floats]:
-    """What the paper plots, in percent, (n,) each, over a sliding window and all replays, which must be equally long.
+def window_curves(
+    replays: Sequence[Replay], window: int = WINDOW, fewest: int = 1
+) -> dict[str, Floats]:
+    """Compute the paper's curves over a sliding window of cycles.
 
-    certain : of all cycles in the window.  certain_low, certain_high : 10th and 90th percentile over the replays.
-    precision, false_positive : of the accepted parts in the windows of all replays together.
-    false_negative : of the rejected parts, likewise.  All three NaN where these are fewer than `fewest`.
+    Parameters
+    ----------
+    replays : sequence of Replay
+        All equally long.
+    window : int, default 300
+    fewest : int, default 1
+        Shares of fewer decisions are NaN.
+
+    Returns
+    -------
+    curves : dict of str to array, shape (n,)
+        In percent. certain : of all cycles in the window, the mean over the replays. certain_low,
+        certain_high : its 10th and 90th percentile over the replays. precision, false_positive : of
+        the accepted parts in the windows of all replays together. false_negative : of the rejected
+        parts.
     """
     certain = sliding_mean(np.stack([r.accepted | r.rejected for r in replays]), window)
 
+    def sum_in_window(name: str) -> Floats:
+        return sliding_sum(sum(getattr(r, name).astype(int) for r in replays), window)
+
     def share(wrong: str, decided: str) -> Floats:
-        bad, of = (sliding_sum(sum(getattr(r, name).astype(int) for r in replays), window) for name in (wrong, decided))
-        return np.where(of >= fewest, bad / np.maximum(of, 1.0), np.nan)
+        n_decided = sum_in_window(decided)
+        shares = sum_in_window(wrong) / np.maximum(n_decided, 1.0)
+        return np.where(n_decided >= fewest, shares, np.nan)
 
     false_positive = share("false_positive", "accepted")
     curves = {
@@ -182,60 +279,120 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     return {name: 100.0 * values for name, values in curves.items()}
 
 
-def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: int = WINDOW) -> Figure:
-    """The paper's two-part curve, a colour a recipe: certain and precision above; below the errors of what was decided.
+def curves(
+    by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: int = WINDOW
+) -> Figure:
+    """Draw the paper's curve, with a colour for each recipe.
 
-    The tolerance 100 - LB is a share of the accepted parts, so the errors are drawn as shares of what was decided alike.
+    Above: the share of certain decisions and their precision. Below: the errors, as shares of what
+    was decided alike, because the tolerance 100 - LB is a share of the accepted parts.
+
+    Parameters
+    ----------
+    by_recipe : mapping of str to sequence of Replay
+    title : str, default ""
+    window : int, default 300
+        Cycles of the sliding window; at most a third of the longest replay.
+
+    Returns
+    -------
+    figure : Figure
     """
-    wide = max(2, min(len(by_recipe), 4))  # recipes side by side in the legends: a column each, and one for the bound
-    figure = blank(3.6 + 2.7 * wide, 7.4, title)
+    # In the legends recipes stand side by side: a column for each, and one for the bound.
+    n_columns = max(2, min(len(by_recipe), 4))
+    figure = blank(3.6 + 2.7 * n_columns, 7.4, title)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(4, 3))
-    all_replays = [r for replays in by_recipe.values() for r in replays]
-    window, bounds = fitting(window, all_replays), sorted({r.recipe.policy.lower_bound for r in all_replays})
+    all_replays = [replay for replays in by_recipe.values() for replay in replays]
+    window = fit_window(window, all_replays)
+    bounds = sorted({replay.recipe.policy.lower_bound for replay in all_replays})
     for colour, (name, replays) in zip(cycle(RECIPES), by_recipe.items(), strict=False):
-        _draw_replays(top, bottom, replays, window, colour, f"{name}: " if len(by_recipe) > 1 else "")
+        prefix = f"{name}: " if len(by_recipe) > 1 else ""
+        _draw_replays(top, bottom, replays, window, colour, prefix)
     for bound in bounds:
         _draw_bounds(top, bottom, bound)
-    finish(top, wide + 1, ylim=(0, 102), ylabel="share [%]")
-    # Above the tolerance at least half as much again: whether the errors keep to it is what the panel is there for.
+    finish(top, n_columns + 1, ylim=(0, 102), ylabel="share [%]")
+    # At least half as much again above the tolerance: the panel shows whether errors keep to it.
     highest = max(bottom.get_ylim()[1], 150 * (1 - bounds[0]))
-    finish(bottom, wide + 1, ylim=(0, highest), ylabel="wrong [% of accepted, rejected]")
-    bottom.set(xlabel=f"cycle (end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn)")
+    finish(bottom, n_columns + 1, ylim=(0, highest), ylabel="wrong [% of accepted, rejected]")
+    windows = f"end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn"
+    bottom.set(xlabel=f"cycle ({windows})")
     return figure
 
 
-def _draw_replays(top: Axes, bottom: Axes, replays: Sequence[Replay], window: int, colour: str, lead: str = "") -> None:
-    """Above the certain share with its spread, and the precision; below the errors, with their counts in the legend."""
-    lines, counts = window_curves(replays, window, FEWEST), [each.stretch() for each in replays]
+def _draw_replays(
+    top: Axes,
+    bottom: Axes,
+    replays: Sequence[Replay],
+    window: int,
+    colour: str,
+    prefix: str = "",
+) -> None:
+    """Draw the certain share with its spread and the precision above, and the errors below.
+
+    The legend has the counts of the errors: where too few parts were decided alike for a curve,
+    they still say what went wrong.
+    """
+    lines = window_curves(replays, window, FEWEST)
+    counts = [replay.stretch() for replay in replays]
     x = np.arange(1, len(lines["certain"]) + 1)  # cycles are counted from 1
-    top.fill_between(x, lines["certain_low"], lines["certain_high"], color=colour, alpha=0.15, linewidth=0)
-    top.plot(x, lines["certain"], color=colour, label=f"{lead}certain, of all cycles")
-    top.plot(x, lines["precision"], color=colour, linestyle="--", label=f"{lead}precision, of accepted")
-    # Where too few parts were decided alike for a curve, the counts still say what went wrong.
-    for wrong, decided, kind, style in ERRORS:
-        label = f"{lead}{sum(n[wrong] for n in counts)} {kind} of {sum(n[decided] for n in counts)} {decided}"
-        bottom.plot(x, lines[wrong], style, color=colour, label=label)
+    low = lines["certain_low"]
+    high = lines["certain_high"]
+    top.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
+    top.plot(x, lines["certain"], color=colour, label=f"{prefix}certain, of all cycles")
+    label = f"{prefix}precision, of accepted"
+    top.plot(x, lines["precision"], color=colour, linestyle="--", label=label)
+    for wrong, decided, name, line in ERRORS:
+        n_wrong = sum(count[wrong] for count in counts)
+        n_decided = sum(count[decided] for count in counts)
+        label = f"{prefix}{n_wrong} {name} of {n_decided} {decided}"
+        bottom.plot(x, lines[wrong], line, color=colour, label=label)
 
 
 def _draw_bounds(top: Axes, bottom: Axes, bound: float) -> None:
+    """Draw LB into the upper axes and the tolerance into the lower ones."""
     top.axhline(100 * bound, label=f"LB = {100 * bound:g} %", **LIMIT)
-    bottom.axhline(100 * (1 - bound), label=f"tolerance 100 - LB = {100 * (1 - bound):g} %", **LIMIT)
+    tolerance = 100 * (1 - bound)
+    bottom.axhline(tolerance, label=f"tolerance 100 - LB = {tolerance:g} %", **LIMIT)
 
 
 def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW) -> Figure:
-    """The paper's figure of its grid: a row an alpha, from the largest; a column an LB; in each cell what `curves` draws.
+    """Draw the paper's figure of its grid.
 
-    replays : of one contender and interval, all equally long.
-    Source: the paper's figure "Results obtained with varying values of the parameters alpha and LB"; there the errors are
-    shares of all cycles.
+    It has a row for each alpha, from the largest, a column for each LB, and in each cell what
+    `curves` draws.
+
+    Parameters
+    ----------
+    replays : sequence of Replay
+        Of one contender and interval, all equally long.
+    title : str, default ""
+    window : int, default 300
+
+    Returns
+    -------
+    figure : Figure
+
+    References
+    ----------
+    The paper's figure "Results obtained with varying values of the parameters alpha and LB"; there
+    the errors are shares of all cycles.
     """
     cells: dict[tuple[float, float], list[Replay]] = {}
-    for r in replays:
-        cells.setdefault((r.recipe.policy.alpha, r.recipe.policy.lower_bound), []).append(r)
-    alphas, bounds = sorted({alpha for alpha, _ in cells}, reverse=True), sorted({bound for _, bound in cells})
+    for replay in replays:
+        policy = replay.recipe.policy
+        cells.setdefault((policy.alpha, policy.lower_bound), []).append(replay)
+    alphas = sorted({alpha for alpha, _ in cells}, reverse=True)
+    bounds = sorted({bound for _, bound in cells})
+    window = fit_window(window, replays)
     figure = blank(1.0 + 3.6 * len(bounds), 1.0 + 3.1 * len(alphas), title)
-    heights, window = [3, 1.6] * len(alphas), fitting(window, replays)
-    axes = figure.subplots(2 * len(alphas), len(bounds), sharex=True, sharey="row", height_ratios=heights, squeeze=False)
+    axes = figure.subplots(
+        2 * len(alphas),
+        len(bounds),
+        sharex=True,
+        sharey="row",
+        height_ratios=[3, 1.6] * len(alphas),
+        squeeze=False,
+    )
     for (i, alpha), (j, bound) in product(enumerate(alphas), enumerate(bounds)):
         top, bottom = axes[2 * i : 2 * i + 2, j]
         top.set_title(f"alpha {alpha:g}, LB {100 * bound:g} %", fontsize=SMALL + 1)
@@ -243,192 +400,350 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
             _draw_replays(top, bottom, cells[alpha, bound], window, GREEN)
             _draw_bounds(top, bottom, bound)
     for i, row in enumerate(axes):
-        row[0].set(ylabel="wrong [%]" if i % 2 else "share [%]", ylim=(0, None) if i % 2 else (0, 102))
-        for each in row:
-            finish(each, legend=0)
-    for each in axes[-1]:
-        each.set_xlabel(f"cycle (end of a window of {window})")
-    drawn = next(pair for pair in zip(axes[0::2].flat, axes[1::2].flat, strict=True) if pair[0].lines)
-    handles = [line for each in drawn for line in each.lines]
-    figure.legend(handles, GRID_LINES, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL)
+        if i % 2:
+            row[0].set(ylabel="wrong [%]", ylim=(0, None))
+        else:
+            row[0].set(ylabel="share [%]", ylim=(0, 102))
+        for panel in row:
+            finish(panel, legend=0)
+    for panel in axes[-1]:
+        panel.set_xlabel(f"cycle (end of a window of {window})")
+    pairs = zip(axes[0::2].flat, axes[1::2].flat, strict=True)
+    drawn = next(pair for pair in pairs if pair[0].lines)
+    handles = [line for panel in drawn for line in panel.lines]
+    style: Style = {"loc": "outside lower center", "frameon": False, "fontsize": SMALL}
+    figure.legend(handles, GRID_LINES, ncols=3, **style)
     return figure
 
 
-def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
-    """A live run: verified share, errors so far and, with a clock, parts an hour."""
-    window, x, timed = fitting(window, [log]), np.arange(1, len(log) + 1), log.clock_s is not None
-    figure = blank(9.0, 8.5 if timed else 6.0, title)
-    axes = figure.subplots(3 if timed else 2, 1, sharex=True)
-    axes[0].plot(x, 100 * sliding_mean(log.verified, window), color=VERIFIED)
+def run_picture(run: Replay, title: str = "", window: int = 100) -> Figure:
+    """Draw a live run: the verified share, the errors so far and, with a clock, parts per hour.
+
+    Parameters
+    ----------
+    run : Replay
+    title : str, default ""
+    window : int, default 100
+        Cycles of the sliding window; at most a third of the run.
+
+    Returns
+    -------
+    figure : Figure
+    """
+    window = fit_window(window, [run])
+    x = np.arange(1, len(run) + 1)
+    has_clock = run.clock_s is not None
+    figure = blank(9.0, 8.5 if has_clock else 6.0, title)
+    axes = figure.subplots(3 if has_clock else 2, 1, sharex=True)
+    axes[0].plot(x, 100 * sliding_mean(run.verified, window), color=VERIFIED)
     finish(axes[0], legend=0, ylim=(0, 104), ylabel=f"verified, last {window} [%]")
-    wrong = np.cumsum([log.false_positive, log.false_negative], axis=1)
-    axes[1].step(x, wrong[0], "-", where="post", color=BAD, label="bad part accepted (FP)")
-    axes[1].step(x, wrong[1], "--", where="post", color=GOOD, label="good part rejected (FN)")
+    false_positives = np.cumsum(run.false_positive)
+    false_negatives = np.cumsum(run.false_negative)
+    label = "bad part accepted (FP)"
+    axes[1].step(x, false_positives, "-", where="post", color=BAD, label=label)
+    label = "good part rejected (FN)"
+    axes[1].step(x, false_negatives, "--", where="post", color=GOOD, label=label)
     axes[1].locator_params(axis="y", nbins=6, integer=True)
-    finish(axes[1], ylabel="errors so far [parts]", ylim=(0, 1 + 1.1 * wrong.max(initial=0)))
-    if log.clock_s is not None:
-        took, settled = np.diff(log.clock_s, prepend=0.0), x >= window  # a rate over few cycles is mostly luck
-        rate = 3600 * sliding_sum(log.finished, window) / sliding_sum(took, window)
-        axes[2].plot(x[settled], rate[settled], color=GREEN, label="this run")
-        if log.verified.any():
-            # The same parts, each at the time that a verified one took: every good one goes on, and nothing stops.
-            always = 3600 * sliding_mean(log.truth == 1.0, window) / float(np.median(took[log.verified]))
-            axes[2].plot(x[settled], always[settled], color=VERIFIED, linestyle=":", label="had every part been verified")
-        finish(axes[2], ylabel=f"good parts/h, last {window}")
-    if not len(log):
+    highest = max(false_positives.max(initial=0), false_negatives.max(initial=0))
+    finish(axes[1], ylabel="errors so far [parts]", ylim=(0, 1 + 1.1 * highest))
+    if run.clock_s is not None:
+        _draw_rate(axes[2], run, run.clock_s, window)
+    if not len(run):
         note(axes[0], "no cycle was finished")
     axes[-1].set(xlabel="cycle")
     return figure
 
 
-def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
-    """Above: cost a part with its interval, and what verifying everything costs; the choice has a ring.
+def _draw_rate(axes: Axes, run: Replay, clock_s: Floats, window: int) -> None:
+    """Draw the good parts per hour of a run, and what they would be if all were verified."""
+    x = np.arange(1, len(run) + 1)
+    seconds = np.diff(clock_s, prepend=0.0)
+    shown = x >= window  # a rate over few cycles is mostly luck
+    rate = 3600 * sliding_sum(run.finished, window) / sliding_sum(seconds, window)
+    axes.plot(x[shown], rate[shown], color=GREEN, label="this run")
+    if run.verified.any():
+        # The same parts, each in the time that a verified one took: every good one goes on, and
+        # nothing stops.
+        verify_seconds = float(np.median(seconds[run.verified]))
+        always = 3600 * sliding_mean(run.truth == 1.0, window) / verify_seconds
+        label = "had every part been verified"
+        axes.plot(x[shown], always[shown], color=VERIFIED, linestyle=":", label=label)
+    finish(axes, ylabel=f"good parts/h, last {window}")
 
-    Below: shares of parts that were decided without a check. unit : of the costs.
+
+def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
+    """Draw a cost curve, with a ring around the chosen policy.
+
+    Above: the cost per part with its interval, and the cost of verifying everything. Below: the
+    share of parts that were decided without a check.
+
+    Parameters
+    ----------
+    curve : CostCurve
+    title : str, default ""
+        "" writes the costs and the shuffles.
+    unit : str, default "s"
+        Of the costs.
+
+    Returns
+    -------
+    figure : Figure
     """
-    prices = {"check": curve.costs.check, "escape": curve.costs.escape, "false reject": curve.costs.false_reject}
-    what = ", ".join(f"{name} {price:g} {unit}" for name, price in prices.items())
-    how = f"{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the ends of their 95 % intervals"
-    figure = blank(9.0, 7.2, title or f"{curve.dataset}, {curve.recipe}: {what}\n{how}")
+    if not title:
+        costs = curve.costs
+        title = (
+            f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape "
+            f"{costs.escape:g} {unit}, false reject {costs.false_reject:g} "
+            f"{unit}\n{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the "
+            "ends of their 95 % intervals"
+        )
+    figure = blank(9.0, 7.2, title)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    asked = [row for row in curve.rows if row.policy.guarantee != "cost"]
-    priced = [row for row in curve.rows if row.policy.guarantee == "cost"]
-    bounds = sorted({row.policy.lower_bound for row in asked})
-    alphas = dict.fromkeys(row.policy.alpha for row in asked)
-    groups = {f"alpha {alpha:g}": [row for row in asked if row.policy.alpha == alpha] for alpha in alphas}
-    if priced:
-        groups["by cost"] = priced
+    by_bound = [row for row in curve.rows if row.policy.guarantee != "cost"]
+    by_cost = [row for row in curve.rows if row.policy.guarantee == "cost"]
+    bounds = sorted({row.policy.lower_bound for row in by_bound})
+    groups: dict[str, list[PolicyCost]] = {}
+    for row in by_bound:
+        groups.setdefault(f"alpha {row.policy.alpha:g}", []).append(row)
+    if by_cost:
+        groups["by cost"] = by_cost
     top.axhline(curve.costs.check, label="verify everything", **LIMIT)
     for i, (label, rows) in enumerate(groups.items()):
-        # The alphas' whiskers side by side.
-        places = [len(bounds) if rows is priced else bounds.index(row.policy.lower_bound) for row in rows]
-        x = np.array(places) + 0.08 * (i - (len(groups) - 1) / 2)
-        cost, lower, upper = np.array([(row.cost, row.lower, row.upper) for row in rows]).T
-        look: Look = {"color": RECIPES[i % len(RECIPES)], "marker": "osD^vP"[i % 6], "markersize": 6}
-        look["label"] = label
-        # A replay's mean lies within what its errors' intervals allow, but for rounding.
-        top.errorbar(x, cost, yerr=np.maximum([cost - lower, upper - cost], 0.0), capsize=3, elinewidth=1.0, **look)
-        bottom.plot(x, [100 * row.certain for row in rows], **look)
-        for at, row in zip(x, rows, strict=True):
-            if row.policy == curve.policy:
-                ring: Look = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
-                top.scatter(at, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
-    means, wide = [row.cost for row in curve.rows], len(groups) + 2
-    lowest, highest = min(0.0, *means), 1.25 * max(curve.costs.check, *means)
-    finish(top, wide, ylim=(lowest, highest), ylabel=f"cost a part [{unit}]")
+        ticks = [
+            len(bounds) if rows is by_cost else bounds.index(row.policy.lower_bound) for row in rows
+        ]
+        # Moved a little, so that the bars of the alphas stand side by side.
+        x = np.array(ticks) + 0.08 * (i - (len(groups) - 1) / 2)
+        style: Style = {
+            "color": RECIPES[i % len(RECIPES)],
+            "marker": "osD^vP"[i % 6],
+            "markersize": 6,
+            "label": label,
+        }
+        _draw_policies(top, bottom, curve, rows, x, style)
+    n_columns = len(groups) + 2
+    means = [row.cost for row in curve.rows]
+    limits = (min(0.0, *means), 1.25 * max(curve.costs.check, *means))
+    finish(top, n_columns, ylim=limits, ylabel=f"cost a part [{unit}]")
     highest = max(10.0, 110 * max(row.certain for row in curve.rows))
-    finish(bottom, wide, ylim=(0, highest), ylabel="decided without a check\n[% of parts]")
-    ticks = [f"{100 * bound:g}" for bound in bounds] + ["by cost"] * len(priced)
-    bottom.set_xticks(range(len(ticks)), ticks)
+    y_label = "decided without a check\n[% of parts]"
+    finish(bottom, n_columns, ylim=(0, highest), ylabel=y_label)
+    names = [f"{100 * bound:g}" for bound in bounds] + ["by cost"] * len(by_cost)
+    bottom.set_xticks(range(len(names)), names)
     bottom.set_xlabel("LB [% of accepted parts that are to be good]")
     return figure
 
 
-def explained_picture(found: Explanation) -> Figure:
-    """Above, a panel a channel: the trace, its nearest references and the band. Below: their distances, and the bound."""
-    past, made, spec = found.decision, found.decision.decision, found.spec
-    widest = np.zeros(len(found.trace))
-    for each in () if found.envelope is None else found.envelope.excesses:
-        widest[each.channel] = max(widest[each.channel], each.widths)
-    channels = sorted(np.argsort(-widest, kind="stable")[:4].tolist())  # those that leave the band farthest
-    version = f"version {made.model_version}" if made.model_version else "no model yet"
-    words = f"{made.id}: {made.action.value}, {made.reason.value} ({version}); label: {past.label}"
-    figure = blank(10.0, 4.1 + 2.3 * len(channels), words)
-    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.5 + 2.3 * len(channels), 2.6))[:, 0]
+def _draw_policies(
+    top: Axes,
+    bottom: Axes,
+    curve: CostCurve,
+    rows: Sequence[PolicyCost],
+    x: Floats,
+    style: Style,
+) -> None:
+    """Draw the costs and certain shares of policies at x (n,), and a ring around the chosen one."""
+    cost = np.array([row.cost for row in rows])
+    lower = np.array([row.lower for row in rows])
+    upper = np.array([row.upper for row in rows])
+    # A replay's mean lies within what its errors' intervals allow, but for rounding.
+    errors = np.maximum([cost - lower, upper - cost], 0.0)
+    top.errorbar(x, cost, yerr=errors, capsize=3, elinewidth=1.0, **style)
+    bottom.plot(x, [100 * row.certain for row in rows], **style)
+    ring: Style = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
+    for tick, row in zip(x, rows, strict=True):
+        if row.policy == curve.policy:
+            top.scatter(tick, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
+
+
+def explained_picture(explanation: Explanation) -> Figure:
+    """Draw why a decision came out as it did.
+
+    Above, a panel for each channel, of at most four: the trace, its nearest references and the
+    envelope of known successes. Below: the distances of the references, and the bound.
+    """
+    stored = explanation.decision
+    decision = stored.decision
+    spec = explanation.spec
+    widest = np.zeros(len(explanation.trace))
+    if explanation.envelope is not None:
+        for excess in explanation.envelope.excesses:
+            widest[excess.channel] = max(widest[excess.channel], excess.widths)
+    # The channels that leave the band farthest.
+    channels = sorted(np.argsort(-widest, kind="stable")[:4].tolist())
+    version = f"version {decision.model_version}" if decision.model_version else "no model yet"
+    title = (
+        f"{decision.id}: {decision.action.value}, {decision.reason.value} ({version}); label: "
+        f"{stored.label}"
+    )
+    figure = blank(10.0, 4.1 + 2.3 * len(channels), title)
+    heights = (1.5 + 2.3 * len(channels), 2.6)
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
     panels = above.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
     for i, (axes, channel) in enumerate(zip(panels, channels, strict=True)):
-        _draw_trace(axes, found, channel)
-        name = spec.columns[channel] if spec.columns else "trace" if spec.channels == 1 else f"channel {channel + 1}"
+        _draw_trace(axes, explanation, channel)
+        name = "trace" if spec.channels == 1 else f"channel {channel + 1}"
+        if spec.columns:
+            name = spec.columns[channel]
         finish(axes, legend=0 if i else 3, ylabel=f"{name} [{spec.units[channel]}]")
     panels[-1].set(xlabel="time [s]")
     left, right = below.subplots(1, 2, width_ratios=(1.15, 1.0))
-    _draw_distances(left, found)
-    _draw_bound(right, found.bound)
+    _draw_distances(left, explanation)
+    _draw_bound(right, explanation.bound)
     return figure
 
 
-def _draw_trace(axes: Axes, found: Explanation, channel: int) -> None:
-    x, band = np.arange(found.trace.shape[1]) / found.spec.rate_hz, found.envelope
-    if band is not None:
-        label = f"95 % of {band.n:,} successes"
-        axes.fill_between(x, band.low[channel], band.high[channel], color=GREEN, alpha=0.22, linewidth=0, label=label)
-        axes.plot(x, band.median[channel], color=GREEN, linewidth=1.0, label="their median")
-    for success, name, colour, line, _ in KINDS:
-        near = [each.trace for each in found.neighbours if each.trace is not None and each.success is success]
-        for i, trace in enumerate(near):
-            label = f"neighbours that were {name} ({len(near)})" if i == 0 else "_"
-            axes.plot(x, trace[channel], line, color=colour, linewidth=0.7, alpha=0.55, label=label)
-    axes.plot(x, found.trace[channel], color=BLACK, linewidth=1.6, label="this trace")
-    outside = [each for each in band.excesses if each.channel == channel and each.widths >= CLEAR] if band else []
-    for i, each in enumerate(outside):
-        half, label = 0.5 / found.spec.rate_hz, "outside the band" if i == 0 else "_"
-        axes.axvspan(each.from_s - half, each.to_s + half, color=ORANGE, alpha=0.3, linewidth=0, label=label, zorder=0)
+def _draw_trace(axes: Axes, explanation: Explanation, channel: int) -> None:
+    """Draw one channel: the envelope, the neighbours' traces, the trace, and where it leaves."""
+    x = np.arange(explanation.trace.shape[1]) / explanation.spec.rate_hz
+    envelope = explanation.envelope
+    if envelope is not None:
+        low = envelope.low[channel]
+        high = envelope.high[channel]
+        label = f"95 % of {envelope.n:,} successes"
+        axes.fill_between(x, low, high, color=GREEN, alpha=0.22, linewidth=0, label=label)
+        median = envelope.median[channel]
+        axes.plot(x, median, color=GREEN, linewidth=1.0, label="their median")
+    for success, name, colour, line, _ in LABEL_STYLES:
+        traces = [
+            neighbour.trace
+            for neighbour in explanation.neighbours
+            if neighbour.trace is not None and neighbour.success is success
+        ]
+        style: Style = {"color": colour, "linewidth": 0.7, "alpha": 0.55}
+        for i, trace in enumerate(traces):
+            # matplotlib leaves labels that begin with _ out of the legend.
+            label = f"neighbours that were {name} ({len(traces)})" if i == 0 else "_"
+            axes.plot(x, trace[channel], line, label=label, **style)
+    axes.plot(x, explanation.trace[channel], color=BLACK, linewidth=1.6, label="this trace")
+    if envelope is None:
+        return
+    excesses = [
+        excess
+        for excess in envelope.excesses
+        if excess.channel == channel and excess.widths >= CLEAR
+    ]
+    half = 0.5 / explanation.spec.rate_hz
+    mark: Style = {"color": ORANGE, "alpha": 0.3, "linewidth": 0, "zorder": 0}
+    for i, excess in enumerate(excesses):
+        label = "outside the band" if i == 0 else "_"
+        axes.axvspan(excess.from_s - half, excess.to_s + half, label=label, **mark)
 
 
-def _draw_distances(axes: Axes, found: Explanation) -> None:
-    """Nearest references by distance, a row a fold: those of one fold live in one space."""
-    near = found.neighbours
-    if not near or found.radius is None:
+def _draw_distances(axes: Axes, explanation: Explanation) -> None:
+    """Draw the nearest references by distance, with a row for each fold, and the radius.
+
+    The references of one fold live in one space of the embedding.
+    """
+    neighbours = explanation.neighbours
+    radius = explanation.radius
+    if not neighbours or radius is None:
         note(axes, "no neighbours", GREY)
         finish(axes, legend=0, xticks=[], yticks=[])
         return
-    spaces, end = sorted({each.space for each in near}), max(each.distance for each in near)
-    for success, name, colour, _, marker in KINDS:
-        some = [each for each in near if each.success is success]
-        x, y = [each.distance for each in some], [spaces.index(each.space) for each in some]
+    spaces = sorted({neighbour.space for neighbour in neighbours})
+    farthest = max(neighbour.distance for neighbour in neighbours)
+    for success, name, colour, _, marker in LABEL_STYLES:
+        group = [neighbour for neighbour in neighbours if neighbour.success is success]
+        x = [neighbour.distance for neighbour in group]
+        y = [spaces.index(neighbour.space) for neighbour in group]
         axes.scatter(x, y, s=34, color=colour, marker=marker, alpha=0.8, label=name)
-    axes.axvline(found.radius, label=f"ball, radius {found.radius:.3g}", **LIMIT)
-    end = max(end, found.radius) if found.radius <= 3.0 * end else end  # else all are inside, and it is not in view
+    axes.axvline(radius, label=f"radius {radius:.3g}", **LIMIT)
+    end = farthest
+    if radius <= 3.0 * farthest:
+        end = max(farthest, radius)  # a larger radius has all references inside, and is not shown
     axes.set(yticks=range(len(spaces)), yticklabels=[f"fold {space}" for space in spaces])
-    name = f"distance of the nearest references of version {found.decision.decision.model_version} [scaled]"
-    finish(axes, ylim=(-0.7, len(spaces) - 0.3), xlim=(0.0, 1.08 * max(end, 1e-9)), xlabel=name)
+    version = explanation.decision.decision.model_version
+    x_label = f"distance of the nearest references of version {version} [scaled]"
+    limits = (0.0, 1.08 * max(end, 1e-9))
+    finish(axes, ylim=(-0.7, len(spaces) - 0.3), xlim=limits, xlabel=x_label)
 
 
 def _draw_bound(axes: Axes, bound: Bound | None) -> None:
-    axes.set(yticks=[], xlim=(-0.02, 1.02), ylim=(-1.0, 1.0), xlabel="success rate in the ball")
+    """Draw the interval of the success rate, its point estimate and the two thresholds."""
+    x_label = "success rate in the neighbourhood"
+    axes.set(yticks=[], xlim=(-0.02, 1.02), ylim=(-1.0, 1.0), xlabel=x_label)
     if bound is None:
         note(axes, "no bound was asked for", GREY)
         finish(axes, legend=0)
         return
-    if n := bound.n_success + bound.n_failure:
-        axes.plot([bound.n_success / n], [0.0], "o", color=BLACK, label=f"{bound.n_success} of {n}")
-    text = f"bound: {bound.lower:.3f} to {bound.upper:.3f}"
-    axes.plot([bound.lower, bound.upper], [0.0, 0.0], color=BLACK, linewidth=3.0, alpha=0.7, label=text)
-    for at, colour, name in ((bound.accept_threshold, GOOD, "accept from"), (bound.reject_threshold, BAD, "reject up to")):
-        if at is not None:
-            axes.axvline(at, color=colour, linestyle=":", linewidth=1.5, label=f"{name} {at:.3g}")
+    n = bound.n_success + bound.n_failure
+    if n:
+        label = f"{bound.n_success} of {n}"
+        axes.plot([bound.n_success / n], [0.0], "o", color=BLACK, label=label)
+    ends = [bound.lower, bound.upper]
+    label = f"bound: {bound.lower:.3f} to {bound.upper:.3f}"
+    axes.plot(ends, [0.0, 0.0], color=BLACK, linewidth=3.0, alpha=0.7, label=label)
+    thresholds = (
+        (bound.accept_at, GOOD, "accept from"),
+        (bound.reject_at, BAD, "reject up to"),
+    )
+    for threshold, colour, name in thresholds:
+        if threshold is not None:
+            label = f"{name} {threshold:.3g}"
+            axes.axvline(threshold, color=colour, linestyle=":", linewidth=1.5, label=label)
     finish(axes, legend=2)
 
 
 def data_picture(data: Dataset, title: str = "") -> Figure:
-    """Above, a channel a panel: the median trace of good and bad parts, and where the middle 80 % lie.
+    """Draw a data set: the traces of good and bad parts, and how the set changes in its order.
 
-    Below: the share of good parts and each trace's mean, as recorded. Traces that are not finite are not drawn.
+    Above, a panel for each channel, of at most three: the median trace of good and of bad parts,
+    and where the middle 80 % lie. Below: the share of good parts and each trace's mean, in recorded
+    order. Traces that are not finite are not drawn.
     """
-    X, y = as_traces(data.X), data.y
-    shown = np.isfinite(X).all(axis=(1, 2))
+    X = as_traces(data.X)
+    y = data.y
+    finite = np.asarray(np.isfinite(X).all(axis=(1, 2)))
     figure = blank(9.0, 7.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
-    names = data.channels or tuple(f"channel {i + 1}" if X.shape[1] > 1 else "trace" for i in range(X.shape[1]))
-    time, axis = np.arange(X.shape[2]) / (data.rate_hz or 1.0), "time [s]" if data.rate_hz else "sample"
+    n_channels = X.shape[1]
+    names = data.channels
+    if not names:
+        names = tuple(f"channel {i + 1}" if n_channels > 1 else "trace" for i in range(n_channels))
     labels = [f"{name} [{unit}]" for name, unit in zip(names, data.spec.units, strict=True)]
     above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
-    for i, axes in enumerate(above.subplots(1, min(X.shape[1], 3), squeeze=False)[0]):
-        for label, name, colour, line, _ in KINDS:
-            some = X[shown & (y == label), i]  # (n, T)
-            if len(some):
-                low, median, high = np.quantile(some, (0.1, 0.5, 0.9), axis=0)
+    time = np.arange(X.shape[2]) / (data.rate_hz or 1.0)
+    x_label = "time [s]" if data.rate_hz else "sample"
+    for i, axes in enumerate(above.subplots(1, min(n_channels, 3), squeeze=False)[0]):
+        for success, name, colour, line, _ in LABEL_STYLES:
+            traces = X[finite & (y == success), i]  # (n, T)
+            if len(traces):
+                low, median, high = np.quantile(traces, (0.1, 0.5, 0.9), axis=0)
                 axes.fill_between(time, low, high, color=colour, alpha=0.18, linewidth=0)
-                axes.plot(time, median, line, color=colour, linewidth=1.2, label=f"{name} ({len(some)})")
-        finish(axes, legend=3 if shown.any() and not i else 0, xlabel=axis, ylabel=labels[i])
-    share, level = below.subplots(2, 1, sharex=True)
-    window, x = max(1, len(y) // 10), np.arange(1, len(y) + 1)
-    full = x >= window  # a share of the first few jumps
-    share.plot(x[full], 100 * sliding_mean(y, window)[full], color=VERIFIED, label=f"good, of the last {window}")
-    share.axhline(100 * y.mean(), label="good, of all", **LIMIT)
-    finish(share, ylim=(0, 104), ylabel="share [%]")
-    for label, name, colour, _, _ in KINDS:
-        some = shown & (y == label)
-        level.scatter(x[some], levels(X[some, :1])[:, 0], s=8, color=colour, alpha=0.5, linewidths=0, label=name)
-    finish(level, xlabel="recording, in the order in which they were made", ylabel=f"mean {labels[0]}")
+                label = f"{name} ({len(traces)})"
+                axes.plot(time, median, line, color=colour, linewidth=1.2, label=label)
+        n_columns = 3 if finite.any() and not i else 0
+        finish(axes, legend=n_columns, xlabel=x_label, ylabel=labels[i])
+    _draw_drift(below, X, y, finite, labels[0])
     return figure
+
+
+def _draw_drift(
+    figure: Any, X: NDArray[np.float32], y: NDArray[Any], finite: NDArray[np.bool_], label: str
+) -> None:
+    """Draw the sliding share of good parts, and the first channel's mean of each finite trace.
+
+    Parameters
+    ----------
+    figure : SubFigure
+    X : array, shape (n, C, T)
+    y : array, shape (n,)
+    finite : array of bool, shape (n,)
+    label : str
+        Name and unit of the first channel.
+    """
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    window = max(1, len(y) // 10)
+    x = np.arange(1, len(y) + 1)
+    full = x >= window  # a share of the first few jumps
+    share = 100 * sliding_mean(y, window)
+    top.plot(x[full], share[full], color=VERIFIED, label=f"good, of the last {window}")
+    top.axhline(100 * y.mean(), label="good, of all", **LIMIT)
+    finish(top, ylim=(0, 104), ylabel="share [%]")
+    for success, name, colour, _, _ in LABEL_STYLES:
+        rows = finite & (y == success)
+        means = channel_means(X[rows, :1])[:, 0]
+        bottom.scatter(x[rows], means, s=8, color=colour, alpha=0.5, linewidths=0, label=name)
+    x_label = "recording, in the order in which they were made"
+    finish(bottom, xlabel=x_label, ylabel=f"mean {label}")

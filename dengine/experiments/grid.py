@@ -1,10 +1,9 @@
-"""Repeated replays over recipes, intervals, alphas and lower bounds, on two cores or on a cluster: the paper's grid.
+"""Grids of replays over recipes, intervals, alphas and lower bounds, on one machine or a cluster.
 
->>> run_grid("insertion", ["conv", "umap"], alphas=[0.1], lower_bounds=[0.9], repeats=30, keep="out/kept")
+>>> run_grid("insertion", ["conv", "umap"], alphas=[0.1], lower_bounds=[0.9], repeats=3, keep="out")
 
-joblib runs the replays, with the backend that the caller picked: `joblib.parallel_config(backend="dask")` is a cluster.
-Finished replays are kept on disk under a hash of all that their decisions depend on: traces and labels, every setting, the
-seed, dengine's own source, and the libraries that compute. Nothing is unpickled; an unreadable file is no replay.
+joblib runs the replays with the caller's backend: `joblib.parallel_config(backend="dask")` uses a
+cluster. `KeptReplays` keeps finished replays on disk, so that an interrupted grid continues.
 """
 
 import hashlib
@@ -29,7 +28,7 @@ from ..errors import DataError, SettingError, expect
 from ..files import read_archive, read_errors, write_output
 from ..records import RetrainReport
 from ..reducers import reducer_class
-from .baselines import require
+from .baselines import require_baseline
 from .replay import Contender, Replay, replay
 from .tables import frame_of
 
@@ -42,7 +41,20 @@ LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "
 
 @dataclass(frozen=True)
 class Task:
-    """One replay to be played: who, which shuffle, how many cycles, and what is known of accepted parts."""
+    """One replay to be played.
+
+    Parameters
+    ----------
+    contender : Contender
+        Who plays.
+    seed : int
+        Of the shuffle and of the engine.
+    cycles : int or None, default None
+        How many; None plays the whole data set.
+    shuffle : bool, default True
+    confirm : bool, default False
+        Whether accepted good parts are confirmed.
+    """
 
     contender: Contender
     seed: int
@@ -52,60 +64,105 @@ class Task:
 
 
 class KeptReplays:
-    """A folder of finished replays of one data set; made if need be."""
+    """A folder of finished replays of one data set, created if it is missing.
+
+    A replay's file is named by a hash of everything that its decisions depend on: traces and
+    labels, all settings, the seed, the source of dengine and of the user's own reducer, and the
+    versions of the libraries that compute. Nothing is unpickled.
+
+    Parameters
+    ----------
+    folder : path
+    data : Dataset
+    """
 
     def __init__(self, folder: Folder, data: Dataset) -> None:
         from joblib import hash as digest
 
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._digest, self._of_data = digest, digest((data.name, data.X, data.y, data.part, data.rate_hz))
+        self._digest = digest
+        self._data_digest = digest((data.name, data.X, data.y, data.part, data.rate_hz))
 
     def path(self, task: Task) -> Path:
-        """Where the replay of a task is kept: a hash of all that its decisions depend on, a reducer's own files among it.
+        """Return where the replay of a task is kept.
 
-        SettingError for a reducer that cannot be told apart from others.
+        Raises
+        ------
+        SettingError
+            The reducer holds something that cannot be hashed, so it cannot be told from others.
         """
-        who, own = task.contender, task.contender.recipe.reducer
-        parts = [reducer_class(own)] if isinstance(own, str) else _parts_of(own)
-        how: tuple[Any, ...] = (task.seed, task.cycles, task.shuffle, task.confirm)
-        how += (who.baseline, dict(who.params), who.recipe.to_toml(), own)
-        try:  # a transformer with all that it holds: arrays and functions too, which its description only names
-            said = self._digest((self._of_data, _digest_of_source(), [_source_of(part) for part in parts], how))
+        contender = task.contender
+        reducer = contender.recipe.reducer
+        parts = [reducer_class(reducer)] if isinstance(reducer, str) else _parts_of(reducer)
+        sources = [_source_of(part) for part in parts]
+        settings = (
+            task.seed,
+            task.cycles,
+            task.shuffle,
+            task.confirm,
+            contender.baseline,
+            dict(contender.params),
+            contender.recipe.to_toml(),
+            # A transformer with everything that it holds: arrays and functions too.
+            reducer,
+        )
+        try:
+            name = self._digest((self._data_digest, _digest_of_source(), sources, settings))
         except (PicklingError, TypeError, AttributeError) as error:
-            got = f"{who.name} holds what has no name in a module, as a lambda ({error})"
-            wanted = "a reducer that can be told apart from others, to keep its replays"
-            raise SettingError(f"Expected {wanted}; {got}: define it there, or leave keep out.") from error
-        return self.folder / f"{said}.npz"
+            raise SettingError(
+                "Expected a reducer that can be told apart from others, to keep its replays; "
+                f"{contender.name} holds something without a name in a module, such as a lambda "
+                f"({error}): define it in a module, or leave keep out."
+            ) from error
+        return self.folder / f"{name}.npz"
 
     def get(self, task: Task) -> Replay | None:
-        """The replay, under the contender's present name; None where it is not there, or damaged."""
+        """Return the kept replay of a task, or None if it is missing or its file is damaged.
+
+        It has the present name and recipe of the contender.
+        """
         path = self.path(task)
         try:
             with read_errors(path, "a kept replay"):
                 arrays: dict[str, Any] = read_archive(path)[0]
-                about = json.loads(str(arrays.pop("about")))
-                retrains = tuple(RetrainReport(**each) for each in about.pop("retrains"))
-                return Replay(**arrays, **about, name=task.contender.name, recipe=task.contender.recipe, retrains=retrains)
+                values = json.loads(str(arrays.pop("about")))
+                retrains = tuple(RetrainReport(**report) for report in values.pop("retrains"))
+                return Replay(
+                    **arrays,
+                    **values,
+                    name=task.contender.name,
+                    recipe=task.contender.recipe,
+                    retrains=retrains,
+                )
         except DataError:
             return None
 
     def put(self, task: Task, replay: Replay) -> None:
-        """Keep a finished replay: the whole file or none, whatever happens meanwhile."""
-        values = {each.name: getattr(replay, each.name) for each in fields(replay) if each.name not in ("name", "recipe")}
-        arrays: dict[str, Any] = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        about = {name: value for name, value in values.items() if name not in arrays}
-        about["retrains"] = [asdict(each) for each in replay.retrains]
+        """Keep the finished replay of a task; its file is written whole or not at all."""
+        arrays: dict[str, Any] = {}
+        values: dict[str, Any] = {}
+        for field in fields(replay):
+            value = getattr(replay, field.name)
+            if isinstance(value, np.ndarray):
+                arrays[field.name] = value
+            elif field.name not in ("name", "recipe"):
+                values[field.name] = value
+        values["retrains"] = [asdict(report) for report in replay.retrains]
         buffer = BytesIO()
-        np.savez_compressed(buffer, about=np.array(json.dumps(about)), **arrays)
+        np.savez_compressed(buffer, about=np.array(json.dumps(values)), **arrays)
         write_output(self.path(task), buffer.getvalue(), force=True)
 
 
 @cache
 def _digest_of_source() -> str:
-    """Of dengine's own source, and of the versions of Python and of the libraries that compute."""
-    held = {each.metadata["Name"]: each.version for name in LIBRARIES for each in distributions(name=name)}
-    digest = hashlib.sha256(f"{sys.version_info[:2]} {held}".encode())
+    """Return a hash of dengine's source and of the versions of Python and of the `LIBRARIES`."""
+    versions = {
+        distribution.metadata["Name"]: distribution.version
+        for name in LIBRARIES
+        for distribution in distributions(name=name)
+    }
+    digest = hashlib.sha256(f"{sys.version_info[:2]} {versions}".encode())
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -113,30 +170,49 @@ def _digest_of_source() -> str:
 
 @cache  # a file that changes while a grid is played is not what was imported
 def _source_of(part: Any) -> str:
+    """Return the source file's text of a class or function; "" if it was typed or compiled."""
     try:
         return Path(getsourcefile(part) or "").read_text(encoding="utf-8")
     except (OSError, TypeError, UnicodeDecodeError):
-        return ""  # typed at a prompt, or compiled
+        return ""
 
 
 def _parts_of(reducer: Any) -> list[Any]:
-    """The classes of a transformer and of the estimators that it is made of, and its functions."""
-    held = reducer.get_params(deep=True).values()
-    kinds = [type(part) for part in [reducer, *(each for each in held if hasattr(each, "fit"))]]
-    return list(dict.fromkeys([*kinds, *(each for each in held if isfunction(each))]))
+    """Return the classes of a transformer and of the estimators in it, and the functions in it."""
+    params = reducer.get_params(deep=True).values()
+    estimators = [reducer, *(param for param in params if hasattr(param, "fit"))]
+    classes = [type(estimator) for estimator in estimators]
+    return list(dict.fromkeys([*classes, *(param for param in params if isfunction(param))]))
 
 
-def contenders(asked: Sequence[Any]) -> list[Contender]:
-    """Each as `Contender.load` takes it. SettingError for two of one name and policy, which no table could tell apart."""
-    loaded = [Contender.load(one) for one in ([asked] if isinstance(asked, str) else asked)]
-    known = [(one.name, one.recipe.policy) for one in loaded]
-    twice = next((name for name, policy in known if known.count((name, policy)) > 1), None)
-    expect(twice is None, "a name of its own for each", twice, "tell them apart by Contender(name, recipe)")
-    return loaded
+def load_contenders(recipes: Sequence[Any]) -> list[Contender]:
+    """Load contenders, each from anything that `Contender.load` takes.
+
+    Raises
+    ------
+    SettingError
+        Two have the same name and policy, so that no table could tell them apart.
+    """
+    recipes = [recipes] if isinstance(recipes, str) else recipes
+    contenders = [Contender.load(recipe) for recipe in recipes]
+    keys = [(contender.name, contender.recipe.policy) for contender in contenders]
+    repeated = next((name for name, policy in keys if keys.count((name, policy)) > 1), None)
+    advice = "tell them apart by Contender(name, recipe)"
+    expect(repeated is None, "a name of its own for each", repeated, advice)
+    return contenders
 
 
-class Played(NamedTuple):
-    """A finished replay. position : of its task.  kept : whether it was there from an earlier run."""
+class PlayedReplay(NamedTuple):
+    """A finished replay.
+
+    Attributes
+    ----------
+    position : int
+        Of its task among the tasks.
+    replay : Replay
+    kept : bool
+        Whether an earlier run had played and kept it.
+    """
 
     position: int
     replay: Replay
@@ -144,34 +220,76 @@ class Played(NamedTuple):
 
 
 def iterate_replays(
-    dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None, on_cycle: Any = None
-) -> Iterator[Played]:
-    """Each task's replay as soon as it is done, played seed by seed: what an interrupted run has finished can be compared.
+    dataset: Any,
+    tasks: Sequence[Task],
+    *,
+    n_jobs: int = 1,
+    keep: Folder | None = None,
+    on_cycle: Any = None,
+) -> Iterator[PlayedReplay]:
+    """Play tasks and yield each replay as soon as it is finished.
 
-    n_jobs : replays at a time, as joblib counts; times are honest with 1 alone.
-    keep : folder of finished replays: those that are there are not played again, the others are kept as they end.
-    on_cycle : as in `replay`, where n_jobs is 1: a callback does not travel.
-    SettingError, before anything is played, where a baseline's library is missing.
+    Tasks are played seed by seed, so that what an interrupted run has finished can be compared.
+    Replays that were kept by an earlier run come first.
+
+    Parameters
+    ----------
+    dataset : object
+        Anything `load_dataset` takes.
+    tasks : sequence of Task
+    n_jobs : int, default 1
+        Replays at a time, as joblib counts them. Timings are right with 1 alone.
+    keep : path or None, default None
+        Folder of finished replays: those in it are not played again, and others are added as they
+        end.
+    on_cycle : callable or None, default None
+        As in `replay`. Only called where `n_jobs` is 1: a callback cannot travel to other
+        processes.
+
+    Yields
+    ------
+    played : PlayedReplay
+
+    Raises
+    ------
+    SettingError
+        A baseline's library is missing. Raised before anything is played.
     """
     from joblib import Parallel, delayed
 
     data = load_dataset(dataset)
-    kept = None if keep is None else KeptReplays(keep, data)
-    found = {i: one for i, task in enumerate(tasks) if kept and (one := kept.get(task)) is not None}
-    yield from (Played(i, one, True) for i, one in found.items())
-    left = sorted((i for i in range(len(tasks)) if i not in found), key=lambda i: tasks[i].seed)
-    for name in sorted({tasks[i].contender.baseline or "" for i in left} - {""}):
-        require(name)  # now, and not when the others have been played
-    parallel, told = Parallel(n_jobs=n_jobs, return_as="generator_unordered"), on_cycle if n_jobs == 1 else None
-    for i, one in parallel(delayed(_play)(data, i, tasks[i], told) for i in left):
-        if kept is not None:
-            kept.put(tasks[i], one)
-        yield Played(i, one, False)
+    kept_replays = None if keep is None else KeptReplays(keep, data)
+    finished = {}
+    if kept_replays is not None:
+        for i, task in enumerate(tasks):
+            kept = kept_replays.get(task)
+            if kept is not None:
+                finished[i] = kept
+    yield from (PlayedReplay(i, kept, True) for i, kept in finished.items())
+    missing = [i for i in range(len(tasks)) if i not in finished]
+    missing.sort(key=lambda i: tasks[i].seed)
+    for name in sorted({tasks[i].contender.baseline or "" for i in missing} - {""}):
+        require_baseline(name)
+    parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered")
+    callback = on_cycle if n_jobs == 1 else None
+    for i, played in parallel(delayed(_play)(data, i, tasks[i], callback) for i in missing):
+        if kept_replays is not None:
+            kept_replays.put(tasks[i], played)
+        yield PlayedReplay(i, played, False)
 
 
 def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
-    how: dict[str, Any] = {"shuffle": task.shuffle, "confirm": task.confirm, "on_cycle": on_cycle}
-    return i, replay(data, task.contender, task.seed, task.cycles, **how)
+    """Play one task in a worker; return its position with the replay."""
+    played = replay(
+        data,
+        task.contender,
+        task.seed,
+        task.cycles,
+        shuffle=task.shuffle,
+        confirm=task.confirm,
+        on_cycle=on_cycle,
+    )
+    return i, played
 
 
 def run_grid(
@@ -186,13 +304,38 @@ def run_grid(
     cycles: int | None = None,
     keep: Folder | None = None,
 ) -> "pd.DataFrame":
-    """A row a replay (see `Replay.summary`), over recipes x intervals x alphas x lower_bounds x seeds from 0 on.
+    """Replay a data set over recipes x intervals x alphas x lower bounds x seeds.
 
-    recipes : a name, or a list of what `replay` takes, baselines too.  keep : folder by which an interrupted grid goes on.
-    Only stops are known of accepted parts, as in the paper.
-    Source: the paper's experiments, 30 shuffled repeats of a 3 x 3 grid. Timings are honest only with n_jobs=1.
+    Of accepted parts only the stops are known, as in the paper.
+
+    Parameters
+    ----------
+    dataset : object
+        Anything `load_dataset` takes.
+    recipes : str or sequence
+        A name, or a list of what `replay` takes, baselines included.
+    alphas, lower_bounds : sequence of float
+    intervals : sequence of str, default ("wilson",)
+    repeats : int, default 30
+        Shuffles; the seeds count from 0.
+    n_jobs : int, default -1
+        Replays at a time, as joblib counts them. Timings are right with 1 alone.
+    cycles : int or None, default None
+        Parts of each replay; None plays all.
+    keep : path or None, default None
+        Folder of finished replays, by which an interrupted grid continues.
+
+    Returns
+    -------
+    frame : DataFrame
+        A row for each replay, see `Replay.summary`.
+
+    References
+    ----------
+    The paper's experiments: 30 shuffled repeats of a 3 x 3 grid.
     """
-    tasks = grid_tasks(recipes, alphas, lower_bounds, intervals, range(repeats), cycles=cycles)
+    seeds = range(repeats)
+    tasks = grid_tasks(recipes, alphas, lower_bounds, intervals, seeds, cycles=cycles)
     return frame_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep))
 
 
@@ -207,17 +350,25 @@ def grid_tasks(
     cycles: int | None = None,
     shuffle: bool = True,
 ) -> list[Task]:
-    """Every combination as a task; None leaves a setting to the recipe."""
+    """Return every combination of settings as a task; None leaves a setting to the recipe."""
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound", "guarantee")
+    combinations = product(
+        load_contenders(recipes), intervals, alphas, lower_bounds, guarantees, confirms
+    )
     tasks = []
-    for who, *asked, confirm in product(contenders(recipes), intervals, alphas, lower_bounds, guarantees, confirms):
-        changes = {name: value for name, value in zip(names, asked, strict=True) if value is not None}
-        tasks += [Task(who.with_policy(**changes), seed, cycles, shuffle, confirm) for seed in seeds]
+    for contender, *settings, confirm in combinations:
+        pairs = zip(names, settings, strict=True)
+        changes = {name: value for name, value in pairs if value is not None}
+        changed = contender.with_policy(**changes)
+        tasks += [Task(changed, seed, cycles, shuffle, confirm) for seed in seeds]
     return tasks
 
 
-def play_tasks(dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None) -> list[Replay]:
-    """Each task's replay, in the tasks' order; the rest as in `iterate_replays`."""
-    found = {each.position: each.replay for each in iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep)}
-    return [found[i] for i in range(len(tasks))]
+def play_tasks(
+    dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None
+) -> list[Replay]:
+    """Play tasks as `iterate_replays` does; return their replays in the order of the tasks."""
+    played = iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep)
+    replays = {position: replay for position, replay, _ in played}
+    return [replays[i] for i in range(len(tasks))]

@@ -1,6 +1,6 @@
-"""What a replay's decisions were worth: errors of many replays with an interval, and costs.
+"""Errors and costs of replays: the pooled error rate with its interval, and what a part costs.
 
->>> pooled_error(replays).rate, pooled_error(replays).upper     # of the accepted parts, the share of bad ones
+>>> pooled_error(replays).rate, pooled_error(replays).upper     # of the accepted parts, bad ones
 """
 
 import math
@@ -9,22 +9,35 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..decision.intervals import wilson_interval
 from ..errors import expect
 from ..records import is_number
 
-SIDES = {"accepted": "false_positive", "rejected": "false_negative"}  # and which of them are wrong
-VERIFY_SECONDS = 5.0  # what a height check costs a cycle, in the paper's cell
-CYCLE_SECONDS = 47.5  # the paper: an insertion takes 45 to 50 s; a good part that was rejected takes one more
-STOP_SECONDS = 120.0  # a system stop, operator included: of the simulated cell, the paper gives none
+# What was decided -> the field of `Replay` that marks the wrong ones among them.
+SIDES = {"accepted": "false_positive", "rejected": "false_negative"}
+VERIFY_SECONDS = 5.0  # what a height check adds to a cycle, in the paper's cell
+# The paper: an insertion takes 45 to 50 s; a good part that was rejected takes one more.
+CYCLE_SECONDS = 47.5
+# A line stop, operator included: of the simulated cell, the paper gives none.
+STOP_SECONDS = 120.0
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorRate:
-    """A share of wrong decisions over many replays, and its interval at level `alpha`.
+    """The share of wrong decisions over many replays, with its interval.
 
-    decided, wrong : decisions in all replays.  traces : different traces among them.  rate : wrong / decided, or NaN.
+    Attributes
+    ----------
+    decided, wrong : int
+        Decisions in all replays, and the wrong ones among them.
+    traces : int
+        Different traces among those that were decided.
+    rate : float
+        wrong / decided; NaN without decisions.
+    lower, upper : float
+        Interval of the rate; (0, 1) without decisions.
     """
 
     decided: int
@@ -36,38 +49,83 @@ class ErrorRate:
 
 
 def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 0.05) -> ErrorRate:
-    """Share of wrong ones among all parts that were accepted (or rejected), with an interval that is honest of shuffles.
+    """Compute the share of wrong decisions over many replays of one data set.
 
-    Thirty shuffles of one set play the same traces thirty times, so they are no thirty samples of the world. A trace is
-    the unit: the variance of the ratio is that between traces (linearised, Cochran 1977, Sampling Techniques, 6.3), and
-    the interval is Wilson's at the number of independent decisions that has this variance, at most the number of
-    different traces where no decision was wrong. It speaks of other parts of the same kind, not of another cell.
+    Thirty shuffles of one set play the same traces thirty times, so they are not thirty samples of
+    the world. The unit is therefore the trace: the variance of the ratio is that between traces,
+    linearised, and the interval is Wilson's for the number of independent decisions that has this
+    variance. If no decision was wrong, that number is the number of different traces. The interval
+    speaks of other parts of the same kind, not of another cell.
 
-    replays : of one data set, each a `Replay`.  side : "accepted" or "rejected"; SettingError for another.
+    Parameters
+    ----------
+    replays : sequence of Replay
+        All of one data set.
+    side : {"accepted", "rejected"}, default "accepted"
+        Which decisions are judged.
+    alpha : float, default 0.05
+        Error level of the interval.
+
+    Returns
+    -------
+    error_rate : ErrorRate
+
+    Raises
+    ------
+    SettingError
+        An unknown side.
+
+    References
+    ----------
+    Cochran (1977), Sampling Techniques, section 6.3.
     """
     expect(side in SIDES, f"side {' or '.join(SIDES)}", side)
-    size = 1 + max((int(r.index.max()) for r in replays if len(r.index)), default=0)
-    decided, wrong = (  # (size,) of each trace
-        np.sum([np.zeros(size), *(np.bincount(r.index[getattr(r, name)], minlength=size) for r in replays)], axis=0)
-        for name in (side, SIDES[side])
-    )
-    total, errors, traces = int(decided.sum()), int(wrong.sum()), int((decided > 0).sum())
-    if not total:
+    size = 1 + max((int(replay.index.max()) for replay in replays if len(replay.index)), default=0)
+    decided = _count_per_trace(replays, side, size)
+    wrong = _count_per_trace(replays, SIDES[side], size)
+    n_decided = int(decided.sum())
+    n_wrong = int(wrong.sum())
+    n_traces = int((decided > 0).sum())
+    if not n_decided:
         return ErrorRate(0, 0, 0, math.nan, 0.0, 1.0)
-    rate = errors / total
-    variance = traces / max(traces - 1, 1) * float(((wrong - rate * decided) ** 2).sum()) / total**2
-    n = rate * (1.0 - rate) / variance if variance > 0.0 and 0.0 < rate < 1.0 else float(traces)
-    lower, upper = wilson_interval(n * rate, n * (1.0 - rate), alpha)
-    return ErrorRate(total, errors, traces, rate, float(lower), float(upper))
+    rate = n_wrong / n_decided
+    residuals = wrong - rate * decided
+    correction = n_traces / max(n_traces - 1, 1)
+    variance = correction * float((residuals**2).sum()) / n_decided**2
+    n_effective = float(n_traces)
+    if variance > 0.0 and 0.0 < rate < 1.0:
+        n_effective = rate * (1.0 - rate) / variance
+    lower, upper = wilson_interval(n_effective * rate, n_effective * (1.0 - rate), alpha)
+    return ErrorRate(n_decided, n_wrong, n_traces, rate, float(lower), float(upper))
+
+
+def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> NDArray[np.float64]:
+    """Return (size,) counts: how often each trace was marked by the field `name` of the replays."""
+    counts = np.zeros(size)
+    for replay in replays:
+        counts += np.bincount(replay.index[getattr(replay, name)], minlength=size)
+    return counts
 
 
 @dataclass(frozen=True, slots=True)
 class Costs:
-    """What a part can cost beyond its cycle, in one unit of the user's: seconds of production, or money.
+    """What a part can cost beyond its cycle, in one unit of the user's: seconds, or money.
 
-    check : an expensive verification.  escape : a bad part that was accepted: a stop, or worse.  false_reject : a good part
-    that was sent back. By default the paper's check, the simulated cell's stop and the paper's cycle, in seconds.
-    SettingError for a check that costs nothing, which would never be worth leaving out, or a cost below 0.
+    The defaults are seconds: the paper's check, the simulated cell's stop and the paper's cycle.
+
+    Parameters
+    ----------
+    check : float, default 5.0
+        Of an expensive verification. It must be above 0: a free check would never be left out.
+    escape : float, default 120.0
+        Of a bad part that was accepted: a line stop, or worse.
+    false_reject : float, default 47.5
+        Of a good part that was rejected.
+
+    Raises
+    ------
+    SettingError
+        A cost below 0 or not finite, or a check that costs nothing.
     """
 
     check: float = VERIFY_SECONDS
@@ -75,16 +133,29 @@ class Costs:
     false_reject: float = CYCLE_SECONDS
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            expect(is_number(value) and 0.0 <= value < math.inf, f"a finite cost of 0 or more as {each.name}", value)
-        expect(self.check > 0.0, "a check that costs something", 0, "where it is free, verify everything")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            is_cost = is_number(value) and 0.0 <= value < math.inf
+            expect(is_cost, f"a finite cost of 0 or more as {field.name}", value)
+        advice = "where it is free, verify everything"
+        expect(self.check > 0.0, "a check that costs something", 0, advice)
 
     @property
     def worst_accept(self) -> float:
-        """An accepted part is worth its risk where it is bad with at most this probability: check / escape, at most 1."""
+        """Largest probability of being bad at which accepting a part pays: check / escape, or 1."""
         return min(1.0, self.check / self.escape) if self.escape else 1.0
 
-    def saved(self, certain: float, false_positive: float = 0.0, false_negative: float = 0.0) -> float:
-        """What so many decisions without a check saved, less what the wrong ones among them cost."""
-        return self.check * certain - self.escape * false_positive - self.false_reject * false_negative
+    def saved(
+        self, certain: float, false_positive: float = 0.0, false_negative: float = 0.0
+    ) -> float:
+        """Return what decisions without a check saved, less what the wrong ones cost.
+
+        Parameters
+        ----------
+        certain : float
+            Number of decisions without a check.
+        false_positive, false_negative : float, default 0.0
+            Bad parts accepted and good parts rejected among them.
+        """
+        checks = self.check * certain
+        return checks - self.escape * false_positive - self.false_reject * false_negative

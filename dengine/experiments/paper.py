@@ -1,15 +1,17 @@
-"""The paper's experiment, whole: its grid, its two tables in its form with its figures beside ours, and its findings.
+"""The paper's experiment: its grid, its two tables with its numbers beside ours, and its findings.
 
     frame = run_grid("insertion", ["conv"], **GRID, repeats=30)
     print(paper_table(frame, "conv", "wilson"))
     for line in findings(frame): print(line)
 
-Source: Duan, Krüger, Heredia, Iversen and Hagelskjær, section "Experiments", tables "Wilson Score" and "Binomial Interval
-score": mean false positives / mean certain predictions of 30 shuffles of 1503 insertions.
+Source: Duan, Krüger, Heredia, Iversen and Hagelskjær, section "Experiments", tables "Wilson Score"
+and "Binomial Interval score": mean false positives / mean certain predictions of 30 shuffles of
+1503 insertions.
 """
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 from .baselines import BASELINES
 
@@ -29,15 +31,30 @@ _ROWS = {  # (interval, alpha) -> false positives and certain predictions for ea
     ("binomial", 0.1): ((40.9, 1324.4), (41.7, 1325.6), (40.5, 1325.0)),
     ("binomial", 0.05): ((41.7, 1328.2), (39.7, 1324.1), (40.2, 1324.6)),
 }
-PUBLISHED = {(*of, bound): cell for of, cells in _ROWS.items() for bound, cell in zip(LOWER_BOUNDS, cells, strict=True)}
+# (interval, alpha, LB) -> false positives and certain predictions, as the paper published them.
+PUBLISHED = {
+    (*row, bound): cell
+    for row, cells in _ROWS.items()
+    for bound, cell in zip(LOWER_BOUNDS, cells, strict=True)
+}
 BUDGET_S = 0.45  # the paper's cycle budget of a retrain
-ANSWERS = 0.1  # certain predictions that vary by more than this share of their mean, over the grid, answer to it
+# The certain predictions answer to alpha and LB if they vary by more than this share of their mean.
+ANSWERS = 0.1
 
 
 def paper_table(frame: "pd.DataFrame", recipe: str, interval: str) -> str:
-    """One of the paper's two tables as Markdown: a row an alpha, a column an LB, `false positives / certain`.
+    """Return one of the paper's two tables as Markdown.
 
-    Ours with the standard deviation over the shuffles; below, in brackets, what the paper published, on other parts.
+    It has a row for each alpha, a column for each LB, and cells `false positives / certain`. Our
+    numbers have the standard deviation over the shuffles. In brackets stands what the paper
+    published, for other parts.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        As `run_grid` gives it.
+    recipe, interval : str
+        Which of its rows are shown.
     """
     rows = frame[(frame["recipe"] == recipe) & (frame["interval"] == interval)]
     bounds = sorted(rows["lower_bound"].unique())
@@ -46,60 +63,102 @@ def paper_table(frame: "pd.DataFrame", recipe: str, interval: str) -> str:
     for alpha in sorted(rows["alpha"].unique(), reverse=True):
         cells = []
         for bound in bounds:
-            played = rows[(rows["alpha"] == alpha) & (rows["lower_bound"] == bound)][["false_positive", "certain"]]
-            pairs = zip(played.mean(), played.std().fillna(0.0), strict=True)
-            ours = " / ".join(f"{mean:.1f} ± {sd:.1f}" for mean, sd in pairs) if len(played) else "-"
-            theirs = PUBLISHED.get((interval, float(alpha), float(bound))) if len(played) else None
-            cells.append(ours if theirs is None else f"{ours} [{theirs[0]} / {theirs[1]}]")
+            played = rows[(rows["alpha"] == alpha) & (rows["lower_bound"] == bound)]
+            counts = played[["false_positive", "certain"]]
+            cells.append(_paper_cell(counts, PUBLISHED.get((interval, float(alpha), float(bound)))))
         lines.append(f"| {alpha:g} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def findings(frame: "pd.DataFrame") -> list[str]:
-    """Which of the paper's findings the replays of a grid bear out: a line a finding, recipe and interval.
+def _paper_cell(counts: "pd.DataFrame", published: tuple[float, float] | None) -> str:
+    """Return a cell of `paper_table`; "-" where nothing was played."""
+    if not len(counts):
+        return "-"
+    pairs = zip(counts.mean(), counts.std().fillna(0.0), strict=True)
+    cell = " / ".join(f"{mean:.1f} ± {deviation:.1f}" for mean, deviation in pairs)
+    return cell if published is None else f"{cell} [{published[0]} / {published[1]}]"
 
-    Those that they say nothing of are left out: of baselines, which decide by rules of their own, what the intervals do.
-    frame : as `run_grid` gives it, of one feedback and one guarantee.
+
+def findings(frame: "pd.DataFrame") -> list[str]:
+    """Check which of the paper's findings the replays of a grid confirm.
+
+    A finding that the replays say nothing about is left out: for baselines, which have their own
+    rules, the findings about intervals.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        As `run_grid` gives it, of one feedback and one guarantee.
+
+    Returns
+    -------
+    lines : list of str
+        "holds: ..." or "does NOT hold: ..." for each finding, recipe and interval.
     """
     lines: list[str] = []
-
-    def say(holds: bool, claim: str, measured: str) -> None:
-        lines.append(f"{'holds' if holds else 'does NOT hold'}: {claim}: {measured}")
-
     for (recipe, interval), rows in frame.groupby(["recipe", "interval"], sort=False):
-        who, ours = f"{recipe}, {interval}", str(recipe).split(" ")[0] not in BASELINES
-        means = rows.groupby(["alpha", "lower_bound"], sort=False)[["certain", "false_positive"]].mean()
-        certain, n = means["certain"], len(means)
-        if ours and n > 1 and interval in INTERVALS and certain.any():
-            answers = bool(certain.max() - certain.min() > ANSWERS * certain.mean())
-            said = "Wilson answers" if interval == "wilson" else "Binomial does not answer"
-            measured = f"certain from {certain.min():.1f} to {certain.max():.1f} over the cells"
-            say(answers == (interval == "wilson"), f"{said} to alpha and LB; {who}", measured)
-        shares = (means["false_positive"] / certain).fillna(0.0)
-        kept = int((shares < 1.0 - means.index.get_level_values("lower_bound")).sum())
-        worst = f"in {kept} of {n} cells, at most {100 * shares.max():.1f} % of the certain"
-        say(kept == n, f"the mean share of false positives stays below 1 - LB; {who}", worst)
-        for bound, column in rows.groupby("lower_bound", sort=False) if ours and interval == "wilson" else ():
-            first = column.groupby("alpha")["first_certain"].mean().dropna().sort_index(ascending=False)
-            if len(first) >= 2:
-                later = bool(first.is_monotonic_increasing and first.iloc[0] < first.iloc[-1])
-                measured = ", ".join(f"cycle {cycle:.0f} at {alpha:g}" for alpha, cycle in first.items())
-                say(later, f"lower alpha delays the first certain prediction; {who}, LB {100 * bound:g} %", measured)
-    for name, rows in frame.groupby("recipe", sort=False):
-        if not math.isnan(slowest := float(rows["retrain_max_s"].max())):
+        lines += _interval_findings(str(recipe), str(interval), rows)
+    for recipe, rows in frame.groupby("recipe", sort=False):
+        slowest = float(rows["retrain_max_s"].max())
+        if not math.isnan(slowest):
             measured = f"median {rows['retrain_p50_s'].median():.3f} s, worst {slowest:.3f} s"
-            say(slowest < BUDGET_S, f"a retrain of {name} takes less than {BUDGET_S:g} s", measured)
+            claim = f"a retrain of {recipe} takes less than {BUDGET_S:g} s"
+            lines.append(_finding(slowest < BUDGET_S, claim, measured))
     return lines
 
 
+def _finding(holds: bool, claim: str, measured: str) -> str:
+    """Return the line of a finding: whether it holds, the claim, and what was measured."""
+    return f"{'holds' if holds else 'does NOT hold'}: {claim}: {measured}"
+
+
+def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
+    """Yield the lines of the findings about one recipe and interval, from the rows of its grid."""
+    who = f"{recipe}, {interval}"
+    is_ours = recipe.split(" ")[0] not in BASELINES
+    cells = rows.groupby(["alpha", "lower_bound"], sort=False)
+    means = cells[["certain", "false_positive"]].mean()
+    certain = means["certain"]
+    n_cells = len(means)
+    if is_ours and n_cells > 1 and interval in INTERVALS and certain.any():
+        answers = bool(certain.max() - certain.min() > ANSWERS * certain.mean())
+        claim = "Wilson answers" if interval == "wilson" else "Binomial does not answer"
+        measured = f"certain from {certain.min():.1f} to {certain.max():.1f} over the cells"
+        holds = answers == (interval == "wilson")
+        yield _finding(holds, f"{claim} to alpha and LB; {who}", measured)
+    shares = (means["false_positive"] / certain).fillna(0.0)
+    n_kept = int((shares < 1.0 - means.index.get_level_values("lower_bound")).sum())
+    worst = f"in {n_kept} of {n_cells} cells, at most {100 * shares.max():.1f} % of the certain"
+    claim = f"the mean share of false positives stays below 1 - LB; {who}"
+    yield _finding(n_kept == n_cells, claim, worst)
+    if not is_ours or interval != "wilson":
+        return
+    for bound, column in rows.groupby("lower_bound", sort=False):
+        first = column.groupby("alpha")["first_certain"].mean().dropna()
+        first = first.sort_index(ascending=False)
+        if len(first) >= 2:
+            is_later = bool(first.is_monotonic_increasing and first.iloc[0] < first.iloc[-1])
+            measured = ", ".join(
+                f"cycle {cycle:.0f} at {alpha:g}" for alpha, cycle in first.items()
+            )
+            claim = "lower alpha delays the first certain prediction"
+            yield _finding(is_later, f"{claim}; {who}, LB {100 * bound:g} %", measured)
+
+
 def grid_lines(frame: "pd.DataFrame") -> list[str]:
-    """Tables and findings as the lines of a Markdown page, for each guarantee and feedback that was played."""
-    told = "false positives / certain, mean ± standard deviation over the shuffles [the paper's, on its own parts]"
+    """Return tables and findings as the lines of a Markdown page, by guarantee and feedback."""
+    caption = (
+        "false positives / certain, mean ± standard deviation over the shuffles [the paper's, on "
+        "its own parts]"
+    )
     lines = []
-    for (guarantee, stops, confirm), rows in frame.groupby(["guarantee", "stops", "confirm"], sort=False):
-        known = "good accepted parts confirmed" if confirm else f"stops: {stops}"
-        lines += [f"## Guarantee {guarantee}, {known}", ""]
-        for recipe, interval in rows[["recipe", "interval"]].drop_duplicates().itertuples(index=False):
-            lines += [f"**{recipe}, {interval}**: {told}", "", paper_table(rows, recipe, interval), ""]
+    groups = frame.groupby(["guarantee", "stops", "confirm"], sort=False)
+    for (guarantee, stops, confirm), rows in groups:
+        feedback = "good accepted parts confirmed" if confirm else f"stops: {stops}"
+        lines += [f"## Guarantee {guarantee}, {feedback}", ""]
+        pairs = rows[["recipe", "interval"]].drop_duplicates()
+        for recipe, interval in pairs.itertuples(index=False):
+            table = paper_table(rows, recipe, interval)
+            lines += [f"**{recipe}, {interval}**: {caption}", "", table, ""]
         lines += [*(f"- {line}" for line in findings(rows)), ""]
     return lines

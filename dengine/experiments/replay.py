@@ -1,4 +1,7 @@
-"""One stream through one engine, cycle by cycle: the paper's prototype online environment, and live runs.
+"""One stream of parts through one engine, cycle by cycle.
+
+`replay` plays a recorded data set through a fresh engine, as the paper's prototype online
+environment does; `watch` lets an engine drive any cell. Both return a `Replay`.
 
 >>> replay("insertion", "conv", seed=0).summary()["certain"]
 >>> watch(DataEngine(), SimulatedCell(cycles=600), cycles=600).stretches(6)
@@ -32,21 +35,46 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-EVIDENCE: dict[str, Any] = dict.fromkeys(("action", "reason"), np.str_)  # of a decision, and how it is kept
-EVIDENCE |= dict.fromkeys(("lower", "upper"), np.float64) | dict.fromkeys(("n_success", "n_failure"), np.int64)
-COUNTED = ("verified", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode", "outside")
+# Fields of a decision that a replay keeps -> their type in its arrays.
+DECISION_FIELDS: dict[str, Any] = {
+    "action": np.str_,
+    "reason": np.str_,
+    "lower": np.float64,
+    "upper": np.float64,
+    "n_success": np.int64,
+    "n_failure": np.int64,
+}
+# Fields of a replay that mark cycles, and are counted in its stretches.
+COUNTED = (
+    "verified",
+    "accepted",
+    "rejected",
+    "false_positive",
+    "false_negative",
+    "novel",
+    "safe_mode",
+    "outside",
+)
 
 
 @dataclass(frozen=True)
 class Contender:
-    """Who plays a stream: dengine by a recipe, or a baseline method in the same loop.
+    """Who plays a stream: dengine with a recipe, or a baseline in the same loop.
 
-    >>> Contender.load("conv")        # a recipe's name, a TOML file, module:Class, a transformer, a Recipe
+    >>> Contender.load("conv")        # a name, TOML file, module:Class, transformer, Recipe
     >>> Contender.load("knn")         # a name in `baselines.BASELINES`
 
-    name : in tables, pictures and file names.
-    recipe : every setting of the engine; of a baseline's, those of the loop and the policy that the baseline is made with.
-    baseline : a name in `BASELINES` that decides in place of reducer and neighbours.  params : the baseline's own settings.
+    Parameters
+    ----------
+    name : str
+        For tables, pictures and file names.
+    recipe : Recipe
+        All settings of the engine. For a baseline those of the loop, and the policy that it is made
+        with.
+    baseline : str or None, default None
+        A name in `BASELINES` that decides instead of the reducer and its neighbours.
+    params : mapping
+        The baseline's own settings.
     """
 
     name: str
@@ -55,45 +83,86 @@ class Contender:
     params: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def load(cls, asked: Any) -> "Contender":
-        """A contender itself, a baseline's name, or what `Recipe.load` takes; SettingError for else."""
-        if isinstance(asked, Contender):
-            return asked
-        if isinstance(asked, str) and asked in BASELINES:
-            # The schedule of conv is its own.
-            recipe = Recipe(retrain_every=Reducer.default_retrain_every)
-            return cls(asked, recipe, asked, BASELINES[asked].tries[BASELINES[asked].chosen])
-        recipe = Recipe.load(asked)
-        by_name = isinstance(asked, str | os.PathLike) and (str(asked) in RECIPES or Path(asked).is_file())
-        return cls(Path(asked).stem if by_name else recipe.name, recipe)
+    def load(cls, recipe: Any) -> "Contender":
+        """Return the contender for a recipe, for a baseline's name, or for itself.
+
+        Parameters
+        ----------
+        recipe : Contender, str or object
+            A contender is returned as it is. A baseline's name gives the baseline with its chosen
+            settings. Otherwise anything that `Recipe.load` takes.
+
+        Raises
+        ------
+        SettingError
+            Anything else.
+        """
+        if isinstance(recipe, Contender):
+            return recipe
+        if isinstance(recipe, str) and recipe in BASELINES:
+            # conv has a schedule of its own; baselines retrain by the default one.
+            schedule = Recipe(retrain_every=Reducer.default_retrain_every)
+            return cls(recipe, schedule, recipe, BASELINES[recipe].chosen_params())
+        loaded = Recipe.load(recipe)
+        is_path = isinstance(recipe, str | os.PathLike)
+        is_named = is_path and (str(recipe) in RECIPES or Path(recipe).is_file())
+        return cls(Path(recipe).stem if is_named else loaded.name, loaded)
 
     def with_policy(self, **changes: Any) -> "Contender":
-        """The same with another alpha, lower_bound, interval, guarantee or stops."""
+        """Return a copy with another alpha, lower_bound, interval, guarantee or stops."""
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
     def engine(self, seed: int) -> DataEngine:
-        """A fresh engine in memory that repeats exactly under a seed."""
-        baseline = None if self.baseline is None else make_baseline(self.baseline, self.recipe.policy, seed, **self.params)
-        return DataEngine(recipe=self.recipe, model=baseline, seed=seed, replaying=True)
+        """Return a new engine in memory that repeats exactly under a seed."""
+        model = None
+        if self.baseline is not None:
+            model = make_baseline(self.baseline, self.recipe.policy, seed, **self.params)
+        return DataEngine(recipe=self.recipe, model=model, seed=seed, replaying=True)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Replay:
-    """One run of a cell, a replay or a live one, of n finished cycles, which may be none.
+    """One run of a cell, recorded or live, of n finished cycles, where n may be 0.
 
-    action, reason : (n,) str.  stopped : (n,) bool, the system stopped on an accepted part.
-    truth : (n,) good or not: bool in a replay; in a live run float, NaN where the cell does not tell.
-    lower, upper, n_success, n_failure : (n,) the evidence.  version : (n,) of the model; 0 before the first retrain.
-    position : (n, d) scaled embedding, mean over the spaces; NaN where no model embedded the trace.
-    safe_mode : (n,) bool, every part is verified after this cycle, whatever the model says.
-    decide_seconds : (n,) wall time of each decision.
-    clock_s : (n,) seconds of production when the cycle was done; None for a cell without a clock.
-    retrains : those that ended in this run.  recipe : of the engine.  name : of who played, in tables.
-
-    Of a replay alone:
-    index : (n,) position in the data set of the trace that each cycle played.  dataset : its name.
-    seed : of the shuffle and of the engine.  confirm : whether accepted good parts were confirmed by the cell.
-    seconds : wall time of the whole replay.
+    Attributes
+    ----------
+    action, reason : array of str, shape (n,)
+    truth : array, shape (n,)
+        Whether the part was good: bool in a replay; float in a live run, NaN where the cell does
+        not tell.
+    lower, upper : array of float, shape (n,)
+        Interval of the success rate.
+    n_success, n_failure : array of int, shape (n,)
+        Labels that were counted.
+    position : array of float, shape (n, d)
+        Scaled embedding, the mean over the spaces; NaN where no model embedded the trace.
+    decide_seconds : array of float, shape (n,)
+        Wall time of each decision.
+    stopped : array of bool, shape (n,)
+        The line stopped at an accepted part.
+    version : array of int, shape (n,)
+        Of the model; 0 before the first retrain.
+    safe_mode : array of bool, shape (n,)
+        After this cycle every part is verified, whatever the model says.
+    clock_s : array of float, shape (n,), or None
+        Seconds of production when the cycle was done; None for a cell without a clock.
+    retrains : tuple of RetrainReport
+        Those that ended in this run.
+    recipe : Recipe
+        Of the engine.
+    name : str
+        Of who played, for tables.
+    index : array of int, shape (n,)
+        Of a replay: position of each cycle's trace in the data set. Empty in a live run, as the
+        following have their defaults there.
+    dataset : str
+        Name of the data set.
+    seed : int
+        Of the shuffle and of the engine.
+    confirm : bool
+        Whether the cell confirmed accepted good parts.
+    seconds : float
+        Wall time of the whole replay.
     """
 
     action: NDArray[np.str_]
@@ -122,179 +191,275 @@ class Replay:
         return len(self.action)
 
     def __repr__(self) -> str:
-        counts, where = self.stretch(), f" on {self.dataset}, seed {self.seed}" if self.dataset else ""
-        told = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
-        told += f"; {len(self.dropped)} retrains dropped, the last {self.dropped[-1]}" if self.dropped else ""
+        where = f" on {self.dataset}, seed {self.seed}" if self.dataset else ""
+        counts = self.stretch()
+        summary = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
+        if self.dropped:
+            summary += f"; {len(self.dropped)} retrains dropped, the last {self.dropped[-1]}"
         cycles = f"{self.recipe.policy.summary}, {len(self)} cycles"
-        return f"<Replay of {self.name or 'a run'}{where}: {cycles}, {told}>"
+        return f"<Replay of {self.name or 'a run'}{where}: {cycles}, {summary}>"
 
     _repr_html_ = to_html
 
     @property
     def dropped(self) -> list[str]:
-        """Why retrains were dropped, each; a reducer that fails at every one leaves a model that is sure of nothing."""
-        return [each.reason for each in self.retrains if not each.accepted]
+        """Reasons of the retrains that were dropped.
+
+        A reducer that fails at every retrain leaves a model that is certain of nothing.
+        """
+        return [report.reason for report in self.retrains if not report.accepted]
 
     @property
     def verified(self) -> Bools:
-        """(n,) the part was checked."""
+        """The part was checked; (n,) bool."""
         return np.asarray(self.action == Action.VERIFY)
 
     @property
     def accepted(self) -> Bools:
-        """(n,) the part went on without a check."""
+        """The part went on without a check; (n,) bool."""
         return np.asarray(self.action == Action.ACCEPT)
 
     @property
     def rejected(self) -> Bools:
-        """(n,) the model sent the part back to the bin, without a check."""
+        """The model rejected the part without a check; (n,) bool."""
         return np.asarray((self.action == Action.REJECT) & ~self.outside)
 
     @property
     def false_positive(self) -> Bools:
-        """(n,) accepted and bad, as far as the truth is known."""
+        """Accepted and bad, as far as the truth is known; (n,) bool."""
         return np.asarray(self.accepted & (self.truth == 0.0))
 
     @property
     def false_negative(self) -> Bools:
-        """(n,) rejected and good, as far as the truth is known."""
+        """Rejected and good, as far as the truth is known; (n,) bool."""
         return np.asarray(self.rejected & (self.truth == 1.0))
 
     @property
     def novel(self) -> Bools:
-        """(n,) verified as unlike all that was learned from."""
+        """Verified because the trace is unlike everything learned; (n,) bool."""
         return np.asarray(self.reason == Reason.NOVEL)
 
     @property
     def outside(self) -> Bools:
-        """(n,) left an operator's window, and was verified or rejected for it: no decision of the model."""
+        """Left an operator's window, and was verified or rejected without the model; (n,) bool."""
         return np.asarray(self.reason == Reason.OUTSIDE)
 
     @property
     def finished(self) -> Bools:
-        """(n,) a good part was passed on, as far as the truth is known."""
+        """A good part was passed on, as far as the truth is known; (n,) bool."""
         return np.asarray((self.action != Action.REJECT) & (self.truth == 1.0))
 
     def to_frame(self) -> "pd.DataFrame":
-        """A row a cycle, numbered from 1, and a column each field of (n,); the position's are embedding_1, embedding_2 …"""
+        """Return a table with a row for each cycle, numbered from 1.
+
+        Its columns are the fields of shape (n,), and embedding_1, embedding_2, ... of the position.
+        """
         import pandas as pd
 
-        known = {each.name: getattr(self, each.name) for each in fields(self)}
-        one_a_cycle = (len(self),)  # a live run has no index of its parts
-        columns = {name: x for name, x in known.items() if isinstance(x, np.ndarray) and x.shape == one_a_cycle}
-        columns |= {f"embedding_{d + 1}": self.position[:, d] for d in range(self.position.shape[1])}
+        columns = {}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            # The shape leaves out the index of a live run, which is empty.
+            if isinstance(value, np.ndarray) and value.shape == (len(self),):
+                columns[item.name] = value
+        for d in range(self.position.shape[1]):
+            columns[f"embedding_{d + 1}"] = self.position[:, d]
         return pd.DataFrame(columns, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
 
     def stretches(self, n: int) -> list[dict[str, Any]]:
-        """The run cut into at most n stretches of about equal length, each as in `stretch`."""
+        """Cut the run into at most n stretches of about equal length; return `stretch` of each."""
         edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
-        return [self.stretch(slice(a, b)) for a, b in pairwise(edges)]
+        return [self.stretch(slice(begin, end)) for begin, end in pairwise(edges)]
 
     def stretch(self, part: slice = slice(None)) -> dict[str, Any]:
-        """Counts over some of the cycles; parts an hour where there is a clock."""
+        """Return counts over some of the cycles.
+
+        Parameters
+        ----------
+        part : slice, default all
+            Of the cycles.
+
+        Returns
+        -------
+        counts : dict
+            first_cycle and last_cycle, counted from 1; verified_share, NaN without cycles; the
+            names in `COUNTED` and stops; parts_per_hour, the good parts passed on, None without a
+            clock.
+        """
         begin, end, _ = part.indices(len(self))
-        counts = {name: int(getattr(self, name)[part].sum()) for name in COUNTED} | {"stops": int(self.stopped[part].sum())}
-        share, rate = float("nan"), None
+        counts = {name: int(getattr(self, name)[part].sum()) for name in COUNTED}
+        share = float("nan")
+        rate = None
         if end > begin:
             share = counts["verified"] / (end - begin)
-            clock_s = np.zeros(0) if self.clock_s is None else np.diff(self.clock_s, prepend=0.0)[begin:end]
-            rate = float(3600.0 * self.finished[part].sum() / clock_s.sum()) if clock_s.sum() > 0 else None
-        about = {"first_cycle": begin + 1, "last_cycle": end, "verified_share": share}
-        return about | counts | {"parts_per_hour": rate}
+            if self.clock_s is not None:
+                seconds = np.diff(self.clock_s, prepend=0.0)[begin:end].sum()
+                if seconds > 0:
+                    rate = float(3600.0 * self.finished[part].sum() / seconds)
+        return {
+            "first_cycle": begin + 1,
+            "last_cycle": end,
+            "verified_share": share,
+            **counts,
+            "stops": int(self.stopped[part].sum()),
+            "parts_per_hour": rate,
+        }
 
     def summary(self, check_seconds: float = VERIFY_SECONDS) -> dict[str, Any]:
-        """One row of a table: counts over the whole stream; NaN where there is nothing to take a share or a time of.
+        """Return one row of a table: settings, counts, shares and times over the whole run.
 
-        check_seconds : that a verification takes in the cell, for what was saved.  dropped : why the last retrain that was
-        dropped was; "" where none was.
+        A share or time of nothing is NaN.
+
+        Parameters
+        ----------
+        check_seconds : float, default 5.0
+            How long a verification takes in the cell, for what was saved.
+
+        Returns
+        -------
+        row : dict
+            Among others first_certain, the cycle of the first decision without a check, counted
+            from 1; dropped, the reason of the last retrain that was dropped, or ""; saved_s and
+            net_s, see `Costs.saved`.
         """
-        counts, policy, nan = self.stretch(), self.recipe.policy, float("nan")
-        accepted, rejected, *wrong = (counts[name] for name in COUNTED[1:5])
-        certain, retrain_s = accepted + rejected, np.array([each.seconds for each in self.retrains])
-        costs, dropped = Costs(check_seconds), self.dropped
+        nan = float("nan")
+        policy = self.recipe.policy
+        counts = self.stretch()
+        accepted = counts["accepted"]
+        rejected = counts["rejected"]
+        false_positive = counts["false_positive"]
+        false_negative = counts["false_negative"]
+        certain = accepted + rejected
+        n_wrong = false_positive + false_negative
+        retrain_seconds = np.array([report.seconds for report in self.retrains])
+        costs = Costs(check_seconds)
+        dropped = self.dropped
 
         def quantile(values: Floats, q: float) -> float:
             return float(np.quantile(values, q)) if len(values) else nan
 
+        first_certain = nan
+        if certain:
+            first_certain = float(np.argmax(self.accepted | self.rejected) + 1)
         return {
             "recipe": self.name,
-            **{name: getattr(policy, name) for name in ("interval", "alpha", "lower_bound", "guarantee", "stops")},
+            "interval": policy.interval,
+            "alpha": policy.alpha,
+            "lower_bound": policy.lower_bound,
+            "guarantee": policy.guarantee,
+            "stops": policy.stops,
             "confirm": self.confirm,
             "seed": self.seed,
             "cycles": len(self),
             "certain": certain,
-            "first_certain": float(np.argmax(self.accepted | self.rejected) + 1) if certain else nan,  # counted from 1
+            "first_certain": first_certain,
             **{name: counts[name] for name in COUNTED[1:]},
-            "precision": 1.0 - wrong[0] / accepted if accepted else nan,
-            "npv": 1.0 - wrong[1] / rejected if rejected else nan,
-            "accuracy": 1.0 - sum(wrong) / certain if certain else nan,
+            "precision": 1.0 - false_positive / accepted if accepted else nan,
+            "npv": 1.0 - false_negative / rejected if rejected else nan,
+            "accuracy": 1.0 - n_wrong / certain if certain else nan,
             "retrains": len(self.retrains),
             "retrains_dropped": len(dropped),
             "dropped": dropped[-1] if dropped else "",
-            "retrain_p50_s": quantile(retrain_s, 0.5),
-            "retrain_max_s": quantile(retrain_s, 1.0),
+            "retrain_p50_s": quantile(retrain_seconds, 0.5),
+            "retrain_max_s": quantile(retrain_seconds, 1.0),
             "decide_p50_us": 1e6 * quantile(self.decide_seconds, 0.5),
             "decide_p99_us": 1e6 * quantile(self.decide_seconds, 0.99),
             "saved_s": costs.saved(certain),
-            "net_s": costs.saved(certain, *wrong),
+            "net_s": costs.saved(certain, false_positive, false_negative),
             "seconds": self.seconds,
         }
 
 
-class Seen(NamedTuple):
-    """A finished cycle, and what its cell told on the side. truth : NaN where it tells none.  clock : seconds, or None."""
+class ObservedCycle(NamedTuple):
+    """A finished cycle, with what its cell tells beside it.
+
+    Attributes
+    ----------
+    cycle : Cycle
+    truth : float
+        1.0 good, 0.0 bad, NaN where the cell does not tell.
+    clock : float or None
+        Seconds of production; None for a cell without a clock.
+    """
 
     cycle: Cycle
     truth: float
     clock: float | None
 
 
-def follow(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Seen]:
-    """Let the engine drive a cell, of which `truth` and `clock` are read where it has them: each cycle as it ends."""
+def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[ObservedCycle]:
+    """Let the engine drive a cell, and yield each cycle as it ends.
+
+    Reads the cell's attributes `truth` and `clock`, if it has them.
+    """
     for cycle in engine.run(cell, cycles):
-        known = getattr(cell, "truth", cycle.success)
-        yield Seen(cycle, float("nan") if known is None else float(known), getattr(cell, "clock", None))
+        truth = getattr(cell, "truth", cycle.success)
+        truth = float("nan") if truth is None else float(truth)
+        yield ObservedCycle(cycle, truth, getattr(cell, "clock", None))
 
 
-def gather(seen: Sequence[Seen], recipe: Recipe) -> Replay:
-    """The run of these cycles, which may be one that was broken off."""
-    cycles = [each.cycle for each in seen]
+def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
+    """Return the run that these cycles make; it may have been interrupted."""
+    cycles = [item.cycle for item in observed]
     decisions = [cycle.decision for cycle in cycles]
-    clocks = [each.clock for each in seen if each.clock is not None]
-    known: dict[str, Any] = {
-        name: np.array([getattr(each, name) for each in decisions], dtype=kind) for name, kind in EVIDENCE.items()
+    clocks = [item.clock for item in observed if item.clock is not None]
+    arrays: dict[str, Any] = {
+        name: np.array([getattr(decision, name) for decision in decisions], dtype=dtype)
+        for name, dtype in DECISION_FIELDS.items()
     }
+    stopped = [cycle.outcome is Outcome.STOPPED for cycle in cycles]
     return Replay(
-        truth=np.array([each.truth for each in seen], dtype=np.float64),
+        truth=np.array([item.truth for item in observed], dtype=np.float64),
         position=_positions(decisions),
-        decide_seconds=np.array([each.decide_seconds for each in cycles], dtype=np.float64),
-        stopped=np.array([each.outcome is Outcome.STOPPED for each in cycles], dtype=np.bool_),
-        version=np.array([each.model_version for each in decisions], dtype=np.int64),
-        safe_mode=np.array([each.safe_mode != "" for each in cycles], dtype=np.bool_),
+        decide_seconds=np.array([cycle.decide_seconds for cycle in cycles], dtype=np.float64),
+        stopped=np.array(stopped, dtype=np.bool_),
+        version=np.array([decision.model_version for decision in decisions], dtype=np.int64),
+        safe_mode=np.array([cycle.safe_mode != "" for cycle in cycles], dtype=np.bool_),
         clock_s=np.array(clocks, dtype=np.float64) if clocks else None,
         retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
         recipe=recipe,
         name=recipe.name,
-        **known,
+        **arrays,
     )
 
 
 def _positions(decisions: list[Decision]) -> Floats:
-    """(n, d) of the newest embedding's width: a reducer may widen as it sees more traces."""
-    means = [np.mean(each.embedding, axis=0) if each.embedding else np.empty(0) for each in decisions]
+    """Return the mean embeddings (n, d), where d is the width of the newest one.
+
+    A reducer may widen as it sees more traces; narrower embeddings and missing ones are NaN.
+    """
+    means = [
+        np.mean(decision.embedding, axis=0) if decision.embedding else np.empty(0)
+        for decision in decisions
+    ]
     width = next((len(mean) for mean in reversed(means) if len(mean)), 2)
     unknown = np.full(width, np.nan)
-    return np.array([mean if len(mean) == width else unknown for mean in means]).reshape(len(means), width)
+    positions = [mean if len(mean) == width else unknown for mean in means]
+    return np.array(positions).reshape(len(means), width)
 
 
-def watch(engine: DataEngine, cell: Cell, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> Replay:
-    """Drive a cell and keep what figures and tables need; on_cycle : called after each."""
-    seen = []
-    for each in follow(engine, cell, cycles):
-        seen.append(each)
+def watch(
+    engine: DataEngine,
+    cell: Cell,
+    cycles: int,
+    on_cycle: Callable[[Cycle], None] | None = None,
+) -> Replay:
+    """Let an engine drive a cell, and return the run as a `Replay`.
+
+    Parameters
+    ----------
+    engine : DataEngine
+    cell : Cell
+    cycles : int
+    on_cycle : callable or None, default None
+        Called with each finished cycle.
+    """
+    observed = []
+    for item in observe_cycles(engine, cell, cycles):
+        observed.append(item)
         if on_cycle is not None:
-            on_cycle(each.cycle)
-    return gather(seen, engine.recipe)
+            on_cycle(item.cycle)
+    return to_replay(observed, engine.recipe)
 
 
 def replay(
@@ -309,40 +474,77 @@ def replay(
     confirm: bool = False,
     on_cycle: Callable[[int], None] | None = None,
 ) -> Replay:
-    """Play a data set through a fresh engine in memory: one shuffled pass, or its first `cycles`.
+    """Play a data set through a fresh engine in memory, in one pass.
 
-    dataset : anything `load_dataset` takes.
-    recipe : anything `Recipe.load` takes, the name of a baseline (`experiments.baselines.BASELINES`), a `Contender`,
-        or a fresh engine, by which a model of your own comes in.
-    seed : of the shuffle and of the engine; the same seed gives the same decisions.
-    alpha, lower_bound : of the policy; None: the recipe's, by default 0.05 and 0.95.
-    shuffle : False plays the stream as it was recorded, drift and all.
-    confirm : whether accepted good parts are confirmed by the cell; by default only stops are seen. With
-        `Policy(stops="all")` the engine takes the silence after them for as much.
-    on_cycle : called with the number of cycles done, for a progress bar.
+    Parameters
+    ----------
+    dataset : object
+        Anything `load_dataset` takes.
+    recipe : object
+        Anything `Recipe.load` takes, the name of a baseline (`experiments.baselines.BASELINES`), a
+        `Contender`, or a fresh engine, for a model of your own.
+    seed : int, default 0
+        Of the shuffle and of the engine; the same seed gives the same decisions.
+    cycles : int or None, default None
+        Only the first so many parts; None plays all.
+    alpha, lower_bound : float or None, default None
+        Of the policy; None takes the recipe's, which are 0.05 and 0.95 by default.
+    shuffle : bool, default True
+        False plays the stream in its recorded order, drift included.
+    confirm : bool, default False
+        Whether the cell confirms accepted good parts. By default only stops are known. With
+        `Policy(stops="all")` the engine takes the absence of a stop as a confirmation anyway.
+    on_cycle : callable or None, default None
+        Called with the number of finished cycles, for a progress bar.
+
+    Returns
+    -------
+    replay : Replay
+
+    Raises
+    ------
+    SettingError
+        A number of cycles that the data set does not have, or alpha or lower_bound beside an
+        engine.
+    DataError
+        The policy has windows in seconds, and the rate of the data set is unknown.
     """
-    numbers = {"alpha": alpha, "lower_bound": lower_bound}
-    numbers = {name: value for name, value in numbers.items() if value is not None}
-    data, who = load_dataset(dataset), None
+    changes = {"alpha": alpha, "lower_bound": lower_bound}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    data = load_dataset(dataset)
+    contender = None
     if not isinstance(recipe, DataEngine):
-        who = Contender.load(recipe).with_policy(**numbers)
-    elif numbers:
-        got = f"{' and '.join(numbers)} beside an engine, which has its own"
-        raise SettingError(f"Expected the policy of an engine on the engine, got {got}; make it with them.")
-    n = len(data) if cycles is None else cycles
-    expect(1 <= n <= len(data), f"1 to {len(data)} cycles from {data.name}", n)
-    order = (np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data)))[:n]
-    engine: DataEngine = recipe if who is None else who.engine(seed)
-    if data.rate_hz is None and any(window.along is None for window in engine.policy.windows):
-        raise DataError(f"Expected the rate of {data.name}, for windows are in seconds; state it, rate_hz=...")
+        contender = Contender.load(recipe).with_policy(**changes)
+    elif changes:
+        raise SettingError(
+            "Expected the policy of an engine on the engine, "
+            f"got {' and '.join(changes)} beside an engine, which has its own; make it with them."
+        )
+    n_cycles = len(data) if cycles is None else cycles
+    expect(1 <= n_cycles <= len(data), f"1 to {len(data)} cycles from {data.name}", n_cycles)
+    order = np.arange(len(data))
+    if shuffle:
+        order = np.random.default_rng(seed).permutation(len(data))
+    order = order[:n_cycles]
+    engine: DataEngine = recipe if contender is None else contender.engine(seed)
+    has_times = any(window.along is None for window in engine.policy.windows)
+    if data.rate_hz is None and has_times:
+        raise DataError(
+            f"Expected the rate of {data.name}, because windows are in seconds; give rate_hz=..."
+        )
+
+    def report(cycle: Cycle) -> None:
+        if on_cycle is not None:
+            on_cycle(cycle.index + 1)
+
     begin = time.perf_counter()
-    log = watch(engine, ReplayCell(data, order, confirm), n, on_cycle and (lambda cycle: on_cycle(cycle.index + 1)))
+    run = watch(engine, ReplayCell(data, order, confirm), n_cycles, report)
     return replace(
-        log,
-        truth=log.truth.astype(np.bool_),
+        run,
+        truth=run.truth.astype(np.bool_),
         index=order,
         confirm=confirm,
-        name=log.name if who is None else who.name,
+        name=run.name if contender is None else contender.name,
         dataset=data.name,
         seed=seed,
         seconds=time.perf_counter() - begin,

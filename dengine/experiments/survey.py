@@ -1,6 +1,9 @@
-"""What a data set is, before anything is learned from it: its size, its labels, its faults, its repeats, its drift.
+"""A survey of a data set before anything is learned from it.
 
-survey(load_dataset("cell_3/", channel="FZ_Base"))
+    survey_dataset(load_dataset("cell_3/", channel="FZ_Base"))
+
+It counts traces, labels, faults and repeats, and looks for drift in the recorded order.
+`dengine data` prints it.
 """
 
 from dataclasses import dataclass
@@ -17,7 +20,7 @@ from ..traces import LARGEST, as_traces
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Of lengths or rates."""
+    """The smallest, median and largest of the lengths or rates of a data set's recordings."""
 
     low: float
     median: float
@@ -26,11 +29,21 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """How one quantity goes with the recorded order.
+    """How one quantity changes with the recorded order.
 
-    rho, p : Spearman's rank correlation with the position, and the probability of one as far from 0 without drift, of this
-    quantity alone; NaN where it never changes.  tenths : its mean in each tenth of the stream, NaN where there is none.
-    Source: Spearman (1904), American Journal of Psychology 15(1).
+    Attributes
+    ----------
+    name : str
+        "good", or a channel whose mean is taken.
+    rho, p : float
+        Spearman's rank correlation with the position, and its p-value for this quantity alone. NaN
+        if the quantity never changes.
+    tenths : tuple of float
+        Its mean in each tenth of the stream, NaN where there is none.
+
+    References
+    ----------
+    Spearman (1904), American Journal of Psychology 15(1).
     """
 
     name: str
@@ -43,13 +56,38 @@ class Drift:
 class Survey:
     """What is known of a data set.
 
-    seconds, rate_hz, lengths, rates : as recorded, None where not known.  faults : what was left out.
-    not_finite, constant, too_large : traces that the engine verifies and never learns from.
-    not_finite_in : files, or rows, of those that are not finite.
-    duplicates : traces equal to an earlier one, sample by sample; contradicting : of these, with another label.
-    near_repeats : of the newest `looked_at` that can be learned from, traces much nearer to another part's than parts are
-    to each other.  parts : how many, where known.  unlabelled : left out, since nobody has checked them yet.
-    drift : of the share of good labels, and of each channel's mean; empty where the order does not say what came first.
+    Attributes
+    ----------
+    name : str
+    traces, channels, samples : int
+        The shape of the traces.
+    names : tuple of str
+        Of the channels, where they have any.
+    seconds, rate_hz : float or None
+        Duration of a trace, and samples per second; None where not known.
+    unit, fit : str
+    lengths, rates : Spread or None
+        Of the recordings; None where not known.
+    good, bad : int
+        Labels.
+    unlabelled : int
+        Recordings left out because nobody has checked the part yet.
+    faults : tuple of Fault
+        Recordings left out because they could not be read.
+    not_finite, constant, too_large : int
+        Traces that the engine verifies and never learns from.
+    not_finite_in : tuple of str
+        Files, or rows, of those that are not finite.
+    duplicates, contradicting : int
+        Traces equal to an earlier one, sample by sample; and those of them with another label.
+    near_repeats, looked_at : int
+        Among the newest `looked_at` usable traces: those that are much nearer to another part's
+        trace than parts are to each other.
+    parts : int or None
+        Different parts, where their numbers are known.
+    drift : tuple of Drift
+        Of the share of good labels, and of each channel's mean. Empty where the order of the
+        recordings is not known.
     """
 
     name: str
@@ -79,59 +117,79 @@ class Survey:
     drift: tuple[Drift, ...]
 
 
-def survey(data: Dataset) -> Survey:
-    """Look at all of a data set once; no label is used but to be counted."""
-    X, good = as_traces(data.X), int(data.y.sum())
+def survey_dataset(data: Dataset) -> Survey:
+    """Survey a data set; labels are only counted, nothing is learned from them."""
+    X = as_traces(data.X)
+    n_good = int(data.y.sum())
     finite = np.isfinite(X).all(axis=(1, 2))
     constant = finite & (X.min(axis=(1, 2)) == X.max(axis=(1, 2)))
     too_large = finite & ~constant & (np.abs(X).max(axis=(1, 2)) > LARGEST)
-    usable, hashes = finite & ~constant & ~too_large, content_hash(X)
+    usable = finite & ~constant & ~too_large
+    hashes = content_hash(X)
     parts: list[str | None] = [None] * len(data) if data.part is None else data.part.tolist()
-    own = np.array([trace_hash(*each) for each in zip(hashes.tolist(), parts, strict=True)], dtype=np.int64)
-    first: dict[int, int] = {}  # the label of each content's first trace
-    labels = zip(hashes[usable].tolist(), data.y[usable].tolist(), strict=True)
-    again = [(first.setdefault(content, label), label) for content, label in labels]
-    names = data.channels or tuple(f"channel {i + 1}" for i in range(X.shape[1]))
-    means = np.where(usable[:, None], levels(np.where(usable[:, None, None], X, 0)), np.nan).T
-    quantities = zip(("good", *names), [data.y.astype(np.float64), *means], strict=True)
+    pairs = zip(hashes.tolist(), parts, strict=True)
+    part_hashes = np.array([own_hash(content, part) for content, part in pairs], dtype=np.int64)
+    first_labels: dict[int, int] = {}  # the label of each content's first trace
+    n_contradicting = 0
+    for content, label in zip(hashes[usable].tolist(), data.y[usable].tolist(), strict=True):
+        n_contradicting += first_labels.setdefault(content, label) != label
+    n_usable = int(usable.sum())
     return Survey(
-        **{name: getattr(data, name) for name in ("name", "rate_hz", "unit", "fit", "unlabelled", "faults")},
+        **{
+            name: getattr(data, name)
+            for name in ("name", "rate_hz", "unit", "fit", "unlabelled", "faults")
+        },
         **dict(zip(("traces", "channels", "samples"), X.shape, strict=True)),
         names=data.channels,
         seconds=None if data.rate_hz is None else X.shape[2] / data.rate_hz,
         lengths=_spread(data.lengths),
         rates=_spread(data.rates),
-        good=good,
-        bad=len(data) - good,
+        good=n_good,
+        bad=len(data) - n_good,
         not_finite=int((~finite).sum()),
         not_finite_in=() if data.source is None else tuple(data.source[~finite].tolist()),
         constant=int(constant.sum()),
         too_large=int(too_large.sum()),
-        duplicates=len(again) - len(first),
-        contradicting=sum(before != label for before, label in again),
-        near_repeats=near_repeats(X[usable], own[usable]),
-        looked_at=min(int(usable.sum()), NEWEST),
+        duplicates=n_usable - len(first_labels),
+        contradicting=n_contradicting,
+        near_repeats=near_repeats(X[usable], part_hashes[usable]),
+        looked_at=min(n_usable, NEWEST),
         parts=None if data.part is None else len(set(parts)),
-        drift=tuple(_drift(*each) for each in quantities) if data.ordered else (),
+        drift=_drifts(data, X, usable) if data.ordered else (),
     )
 
 
-def levels(X: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(n, C, T) -> (n, C): each channel's mean over the trace."""
+def channel_means(X: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return each channel's mean over the trace, (n, C), of traces (n, C, T)."""
     return np.asarray(X.mean(axis=2, dtype=np.float64))
 
 
 def _spread(values: NDArray[Any] | None) -> Spread | None:
-    known = np.empty(0) if values is None else values[np.isfinite(values)]
-    return Spread(*np.quantile(known, (0.0, 0.5, 1.0)).tolist()) if len(known) else None
+    """Return the spread of the finite values; None if there is none."""
+    finite = np.empty(0) if values is None else values[np.isfinite(values)]
+    return Spread(*np.quantile(finite, (0.0, 0.5, 1.0)).tolist()) if len(finite) else None
+
+
+def _drifts(data: Dataset, X: NDArray[np.float32], usable: NDArray[np.bool_]) -> tuple[Drift, ...]:
+    """Return the drift of the labels and of each channel's mean over usable traces (n, C, T)."""
+    names = data.channels or tuple(f"channel {i + 1}" for i in range(X.shape[1]))
+    means = channel_means(np.where(usable[:, None, None], X, 0))
+    means = np.where(usable[:, None], means, np.nan)
+    quantities = [data.y.astype(np.float64), *means.T]
+    return tuple(_drift(*pair) for pair in zip(("good", *names), quantities, strict=True))
 
 
 def _drift(name: str, values: NDArray[np.float64]) -> Drift:
-    """Of (n,) values in recorded order; NaN ones are left out."""
+    """Return the drift of values (n,) in recorded order, leaving out those that are NaN."""
     from scipy.stats import spearmanr
 
-    place, known = np.arange(len(values)), np.isfinite(values)
-    varies = known.sum() > 2 and len(np.unique(values[known])) > 1
-    rho, p = spearmanr(place[known], values[known]) if varies else (np.nan, np.nan)
-    tenths = [block[np.isfinite(block)] for block in np.array_split(values, 10)]
-    return Drift(name, float(rho), float(p), tuple(float(block.mean()) if len(block) else np.nan for block in tenths))
+    position = np.arange(len(values))
+    finite = np.isfinite(values)
+    rho = p = np.nan
+    if finite.sum() > 2 and len(np.unique(values[finite])) > 1:
+        rho, p = spearmanr(position[finite], values[finite])
+    tenths = []
+    for block in np.array_split(values, 10):
+        block = block[np.isfinite(block)]
+        tenths.append(float(block.mean()) if len(block) else np.nan)
+    return Drift(name, float(rho), float(p), tuple(tenths))

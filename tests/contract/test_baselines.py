@@ -27,8 +27,8 @@ learning_baseline = pytest.mark.parametrize("name", [name for name in BASELINES 
 
 
 def new(name: str, policy: Policy = LOOSE, seed: int = 0, **params: Any) -> Baseline:
-    if BASELINES[name].needs:
-        pytest.importorskip(BASELINES[name].needs)
+    if BASELINES[name].library:
+        pytest.importorskip(BASELINES[name].library)
     return make_baseline(name, policy, seed, **QUICK.get(name, {}) | params)
 
 
@@ -88,7 +88,7 @@ def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_m
 def test_the_table_is_complete_and_imports_nothing() -> None:
     code = "import sys; from dengine.experiments.baselines import BASELINES; print(*{'aeon'} & {*sys.modules})"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == []
-    assert all(len(kind.tries) == 4 and 0 <= kind.chosen < 4 for kind in BASELINES.values())
+    assert all(len(kind.candidates) == 4 and 0 <= kind.chosen < 4 for kind in BASELINES.values())
     assert [name for name, kind in BASELINES.items() if not kind.bound] == ["knn", "never"]
 
 
@@ -103,8 +103,8 @@ def test_the_table_is_complete_and_imports_nothing() -> None:
     ],
 )
 def test_a_wrong_setting_is_named(name: str, params: dict[str, Any], words: str) -> None:
-    if name in BASELINES and BASELINES[name].needs:
-        pytest.importorskip(BASELINES[name].needs)
+    if name in BASELINES and BASELINES[name].library:
+        pytest.importorskip(BASELINES[name].library)
     with pytest.raises(SettingError, match=words):
         make_baseline(name, LOOSE, 0, **params)
 

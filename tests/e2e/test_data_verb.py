@@ -17,7 +17,7 @@ from click.testing import Result
 from dengine import DataEngine, Dataset, load_dataset
 from dengine.errors import DataError
 from dengine.experiments.figures import data_picture
-from dengine.experiments.survey import survey
+from dengine.experiments.survey import survey_dataset
 from tests.support.command_line import dengine, document, well
 from tests.support.recording_forms import NOT_CHECKED
 from training.make_recordings import write_plants, write_recordings
@@ -398,26 +398,27 @@ def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset])
     X[50], y[50] = X[10], y[10]
     X[51], y[51] = X[11], 1 - y[11]
     X[52:60] = X[20:28] + np.float32(1e-3)
-    found = survey(replace(data, X=X, y=y))
+    found = survey_dataset(replace(data, X=X, y=y))
     assert (found.not_finite, found.constant, found.too_large) == (1, 1, 1)
     assert (found.duplicates, found.contradicting) == (2, 1)
     assert 14 <= found.near_repeats <= 20
     assert found.looked_at == 117
     assert (found.good + found.bad, found.lengths) == (120, None)
-    assert survey(make_data(120, samples=60)).near_repeats <= 3
+    assert survey_dataset(make_data(120, samples=60)).near_repeats <= 3
 
 
 def test_drift_is_seen_where_there_is_some_and_only_there(make_data: Callable[..., Dataset]) -> None:
     data = make_data(300, samples=60)
-    still = {each.name: each for each in survey(data).drift}
+    still = {each.name: each for each in survey_dataset(data).drift}
     assert still["good"].p > 0.01
     assert still["channel 1"].p > 0.01
     rng = np.random.default_rng(1)
     y = (rng.random(300) < np.linspace(1.0, 0.3, 300)).astype(np.int8)
-    moved = {each.name: each for each in survey(replace(data, X=data.X + np.linspace(0, 9, 300)[:, None], y=y)).drift}
+    drifting = replace(data, X=data.X + np.linspace(0, 9, 300)[:, None], y=y)
+    moved = {drift.name: drift for drift in survey_dataset(drifting).drift}
     assert moved["good"].p < 1e-4 > moved["channel 1"].p
     assert moved["good"].rho < -0.2 < 0.3 < moved["channel 1"].rho
-    flat = survey(replace(data, y=np.ones(300, dtype=np.int8))).drift[0]
+    flat = survey_dataset(replace(data, y=np.ones(300, dtype=np.int8))).drift[0]
     assert np.isnan([flat.rho, flat.p]).all()
     assert flat.tenths == (1.0,) * 10
 

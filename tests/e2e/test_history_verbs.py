@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dengine import Action, DataEngine, Dataset, Policy, ReplayCell
-from dengine.cli.history import WIDEST
+from dengine.cli.history import TABLE_WIDTH
 from dengine.decision.intervals import wilson_interval
 from dengine.history.status import bad_accepts
 from dengine.store.records import Outcomes
@@ -32,7 +32,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(store: Path) -> None:
     shown = succeed("history", store, "--last", 400, "--events").splitlines()
-    assert max(map(len, shown)) <= WIDEST == 120
+    assert max(map(len, shown)) <= TABLE_WIDTH == 120
     newest = document("history", store, "--last", 1)["decisions"][0]
     assert newest["id"] in shown[-1]
     assert sum("  * retrain to version" in line for line in shown) >= 5

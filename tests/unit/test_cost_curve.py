@@ -8,7 +8,7 @@ import pytest
 
 from dengine import Dataset, Policy, Recipe
 from dengine.errors import SettingError
-from dengine.experiments.costs import CostCurve, cost_a_part, cost_curve, curve_of
+from dengine.experiments.costs import CostCurve, cost_curve, cost_per_part, curve_of
 from dengine.experiments.figures import cost_picture
 from dengine.experiments.metrics import Costs
 from dengine.experiments.replay import Replay, replay
@@ -43,17 +43,17 @@ def curve(lax: Sequence[tuple[int, int]], strict: Sequence[tuple[int, int]] = ((
 
 def test_a_parts_cost_is_checks_and_errors_over_all_parts() -> None:
     one = played(LAX, 0, verified=60, accepted=25, bad=2, rejected=15, good=3)
-    assert cost_a_part(one, COSTS) == pytest.approx((60 * 5 + 2 * 100 + 3 * 20) / 100)
-    assert cost_a_part(one, COSTS, slice(60, 85)) == pytest.approx(2 * 100 / 25)
+    assert cost_per_part(one, COSTS) == pytest.approx((60 * 5 + 2 * 100 + 3 * 20) / 100)
+    assert cost_per_part(one, COSTS, slice(60, 85)) == pytest.approx(2 * 100 / 25)
 
 
 def test_one_half_of_the_shuffles_chooses_and_the_other_reports() -> None:
     found = curve(lax=[(50, 0), (50, 0), (50, 1), (60, 1)], strict=[(90, 0), (80, 0), (70, 0), (70, 0)])
     lax, strict = found.rows
     assert (found.choosing, found.reporting) == (2, 2)
-    assert (lax.chosen_by, lax.cost) == (pytest.approx(2.5 + 50 * 0.5 / 51), (3.5 + 4.0) / 2)
+    assert (lax.expected_cost, lax.cost) == (pytest.approx(2.5 + 50 * 0.5 / 51), (3.5 + 4.0) / 2)
     assert curve(lax=[(50, 0)] * 4, strict=[(50, 0)] * 4).policy == STRICT  # of equal ones
-    assert (strict.chosen_by, strict.cost) == (pytest.approx(4.25 + 15 * 0.5 / 16), 3.5)
+    assert (strict.expected_cost, strict.cost) == (pytest.approx(4.25 + 15 * 0.5 / 16), 3.5)
     assert found.policy == LAX  # cheaper where it was chosen, though not where it is reported
     assert f"{lax.cost:.3g} a part" in found.sentence
 
@@ -109,7 +109,7 @@ def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(found: Co
     asked = RECIPE.with_policy(alpha=0.5, lower_bound=0.8)
     again = [replay(make_data(160), asked, seed, 120) for seed in (2, 3)]
     assert (found.rows[0].policy, asked.policy.stops) == (asked.policy, "all")
-    assert found.rows[0].cost == pytest.approx(np.mean([cost_a_part(one, found.costs) for one in again]))
+    assert found.rows[0].cost == pytest.approx(np.mean([cost_per_part(one, found.costs) for one in again]))
     by_cost = found.rows[-1]
     assert (by_cost.policy.guarantee, by_cost.policy.prices) == ("cost", (5.0, 20.0, 11.0))
     assert (found.cycles, found.choosing, found.reporting, found.dataset) == (120, 2, 2, "insertion-like")

@@ -20,7 +20,7 @@ from dengine.experiments.figures import (
     save,
     window_curves,
 )
-from dengine.experiments.replay import Replay, gather
+from dengine.experiments.replay import Replay, to_replay
 from dengine.experiments.tables import frame_of, pool, pooled_table, promise_lines
 from dengine.reducers import has_own_unit
 from tests.support.replays import replay_of as by_hand
@@ -136,7 +136,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "map of nothing": lambda: embedding_map(blank()),
     "run": lambda: run_picture(log_of(np.arange(1.0, 101.0)), "a title"),
     "run without a clock": lambda: run_picture(log_of(None)),
-    "run of no cycle": lambda: run_picture(gather([], RECIPE)),
+    "run of no cycle": lambda: run_picture(to_replay([], RECIPE)),
 }
 
 

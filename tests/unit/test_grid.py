@@ -13,7 +13,7 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from dengine import Dataset, Recipe, replay, run_grid
 from dengine.errors import SettingError
 from dengine.experiments.baselines import BASELINES
-from dengine.experiments.grid import KeptReplays, Task, contenders, grid_tasks, iterate_replays
+from dengine.experiments.grid import KeptReplays, Task, grid_tasks, iterate_replays, load_contenders
 from dengine.experiments.replay import Contender
 from dengine.recipe import RECIPES
 from tests.support.driving import RECIPE
@@ -90,7 +90,7 @@ def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: P
 
 
 def test_a_baseline_without_its_library_is_refused_before_anything_is_played(data, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(BASELINES["always"], "needs", "no_such_library")
+    monkeypatch.setattr(BASELINES["always"], "library", "no_such_library")
     with pytest.raises(SettingError, match=r'always needs no_such_library.*pip install "dengine\[baselines\]"'):
         run_grid(data, [RECIPE, "always"], **GRID, n_jobs=1, keep=tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -115,8 +115,8 @@ def test_two_of_one_name_and_policy_are_refused_and_a_policy_has_columns_of_its_
         Contender("narrow", replace(plain, radius=0.3)),
         "conv",
     ]
-    assert [one.name for one in contenders(asked)] == ["pca", "pca", "narrow", "conv"]
+    assert [one.name for one in load_contenders(asked)] == ["pca", "pca", "narrow", "conv"]
     for twice in ([plain, replace(plain, radius=0.3)], [PCA(1), PCA(2)]):
         with pytest.raises(SettingError, match=r"a name of its own for each.*by Contender\(name, recipe\)"):
-            contenders(twice)
+            load_contenders(twice)
     assert set(BASELINES) & set(RECIPES) == set()

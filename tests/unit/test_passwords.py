@@ -10,7 +10,7 @@ import sqlalchemy as sa
 
 from dengine import errors as all_errors
 from dengine.cli import main
-from dengine.cli.output import progress
+from dengine.cli.output import progress_bar
 from dengine.errors import DengineError, StoreError, without_password
 from dengine.representation import to_jsonable
 from dengine.store import SqlStore
@@ -85,7 +85,7 @@ def test_no_verb_shows_the_password_of_what_it_cannot_use(words: str, tmp_path: 
 
 def test_json_and_progress_mask_it(capsys: pytest.CaptureFixture) -> None:
     assert SECRET not in json.dumps(to_jsonable({"store": NOBODY, "all": [NOBODY, (NOBODY,)], "path": Path(NOBODY)}))
-    with progress(f"importing {NOBODY}", 3) as advance:
+    with progress_bar(f"importing {NOBODY}", 3) as advance:
         advance(3)
     assert SECRET not in "".join(capsys.readouterr())
 

@@ -420,7 +420,7 @@ def test_resampled_recordings_are_imported_once_also_when_others_are_added(tmp_p
 
 
 def left_out(data: Dataset) -> list[str]:
-    from dengine.cli.options import left_out as lines
+    from dengine.cli.options import fault_lines as lines
 
     return lines(data, 10)[1:]
 
