@@ -83,7 +83,7 @@ class Verbs(click.Group):
 )
 @click.version_option(__version__, prog_name="dengine", message="%(prog)s %(version)s")
 def main() -> None:
-    """Let a robot cell start with a slow check on every part, and need it less as it learns.
+    """Let a robot cell start with a slow check, and need it less as it learns.
 
     Exit codes: 0 success; 1 failure, with one line that says why; 2 wrong usage; 130 interrupted by
     Ctrl-C, and what was done until then is kept and shown.

@@ -259,7 +259,7 @@ def compare(
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
         raise click.UsageError(
-            f"--reducers needs a different name for each method, got {', '.join(short_names)}."
+            f"--reducers needs a name of its own for each method, got {', '.join(short_names)}."
         )
     from ..experiments.paper import GRID
 

@@ -236,7 +236,7 @@ _EXPECT = (
 @click.option("--expect", metavar="DIGEST", help=_EXPECT)
 @click.pass_context
 def verify(context: click.Context, store: str, cell: str | None, expect: str | None) -> None:
-    """Check that a store's history is unchanged since it was written.
+    """Check that a store's history is what was written.
 
     Every row is compared with its checksum, and every entry of the ledger with its rows. What was
     changed, is missing or was never chained is listed, with exit code 1. Nothing is written, and

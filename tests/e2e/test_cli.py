@@ -87,7 +87,8 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy() -> None:
     command = [sys.executable, "-X", "importtime", "-m", "dengine", "-h"]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert done.stdout == succeed("-h").replace("Usage: main", "Usage: dengine")
+    # Where lines break depends on the length of the program's name.
+    assert done.stdout.split() == succeed("-h").replace("Usage: main", "Usage: dengine").split()
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert {"dengine.cli.options", "numpy", "torch", "pandas", "rich", "sklearn"} & imported == {"dengine.cli.options"}
 
@@ -233,7 +234,7 @@ def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, own: Path, mo
         out = succeed("train", "--data", data, "--store", "e.db", *words)
         assert "his" in sys.modules
         assert sys.path[-1] == str(own)  # last: a module of this folder shadows nothing
-        assert "FirstAndLast answers" in out or "imported │ 0" in " ".join(out.split())
+        assert "FirstAndLast answers" in " ".join(out.split())
     assert "his:FirstAndLast" in succeed("status", "e.db")
     words = ["compare", "--data", data, "--reducers", "pca,his:FirstAndLast", *POLICY, "--repeats", 1, "--out", "out"]
     assert [(row["recipe"], row["certain"] > 0) for row in document(*words)["rows"]][1] == ("FirstAndLast", True)
@@ -296,7 +297,7 @@ def test_a_foreseen_failure_is_one_line_and_exit_code_1(words: str, data: Path, 
         ("replay --audit-rate 1", "1.0 is not in the range 0.0<=x<1.0"),
         ("compare --reducers ,", "at least one value"),
         ("compare --alphas 0.1,2", "2.0 is not in the range"),
-        ("compare --alphas 0.1 --alpha 0.1", "--alpha names one value"),
+        ("compare --alphas 0.1 --alpha 0.1", "--alpha gives one value"),
         ("compare --reducers pca,pca", "a name of its own"),
         ("compare --intervals wald", "'wald' is not one of 'wilson', 'binomial'"),
         ("train", "Missing option"),

@@ -305,7 +305,9 @@ def test_a_long_table_whose_times_are_not_named_is_told_to_name_them(make_data, 
     assert "a long table needs" in done.stderr
     assert "--time time" in done.stderr
     assert "--part serial" not in done.stderr
-    assert "a long one, a row a sample, with --part, --time" in " ".join(well("data", "--help").stdout.split())
+    assert "a long one, with a row for each sample, read by --part, --time" in " ".join(
+        well("data", "--help").stdout.split()
+    )
 
 
 @pytest.mark.parametrize("empty", NOT_CHECKED, ids=repr)

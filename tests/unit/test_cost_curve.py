@@ -143,4 +143,4 @@ def test_the_verb_shows_a_table_and_writes_the_curve(data: Dataset, tmp_path: Pa
     assert told["sentence"] in " ".join(shown.split())
     assert len(list((tmp_path / "kept").iterdir())) == 4  # played once
     assert "by cost" in succeed(*words.replace("reject 10", "reject 11").split(), "--stops", "all")
-    assert "name those to be tried, --alphas" in " ".join(dengine(*words.split(), "--alpha", "0.1").output.split())
+    assert "but a list is tried here: use --alphas" in " ".join(dengine(*words.split(), "--alpha", "0.1").output.split())

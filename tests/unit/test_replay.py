@@ -104,7 +104,7 @@ def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(playe
 def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(data: Dataset, played: Replay) -> None:
     highest = data.X.max(axis=1)
     window = f"0:1:-1e9:{np.quantile(highest, 0.8)}:reject"
-    with pytest.raises(DataError, match="for windows are in seconds; state it, rate_hz"):
+    with pytest.raises(DataError, match="because windows are in seconds; give rate_hz"):
         replay(data, RECIPE.with_policy(windows=[window]))
     data = replace(data, rate_hz=500.0)
     log, wide = (replay(data, RECIPE.with_policy(windows=[each]), seed=1) for each in (window, "0:1:-1e9:"))
