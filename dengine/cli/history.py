@@ -91,8 +91,8 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     of the model, and label is what the part turned out to be. `dengine explain` tells more about
     one decision.
     """
-    from ..history.status import read_retrains_and_events
     from ..history.status import history as read_history
+    from ..history.status import read_retrains_and_events
     from ..representation import to_jsonable
     from ..store.opening import open_store
 

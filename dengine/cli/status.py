@@ -145,27 +145,27 @@ def _span_cell(name: str, span: "Span") -> str:
         return "as bad accepts, below"  # the same parts
     if not hasattr(value, "verdict"):
         return format_value(name, value)
-    return _judged_cell(value, span.false_accepts if name == "bad_accepts" else 0)
+    return _error_cell(value, span.false_accepts if name == "bad_accepts" else 0)
 
 
-def _judged_cell(judged: "Judged", n_stops: int) -> str:
+def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
     """Return how the share of wrong decisions compares with the tolerance, after the line stops.
 
     Parameters
     ----------
-    judged : Judged
+    estimate : ErrorEstimate
         The interval of the share, and what it rests on.
     n_stops : int
         Line stops, which are named first where the share does not include them.
     """
     stops = ""
-    if n_stops and judged.by != "every outcome":
+    if n_stops and estimate.basis != "every outcome":
         stops = f"{n_stops:,} stop{'s' * (n_stops > 1)}; "
-    if not judged.known and judged.verdict == "open":
+    if not estimate.n_known and estimate.verdict == "open":
         return stops + ("else unknown" if n_stops else "none is known")
     basis = ""
-    if judged.known:
-        basis = f"{judged.wrong:,} of {judged.known:,} by {judged.by}: "
-    interval = f"{100 * judged.lower:.1f} to {percent(judged.upper)}"
-    verdict = f"{VERDICTS[judged.verdict]} {percent(judged.tolerance, 'g')}"
+    if estimate.n_known:
+        basis = f"{estimate.n_wrong:,} of {estimate.n_known:,} by {estimate.basis}: "
+    interval = f"{100 * estimate.lower:.1f} to {percent(estimate.upper)}"
+    verdict = f"{VERDICTS[estimate.verdict]} {percent(estimate.tolerance, 'g')}"
     return f"{stops}{basis}{interval}, {verdict}"

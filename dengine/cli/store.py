@@ -95,7 +95,7 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
     from ..history.explain import find_decision_id
 
     def change(engine: DataEngine) -> Changed:
-        id_ = of_part(engine.store, part)
+        id_ = find_decision_id(engine.store, part)
         stored = engine.find(id_)
         if stored is not None and stored.success is LABELS[label]:
             text = f"Decision {id_} was {label} already; nothing changed."
@@ -122,7 +122,7 @@ def correct(store: str, part: str, label: str, author: str, allow_import: bool) 
     from ..history.explain import find_decision_id
 
     def change(engine: DataEngine) -> Changed:
-        return engine.correct(of_part(engine.store, part), LABELS[label], author)
+        return engine.correct(find_decision_id(engine.store, part), LABELS[label], author)
 
     _change_and_print(store, author, allow_import, change)
 
@@ -268,7 +268,7 @@ def _verification_lines(report: HistoryReport) -> list[str]:
     for fault in report.faults[:MOST_FAULTS]:
         cell_text = fault.cell_id and f"cell {fault.cell_id}:"
         where = " ".join(filter(None, (cell_text, fault.table, fault.key)))
-        lines.append(f"{where} {fault.what}.")
+        lines.append(f"{where} {fault.problem}.")
     if len(report.faults) > MOST_FAULTS:
         lines.append(f"And {len(report.faults) - MOST_FAULTS} more; --json shows all.")
     if report.ok:

@@ -675,8 +675,8 @@ def _draw_bound(axes: Axes, bound: Bound | None) -> None:
     label = f"bound: {bound.lower:.3f} to {bound.upper:.3f}"
     axes.plot(ends, [0.0, 0.0], color=BLACK, linewidth=3.0, alpha=0.7, label=label)
     thresholds = (
-        (bound.accept_at, GOOD, "accept from"),
-        (bound.reject_at, BAD, "reject up to"),
+        (bound.accept_threshold, GOOD, "accept from"),
+        (bound.reject_threshold, BAD, "reject up to"),
     )
     for threshold, colour, name in thresholds:
         if threshold is not None:

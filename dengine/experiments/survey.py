@@ -128,7 +128,7 @@ def survey_dataset(data: Dataset) -> Survey:
     hashes = content_hash(X)
     parts: list[str | None] = [None] * len(data) if data.part is None else data.part.tolist()
     pairs = zip(hashes.tolist(), parts, strict=True)
-    part_hashes = np.array([own_hash(content, part) for content, part in pairs], dtype=np.int64)
+    part_hashes = np.array([trace_hash(content, part) for content, part in pairs], dtype=np.int64)
     first_labels: dict[int, int] = {}  # the label of each content's first trace
     n_contradicting = 0
     for content, label in zip(hashes[usable].tolist(), data.y[usable].tolist(), strict=True):
