@@ -156,8 +156,8 @@ def train(
     from ..store.opening import UNHURRIED
 
     # The form of the store's earlier traces holds where no other one was asked for.
-    stored_form = form_in(store, source.data)
-    dataset = replace(source, options={**stored_form, **source.options}).load()
+    earlier_form = stored_form(store, source.data)
+    dataset = replace(source, options={**earlier_form, **source.options}).load()
     recipe = choice.load_if_given()
     try:
         with interruptible_steps(f"importing {dataset.name}", len(dataset)) as count:

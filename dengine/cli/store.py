@@ -332,7 +332,7 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
     report = import_journal(store, journal, any_model=any_model)
     print_result(
         {"store": store, "journal": journal} | asdict(report),
-        table_of_rows(f"{journal} into {store}", field_rows(report, "aside")),
+        table_of_rows(f"{journal} into {store}", field_rows(report, "set_aside")),
     )
-    if report.aside:
-        raise click.ClickException(report.aside)
+    if report.set_aside:
+        raise click.ClickException(report.set_aside)

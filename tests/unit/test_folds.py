@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from dengine import TraceSpec
-from dengine.decision.decider import DecisionConditions, Decider, VerifyAll
+from dengine.decision.decider import Decider, DecisionConditions, VerifyAll
 from dengine.decision.scripting import script
 from dengine.folds import content_fold, content_hash, fold_of, toss
 from dengine.records import Reason
