@@ -422,7 +422,7 @@ _TIME = (
 )
 _HERTZ = "Samples per second.  [default: from the timestamps; live: 500]"
 _UNIT = (
-    "Unit of the samples; recordings whose header names another one, kN for N, are converted.  "
+    "Unit of the samples; those that are in another one, kN for N, are converted.  "
     "[default: the header's, else N]"
 )
 _COLUMNS = "The names of the columns of text files without a header, as in time,fx,fz."
