@@ -4,9 +4,9 @@
     python training/evidence.py --only conv --n-jobs 2      # what is not asked for stays as it was
 
 Shuffle by shuffle, so that what is finished can be compared; finished replays are kept in --keep, so that a killed run goes
-on. After each shuffle it writes OUT/evidence/replays.csv (a row a replay, with the commit of the dengine that played it),
-differences.csv, curves.png, and the tables of OUT/explanation/evidence.md. Rows give way to those of another commit where
-their condition is played again.
+on. After each shuffle it writes into OUT/evidence: replays.csv (one row per replay, with the commit of the dengine
+that played it), differences.csv, curves.png, and tables.md. The rows of a condition that another commit plays again are
+replaced.
 
 Recorded sets are shuffled by the seed; of a made one each seed draws new parts, which come in their order. Everybody sees
 the same parts in the same order: differences are paired, to conv's replay of the same seed, with Student's interval.
@@ -42,7 +42,6 @@ from dengine.files import write_output
 from dengine.reducers import ConvReducer
 from dengine.reducers.base import StopRule
 
-ROOT, PAGE = Path(__file__).resolve().parents[1], Path("docs/explanation/evidence.md")
 CELLS = ((0.1, 0.9), (0.05, 0.95))  # alpha, LB
 # Seconds of a core that a replay takes.
 SECONDS = {
@@ -288,7 +287,7 @@ def cost_of_promises(told: pd.DataFrame) -> list[str]:
 
 
 def write(frame: pd.DataFrame, out: Path) -> None:
-    """CSV files, the picture and the page."""
+    """Write the CSV files, the picture and the tables into the folder `evidence` of out."""
     told, folder = differences(frame), out / "evidence"
     write_csv(frame, folder / "replays.csv", force=True)
     write_csv(told.round(3), folder / "differences.csv", force=True)
@@ -296,19 +295,15 @@ def write(frame: pd.DataFrame, out: Path) -> None:
     sides = told.groupby(["recipe", "commit"], sort=False)["replays"].agg(["min", "max"]).reset_index()
     rows = [[r["recipe"], r["commit"], f"{r['min']} to {r['max']}"] for _, r in sides.iterrows()]
     seeds = f"seeds {frame['seed'].min()} to {frame['seed'].max()}"
-    said = {
-        "machine": [f"Last on {datetime.now(UTC):%d %B %Y}, {seeds}.", "", *machine()],
-        "played": table(["who", "commit", "shuffles of a condition"], rows),
-        "reducers": compared(told),
-        "paper": paper(frame),
-        "promises": cost_of_promises(told),
+    sections = {
+        "Machine": [f"Last on {datetime.now(UTC):%d %B %Y}, {seeds}.", "", *machine()],
+        "Replays": table(["method", "commit", "shuffles of a condition"], rows),
+        "Reducers and baselines": compared(told),
+        "The paper's cells": paper(frame),
+        "What each promise costs": cost_of_promises(told),
     }
-    page = (ROOT / PAGE).read_text(encoding="utf-8")
-    for name, lines in said.items():
-        mark = f"<!-- {name}: by training/evidence.py -->\n"
-        before, _, after = page.split(mark)
-        page = mark.join([before, "\n".join(["", *lines]).rstrip() + "\n\n", after])
-    write_output(out / PAGE.relative_to("docs"), page.encode(), force=True, make_folder=True)
+    page = "\n".join(line for title, lines in sections.items() for line in (f"## {title}", "", *lines, ""))
+    write_output(folder / "tables.md", page.encode(), force=True)
 
 
 def machine() -> list[str]:
@@ -332,7 +327,7 @@ def commit() -> str:
 
 def main() -> None:
     """Parse, say the cost, play, write."""
-    parser = options(__doc__, seeds="100:130", n_jobs=2, keep=Path("out/evidence"), out=Path("docs"))
+    parser = options(__doc__, seeds="100:130", n_jobs=2, keep=Path("out/evidence"), out=Path("out"))
     parser.add_argument("--screw", help="the screw-driving set, an .npz file")
     parser.add_argument("--sets", default=",".join(SETS), help="with commas between; all by default")
     parser.add_argument("--only", help="reducers and baselines, with commas between; 'promises' for the variants of conv")

@@ -50,7 +50,7 @@ def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run: Run, tmp_pa
     more = told.query("alpha == 0.1 and recipe == 'knn'").iloc[0]
     assert more["certain_more"] == pytest.approx((certain["knn"] - certain["conv"]).mean(), abs=1e-3)
     assert more["certain_low"] < more["certain_more"] < more["certain_high"]
-    assert "| opposite | " in (tmp_path / "explanation" / "evidence.md").read_text(encoding="utf-8")
+    assert "| opposite | " in (tmp_path / "evidence" / "tables.md").read_text(encoding="utf-8")
 
 
 def test_a_row_of_the_evidence_gives_way_where_another_commit_plays_its_condition() -> None:
