@@ -535,7 +535,7 @@ def _explain_in_words(
     """Yield the sentences that explain a decision: its reason, its bounds, its outcome."""
     decision = item.decision
     reason = (
-        ": the row was made from a stop whose decision was lost; on what evidence is not known."
+        ": the decision was lost, and recorded again from its line stop; its evidence is unknown."
     )
     if not _was_lost(decision):
         reason = WHY[decision.reason](decision, item.trace, circumstances)
@@ -608,7 +608,7 @@ def _explain_outside(
 WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]] = {
     Reason.CERTAIN: lambda *_: ": the bound meets the policy.",
     Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
-    Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was.",
+    Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was verified.",
     Reason.AUDIT: _explain_audit,
     Reason.NOT_FINITE: _explain_not_finite,
     Reason.CONSTANT: lambda decision, trace, circumstances: (
@@ -620,22 +620,22 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
         f"{circumstances.spec.units[np.abs(trace).max(axis=1).argmax()]}; beyond "
         f"{LARGEST:g} nothing can be computed from it."
     ),
-    Reason.MODEL_ERROR: lambda *_: ": the model raised an error, which the log of that time tells.",
+    Reason.MODEL_ERROR: lambda *_: ": the model raised an error; see the log of that time.",
     Reason.NOVEL: lambda decision, trace, circumstances: (
-        ": unlike all that was learned "
+        ": unlike all traces that were learned "
         f"from{'' if circumstances.novelty is None else f': {circumstances.novelty}'}. "
-        "What its neighbours say does not count then."
+        "The labels of its neighbours do not count then."
     ),
     Reason.SAFE_MODE: lambda decision, trace, circumstances: (
-        " in safe mode, in which every part is: "
+        " in safe mode, in which every part is verified: "
         f"{circumstances.safe_mode or 'its reason is not kept'}."
     ),
     Reason.NO_STORE: lambda *_: (
-        ": the cell's disk did not take it then, or could not say whether its id was new, so "
-        "the model was not asked."
+        ": the disk or the store did not respond in time, so the decision could not be recorded, "
+        "or its id could not be looked up, and the model was not asked."
     ),
     Reason.LATE: lambda *_: (
-        ": whoever asked could wait no longer, and verified, so the model was not asked."
+        ": the caller timed out and verified the part, so the model was not asked."
     ),
     Reason.OUTSIDE: _explain_outside,
 }
@@ -1009,7 +1009,7 @@ def _notes(
     elif neighbourhood is None:
         why = f"version {decision.model_version}, which answered, is not kept any more"
         if decision.embedding is None:
-            why = "nothing placed the trace"
+            why = "the trace was not embedded"
         yield f"No neighbours are shown: {why}."
     else:
         recorded = (decision.n_success, decision.n_failure)

@@ -144,8 +144,8 @@ def test_each_reason_is_explained_by_what_it_rests_on(make_data: Callable[..., D
     assert "below the audit rate 0.1" in said_of(audited)
     assert 0.0 <= float(re.search(r"coin fell on ([\d.]+),", said_of(audited)).group(1)) < 0.1
     assert "no model had been trained yet" in said_of(untrained)
-    assert "nothing placed the trace" in said_of(untrained)
-    assert "a stop whose decision was lost" in said_of(lost)
+    assert "the trace was not embedded" in said_of(untrained)
+    assert "the decision was lost, and recorded again" in said_of(lost)
     assert "The part turned out bad (stop)" in said_of(lost)
 
 
@@ -157,7 +157,7 @@ def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
         usual = engine.decide(data.X[0] + np.float32(0.001))
         assert usual.reason is Reason.SAFE_MODE
         found = engine.explain(usual.id)
-        assert "in safe mode, in which every part is: too many traces were novel" in said_of(found)
+        assert "in safe mode, in which every part is verified: too many traces were novel" in said_of(found)
         assert "Nothing could pass, whatever the bound: too many traces were novel" in said_of(found)
         before = next(past for past in engine.history() if past.decision.reason is Reason.CERTAIN)
         assert "safe mode" not in said_of(engine.explain(before.decision.id))
