@@ -153,7 +153,7 @@ def train(
     from ..datasets.importing import import_labelled, stored_form
     from ..engine.engine import DataEngine, core_of
     from ..experiments.tables import retrain_line
-    from ..store.opening import UNHURRIED
+    from ..store.opening import LONG_WAIT
 
     # The form of the store's earlier traces holds where no other one was asked for.
     earlier_form = stored_form(store, source.data)
@@ -168,7 +168,7 @@ def train(
             f"command continues there."
         )
     with DataEngine.open_or_create(
-        store, wait=UNHURRIED, recipe=recipe, allow_import=allow_import
+        store, wait=LONG_WAIT, recipe=recipe, allow_import=allow_import
     ) as engine:
         name = short_name(engine.recipe.name)
         record = {

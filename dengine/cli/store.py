@@ -65,9 +65,9 @@ def _change_and_print(
 ) -> None:
     """Open the store's engine, change it, and print what changed with the new certificate."""
     from ..engine.engine import DataEngine
-    from ..store.opening import UNHURRIED
+    from ..store.opening import LONG_WAIT
 
-    with DataEngine.open(store, wait=UNHURRIED, allow_import=allow_import) as engine:
+    with DataEngine.open(store, wait=LONG_WAIT, allow_import=allow_import) as engine:
         changed = change(engine)
         certificate = engine.certificate()
         policy = engine.policy
@@ -200,9 +200,9 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
-    from ..store.opening import UNHURRIED
+    from ..store.opening import LONG_WAIT
 
-    with DataEngine.open(store, wait=UNHURRIED, allow_import=allow_import) as engine:
+    with DataEngine.open(store, wait=LONG_WAIT, allow_import=allow_import) as engine:
         report = engine.retrain()
         text = f"trained by hand on {report.n_traces} traces: {report.reason}"
         engine.store.put_event("retrain", text, asdict(report), author)

@@ -35,7 +35,7 @@ from ..records import (
     source_of,
     stored_trace_spec,
 )
-from ..store.opening import UNHURRIED, opening
+from ..store.opening import LONG_WAIT, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
@@ -164,7 +164,7 @@ def import_labelled(
     """
     data = load_dataset(dataset, **stored_form(store, dataset))
     engine = DataEngine.open_or_create(
-        store, seed, wait=UNHURRIED, recipe=recipe, allow_import=allow_import
+        store, seed, wait=LONG_WAIT, recipe=recipe, allow_import=allow_import
     )
     try:
         spec = core_of(engine).set_trace_spec(data.spec)

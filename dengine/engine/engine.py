@@ -46,7 +46,7 @@ from ..records import (
 )
 from ..reducers.base import Reducer
 from ..representation import to_html
-from ..store.opening import UNHURRIED, opening
+from ..store.opening import LONG_WAIT, opening
 from ..store.outbox import Outbox
 from ..store.records import StoredDecision
 from .core import EngineCore
@@ -453,7 +453,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Yield a record of each cycle, and flush at the end, however it comes."""
         with ExitStack() as ending:
-            ending.callback(self.flush, UNHURRIED if self.store.wait is not None else None)
+            ending.callback(self.flush, LONG_WAIT if self.store.wait is not None else None)
             for index in range(cycles):
                 if index == WARM_UP:
                     ending.enter_context(frozen_objects())

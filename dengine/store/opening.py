@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     StoreLike = str | os.PathLike[str] | SqlStore
 
-UNHURRIED = 10.0  # seconds to wait for a store while no cell runs: the parameter `wait`
+LONG_WAIT = 10.0  # seconds to wait for a store while no cell runs: the parameter `wait`
 
 
 def open_store(
@@ -36,7 +36,7 @@ def open_store(
     must_exist : bool, default False
         Raise a StoreError for a file or cell that does not exist, instead of creating it.
     wait : float or None
-        As `SqlStore` takes it; `UNHURRIED` if no cell waits for it.
+        As `SqlStore` takes it; `LONG_WAIT` if no cell waits for it.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def open_store(
     StoreError
         For anything else, and as of `SqlStore`.
     """
-    from .peers import must_have_cell  # SQLAlchemy is imported where it is used
+    from .peers import check_cell_exists  # SQLAlchemy is imported where it is used
     from .sql import SqlStore
 
     if isinstance(store, SqlStore):
@@ -62,7 +62,7 @@ def open_store(
         cell_id = store.cell_id
         product = store.product
     if must_exist:
-        must_have_cell(os.fspath(store), cell_id)
+        check_cell_exists(os.fspath(store), cell_id)
     return SqlStore(os.fspath(store), cell_id, product=product, wait=wait)
 
 

@@ -39,7 +39,7 @@ class CellSummary:
     last_seen: float | None
 
 
-def must_agree(
+def check_peer_settings(
     settings: Mapping[str, str], peer_settings: Mapping[str, str], name: str, product: str
 ) -> None:
     """Check that two cells of a product would embed a trace in the same way.
@@ -90,7 +90,7 @@ def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
     return of_recipe | {key: settings.get(key) for key in ("seed", "trace", "model", "described")}
 
 
-def must_have_cell(url: str, cell_id: str) -> None:
+def check_cell_exists(url: str, cell_id: str) -> None:
     """Raise a StoreError if a database has no such cell, or is no store."""
     with reading(url) as connection:
         names = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())

@@ -25,7 +25,7 @@ from ..records import Action, Reason, RetrainReport, Source
 from .connections import Database
 from .journal import Journal, Record, journal_path
 from .ledger import is_intact, read_settings, state_sum
-from .peers import must_agree
+from .peers import check_peer_settings
 from .queries import (
     LABEL_OF_DECISION,
     SOURCE,
@@ -209,7 +209,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         if self.product is not None:
             lock(connection, PRODUCT, self.product)
             for name, peer_settings in self._read_peers(connection).items():
-                must_agree(settings, peer_settings, name, self.product)
+                check_peer_settings(settings, peer_settings, name, self.product)
         is_replaced = (SETTING.c.cell_id == self.cell_id) & SETTING.c.key.not_in(RESERVED)
         connection.execute(sa.delete(SETTING).where(is_replaced))
         rows = [
