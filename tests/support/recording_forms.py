@@ -184,7 +184,7 @@ def tables() -> dict[str, str]:
         *head,
         *label_rows,
         "",
-        f"An empty label, or {empty}, is of a part that was not checked yet: it is counted, and left out.",
+        f"A recording with an empty label, or {empty}, is counted as unlabelled and left out.",
     ]
     return {"recordings": "\n".join(lines), "labels": "\n".join(labels)}
 
