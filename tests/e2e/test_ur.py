@@ -13,8 +13,8 @@ import pytest
 from dengine import DataEngine, Dataset, Policy, ReplayCell
 from dengine.cells import Cell, FakeController, RtdeRecorder, UrCell
 from dengine.cells.ur import RobotProgram, Trouble
-from dengine.cells.ur.cell import ANSWER, MOST, ORDER, PHASE, RUNTIME, Answer, Runtime, Verb, word
-from dengine.cells.ur.protocol import CHANNELS, TYPES, Kind, Package, Packages, Recipe
+from dengine.cells.ur.cell import ANSWER, MAX_NUMBER, ORDER, PHASE, RUNTIME, ResultCode, Runtime, Verb, encode_message
+from dengine.cells.ur.protocol import CHANNELS, TYPES, Package, PackageReader, PackageType, RtdeRecipe
 from dengine.cells.ur.stream import RtdeClient, RtdeStream
 from dengine.datasets.triggers import Trigger
 from dengine.errors import CellError, DengineError
@@ -39,16 +39,16 @@ def nan_places(part: int, trace: np.ndarray) -> set[tuple[int, int]]:
 
 
 def test_packages_come_whole_from_pieces_of_any_size() -> None:
-    sent = [Package(Kind.DATA, bytes(range(n))) for n in (0, 1, 40)]
+    sent = [Package(PackageType.DATA, bytes(range(n))) for n in (0, 1, 40)]
     for size in (1, 2, 7, 100):
-        stream, packages = b"".join(each.packed() for each in sent), Packages()
+        stream, packages = b"".join(each.to_bytes() for each in sent), PackageReader()
         pieces = [stream[i : i + size] for i in range(0, len(stream), size)]
         assert [found for piece in pieces for found in packages.feed(piece)] == sent
 
 
 @pytest.mark.parametrize("kind", TYPES)
 def test_every_type_of_the_guide_is_packed_and_unpacked(kind: str) -> None:
-    recipe = Recipe(3, ("a", "b"), ("DOUBLE", kind))
+    recipe = RtdeRecipe(3, ("a", "b"), ("DOUBLE", kind))
     values = dict(zip(recipe.columns, (0.5, *range(1, TYPES[kind][1] + 1)), strict=True))
     assert recipe.unpack(recipe.pack(values)[3:]) == values
     with pytest.raises(CellError, match="Expected a data package"):
@@ -57,22 +57,24 @@ def test_every_type_of_the_guide_is_packed_and_unpacked(kind: str) -> None:
 
 def test_a_data_package_is_bytes_as_the_guide_says() -> None:
     # Header: size uint16 and kind uint8; then the recipe's number; big-endian.
-    recipe = Recipe(1, ("timestamp", "output_int_register_24"), ("DOUBLE", "INT32"))
+    recipe = RtdeRecipe(1, ("timestamp", "output_int_register_24"), ("DOUBLE", "INT32"))
     assert recipe.pack({"output_int_register_24": -1, "timestamp": 2.0}) == struct.pack(">HBBdi", 16, ord("U"), 1, 2.0, -1)
 
 
 @pytest.mark.parametrize(
     ("refused", "column", "said"),
     [
-        (Kind.VERSION, FORCE, "protocol version 2"),
-        (Kind.START, FORCE, "refuses"),
+        (PackageType.VERSION, FORCE, "protocol version 2"),
+        (PackageType.START, FORCE, "refuses"),
         ("actual_TCP_force", FORCE, "does not know actual_TCP_force"),
         (ORDER, FORCE, f"Expected to write {ORDER}, another client"),
         ("", "FZ", "does not know FZ"),
         ("", "actual_q[9]", r"Expected a channel among FX_Base, .* got actual_q\[9\]"),
     ],
 )
-def test_what_a_controller_refuses_or_does_not_have_is_said_at_once(refused: Kind | str, column: str, said: str) -> None:
+def test_what_a_controller_refuses_or_does_not_have_is_said_at_once(
+    refused: PackageType | str, column: str, said: str
+) -> None:
     with FakeController(speed=None, refuses=[refused]) as fake, pytest.raises(DengineError, match=said):
         RtdeClient(fake.host, fake.port, (column,), (ORDER,))
 
@@ -213,7 +215,7 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(pa
 
 
 def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:
-    now, order = [0.0], word(7, Verb.INSERT)
+    now, order = [0.0], encode_message(7, Verb.INSERT)
     fake = FakeController(speed=20.0)
 
     def until(true: Callable[[], bool]) -> None:
@@ -252,10 +254,13 @@ def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its
             with pytest.raises(CellError, match="order 1"):
                 first.insert()
         with cell_of(fake) as second:
-            assert program.outputs[ANSWER] == word(1, Answer.DONE)  # `open` waited for it
+            assert program.outputs[ANSWER] == encode_message(1, ResultCode.DONE)  # `open` waited for it
             second.reject()
-            assert fake.inputs[ORDER] == word(2, Verb.REJECT)
-        program.step = lambda inputs: {**program.outputs, ANSWER: word(1, Answer.DONE)}  # it owes an answer to order 2
+            assert fake.inputs[ORDER] == encode_message(2, Verb.REJECT)
+        program.step = lambda inputs: {
+            **program.outputs,
+            ANSWER: encode_message(1, ResultCode.DONE),
+        }  # it owes an answer to order 2
         with pytest.raises(CellError, match="it owes an answer to order 2"):
             UrCell(fake.host, port=fake.port, start_timeout=0.5)
 
@@ -285,7 +290,7 @@ def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goe
         shown = " ".join(done.output.split())
         assert done.exit_code == 1
         assert "1 to 10 100 %" in shown
-        assert "order 21 (insert), it says that it failed; look at the part, then begin again. 10 of 14" in shown
+        assert "order 21 (insert), it reported a failure; look at the part, then begin again. 10 of 14" in shown
         assert f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there." in shown
         program.played.clear()  # somebody has filled it
         succeed(*run_on(fake, store), "--cycles", 4)
@@ -310,12 +315,14 @@ def test_what_is_wrong_with_a_robot_is_one_line(words: str, expected: str) -> No
 
 
 def test_the_robots_program_of_the_repository_keeps_to_the_same_handshake(repo: Path) -> None:
-    assert divmod(word(12, Verb.PROCEED), 10) == (12, Verb.PROCEED)
-    assert word(MOST, Answer.FAILED) < 2**31  # as a register holds it
+    assert divmod(encode_message(12, Verb.PROCEED), 10) == (12, Verb.PROCEED)
+    assert encode_message(MAX_NUMBER, ResultCode.FAILED) < 2**31  # as a register holds it
     text = (repo / "training" / "ur_cell.script").read_text(encoding="utf-8")
     for name in (ORDER, ANSWER, PHASE):
         way, _, number = name.partition("_int_register_")
         verb = "read_input" if way == "input" else "write_output"
         assert f"{verb}_integer_register({number}" in text
-    for each in (*Verb, *Answer):
-        assert f"{type(each).__name__.upper()}_{each.name} = {each.value}\n" in text
+    for verb in Verb:
+        assert f"VERB_{verb.name} = {verb.value}\n" in text
+    for code in ResultCode:
+        assert f"RESULT_{code.name} = {code.value}\n" in text

@@ -1,9 +1,9 @@
-"""A Universal Robots controller: its forces recorded, and a cell of its own driven, over RTDE (TCP port 30004).
+"""Universal Robots: record insertions and drive a cell over RTDE (TCP port 30004).
 
-The client is our own: a trace must be every sample, or say which are missing. ur_rtde keeps the newest package only, and
-records at the PC's clock: some packages are lost and others are there twice, unnoticed; when the controller hangs up, its
-getters answer with the last values for ever. Ours keeps every package, goes by the controller's own timestamps, connects
-again, and writes orders over the connection that answers them.
+dengine has an RTDE client of its own, since a trace must hold every sample or say which are
+missing. The library ur_rtde keeps only the newest package and records at the PC's clock, so that
+packages are lost or doubled unnoticed; and after the controller has disconnected it returns the
+last values for ever.
 """
 
 from .cell import UrCell
@@ -11,4 +11,12 @@ from .controller import FakeController, RobotProgram, Trouble
 from .recorder import InsertionRecord, RtdeRecorder
 from .stream import StreamReport
 
-__all__ = ["FakeController", "InsertionRecord", "RobotProgram", "RtdeRecorder", "StreamReport", "Trouble", "UrCell"]
+__all__ = [
+    "FakeController",
+    "InsertionRecord",
+    "RobotProgram",
+    "RtdeRecorder",
+    "StreamReport",
+    "Trouble",
+    "UrCell",
+]

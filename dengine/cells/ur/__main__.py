@@ -1,4 +1,4 @@
-"""A controller without a robot, to drive `dengine run --cell ur` against: it plays a data set, part by part.
+"""A simulated controller that plays a data set, for `dengine run --cell ur` without a robot.
 
 python -m dengine.cells.ur --port 30004 --speed 10
 """
@@ -14,10 +14,14 @@ from .protocol import PORT
 
 
 @click.command(help=__doc__)
-@click.option("--data", default="insertion", show_default=True, help="Anything that load_dataset takes.")
+@click.option(
+    "--data", default="insertion", show_default=True, help="Anything that load_dataset takes."
+)
 @click.option("--host", default="127.0.0.1", show_default=True)
 @click.option("--port", default=PORT, show_default=True, help="0: any that is free.")
-@click.option("--speed", default=1.0, show_default=True, help="Against real time; 0: as fast as it is read.")
+@click.option(
+    "--speed", default=1.0, show_default=True, help="Against real time; 0: as fast as it is read."
+)
 def main(data: str, host: str, port: int, speed: float) -> None:
     """Listen until interrupted."""
     try:
@@ -25,7 +29,10 @@ def main(data: str, host: str, port: int, speed: float) -> None:
     except DengineError as error:
         sys.exit(str(error))
     with FakeController(program, host, port, speed or None) as fake:
-        click.echo(f"A controller without a robot at {host}:{fake.port}, {len(program.data)} parts; Ctrl-C ends it.")
+        click.echo(
+            f"A simulated controller at {host}:{fake.port}, {len(program.data)} parts; "
+            "Ctrl-C ends it."
+        )
         threading.Event().wait()
 
 

@@ -1,13 +1,16 @@
-"""A cell of a Universal Robots controller, driven by orders to the robot's program: the paper's loop on a real robot.
+"""`UrCell`, a cell with a Universal Robots controller that carries out orders.
 
 with UrCell("192.168.1.10") as cell, DataEngine.open_or_create("cell.db") as engine:
     for cycle in engine.run(cell, cycles=300): ...
 
-The handshake is one order and one answer, each a number in one register. dengine writes `10 * number + verb` into
-`input_int_register_24`; the program carries it out and writes `10 * number + answer` into `output_int_register_24`. One
-register each, so that neither side can see half of a message; a number each, so that an order sent twice is carried out
-once, and an old answer is known as old. While the robot inserts, `output_int_register_25` holds the order's number: the
-trigger. A program that starts answers an old order with VOID. `training/ur_cell.script` is one.
+dengine and the robot's program exchange numbers in integer registers. dengine writes an order,
+`10 * number + verb`, to `input_int_register_24`. The program carries it out and writes
+`10 * number + result code` to `output_int_register_24`. A single register holds a whole message,
+so that neither side can read half of one. Each order has a number of its own, so that an order
+that is sent twice is carried out once, and an old result is recognised. While the robot inserts,
+`output_int_register_25` holds the order's number, which triggers the recording. A program that
+starts anew writes the result code VOID for an order that it finds. `training/ur_cell.script` is
+such a program.
 """
 
 from contextlib import AbstractContextManager
@@ -28,11 +31,11 @@ ORDER = "input_int_register_24"
 ANSWER = "output_int_register_24"
 PHASE = "output_int_register_25"
 RUNTIME = "runtime_state"
-MOST = 2 * 10**8  # numbers begin again at 1: ten times as much is an int32 still
+MAX_NUMBER = 2 * 10**8  # of an order, then 1 again; ten times as much still fits an int32
 
 
 class Verb(IntEnum):
-    """What the robot is told to do."""
+    """An order to the robot."""
 
     INSERT = 1
     VERIFY = 2
@@ -40,46 +43,74 @@ class Verb(IntEnum):
     REJECT = 4
 
 
-class Answer(IntEnum):
-    """What came of it."""
+class ResultCode(IntEnum):
+    """The result of an order."""
 
-    VOID = 0  # the program was started anew: the order is not carried out
-    DONE = 1  # to INSERT and REJECT
-    GOOD = 2  # to VERIFY
-    BAD = 3  # to VERIFY
-    UNKNOWN = 4  # to PROCEED: the line went on, and says no more
-    CONFIRMED = 5  # to PROCEED: the part is known to be fine
-    STOPPED = 6  # to PROCEED: the part was bad, and stopped the line
+    VOID = 0  # the program was started anew and does not carry the order out
+    DONE = 1  # of INSERT and REJECT
+    GOOD = 2  # of VERIFY
+    BAD = 3  # of VERIFY
+    UNKNOWN = 4  # of PROCEED: the line goes on; nothing is known of the part
+    CONFIRMED = 5  # of PROCEED: the part is known to be good
+    STOPPED = 6  # of PROCEED: the part was bad and stopped the line
     FAILED = 9  # the robot could not do it
 
 
 class Runtime(IntEnum):
-    """A controller's `runtime_state`, as far as it matters here."""
+    """Values of a controller's `runtime_state` that matter here."""
 
     STOPPING = 0
     STOPPED = 1
-    PLAYING = 2  # then PAUSING, PAUSED and RESUMING, which end by themselves
+    PLAYING = 2  # larger values are PAUSING, PAUSED and RESUMING
 
 
-OUTCOMES = {Answer[outcome.name]: outcome for outcome in Outcome}
-ANSWERS = {Verb.VERIFY: (Answer.GOOD, Answer.BAD), Verb.PROCEED: tuple(OUTCOMES)}  # to the others DONE
-REFUSALS: dict[int, str] = {Answer.VOID: "its program was started anew", Answer.FAILED: "it says that it failed"}
+OUTCOMES = {ResultCode[outcome.name]: outcome for outcome in Outcome}
+SUCCESSES = {  # result codes that an order may have; INSERT and REJECT have DONE
+    Verb.VERIFY: (ResultCode.GOOD, ResultCode.BAD),
+    Verb.PROCEED: tuple(OUTCOMES),
+}
+FAILURES: dict[int, str] = {
+    ResultCode.VOID: "its program was started anew",
+    ResultCode.FAILED: "it reported a failure",
+}
 
 
-def word(number: int, what: Verb | Answer) -> int:
-    """An order, or an answer, as it stands in its register."""
-    return 10 * number + what
+def encode_message(number: int, code: Verb | ResultCode) -> int:
+    """Return an order or a result as the integer that its register holds."""
+    return 10 * number + code
 
 
 class UrCell(AbstractContextManager["UrCell"]):
-    """A `Cell` whose insert, verify, proceed and reject are orders to the program that runs on the robot.
+    """A `Cell` whose methods are orders to the program that runs on the robot.
 
-    host, trigger, how : as in `RtdeRecorder`; the trace is recorded while the robot inserts.
-    order_timeout : seconds for each order to be answered.  start_timeout : seconds, at first, for the program to run and to
-    have finished what an earlier owner ordered.
+    The trace is recorded while the robot inserts. Missing samples of a trace are NaN: the engine
+    verifies the part and does not learn from it.
 
-    A trace with a gap is handed on with NaN in it: the engine verifies that part and never learns from it; `last` says what
-    is missing, `incomplete` counts them. CellError where the robot does not answer, its program stops, or it says FAILED.
+    Parameters
+    ----------
+    host : str
+        Name or address of the controller.
+    trigger : Trigger or str
+        What begins an insertion; see `RtdeRecorder`.
+    order_timeout : float, default 60
+        Seconds within which the robot must carry out an order.
+    start_timeout : float, default 30
+        Seconds within which, at first, the program must run and have finished its last order.
+    **how
+        Further parameters of `RtdeRecorder`.
+
+    Attributes
+    ----------
+    last : InsertionRecord or None
+        The newest insertion, which says what is missing in its trace.
+    incomplete : int
+        Number of traces with missing samples.
+
+    Raises
+    ------
+    CellError
+        If the robot does not answer, its program stops, or it reports a failure. Every method may
+        raise it.
     """
 
     def __init__(
@@ -91,8 +122,11 @@ class UrCell(AbstractContextManager["UrCell"]):
         start_timeout: float = 30.0,
         **how: Any,
     ) -> None:
-        self.recorder = RtdeRecorder(host, trigger, also=(ANSWER, ORDER, RUNTIME), inputs=(ORDER,), **how)
-        self.order_timeout, self.start_timeout = order_timeout, start_timeout
+        self.recorder = RtdeRecorder(
+            host, trigger, also=(ANSWER, ORDER, RUNTIME), inputs=(ORDER,), **how
+        )
+        self.order_timeout = order_timeout
+        self.start_timeout = start_timeout
         self.last: InsertionRecord | None = None
         self.incomplete = 0
         try:
@@ -102,83 +136,100 @@ class UrCell(AbstractContextManager["UrCell"]):
             raise
 
     def close(self) -> None:
+        """Close the connection; the robot's program goes on."""
         self.recorder.close()
 
     def __exit__(self, *raised: object) -> None:
         self.close()
 
     def report(self) -> StreamReport:
-        """Counts of all packages, and of the traces with a gap."""
+        """Return the counts of all packages, and of the traces with missing samples."""
         return replace(self.recorder.report(), incomplete=self.incomplete)
 
     def insert(self) -> NDArray[np.float32]:
-        """Pick a part, push it in, and give the force: (T,) or (C, T), NaN where a sample never came."""
+        """Have a part inserted; return its trace, (T,) or (C, T), NaN for lost samples."""
         self._ask(Verb.INSERT)
-        if self.last is None:  # answered, and no start was seen: the trigger fell into a gap, or is the wrong one
+        if self.last is None:  # the start was lost, or the trigger is wrong
             self.last = self.recorder.cut()
         self.incomplete += self.last.missing > 0
         return self.last.trace
 
     def verify(self) -> bool:
-        """Have what was inserted measured: True for a success. A bad part goes back to the bin."""
-        return self._ask(Verb.VERIFY) is Answer.GOOD
+        """Have the part measured; return whether it is good. A bad part goes back to the bin."""
+        return self._ask(Verb.VERIFY) is ResultCode.GOOD
 
     def proceed(self) -> Outcome:
-        """Go on without measuring; what the line says of the part."""
+        """Have the line go on without measuring; return what became known of the part."""
         return OUTCOMES[self._ask(Verb.PROCEED)]
 
     def reject(self) -> None:
-        """Back to the bin, not measured."""
+        """Have the part put back to the bin without measuring."""
         self._ask(Verb.REJECT)
 
-    def _ask(self, verb: Verb) -> Answer:
-        """Give one order, and read until it is answered; an insertion also until its trace is over."""
-        self.recorder.arm()  # what came while nothing was asked is nobody's
-        self._number = self._number % MOST + 1
+    def _ask(self, verb: Verb) -> ResultCode:
+        """Send an order and wait for its result; after INSERT also for the end of the trace."""
+        self.recorder.arm()  # discards what was received between orders
+        self._number = self._number % MAX_NUMBER + 1
         self.last = None if verb is Verb.INSERT else self.last
-        self.recorder.stream.write({ORDER: word(self._number, verb)})
-        answer: Answer | None = None
+        self.recorder.stream.write({ORDER: encode_message(self._number, verb)})
+        result: ResultCode | None = None
         for row in self.recorder.rows(self.order_timeout):
             if verb is Verb.INSERT and self.last is None:
                 self.last = self.recorder.feed(row)
-            answer = answer or self._answered(row, verb)
-            if answer and not (verb is Verb.INSERT and self.last is None and self.recorder.begun):
+            result = result or self._find_result(row, verb)
+            is_recording = verb is Verb.INSERT and self.last is None and self.recorder.begun
+            if result and not is_recording:
                 break
-        if answer is None:
-            raise self._silence(f"to answer order {self._number} ({verb.name.lower()})")
+        if result is None:
+            raise self._timeout_error(f"to answer order {self._number} ({verb.name.lower()})")
         self.recorder.stream.write(None)
-        return answer
+        return result
 
-    def _silence(self, what: str) -> CellError:
-        stream, why = self.recorder.stream, "it did not; does its program do what ur_cell.script does, is it paused?"
-        why = f"there is no connection: {stream.trouble}" if stream.trouble else why
-        return CellError(f"Expected the robot at {stream.where} {what} in time, {why}")
+    def _timeout_error(self, expected: str) -> CellError:
+        """Return the error for a robot that did not do what was expected of it in time."""
+        stream = self.recorder.stream
+        reason = "it did not; does its program do what ur_cell.script does, is it paused?"
+        if stream.trouble:
+            reason = f"there is no connection: {stream.trouble}"
+        return CellError(f"Expected the robot at {stream.where} {expected} in time, {reason}")
 
-    def _answered(self, row: Row, verb: Verb) -> Answer | None:
-        """The answer to the order under way, if this package holds it; CellError for one that is no success."""
-        number, what = divmod(int(row.values[ANSWER]), 10)
+    def _find_result(self, row: Row, verb: Verb) -> ResultCode | None:
+        """Return the result of the present order if this package holds it, else None.
+
+        Raises CellError for a failure, and if the robot's program has stopped.
+        """
+        number, code = divmod(int(row.values[ANSWER]), 10)
         state = int(row.values[RUNTIME])
-        about = f"order {self._number} ({verb.name.lower()})"
+        order = f"order {self._number} ({verb.name.lower()})"
         if number == self._number:
-            if what in ANSWERS.get(verb, (Answer.DONE,)):
-                return Answer(what)
-            said = REFUSALS.get(what, f"it answered {what}")
-            raise CellError(f"Expected the robot to carry out {about}, {said}; look at the part, then begin again.")
+            if code in SUCCESSES.get(verb, (ResultCode.DONE,)):
+                return ResultCode(code)
+            failure = FAILURES.get(code, f"it answered {code}")
+            raise CellError(
+                f"Expected the robot to carry out {order}, {failure}; "
+                "look at the part, then begin again."
+            )
         if state in (Runtime.STOPPING, Runtime.STOPPED):
-            raise CellError(f"Expected the robot to carry out {about}, its program has stopped; start it, begin again.")
+            raise CellError(
+                f"Expected the robot to carry out {order}, its program has stopped; "
+                "start it and begin again."
+            )
         return None
 
     def _take_over(self) -> int:
-        """The number of the last order there was, once it is answered and the program runs."""
-        what = ""
+        """Wait until the program runs and its last order has a result; return its number."""
+        problem = ""
         for row in self.recorder.rows(self.start_timeout):
             ordered, answered, state = (int(row.values[name]) for name in (ORDER, ANSWER, RUNTIME))
             if state == Runtime.PLAYING and ordered // 10 == answered // 10:
                 return ordered // 10
-            owing = f"it owes an answer to order {ordered // 10}"
-            what = owing if state == Runtime.PLAYING else "its program does not run"
-        if not what:
-            raise self._silence("to send its state")
+            is_playing = state == Runtime.PLAYING
+            waiting = f"it owes an answer to order {ordered // 10}"
+            problem = waiting if is_playing else "its program does not run"
+        if not problem:
+            raise self._timeout_error("to send its state")
         do = "start training/ur_cell.script, or your own program of the same handshake, on it"
         where = f"the robot at {self.recorder.stream.where}"
-        raise CellError(f"Expected {where} to be ready within {self.start_timeout:g} s, {what}; {do}.")
+        raise CellError(
+            f"Expected {where} to be ready within {self.start_timeout:g} s, {problem}; {do}."
+        )

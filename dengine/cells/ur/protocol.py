@@ -1,8 +1,12 @@
-"""RTDE on the wire: packages, recipes and field types, written from Universal Robots' published guide to the protocol.
+"""Encoding and decoding of RTDE, the protocol over which a Universal Robots controller sends data.
 
-A package is its size (uint16, header included), its kind (uint8) and what it carries; all numbers are big-endian. A recipe
-is a list of fields that the controller has given types to: a data package is the recipe's number and the fields' values.
-Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
+A package is its size (uint16, with the header), its type (uint8) and a payload; all numbers are
+big-endian. A recipe is a list of fields to which the controller has assigned types. A data package
+holds the recipe's number and the values of its fields.
+
+References
+----------
+Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
 """
 
 import struct
@@ -17,8 +21,9 @@ from ...errors import CellError, expect
 PORT = 30004
 VERSION = 2
 HEADER = struct.Struct(">HB")
-NOT_FOUND, IN_USE = "NOT_FOUND", "IN_USE"
-TYPES = {  # struct's letter, and how many of it
+NOT_FOUND = "NOT_FOUND"
+IN_USE = "IN_USE"
+TYPES = {  # by field type: the letter of `struct`, and the number of values
     "BOOL": ("?", 1),
     "UINT8": ("B", 1),
     "UINT32": ("I", 1),
@@ -33,11 +38,11 @@ TYPES = {  # struct's letter, and how many of it
 
 
 class HeldError(CellError):
-    """An input that another client writes; it may be one that has just gone, which the controller has not noticed yet."""
+    """Another client writes this input; maybe one that has gone, as the controller will notice."""
 
 
-class Kind(IntEnum):
-    """Of a package: the letter that its header names it by."""
+class PackageType(IntEnum):
+    """Type of a package, the letter in its header."""
 
     VERSION = ord("V")
     CONTROLLER = ord("v")
@@ -52,37 +57,40 @@ class Kind(IntEnum):
 class Package(NamedTuple):
     """One package, without its header."""
 
-    kind: Kind
+    type: PackageType
     payload: bytes
 
-    def packed(self) -> bytes:
-        """As it goes over the wire."""
-        return HEADER.pack(HEADER.size + len(self.payload), self.kind) + self.payload
+    def to_bytes(self) -> bytes:
+        """Return the package with its header, as it is sent."""
+        return HEADER.pack(HEADER.size + len(self.payload), self.type) + self.payload
 
 
-class Packages:
-    """Takes bytes as they come, in pieces of any size, and gives whole packages in their order."""
+class PackageReader:
+    """Splits a stream of bytes, received in pieces of any size, into packages."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
 
     def feed(self, piece: bytes) -> Iterator[Package]:
-        """Every package that is whole now; CellError for what can be no package."""
+        """Add bytes, and yield every package that is complete; CellError if they are not RTDE."""
         self._bytes += piece
         while len(self._bytes) >= HEADER.size:
             size, letter = HEADER.unpack_from(self._bytes)
-            if size < HEADER.size or letter not in Kind._value2member_map_:
-                raise CellError(f"Expected an RTDE package, got {size} bytes of kind {letter}; is it port 30004?")
+            if size < HEADER.size or letter not in PackageType._value2member_map_:
+                raise CellError(
+                    f"Expected an RTDE package, got {size} bytes of type {letter}; "
+                    "is it port 30004?"
+                )
             if len(self._bytes) < size:
                 return
-            package = Package(Kind(letter), bytes(self._bytes[HEADER.size : size]))
+            package = Package(PackageType(letter), bytes(self._bytes[HEADER.size : size]))
             del self._bytes[:size]
             yield package
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """The fields of a data package, with the types that the controller gave them."""
+class RtdeRecipe:
+    """The fields of a data package, with the types that the controller assigned to them."""
 
     number: int
     names: tuple[str, ...]
@@ -90,47 +98,89 @@ class Recipe:
 
     @cached_property
     def layout(self) -> struct.Struct:
-        """Of a data package: the recipe's number, and the values."""
-        return struct.Struct(">B" + "".join(n * letter for letter, n in map(TYPES.__getitem__, self.types)))
+        """Binary layout of a data package: the recipe's number, then the values."""
+        return struct.Struct(
+            ">B" + "".join(n * letter for letter, n in map(TYPES.__getitem__, self.types))
+        )
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
-        """A name for each number: `timestamp`, and `actual_TCP_force[2]` for one of a vector."""
-        sizes = [TYPES[each][1] for each in self.types]
-        named = zip(self.names, sizes, strict=True)
-        return tuple(name if size == 1 else f"{name}[{i}]" for name, size in named for i in range(size))
+        """Name of each value: `timestamp`, or `actual_TCP_force[2]` for an element of a vector."""
+        sizes = [TYPES[field_type][1] for field_type in self.types]
+        fields = zip(self.names, sizes, strict=True)
+        return tuple(
+            name if size == 1 else f"{name}[{i}]" for name, size in fields for i in range(size)
+        )
 
     def pack(self, values: Mapping[str, float]) -> bytes:
-        """A data package of these columns, 0 where one is left out; a field that is no double takes a whole number."""
-        letters = zip(self.columns, self.layout.format[2:], strict=True)
-        held = [values.get(name, 0) if letter == "d" else int(values.get(name, 0)) for name, letter in letters]
-        return Package(Kind.DATA, self.layout.pack(self.number, *held)).packed()
+        """Return a data package with these values by column; 0 for columns that are left out."""
+        numbers = [
+            values.get(name, 0) if letter == "d" else int(values.get(name, 0))
+            for name, letter in zip(self.columns, self.layout.format[2:], strict=True)
+        ]
+        return Package(PackageType.DATA, self.layout.pack(self.number, *numbers)).to_bytes()
 
     def unpack(self, payload: bytes) -> dict[str, float]:
-        """The values by column; CellError for a package of another size, or of another recipe."""
+        """Return the values of a data package by column; CellError for one of another recipe."""
         if len(payload) != self.layout.size or payload[0] != self.number:
-            got = f"one of recipe {payload[0] if payload else 'none'} with {len(payload)}"
-            raise CellError(f"Expected a data package of recipe {self.number} with {self.layout.size} bytes, got {got}.")
+            number = payload[0] if payload else "none"
+            raise CellError(
+                f"Expected a data package of recipe {self.number} with {self.layout.size} bytes, "
+                f"got one of recipe {number} with {len(payload)}."
+            )
         return dict(zip(self.columns, self.layout.unpack(payload)[1:], strict=True))
 
 
-def recipe_of(payload: bytes, names: Sequence[str], what: str) -> Recipe:
-    """What the controller answered to a set-up; CellError names the fields that it does not have, or that others hold."""
+def read_recipe(payload: bytes, names: Sequence[str], direction: str) -> RtdeRecipe:
+    """Return the recipe in a controller's response to a request for fields.
+
+    Parameters
+    ----------
+    payload : bytes
+        The response: the recipe's number and the types of the fields.
+    names : sequence of str
+        Fields that were requested.
+    direction : str
+        "input" or "output", for messages.
+
+    Raises
+    ------
+    CellError
+        If the controller does not have a field.
+    HeldError
+        If another client writes a field.
+    """
     types = tuple(payload[1:].decode("ascii", errors="replace").split(",")) if payload else ()
-    expect(len(types) == len(names), f"the types of {len(names)} {what} fields", types, error=CellError)
-    named = dict(zip(names, types, strict=True))
-    if unknown := [name for name, kind in named.items() if kind not in (*TYPES, IN_USE)]:
-        do = "name others, or bring its software up to date (registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)"
-        raise CellError(f"Expected {what} fields that this controller has, it does not know {', '.join(unknown)}; {do}.")
-    if held := [name for name, kind in named.items() if kind == IN_USE]:
+    expect(
+        len(types) == len(names),
+        f"the types of {len(names)} {direction} fields",
+        types,
+        error=CellError,
+    )
+    type_by_name = dict(zip(names, types, strict=True))
+    unknown = [name for name, type_ in type_by_name.items() if type_ not in (*TYPES, IN_USE)]
+    if unknown:
+        do = (
+            "name others, or update its software "
+            "(registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)"
+        )
+        raise CellError(
+            f"Expected {direction} fields that this controller has, "
+            f"it does not know {', '.join(unknown)}; {do}."
+        )
+    in_use = [name for name, type_ in type_by_name.items() if type_ == IN_USE]
+    if in_use:
         do = "close it, or its fieldbus unit (EtherNet/IP, PROFINET), or choose other registers"
-        raise HeldError(f"Expected to write {', '.join(held)}, another client of this controller does; {do}.")
-    return Recipe(payload[0], tuple(names), types)
+        raise HeldError(
+            f"Expected to write {', '.join(in_use)}, another client of this controller does; {do}."
+        )
+    return RtdeRecipe(payload[0], tuple(names), types)
 
 
 AXES = ("FX_Base", "FY_Base", "FZ_Base", "MuX_Base", "MuY_Base", "MuZ_Base")
 POSES = ("TCP_X", "TCP_Y", "TCP_Z", "TCP_RX", "TCP_RY", "TCP_RZ")
-CHANNELS = {  # as recordings of UR cells call them; newtons and newton metres, metres and radians, in the robot's base
+# Names in recordings of UR cells; newtons, newton metres, metres and radians in the robot's base.
+CHANNELS = {
     **{name: f"actual_TCP_force[{i}]" for i, name in enumerate(AXES)},
     **{name: f"actual_TCP_pose[{i}]" for i, name in enumerate(POSES)},
 }

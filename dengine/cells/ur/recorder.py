@@ -1,4 +1,4 @@
-"""Insertions, cut out of what a Universal Robots controller sends 500 times a second.
+"""`RtdeRecorder`, which records insertions from a Universal Robots controller.
 
 with RtdeRecorder("192.168.1.10", trigger="bit=0") as recorder:
     while True:
@@ -23,10 +23,18 @@ from .stream import Row, RtdeStream, StreamReport
 
 @dataclass(frozen=True, slots=True)
 class InsertionRecord:
-    """One recorded insertion. trace : (T,), or (C, T) of several channels, float32; NaN where a sample never came.
+    """One recorded insertion.
 
-    missing : samples that never came; where the start itself fell into a gap all of them, for then no place is known.
-    repeated : samples that came twice; the first counts.  reconnects : connections made again meanwhile.
+    Attributes
+    ----------
+    trace : array of float32, shape (T,) or (C, T)
+        NaN for samples that were lost.
+    missing : int
+        Number of lost samples; all of them if the start was lost, since no time is known then.
+    repeated : int
+        Samples that came twice, of which the first counts.
+    reconnects : int
+        Reconnections during the insertion.
     """
 
     trace: NDArray[np.float32]
@@ -36,15 +44,36 @@ class InsertionRecord:
 
 
 class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
-    """Records insertions from a controller's RTDE interface; it only listens. CellError where it cannot be reached.
+    """Records insertions over RTDE; by itself it only reads.
 
-    host : the controller's name or address.  trigger : when an insertion begins, a `Trigger` or its text (`as_trigger`).
-    samples, rate_hz : of a trace; CB3 controllers send at most 125 a second.  channels : names of CHANNELS, or numbers of
-    the controller such as `actual_q[5]`; several give (C, T).  before : samples of a trace from before the trigger.
-    timeout : seconds of silence after which the connection is made again.  also, inputs : further fields, for a cell.
+    A lost sample is NaN in the trace, so that an engine verifies the part and does not learn from
+    it. An insertion that lies entirely within a gap is not recorded; `report().missing` counts the
+    gap.
 
-    A sample that never came is a NaN at its place, and counted: an engine verifies such a part, and never learns from it.
-    An insertion that begins and ends within one gap is not seen; `report().missing` tells of the gap.
+    Parameters
+    ----------
+    host : str
+        Name or address of the controller.
+    trigger : Trigger or str
+        What begins an insertion; see `as_trigger` for the text form.
+    samples : int, default 1000
+    channels : sequence of str, default ("FZ_Base",)
+        Names in `CHANNELS`, or values of the controller such as `actual_q[5]`. Several give traces
+        (C, T).
+    rate_hz : float, default 500
+        Samples per second. CB3 controllers send at most 125.
+    before : int, default 0
+        Samples of a trace from before the trigger.
+    port : int, default 30004
+    timeout : float, default 2
+        Seconds of silence after which the connection is made again.
+    also, inputs : sequence of str
+        Further values to receive, and fields to write, for `UrCell`.
+
+    Raises
+    ------
+    CellError
+        If the controller cannot be reached.
     """
 
     def __init__(
@@ -66,35 +95,44 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self._columns = [CHANNELS.get(name, name) for name in self.channels]
         self._signals = {name: CHANNELS.get(name, name) for name in self.trigger.signals}
         forces = {f"actual_TCP_force[{i}]" for i in range(3)}.issuperset(self._columns)
-        self.spec = TraceSpec(samples, rate_hz, len(self.channels), "N" if forces else "mixed units", columns=self.channels)
+        self.spec = TraceSpec(
+            samples,
+            rate_hz,
+            len(self.channels),
+            "N" if forces else "mixed units",
+            columns=self.channels,
+        )
         self._before = before
-        self.stream = RtdeStream(host, (*self._columns, *self._signals.values(), *also), inputs, rate_hz, port, timeout)
+        self.stream = RtdeStream(
+            host, (*self._columns, *self._signals.values(), *also), inputs, rate_hz, port, timeout
+        )
         self._step = self.stream.step
         self._finder = StartFinder(self._step, self.trigger.quiet_s)
         self._rows: list[Row] = []
         self._start: Start | None = None
-        self._armed: int | None = None  # connections before, when an insertion was waited for
+        self._armed: int | None = None  # number of connections when `arm` was called
 
     def close(self) -> None:
+        """Close the connection."""
         self.stream.close()
 
     def __exit__(self, *raised: object) -> None:
         self.close()
 
     def arm(self) -> None:
-        """Look for an insertion from now on: what came before is given up."""
+        """Discard what was received so far; record an insertion that begins from now on."""
         self._forget()
         self._armed = self.stream.clear()
 
     def report(self) -> StreamReport:
-        """Counts of all packages since it was opened."""
+        """Return the counts of all packages since the connection was opened."""
         return self.stream.report()
 
     def record(self, timeout: float = 60.0) -> InsertionRecord:
-        """Wait for the next insertion, from where the last one ended; `arm` begins later.
+        """Wait for the next insertion after the last one, or after `arm`, and return it.
 
-        timeout : seconds; where the trigger never went on, CellError; where the insertion began and the controller fell
-        silent, what there is of it.
+        If the controller falls silent during an insertion, the part that was received is returned.
+        Raises CellError if no insertion begins within `timeout` seconds.
         """
         for row in self.rows(timeout):
             if (record := self.feed(row)) is not None:
@@ -102,11 +140,17 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         if self.begun:
             return self.cut()
         trouble = self.stream.trouble
-        why = f"there is no connection: {trouble}" if trouble else f"the trigger never went on: {self.trigger}"
-        raise CellError(f"Expected an insertion at {self.stream.where} within {timeout:g} s, {why}.")
+        why = (
+            f"there is no connection: {trouble}"
+            if trouble
+            else f"the trigger never went on: {self.trigger}"
+        )
+        raise CellError(
+            f"Expected an insertion at {self.stream.where} within {timeout:g} s, {why}."
+        )
 
     def rows(self, seconds: float) -> Iterator[Row]:
-        """The packages that nobody has looked at, as they come, for so long."""
+        """Yield packages as they arrive, for this many seconds."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             if (row := self.stream.take(left)) is not None:
@@ -114,40 +158,58 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
     @property
     def begun(self) -> bool:
-        """Whether an insertion has begun and is not over."""
+        """Return whether an insertion has begun and is not complete."""
         return self._start is not None
 
     def feed(self, row: Row) -> InsertionRecord | None:
-        """Take the next package; the insertion that is over by it, if one is."""
+        """Add a package; return the insertion that it completes, if any."""
         record = None
-        if self._rows and row.timestamp < self._rows[-1].timestamp - self._step / 2:  # the controller began anew
+        if (
+            self._rows and row.timestamp < self._rows[-1].timestamp - self._step / 2
+        ):  # it was restarted
             if self.begun:
                 record = self.cut()
             self._forget()
         self._rows.append(row)
         if self._start is None:
-            active = self.trigger.active({name: np.array([row.values[c]]) for name, c in self._signals.items()})
+            active = self.trigger.active(
+                {name: np.array([row.values[c]]) for name, c in self._signals.items()}
+            )
             self._start = self._finder.feed(row.timestamp, bool(active[0]))
-            del self._rows[: -self._before - 2]  # two more: the edge, and the connection that it came by
+            del self._rows[
+                : -self._before - 2
+            ]  # keeps two more: the edge, and the connection before it
         last = self._first() + (self.spec.samples - 1.5) * self._step
         return self.cut() if row.timestamp > last else record
 
     def cut(self) -> InsertionRecord:
-        """What there is of the insertion; all of it NaN where its start was not seen."""
-        start, first, rows, armed = self._start, self._first(), self._rows, self._armed
+        """Return and forget the insertion as far as it was received; NaN if its start was lost."""
+        start = self._start
+        first = self._first()
+        rows = self._rows
+        armed = self._armed
         self._forget()
-        reconnects = 0 if start is None else rows[-1].session - (rows[0].session if armed is None else armed)
+        reconnects = (
+            0 if start is None else rows[-1].session - (rows[0].session if armed is None else armed)
+        )
         rows = rows if start is not None and start.seen else []
-        values = np.array([[row.values[c] for c in self._columns] for row in rows], dtype=np.float64)
+        values = np.array(
+            [[row.values[c] for c in self._columns] for row in rows], dtype=np.float64
+        )
         values = values.reshape(len(rows), len(self._columns))
-        placed = place([row.timestamp for row in rows], values, first, self.spec.samples, self._step)
+        placed = place(
+            [row.timestamp for row in rows], values, first, self.spec.samples, self._step
+        )
         trace = placed.trace[0] if len(self._columns) == 1 else placed.trace
         return InsertionRecord(trace, len(placed.missing), placed.repeated, reconnects)
 
     def _first(self) -> float:
-        """The time of the trace's first sample; NaN while there is none."""
+        """Return the time of the trace's first sample; NaN before an insertion begins."""
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
     def _forget(self) -> None:
+        """Discard packages, start and arming."""
         self._finder.forget()
-        self._rows, self._start, self._armed = [], None, None
+        self._rows = []
+        self._start = None
+        self._armed = None

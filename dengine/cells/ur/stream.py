@@ -1,4 +1,4 @@
-"""All that a controller sends, in order, by a thread that reads and connects again where the connection is lost."""
+"""`RtdeStream`, which receives all packages of a controller in a thread, and reconnects."""
 
 import socket
 import struct
@@ -12,19 +12,44 @@ from functools import partial
 from itertools import chain
 
 from ...errors import CellError, SettingError, instead
-from .protocol import CHANNELS, PORT, VERSION, HeldError, Kind, Package, Packages, recipe_of
+from .protocol import (
+    CHANNELS,
+    PORT,
+    VERSION,
+    HeldError,
+    Package,
+    PackageReader,
+    PackageType,
+    read_recipe,
+)
 
-PIECE = 65536  # bytes asked of the socket at once
+RECEIVE_BYTES = 65536  # at once
 Values = Mapping[str, float]  # by column: `timestamp`, `actual_TCP_force[2]`
 
 
 class RtdeClient:
-    """Connects, agrees on the recipes and starts; then every package that comes is given, in its order.
+    """One connection to a controller, which sends data packages from its creation on.
 
-    columns : numbers to receive beside `timestamp`, as `actual_TCP_force[2]`.  inputs : fields to write, set together by
-    `send`.  rate_hz : packages a second.  timeout : seconds of silence after which the connection counts as lost.
-    CellError where the controller cannot be reached, refuses something, falls silent, hangs up or sends what is no package;
-    SettingError for a column that is none.
+    Parameters
+    ----------
+    host : str
+    port : int, default 30004
+    columns : sequence of str
+        Values to receive beside `timestamp`, for example `actual_TCP_force[2]`.
+    inputs : sequence of str
+        Fields that `send` writes.
+    rate_hz : float, default 500
+        Packages per second.
+    timeout : float, default 2
+        Seconds of silence after which the connection counts as lost.
+
+    Raises
+    ------
+    CellError
+        If the controller cannot be reached or refuses something; later, if the connection is lost
+        or something else than RTDE is received.
+    SettingError
+        If the controller has no such column.
     """
 
     def __init__(
@@ -37,33 +62,49 @@ class RtdeClient:
         timeout: float = 2.0,
     ) -> None:
         self.where = f"{host}:{port}"
-        self._why = ""  # the controller's last text message, as an error ends with it
-        outputs = tuple(dict.fromkeys(("timestamp", *(column.partition("[")[0] for column in columns))))
+        self._last_text = ""  # the controller's newest text message, for errors
+        outputs = tuple(
+            dict.fromkeys(("timestamp", *(column.partition("[")[0] for column in columns)))
+        )
         do = "turn the robot on, and enable RTDE under Settings, Security, Services"
-        with instead(CellError, f"Expected an RTDE controller at {self.where}, it cannot be reached", OSError, do=do):
+        with instead(
+            CellError,
+            f"Expected an RTDE controller at {self.where}, it cannot be reached",
+            OSError,
+            do=do,
+        ):
             self._socket = socket.create_connection((host, port), timeout)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._incoming = self._received()
         try:
-            if self._ask(Kind.VERSION, struct.pack(">H", VERSION))[:1] != b"\1":
-                raise CellError(f"Expected RTDE protocol version {VERSION} at {self.where}, it says no; update it.")
+            if self._ask(PackageType.VERSION, struct.pack(">H", VERSION))[:1] != b"\1":
+                raise CellError(
+                    f"Expected RTDE protocol version {VERSION} at {self.where}, "
+                    "which refuses it; update it."
+                )
             named = struct.pack(">d", rate_hz) + ",".join(outputs).encode()
-            self._outputs = recipe_of(self._ask(Kind.OUTPUTS, named), outputs, "output")
+            self._outputs = read_recipe(self._ask(PackageType.OUTPUTS, named), outputs, "output")
             if unknown := ", ".join(set(columns) - {*self._outputs.columns}):
                 number = "a number of the controller, as actual_q[5] or output_double_register_24"
-                raise SettingError(f"Expected a channel among {', '.join(CHANNELS)}, or {number}, got {unknown}.")
+                raise SettingError(
+                    f"Expected a channel among {', '.join(CHANNELS)}, or {number}, got {unknown}."
+                )
             if inputs:
-                self._inputs = recipe_of(self._ask(Kind.INPUTS, ",".join(inputs).encode()), inputs, "input")
-            if self._ask(Kind.START, b"")[:1] != b"\1":
-                raise CellError(f"Expected {self.where} to start sending, it refuses to{self._why}.")
+                self._inputs = read_recipe(
+                    self._ask(PackageType.INPUTS, ",".join(inputs).encode()), inputs, "input"
+                )
+            if self._ask(PackageType.START, b"")[:1] != b"\1":
+                raise CellError(
+                    f"Expected {self.where} to start sending, it refuses to{self._last_text}."
+                )
         except BaseException:
             self.close()
             raise
 
     def rows(self) -> Iterator[Values]:
-        """Every data package as it comes; once, and for ever."""
+        """Yield the values of every data package by column, without an end."""
         for package in self._incoming:
-            if package.kind is Kind.DATA:
+            if package.type is PackageType.DATA:
                 yield self._outputs.unpack(package.payload)
 
     def send(self, values: Values) -> None:
@@ -71,67 +112,94 @@ class RtdeClient:
         self._send(self._inputs.pack(values))
 
     def close(self) -> None:
-        with suppress(OSError):  # it may have hung up first
+        """Close the connection."""
+        with suppress(OSError):  # the controller may have closed it first
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
-    def _ask(self, kind: Kind, payload: bytes) -> bytes:
-        """Send a request and wait for its answer; text messages may come between."""
-        self._send(Package(kind, payload).packed())
-        while (package := next(self._incoming)).kind is not kind:
-            if kind is Kind.START and package.kind is Kind.DATA:  # its first data can overtake its yes
+    def _ask(self, type_: PackageType, payload: bytes) -> bytes:
+        """Send a request and return the payload of its response."""
+        self._send(Package(type_, payload).to_bytes())
+        while (package := next(self._incoming)).type is not type_:
+            if type_ is PackageType.START and package.type is PackageType.DATA:
+                # The first data may arrive before the response.
                 self._incoming = chain([package], self._incoming)
                 return b"\1"
         return package.payload
 
     def _send(self, data: bytes) -> None:
-        with instead(CellError, f"Expected {self.where} to take what it is sent, the connection is lost", OSError):
+        with instead(
+            CellError,
+            f"Expected {self.where} to take what it is sent, the connection is lost",
+            OSError,
+        ):
             self._socket.sendall(data)
 
     def _received(self) -> Iterator[Package]:
-        packages = Packages()
+        """Yield packages as they arrive; keep the text of messages, for errors."""
+        packages = PackageReader()
         while True:
             try:
-                piece = self._socket.recv(PIECE)
+                piece = self._socket.recv(RECEIVE_BYTES)
             except OSError as error:
                 silent = f"it was silent for {self._socket.gettimeout():g} s"
-                what = silent if isinstance(error, TimeoutError) else f"the connection is lost: {error}"
-                raise CellError(f"Expected packages from {self.where}, {what}{self._why}.") from error
+                what = (
+                    silent
+                    if isinstance(error, TimeoutError)
+                    else f"the connection is lost: {error}"
+                )
+                raise CellError(
+                    f"Expected packages from {self.where}, {what}{self._last_text}."
+                ) from error
             if not piece:
-                raise CellError(f"Expected packages from {self.where}, it hung up{self._why}.")
+                raise CellError(
+                    f"Expected packages from {self.where}, it hung up{self._last_text}."
+                )
             for package in packages.feed(piece):
-                if package.kind is Kind.TEXT:
-                    said = package.payload[1 : 1 + package.payload[0]].decode("utf-8", "replace")
-                    self._why = f' (it said: "{said[:200]}")'
+                if package.type is PackageType.TEXT:
+                    text = package.payload[1 : 1 + package.payload[0]].decode("utf-8", "replace")
+                    self._last_text = f' (it said: "{text[:200]}")'
                 else:
                     yield package
 
 
-KEPT_S = 60.0  # of packages, for whoever reads them late; what is older is a gap
-FRESH_S = 10.0  # an input that is older is not repeated: no controller is off and on again sooner
-RELEASE_S = 2.0  # in which a controller notices that an earlier owner has gone
-RETRY_S = (0.05, 1.0)  # between attempts to connect: the first, and the longest
+BUFFER_S = 60.0  # of packages that nobody has taken; older ones are lost
+REPEAT_S = 10.0  # an input is written again after a reconnection if it is at most this old
+RELEASE_S = 2.0  # within which a controller notices that an earlier client has gone
+RETRY_S = (0.05, 1.0)  # between attempts to connect: the shortest and the longest
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One data package. values : by column.  session : connections before."""
+    """One data package: its values by column, and the number of connections before its own."""
 
     values: Values
     session: int
 
     @property
     def timestamp(self) -> float:
-        return self.values["timestamp"]  # seconds of the controller's clock
+        """Return the time of the controller's clock in seconds."""
+        return self.values["timestamp"]
 
 
 @dataclass(frozen=True, slots=True)
 class StreamReport:
-    """What came since the stream was opened, by the controller's own timestamps.
+    """Counts since the stream was opened, by the controller's own timestamps.
 
-    packages : that came.  missing : timestamps without one, reconnections included.
-    repeated : with a timestamp that had come before.  reconnects : connections that were lost and made again.
-    restarts : the controller's clock began anew.  incomplete : traces with a gap, verified and never learned from.
+    Attributes
+    ----------
+    packages : int
+        Packages received.
+    missing : int
+        Timestamps without a package, those during a reconnection included.
+    repeated : int
+        Packages with the timestamp of an earlier one.
+    reconnects : int
+        Connections that were lost and made again.
+    restarts : int
+        Times that the controller's clock started anew.
+    incomplete : int
+        Traces with missing samples.
     """
 
     packages: int = 0
@@ -143,11 +211,17 @@ class StreamReport:
 
 
 class RtdeStream(AbstractContextManager["RtdeStream"]):
-    """Reads in a thread of its own, so that no package waits for whoever uses them. The arguments are `RtdeClient`'s.
+    """Receives packages in a thread and buffers them for `take`.
 
-    Connecting for the first time raises CellError; a connection lost later is made again, for as long as it takes, and what
-    was written last is written again, unless that was long ago, or the controller itself began anew: it knows nothing of
-    what it was told before. clock : seconds, for telling old inputs.
+    The parameters are those of `RtdeClient`, and `clock`, which returns seconds. The first
+    connection raises CellError if it fails. A connection that is lost later is made again, with
+    as many attempts as that takes, and the newest inputs are written again, unless they are old or
+    the controller was restarted.
+
+    Attributes
+    ----------
+    trouble : str
+        Why there is no connection at present; "" if there is one.
     """
 
     def __init__(
@@ -162,15 +236,18 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     ) -> None:
         self.step = 1.0 / rate_hz
         self.where = f"{host}:{port}"
-        self.trouble = ""  # why there is no connection; empty while there is one
+        self.trouble = ""
         self._open = partial(RtdeClient, host, port, columns, inputs, rate_hz, timeout)
         self._clock = clock
-        self._rows = deque[Row](maxlen=int(KEPT_S * rate_hz))  # that nobody has taken
+        self._rows = deque[Row](maxlen=int(BUFFER_S * rate_hz))  # not taken yet
         self._news = threading.Condition()
         self._newest: Row | None = None
         self._written: Values | None = None
         self._written_at = 0.0
-        self._session, self._again = 0, False  # connections before; whether this one has not told yet what was written
+        self._session = 0  # number of earlier connections
+        self._must_repeat = (
+            False  # whether this connection must still write the newest inputs again
+        )
         self._counts = Counter[str]()
         self._closing = threading.Event()
         self._client = self._connect(time.monotonic() + RELEASE_S)
@@ -178,7 +255,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         self._thread.start()
 
     def close(self) -> None:
-        """Hang up, and end the thread."""
+        """Close the connection and end the thread."""
         self._closing.set()
         with self._news:
             client = self._client
@@ -191,36 +268,42 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         self.close()
 
     def report(self) -> StreamReport:
+        """Return the counts so far."""
         with self._news:
             return StreamReport(**self._counts)
 
     def take(self, timeout: float) -> Row | None:
-        """The oldest package that nobody has taken; None where none came for `timeout` seconds."""
+        """Return and remove the oldest buffered package; None if none comes within `timeout` s."""
         with self._news:
             self._news.wait_for(lambda: self._rows or self._closing.is_set(), timeout)
             return self._rows.popleft() if self._rows else None
 
     def clear(self) -> int:
-        """Give up what nobody has taken; the connections before."""
+        """Discard the buffered packages; return the number of earlier connections."""
         with self._news:
             self._rows.clear()
             return self._session
 
     def write(self, values: Values | None) -> None:
-        """Set the inputs: now, or as soon as there is a connection again. None: what was written is not to be repeated."""
+        """Write inputs now, or once there is a connection again.
+
+        None: do not write the newest inputs again after a reconnection.
+        """
         with self._news:
-            self._written, self._written_at = values, self._clock()
+            self._written = values
+            self._written_at = self._clock()
             self._send()
 
     def _send(self) -> None:
-        """What is to be written, with the lock held, so that nothing older comes after it."""
+        """Write the newest inputs; the caller holds the lock, so that their order is kept."""
         if self._client is not None and self._written is not None:
             try:
                 self._client.send(self._written)
-            except CellError as error:  # the reader finds the same, and connects again: then it is written
+            except CellError as error:  # the reading thread reconnects and writes them again
                 self.trouble = str(error)
 
     def _read(self) -> None:
+        """Receive packages and reconnect until the stream is closed (the thread's work)."""
         while self._client is not None:
             client = self._client
             try:
@@ -229,46 +312,53 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             except CellError as error:
                 client.close()
                 with self._news:
-                    self._client, self.trouble = None, str(error)
-            again = self._connect()
+                    self._client = None
+                    self.trouble = str(error)
+            new_client = self._connect()
             with self._news:
-                self._client = again
-                if again is not None:
-                    self.trouble, self._again = "", True
+                self._client = new_client
+                if new_client is not None:
+                    self.trouble = ""
+                    self._must_repeat = True
                     self._session += 1
                     self._counts["reconnects"] += 1
-                    if self._closing.is_set():  # too late for `close`
-                        again.close()
+                    if self._closing.is_set():  # `close` did not see this client
+                        new_client.close()
 
     def _keep(self, row: Row) -> None:
+        """Count and buffer a package; write inputs again if the connection is new."""
         with self._news:
             if self._newest is not None:
                 steps = round((row.timestamp - self._newest.timestamp) / self.step)
                 self._counts["missing"] += max(steps - 1, 0)
                 self._counts["repeated"] += steps == 0
                 self._counts["restarts"] += steps < 0
-                self._written = None if steps < 0 else self._written  # it began anew: that was meant for before
+                if steps < 0:  # the controller was restarted: the inputs were meant for before
+                    self._written = None
             self._counts["packages"] += 1
             self._newest = row
             self._rows.append(row)
-            if self._again and self._clock() - self._written_at < FRESH_S:
+            if self._must_repeat and self._clock() - self._written_at < REPEAT_S:
                 self._send()
-            self._again = False
+            self._must_repeat = False
             self._news.notify_all()
 
     def _connect(self, until: float = float("inf")) -> RtdeClient | None:
-        """Try until there is a connection; None where the stream is closed meanwhile.
+        """Try to connect until it succeeds; return None if the stream is closed meanwhile.
 
-        until : of `time.monotonic`; a first connection waits so long for an earlier owner to be noticed as gone.
+        `until`, a time of `time.monotonic`, is given for the first connection. Then a failure
+        raises its error; but an input that another client writes is waited for until that time.
         """
-        wait, longest = RETRY_S
+        wait, longest_wait = RETRY_S
         while not self._closing.is_set():
             try:
                 return self._open()
             except CellError as error:
-                if until < float("inf") and not (isinstance(error, HeldError) and time.monotonic() < until):
+                if until < float("inf") and not (
+                    isinstance(error, HeldError) and time.monotonic() < until
+                ):
                     raise
                 self.trouble = str(error)
             self._closing.wait(wait)
-            wait = min(2 * wait, longest)
+            wait = min(2 * wait, longest_wait)
         return None
