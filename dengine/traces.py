@@ -46,17 +46,17 @@ LARGEST = 1e18  # of a sample; in float32 the squares of larger ones overflow, o
 MIN_SAMPLES = 10  # of a first trace: 20 ms at 500 Hz
 
 
-def as_trace(trace: Any, spec: TraceSpec | None) -> NDArray[np.float32]:
+def as_trace(trace: Any, trace_spec: TraceSpec | None) -> NDArray[np.float32]:
     """Convert one trace to float32 of shape (channels, samples).
 
     Parameters
     ----------
     trace : array, shape (samples,) or (channels, samples), Series or DataFrame
         Of any real dtype. A DataFrame has a row for each sample: its channels are the columns that
-        the spec names, or all but those of time. A Series is one channel.
-    spec : TraceSpec or None
-        What the trace must look like. Another length is fitted as `spec.fit` says. None: any shape
-        with no more channels than samples.
+        the `TraceSpec` names, or all but those of time. A Series is one channel.
+    trace_spec : TraceSpec or None
+        What the trace must look like. Another length is fitted as `trace_spec.fit` says. None: any
+        shape with no more channels than samples.
 
     Returns
     -------
@@ -68,13 +68,13 @@ def as_trace(trace: Any, spec: TraceSpec | None) -> NDArray[np.float32]:
     TraceError
         For a trace of another shape, or of values that are no real numbers.
     """
-    x = _as_real(trace if isinstance(trace, np.ndarray) else _frame_to_array(trace, spec))
+    x = _as_real(trace if isinstance(trace, np.ndarray) else _frame_to_array(trace, trace_spec))
     x = x[None, :] if x.ndim == 1 else x
     if x.ndim != 2 or x.size == 0:
         wanted = "one trace, (samples,) or (channels, samples)"
         raise TraceError(f"Expected {wanted}, got shape {np.shape(trace)}.")
-    if spec is not None:
-        x = _match_spec(x, spec)
+    if trace_spec is not None:
+        x = _match_spec(x, trace_spec)
     elif len(x) > x.shape[1] and _is_frame(trace):
         wanted = "a DataFrame of one trace, a row a sample, a column a channel"
         actual = f"{x.shape[1]} rows of {len(x)} columns"
@@ -89,15 +89,15 @@ def as_trace(trace: Any, spec: TraceSpec | None) -> NDArray[np.float32]:
     return x if x.flags.writeable else x.copy()  # torch warns of read-only, memory-mapped arrays
 
 
-def as_traces(X: ArrayLike, spec: TraceSpec | None = None) -> NDArray[np.float32]:
+def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> NDArray[np.float32]:
     """Convert many traces to float32 of shape (n, channels, samples).
 
     Parameters
     ----------
     X : array, shape (n, samples) or (n, channels, samples)
         Of any real dtype.
-    spec : TraceSpec, optional
-        What the traces must look like; another length is fitted as `spec.fit` says.
+    trace_spec : TraceSpec, optional
+        What the traces must look like; another length is fitted as `trace_spec.fit` says.
 
     Returns
     -------
@@ -113,8 +113,8 @@ def as_traces(X: ArrayLike, spec: TraceSpec | None = None) -> NDArray[np.float32
     if x.ndim != 3 or 0 in x.shape[1:]:
         wanted = "traces (n, samples) or (n, channels, samples)"
         raise TraceError(f"Expected {wanted}, got shape {np.shape(X)}.")
-    if spec is not None:
-        x = _match_spec(x, spec)
+    if trace_spec is not None:
+        x = _match_spec(x, trace_spec)
     return np.ascontiguousarray(x)
 
 
@@ -205,23 +205,25 @@ def _is_frame(trace: Any) -> bool:
     return hasattr(trace, "columns") and hasattr(trace, "to_numpy")
 
 
-def _frame_to_array(trace: Any, spec: TraceSpec | None) -> Any:
+def _frame_to_array(trace: Any, trace_spec: TraceSpec | None) -> Any:
     """Return the channels of a DataFrame as an array (C, T), anything else unchanged.
 
-    The channels are the columns that the spec names, else all but those of time. Raises TraceError
-    if columns are missing, or there are not as many as the spec's channels.
+    The channels are the columns that the `TraceSpec` names, else all but those of time. Raises
+    TraceError if columns are missing, or there are not as many as its channels.
     """
     if not _is_frame(trace):
         return trace
     columns = list(trace.columns)
-    if spec is not None and spec.columns:
-        if not set(spec.columns) <= set(columns):
-            wanted = f"the columns {', '.join(spec.columns)}"
+    if trace_spec is not None and trace_spec.columns:
+        if not set(trace_spec.columns) <= set(columns):
+            wanted = f"the columns {', '.join(trace_spec.columns)}"
             raise TraceError(f"Expected {wanted}, got {listed(columns)}.")
-        return trace[list(spec.columns)].to_numpy().T
+        return trace[list(trace_spec.columns)].to_numpy().T
     names = _channel_columns(trace)
-    if not names or (spec is not None and len(names) != spec.channels):
-        number = "at least one channel" if spec is None else f"{spec.channels} channel(s)"
+    if not names or (trace_spec is not None and len(names) != trace_spec.channels):
+        number = (
+            "at least one channel" if trace_spec is None else f"{trace_spec.channels} channel(s)"
+        )
         wanted = f"a DataFrame with {number}, a column each"
         do = "pass the right ones, or name them, TraceSpec(columns=...)"
         raise TraceError(f"Expected {wanted}, got the columns {listed(columns)}; {do}.")
@@ -254,27 +256,27 @@ def _as_real(values: ArrayLike) -> NDArray[np.float32]:
         return array.astype(np.float32, copy=False)
 
 
-def _match_spec(x: NDArray[np.float32], spec: TraceSpec) -> NDArray[np.float32]:
-    """Return traces (..., C, T) with the channels and samples of a spec.
+def _match_spec(x: NDArray[np.float32], trace_spec: TraceSpec) -> NDArray[np.float32]:
+    """Return traces (..., C, T) with the channels and samples of a `TraceSpec`.
 
-    Another length is fitted as `spec.fit` says. Raises TraceError for another number of channels,
-    and for another length if that is "strict".
+    Another length is fitted as `trace_spec.fit` says. Raises TraceError for another number of
+    channels, and for another length if that is "strict".
     """
     channels, samples = x.shape[-2:]
-    if channels != spec.channels:
-        is_transposed = (samples, channels) == (spec.channels, spec.samples)
+    if channels != trace_spec.channels:
+        is_transposed = (samples, channels) == (trace_spec.channels, trace_spec.samples)
         turn = "; it looks transposed: turn it, trace.T" if is_transposed else ""
         do = f"pass (channels, samples){turn}"
-        raise TraceError(f"Expected {spec.channels} channel(s), got {channels}; {do}.")
-    if samples == spec.samples:
+        raise TraceError(f"Expected {trace_spec.channels} channel(s), got {channels}; {do}.")
+    if samples == trace_spec.samples:
         return x
-    if spec.fit == "strict":
-        form = f"{spec.rate_hz:g} Hz x {spec.samples / spec.rate_hz:g} s"
-        new = f"TraceSpec(samples={spec.samples}, fit='pad')"
+    if trace_spec.fit == "strict":
+        form = f"{trace_spec.rate_hz:g} Hz x {trace_spec.samples / trace_spec.rate_hz:g} s"
+        new = f"TraceSpec(samples={trace_spec.samples}, fit='pad')"
         do = f"resample the trace to {form}, or start a new store with {new}"
-        raise TraceError(f"Expected {spec.samples} samples, got {samples}; {do}.")
+        raise TraceError(f"Expected {trace_spec.samples} samples, got {samples}; {do}.")
     tensor = torch.from_numpy(np.array(x, order="C"))
-    return np.asarray(fit_length(tensor, spec.samples, FITS.index(spec.fit)))
+    return np.asarray(fit_length(tensor, trace_spec.samples, FITS.index(trace_spec.fit)))
 
 
 # Of `clip_extremes`.
@@ -316,16 +318,16 @@ class TraceGate(nn.Module):
 
     Parameters
     ----------
-    spec : TraceSpec
-        Shape of the traces, and the sensor's range, `spec.limit`.
+    trace_spec : TraceSpec
+        Shape of the traces, and the sensor's range, `trace_spec.limit`.
     """
 
     quantum: Tensor
     weights: Tensor
 
-    def __init__(self, spec: TraceSpec) -> None:
+    def __init__(self, trace_spec: TraceSpec) -> None:
         super().__init__()
-        self.limit = float("inf") if spec.limit is None else float(spec.limit)
+        self.limit = float("inf") if trace_spec.limit is None else float(trace_spec.limit)
         self.clamp = float(CLAMP)
         self.not_finite = NOT_FINITE
         self.constant = CONSTANT
@@ -334,7 +336,7 @@ class TraceGate(nn.Module):
         self.largest = LARGEST
         # A buffer, for a plain number would become a tensor at each product.
         self.register_buffer("quantum", torch.tensor(QUANTUM))
-        weights = hash_weights(spec.channels * spec.samples)
+        weights = hash_weights(trace_spec.channels * trace_spec.samples)
         self.register_buffer("weights", torch.from_numpy(weights))
 
     def forward(self, x: Tensor) -> tuple[int, int]:
@@ -384,7 +386,7 @@ class ForceLimitsGate(nn.Module):
     Parameters
     ----------
     windows : sequence of ForceLimits
-    spec : TraceSpec
+    trace_spec : TraceSpec
         Shape of the traces, their rate and the names of their columns.
 
     Raises
@@ -399,14 +401,14 @@ class ForceLimitsGate(nn.Module):
     action: Tensor
     time: Tensor
 
-    def __init__(self, windows: Sequence[ForceLimits], spec: TraceSpec) -> None:
+    def __init__(self, windows: Sequence[ForceLimits], trace_spec: TraceSpec) -> None:
         super().__init__()
-        time = torch.tensor([[i / spec.rate_hz for i in range(spec.samples)]])
-        rows: dict[Any, int] = {None: spec.channels}  # time is the row behind the channels
-        rows |= {i: i for i in range(spec.channels)}
-        rows |= {name: i for i, name in enumerate(spec.columns)}
-        shape = f"{spec.channels} x {spec.samples} samples at {spec.rate_hz:g} Hz"
-        wanted = f"a window on some of {shape} {listed(spec.columns)}".rstrip()
+        time = torch.tensor([[i / trace_spec.rate_hz for i in range(trace_spec.samples)]])
+        rows: dict[Any, int] = {None: trace_spec.channels}  # time is the row behind the channels
+        rows |= {i: i for i in range(trace_spec.channels)}
+        rows |= {name: i for i, name in enumerate(trace_spec.columns)}
+        shape = f"{trace_spec.channels} x {trace_spec.samples} samples at {trace_spec.rate_hz:g} Hz"
+        wanted = f"a window on some of {shape} {listed(trace_spec.columns)}".rstrip()
         for window in windows:
             start, end = torch.tensor([window.start, window.end])
             has_samples = window.along is not None or bool(((time >= start) & (time <= end)).any())
@@ -438,23 +440,25 @@ class ForceLimitsGate(nn.Module):
         return int(torch.where(kept, 0, self.action).max().item())
 
 
-def convert_trace(trace: Any, spec: TraceSpec | None, may_start_over: bool) -> NDArray[np.float32]:
+def convert_trace(
+    trace: Any, trace_spec: TraceSpec | None, may_start_over: bool
+) -> NDArray[np.float32]:
     """Convert a trace as `as_trace`, with advice in its TraceError on how to start over.
 
     Parameters
     ----------
-    trace, spec
+    trace, trace_spec
         As in `as_trace`.
     may_start_over : bool
-        Whether the spec was inferred from the first trace and no label was reported yet: the error
-        then says that the first trace may have been the wrong one.
+        Whether the `TraceSpec` was inferred from the first trace and no label was reported yet:
+        the error then says that the first trace may have been the wrong one.
     """
     try:
-        return as_trace(trace, spec)
+        return as_trace(trace, trace_spec)
     except TraceError as error:
-        if not may_start_over or spec is None:
+        if not may_start_over or trace_spec is None:
             raise
-        shape = f"{spec.channels} x {spec.samples}"
+        shape = f"{trace_spec.channels} x {trace_spec.samples}"
         origin = f"The contract, {shape}, was set by the first trace"
         do = f"start over with a new store and {_spec_advice(trace)}"
         why = "nothing was learned by it yet: if that trace was the wrong one"
@@ -480,21 +484,21 @@ def infer_trace_spec(x: NDArray[np.float32], trace: Any) -> tuple[TraceSpec, boo
 
     Returns
     -------
-    spec : TraceSpec
+    trace_spec : TraceSpec
     is_faultless : bool
-        Whether the trace has no fault. The spec of a faulty trace should not be kept.
+        Whether the trace has no fault. The `TraceSpec` of a faulty trace should not be kept.
 
     Raises
     ------
     TraceError
         For a trace of fewer than `MIN_SAMPLES` samples.
     """
-    spec = spec_of(x, trace)
-    if spec.samples < MIN_SAMPLES:
+    trace_spec = spec_of(x, trace)
+    if trace_spec.samples < MIN_SAMPLES:
         wanted = f"a first trace of {MIN_SAMPLES} samples or more"
         why = "for it sets the contract of all that follow"
         do = f"record longer, or start with {_spec_advice(x)} if it is meant"
-        actual = f"{spec.channels} x {spec.samples}"
+        actual = f"{trace_spec.channels} x {trace_spec.samples}"
         raise TraceError(f"Expected {wanted}, {why}, got {actual}; {do}.")
-    reason, _ = TraceGate(spec)(torch.from_numpy(x))
-    return spec, reason == 0
+    reason, _ = TraceGate(trace_spec)(torch.from_numpy(x))
+    return trace_spec, reason == 0

@@ -63,35 +63,38 @@ def stored_form(store: "StoreLike", source: Any) -> dict[str, Any]:
         return {}
     try:
         with opening(store, must_exist=True) as opened:
-            spec = stored_trace_spec(opened.settings())
+            trace_spec = stored_trace_spec(opened.settings())
             if opened is not store:
                 opened.close()
     except StoreError:
         return {}  # a new store; any other error comes again when it is opened to be written
-    if spec is None:
+    if trace_spec is None:
         return {}
-    return {"samples": spec.samples, "fit": None if spec.fit == "strict" else spec.fit}
+    return {
+        "samples": trace_spec.samples,
+        "fit": None if trace_spec.fit == "strict" else trace_spec.fit,
+    }
 
 
-def check_agreement(data: Dataset, spec: TraceSpec) -> None:
+def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     """Raise TraceError if a data set does not agree with the `TraceSpec` of a store.
 
     It must have its rate and channels, and its recordings must have been brought to one length in
     the same way.
     """
     data_spec = data.spec
-    is_other_fit = data_spec.fit != spec.fit and "resample" in (data_spec.fit, spec.fit)
-    if data.lengths is not None and (is_other_fit or data_spec.samples != spec.samples):
-        wanted = f"recordings brought to {spec.samples} samples by {spec.fit}"
+    is_other_fit = data_spec.fit != trace_spec.fit and "resample" in (data_spec.fit, trace_spec.fit)
+    if data.lengths is not None and (is_other_fit or data_spec.samples != trace_spec.samples):
+        wanted = f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}"
         actual = f"{data.name} was to {data_spec.samples} by {data_spec.fit}"
-        do = f"load it with samples={spec.samples}, fit={spec.fit!r}"
+        do = f"load it with samples={trace_spec.samples}, fit={trace_spec.fit!r}"
         raise TraceError(f"Expected {wanted}, {actual}; {do}, or what is known would count again.")
-    is_other_rate = not math.isclose(spec.rate_hz, data_spec.rate_hz, rel_tol=RATE_TOLERANCE)
+    is_other_rate = not math.isclose(trace_spec.rate_hz, data_spec.rate_hz, rel_tol=RATE_TOLERANCE)
     if data.rate_hz is not None and is_other_rate:
         actual = f"{data.name} has {data_spec.rate_hz:g} Hz"
-        raise TraceError(f"Expected traces at {spec.rate_hz:g} Hz, {actual}; resample it.")
-    if data.channels and spec.columns and data.channels != spec.columns:
-        wanted = ", ".join(spec.columns)
+        raise TraceError(f"Expected traces at {trace_spec.rate_hz:g} Hz, {actual}; resample it.")
+    if data.channels and trace_spec.columns and data.channels != trace_spec.columns:
+        wanted = ", ".join(trace_spec.columns)
         raise TraceError(f"Expected the channels {wanted}, got {', '.join(data.channels)}.")
 
 
@@ -167,12 +170,12 @@ def import_labelled(
         store, seed, wait=LONG_WAIT, recipe=recipe, allow_import=allow_import
     )
     try:
-        spec = core_of(engine).set_trace_spec(data.spec)
-        check_agreement(data, spec)
-        traces = as_traces(data.X, spec)
+        trace_spec = core_of(engine).set_trace_spec(data.spec)
+        check_agreement(data, trace_spec)
+        traces = as_traces(data.X, trace_spec)
         decisions = _verifying_decisions(traces, data)
         parts = list(zip(decisions, traces, map(as_success, data.y), strict=True))
-        report = import_parts(engine.store, parts, spec, engine.policy, on_traces)
+        report = import_parts(engine.store, parts, trace_spec, engine.policy, on_traces)
     finally:
         if isinstance(store, str | os.PathLike):
             engine.close()
@@ -182,7 +185,7 @@ def import_labelled(
 def import_parts(
     store: "SqlStore",
     parts: Sequence[tuple[Decision, NDArray[np.float32], bool | None]],
-    spec: TraceSpec,
+    trace_spec: TraceSpec,
     policy: Policy,
     on_traces: Callable[[int], None] | None = None,
 ) -> ImportReport:
@@ -194,7 +197,7 @@ def import_parts(
     parts : sequence of (Decision, array of float32 of shape (C, T), bool or None)
         The decision, the trace and the label of each; None if nothing was heard of the part. A part
         whose label came later has a second row.
-    spec : TraceSpec
+    trace_spec : TraceSpec
         Of the traces.
     policy : Policy
         Under which the decisions were made.
@@ -206,7 +209,7 @@ def import_parts(
     ImportReport
         It counts labels.
     """
-    gate = TraceGate(spec)
+    gate = TraceGate(trace_spec)
     counts = Counter[str]()
     n_silent = 0  # accepted parts since the last label of which nothing was heard
     counts_silence = policy.stops == "some"
