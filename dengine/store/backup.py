@@ -52,7 +52,6 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
     Engines may run meanwhile: everything that they had acknowledged when this was called is in the
     copy. The copy is written in full or not at all.
 
-
     Parameters
     ----------
     url : str or path

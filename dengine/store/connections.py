@@ -117,10 +117,7 @@ def make_engine(url: str | None) -> sa.Engine:
 
 
 def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
-    """Register how an engine connects to SQLite, sets its pragmas, and begins.
-
-    Return the engine.
-    """
+    """Have an engine use `_connect`, `_set_pragmas` and `_begin` below; return the engine."""
     sa.event.listen(engine, "do_connect", _connect)
     sa.event.listen(engine, "connect", _set_pragmas)
     sa.event.listen(engine, "begin", _begin)
@@ -352,10 +349,7 @@ class Database:
         self._opened = None if self._file is None else self._file.stat()
 
     def _open(self, product: str | None) -> Scope:
-        """Create or check the tables, enter the cell, read the newest ledger entry.
-
-        Return the scope.
-        """
+        """Create or check the tables, enter the cell, and set `newest_entry`; return the scope."""
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
                 connection = plain.execution_options(dengine_write=True)
@@ -498,9 +492,9 @@ class Database:
             raise
 
     def _take_lease(self, connection: Any, record: Any) -> None:
-        """Lock the cell as long as a new PostgreSQL connection lives.
+        """Lock the cell for a new PostgreSQL connection, until that is closed.
 
-        Close it and raise StoreError if another has the lock.
+        If another engine has the lock, the connection is closed and StoreError is raised.
         """
         digest = hashlib.sha256(b"dengine " + self.cell_id.encode()).digest()
         key = int.from_bytes(digest[:8], "big", signed=True)

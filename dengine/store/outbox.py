@@ -662,7 +662,7 @@ class Outbox:
         return self.wait_for_result(self.submit(call))
 
     def wait_for_result(self, future: Future[T]) -> T:
-        """Return the result of a call that was submitted.
+        """Wait for a submitted call; return its result, or raise what it raised.
 
         Raises
         ------

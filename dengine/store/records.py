@@ -581,7 +581,7 @@ def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
 
 
 def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
-    """Return arrays as an npz file, member by member: `np.savez` reserves the name `file`."""
+    """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in state.items():
