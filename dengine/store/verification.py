@@ -363,7 +363,8 @@ class CellCheck:
     def _check_settings(self) -> Iterator[HistoryFault]:
         """Yield a fault for each setting that differs from the ledger's copy.
 
-        A cell without the setting of its schema is a fault, too."""
+        A cell without the setting of its schema is a fault, too.
+        """
         for key, problem in find_settings_faults(self.connection, self.cell_id).items():
             yield self._fault(SETTING.name, key, problem)
         is_schema = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
