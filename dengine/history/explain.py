@@ -159,7 +159,7 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
     gate = NoveltyGate(*(int(n) for n in stored.state["trace_shape"]))
-    gate.asleep = False
+    gate.disabled = False
     try:
         restore(gate, arrays_with_prefix(stored.state, "novelty."))
     except StoreError:  # the gate of another version of dengine

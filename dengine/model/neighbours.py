@@ -357,7 +357,7 @@ class ModelPrediction(EngineModel):
             ):
                 shape, own = X.shape[1:], self.classifier
                 gate = NoveltyGate(*shape)
-                gate.asleep = not self.novelty
+                gate.disabled = not self.novelty
                 around = own.neighbours_over(
                     RadiusIndex(blank.dim, own.capacity), self.rule, self.spaces.scores
                 )
@@ -608,7 +608,7 @@ class ModelPrediction(EngineModel):
                 f"rule.{name}": buffer.numpy().copy()
                 for name, buffer in self.rule.state_dict().items()
             }
-        if not self.gate.asleep:
+        if not self.gate.disabled:
             state |= {
                 f"novelty.{name}": buffer.numpy().copy()
                 for name, buffer in self.gate.state_dict().items()
@@ -628,7 +628,7 @@ class ModelPrediction(EngineModel):
         self.scale = np.asarray(state["scale"])
         self.index = RadiusIndex.from_state(state, self.classifier.capacity)
         self.gate = NoveltyGate(*self.trace_shape)
-        self.gate.asleep = not arrays_with_prefix(state, "novelty.")
+        self.gate.disabled = not arrays_with_prefix(state, "novelty.")
         for module, prefix in ((self.rule, "rule."), (self.gate, "novelty.")):
             if arrays := arrays_with_prefix(state, prefix):
                 restore(module, arrays)
