@@ -1,4 +1,7 @@
-"""From counts to an action, in one place: intervals, the user's policy, references, the rule, and its scikit-learn face."""
+"""From a trace to an action: policy, intervals, references, rules, novelty and the decider.
+
+The model and the engine are built on this family; what users import is listed in `__init__.pyi`.
+"""
 
 import lazy_loader
 

@@ -217,9 +217,10 @@ def fit_novelty(
 
 
 def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
-    """Return a twentieth of the usual roughness of traces (n, C, T), for each stretch, (C, 2*S + 3).
+    """Return a twentieth of the usual roughness of traces (n, C, T), shape (C, 2*S + 3).
 
-    A channel that never moved has the least number above 0: any sound is far away.
+    There is a value for each stretch. A channel that never moved has the least number above 0: any
+    sound is far away.
     """
     n_samples = x.size(2)
     steps = torch.zeros(x.size(1))
@@ -308,7 +309,7 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
 
 
 def _limits(points: Tensor, same: Tensor) -> tuple[float, Tensor]:
-    """Return the usual squared distance from points (n, P) to the nearest other one, and each reach.
+    """Return the usual squared distance between nearest points (n, P), and each point's reach.
 
     `same` (n, n) bool marks points that are not other ones. The usual distance is the QUANTILE,
     capped by what nine in ten show, so that a few outliers are not the measure of the others. The

@@ -1,13 +1,15 @@
-"""An exported file, whatever its format: what it is made from, what it says of itself, its checksum and its signature.
+"""What every exported file has, TorchScript or ONNX: description, checksum and signature.
 
-    dengine export --make-key cell.key
-    dengine export engine.db --out model.ts --key cell.key          # model.ts.sha256 and model.ts.sig beside it
-    load_exported("model.ts", key="cell.key")
+    dengine export --make-key cell.key dengine export engine.db --out model.ts --key cell.key    #
+    model.ts, model.ts.sha256, model.ts.sig load_exported("model.ts", key="cell.key")
 
-The checksum guards against damage, not against an adversary: whoever can change the file can change the sum. The signature
-says who made it, before a byte of it is run: HMAC-SHA256 (FIPS 198-1) with a secret that both sides have, so whoever can
-check one can make one. Keep the key's file where only the exporter and the controller read it. An earlier file that was
-signed with the same key is as valid as the newest one.
+`torchscript` and `onnx` write and read their files through the functions here.
+
+The checksum guards against damage, not against an adversary: whoever can change the file can change
+the sum. The signature says who made the file before a byte of it is run. It is HMAC-SHA256 (FIPS
+198-1) with a secret that both sides have, so whoever can check one can make one. Keep the key's
+file where only the exporter and the controller can read it. An earlier file signed with the same
+key is as valid as the newest one.
 """
 
 import hashlib
@@ -49,66 +51,105 @@ KeyFile = str | os.PathLike[str]
 
 
 def make_key(path: KeyFile) -> Path:
-    """Write a new random key, 64 hexadecimal digits, to a file that is not there yet and that only its owner reads.
+    """Write a new random key, 64 hexadecimal digits, to a new file that only its owner can read.
 
-    ExportError where there is a file already: models were signed with it.
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    ExportError
+        If there is a file already, because models may be signed with it, or it cannot be written.
     """
     target = Path(path)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     try:
-        with os.fdopen(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
+        with os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file:
             file.write(secrets.token_hex(32) + "\n")
             file.flush()
             os.fsync(file.fileno())
     except FileExistsError as error:
-        raise ExportError(f"{target} is there already, and files may be signed with it; name a new one.") from error
+        problem = f"{target} is there already, and files may be signed with it"
+        raise ExportError(f"{problem}; name a new one.") from error
     except OSError as error:
-        said = f"Cannot write {target}: {error.strerror}; choose a folder that exists and is writable."
-        raise ExportError(said) from error
+        problem = f"Cannot write {target}: {error.strerror}"
+        raise ExportError(f"{problem}; choose a folder that exists and is writable.") from error
     return target
 
 
 def signature(content: bytes, key: KeyFile) -> str:
-    """What a signature's line begins with, by the secret in a key's file; ExportError for what is too short to be one."""
-    return PREFIX + hmac.new(read_key(key, ExportError), content, hashlib.sha256).hexdigest()
+    """Return the signature of a content with the secret in a key's file.
+
+    Raises ExportError for a file that is too short to be a key.
+    """
+    secret = read_key(key, ExportError)
+    return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
 
 
 def beside(path: str | os.PathLike[str], suffix: str) -> Path:
-    """Where a file's checksum (sha256, as `sha256sum --check` reads it) or its signature (sig) lies."""
+    """Return the path of a file's checksum (sha256) or signature (sig), PATH.SUFFIX.
+
+    `sha256sum --check` reads the former.
+    """
     return Path(f"{os.fspath(path)}.{suffix}")
 
 
-def prepared(
+def prepare_export(
     engine_or_model: Any, trace: TraceSpec | None, path: str | os.PathLike[str], force: bool
 ) -> tuple[Exportable, DecisionModule]:
-    """What an exporter starts from, and its decision as one eager module.
+    """Check that an engine or a model can be exported, and build its decision module.
 
-    ExportError for a baseline, before the first training, and where a part of the decision does not compile; OutputError
-    where `path` must not be written: before the work of an export.
+    Parameters
+    ----------
+    engine_or_model : DataEngine or ModelPrediction
+    trace : TraceSpec or None
+        Another trace contract than the engine's.
+    path : path-like
+        Where the file will be written.
+    force : bool
+        Whether it may replace a file.
+
+    Returns
+    -------
+    source : Exportable
+    module : DecisionModule
+
+    Raises
+    ------
+    ExportError
+        For a baseline, before the first training, for code that was changed or does not compile,
+        and if the rule has missed an outcome.
+    OutputError
+        If `path` must not be written; this is checked first.
     """
     _check_outputs(path, force)
-    if isinstance(engine_or_model, DataEngine):
-        engine_or_model = core_of(engine_or_model)
+    is_engine = isinstance(engine_or_model, DataEngine)
+    exporter = core_of(engine_or_model) if is_engine else engine_or_model
     try:
-        source: Exportable = engine_or_model.exported(trace)
+        source: Exportable = exporter.exported(trace)
     except AttributeError as error:
         got = type(engine_or_model).__name__
         wanted = "Expected a DataEngine or a ModelPrediction to export"
         raise ExportError(f"{wanted}, got {got}; a baseline stays in Python.") from error
     model = source.model
+    encoder = model.spaces.module()
     if not model.rule.scriptable:
         rule = f"{type(model.rule).__name__} with the interval {model.rule.interval!r}"
         do = f"use {' or '.join(SCALAR_BOUNDS)}, and a rule that does"
         raise ExportError(f"{rule} does not compile to TorchScript; {do}.")
-    changed = [each for each in (model.rule, model.spaces.module()) if each is not None and is_code_changed(each)]
-    if changed:
-        named = type(changed[0]).__name__
-        raise ExportError(f"The code of {named} was changed after it was compiled; start Python anew, then export.")
+    for module in (model.rule, encoder):
+        if module is not None and is_code_changed(module):
+            problem = f"The code of {type(module).__name__} was changed after it was compiled"
+            raise ExportError(f"{problem}; start Python anew, then export.")
     if model.rule_is_stale:
-        raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
-    if model.spaces.module() is None:
+        problem = "The rule has missed what became of a part"
+        raise ExportError(f"{problem}; open the engine's store again, then export.")
+    if encoder is None:
         raise ExportError(
-            f"{model.name} cannot be exported, for it has no module: give it `module()`, which returns the embedding "
-            "as an nn.Module (see `Reducer.module`)."
+            f"{model.name} cannot be exported, for it has no module: give it `module()`, which "
+            "returns the embedding as an nn.Module (see `Reducer.module`)."
         )
     conditions = DecisionConditions(source.trace, source.windows, source.audit_rate, source.seed)
     shape = (model.n_spaces, model.index.dim)
@@ -117,10 +158,16 @@ def prepared(
 
 
 def describe(source: Exportable) -> dict[str, Any]:
-    """What the file says of itself, readable without loading it."""
-    model, index, rule = source.model, source.model.index, type(source.model.rule)
-    ours = getattr(member_rules, rule.__name__, None) is rule
-    named = next((name for name, rules in RULES.items() if ours and rule.__name__ in rules.values()), "")
+    """Return the description that is written into the file, as a dict for JSON.
+
+    It can be read without loading the model, see `read_metadata`.
+    """
+    model = source.model
+    index = model.index
+    rule = type(model.rule)
+    guarantee = f"{rule.__module__}:{rule.__qualname__}"
+    if getattr(member_rules, rule.__name__, None) is rule:
+        guarantee = next(name for name, rules in RULES.items() if rule.__name__ in rules.values())
     return {
         "schema": SCHEMA,
         "dengine": __version__,
@@ -130,7 +177,7 @@ def describe(source: Exportable) -> dict[str, Any]:
         "alpha": model.classifier.alpha,
         "lower_bound": model.classifier.lower_bound,
         "interval": model.classifier.interval,
-        "guarantee": named or f"{rule.__module__}:{rule.__qualname__}",
+        "guarantee": guarantee,
         "stops": "all" if source.stops_all else "some",
         "novelty": model.novelty,
         "spaces": model.n_spaces,
@@ -156,86 +203,146 @@ def write_export(
     key: KeyFile | None = None,
     source: Exportable | None = None,
 ) -> Path:
-    """Write a file, its checksum, and with a key its signature; note it in the store that the engine remembers in.
+    """Write a file, its checksum and, with a key, its signature.
 
-    OutputError where they must not or cannot be written. A file, its sum and its signature are renames of their own:
-    where a kill comes between, the file is refused as damaged until it is exported again.
+    Each is a rename of its own: if a kill comes between, the file is refused as damaged until it is
+    exported again. The export is noted in the engine's store first.
+
+    Parameters
+    ----------
+    path : path-like
+    content : bytes
+    force : bool, default False
+        Whether it may replace a file. Without a key the signature of the replaced file is removed.
+    key : path-like, optional
+        File of the key to sign with.
+    source : Exportable, optional
+        Its `note` records the checksum.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    OutputError
+        If a file must not or cannot be written.
     """
-    target, digest = Path(path), hashlib.sha256(content).hexdigest()
-    written = {target: content, beside(target, "sha256"): f"{digest}  {target.name}\n".encode()}
+    target = Path(path)
+    digest = hashlib.sha256(content).hexdigest()
+    files = {target: content, beside(target, "sha256"): f"{digest}  {target.name}\n".encode()}
     if key is not None:
-        written[beside(target, "sig")] = f"{signature(content, key)}  {target.name}\n".encode()
+        line = f"{signature(content, key)}  {target.name}\n"
+        files[beside(target, "sig")] = line.encode()
     _check_outputs(target, force)
     if source is not None and source.note is not None:
         source.note("export", f"{digest} {target.name}, version {source.model_version}")
-    for each, what in written.items():
-        write_output(each, what, force)
+    for file, data in files.items():
+        write_output(file, data, force)
     if key is None and force:
-        beside(target, "sig").unlink(missing_ok=True)  # of the file that was replaced
+        beside(target, "sig").unlink(missing_ok=True)
     return target
 
 
 def _check_outputs(path: str | os.PathLike[str], force: bool) -> None:
-    for each in (Path(path), beside(path, "sha256"), beside(path, "sig")):
-        check_output(each, force)
+    """Raise OutputError unless the file, its checksum and its signature may be written."""
+    for file in (Path(path), beside(path, "sha256"), beside(path, "sig")):
+        check_output(file, force)
 
 
 def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> dict[str, Any]:
-    """What a file says of itself, after checking its sum, and its signature by a key, and without loading its code."""
-    return metadata_of(checked_bytes(Path(path), key), Path(path))
+    """Read the description in an exported TorchScript file, without loading its code.
+
+    Parameters
+    ----------
+    path : path-like
+    key : path-like, optional
+        File of the key that it must be signed with.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    ExportError
+        As of `read_checked`, and for a file that is no export or has another schema.
+    """
+    return metadata_of(read_checked(Path(path), key), Path(path))
 
 
-def checked_bytes(path: Path, key: KeyFile | None = None) -> bytes:
-    """A file's content; ExportError unless its sum is as its sum file says, and, with a key, it was signed with this key.
+def read_checked(path: Path, key: KeyFile | None = None) -> bytes:
+    """Read a file after checking its checksum and, with a key, its signature.
 
     libtorch itself does not notice flipped bits.
+
+    Raises
+    ------
+    ExportError
+        If a file is missing or unreadable, the content does not have the sum in PATH.sha256, or it
+        was not signed with this key.
     """
-    _read(path, most=0)  # of the two it is the file itself that is named where both are missing
+    _read(path, most=0)  # if both are missing, the error names the file itself
     expected = _first_word(_read(beside(path, "sha256"), SUM_BYTES))
     if not SHA256.fullmatch(expected):
-        raise ExportError(f"{path}.sha256 holds no SHA-256 sum of {path.name}; copy it again together with {path.name}.")
+        problem = f"{path}.sha256 holds no SHA-256 sum of {path.name}"
+        raise ExportError(f"{problem}; copy it again together with {path.name}.")
     content = _read(path)
     found = hashlib.sha256(content).hexdigest()
     if found != expected:
-        known = f"its SHA-256 is {found[:12]}…, expected {expected[:12]}…"
-        raise ExportError(f"{path} is damaged or truncated: {known}; copy it again.")
+        sums = f"its SHA-256 is {found[:12]}…, expected {expected[:12]}…"
+        raise ExportError(f"{path} is damaged or truncated: {sums}; copy it again.")
     if key is not None:
         signed = signature(content, key)
-        if not (file := beside(path, "sig")).exists():
-            raise ExportError(f"A key was given, and {path} is not signed: {file} is missing; export it anew with it.")
+        file = beside(path, "sig")
+        if not file.exists():
+            problem = f"A key was given, and {path} is not signed: {file} is missing"
+            raise ExportError(f"{problem}; export it anew with it.")
         if not hmac.compare_digest(_first_word(_read(file, SUM_BYTES)).encode(), signed.encode()):
-            raise ExportError(f"{path} has no signature by the key in {key}: it was changed, or signed with another one.")
+            problem = f"{path} has no signature by the key in {key}"
+            raise ExportError(f"{problem}: it was changed, or signed with another one.")
     return content
 
 
 def _first_word(content: bytes) -> str:
-    """Of a sum's or a signature's line; the file's name follows it."""
+    """Return the sum or the signature at the start of a line; the file's name follows it there."""
     return (content.decode("utf-8", errors="replace").split() or [""])[0]
 
 
 def _read(path: Path, most: int = -1) -> bytes:
+    """Return a file's content, or its first `most` bytes; ExportError if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(most)
     except FileNotFoundError as error:
-        raise ExportError(f"{error.filename} is missing; an export is a file and its .sha256, copied together.") from error
+        problem = f"{error.filename} is missing"
+        do = "an export is a file and its .sha256, copied together"
+        raise ExportError(f"{problem}; {do}.") from error
     except (OSError, ValueError) as error:
         raise ExportError(f"{path} cannot be read: {error}.") from error
 
 
 def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
-    """What the content of a TorchScript file says of itself."""
-    said = f"{path} is not a dengine export, it holds no {METADATA}"
-    with instead(ExportError, said, *UNREADABLE), zipfile.ZipFile(io.BytesIO(content)) as archive:
-        name = next((n for n in archive.namelist() if n.endswith(f"extra/{METADATA}")), METADATA)
-        return checked_schema(json.loads(archive.read(name)), path)
+    """Return the description inside the content of a TorchScript file.
+
+    Raises ExportError, which names `path`, if there is none or it has another schema.
+    """
+    problem = f"{path} is not a dengine export, it holds no {METADATA}"
+    with (
+        instead(ExportError, problem, *UNREADABLE),
+        zipfile.ZipFile(io.BytesIO(content)) as archive,
+    ):
+        names = (name for name in archive.namelist() if name.endswith(f"extra/{METADATA}"))
+        return check_schema(json.loads(archive.read(next(names, METADATA))), path)
 
 
-def checked_schema(metadata: Any, path: Path) -> dict[str, Any]:
-    """A description of the present schema; ExportError for another."""
-    known = metadata if isinstance(metadata, dict) else {}
-    if known.get("schema") != SCHEMA:
-        wrote = f"schema {known.get('schema')}, written by dengine {known.get('dengine', 'of an unknown version')}"
+def check_schema(metadata: Any, path: Path) -> dict[str, Any]:
+    """Return a description if it has the present schema; ExportError, naming `path`, otherwise."""
+    fields = metadata if isinstance(metadata, dict) else {}
+    if fields.get("schema") != SCHEMA:
+        writer = f"dengine {fields.get('dengine', 'of an unknown version')}"
+        got = f"schema {fields.get('schema')}, written by {writer}"
         do = "export it anew, or load it with the dengine that wrote it"
-        raise ExportError(f"{path} has {wrote}; this one reads schema {SCHEMA}: {do}.")
-    return known
+        raise ExportError(f"{path} has {got}; this one reads schema {SCHEMA}: {do}.")
+    return fields

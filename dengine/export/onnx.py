@@ -1,11 +1,14 @@
-"""The decision as ONNX, for the day that TorchScript is gone or a controller runs onnxruntime.
+"""Export to ONNX, for controllers that run onnxruntime.
 
     >>> export_onnx(engine, "model.onnx")          # model.onnx and model.onnx.sha256
     >>> load_onnx("model.onnx").decide(trace)
 
-A pure-tensor twin of the decision that TorchScript carries, checked against it when it is written. What ONNX cannot
-carry: references that grow and rules that learn, so nothing is learned in the cell; hashes, so there are no audits, no
-votes of parts that came again, and a reference that is asked about itself counts itself.
+An ONNX program of torch.export has neither branches nor state, so `OnnxDecision` repeats what
+`Decider` and `RadiusNeighbours` do with tensors; the interval's formula is shared. `export_onnx`
+checks each file against the model before it keeps it, and `tests/e2e/test_onnx.py` holds the two to
+one another. ONNX cannot carry references that grow or rules that learn, so nothing is learned in
+the cell. It has no hashes either, so there are no audits and no votes of parts that came again, and
+a reference that is asked about itself counts itself.
 """
 
 import json
@@ -31,16 +34,25 @@ from ..model.base import Exportable
 from ..model.neighbours import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
 from ..traces import CONSTANT, LARGEST, NOT_FINITE, SATURATED, TOO_LARGE, as_trace, as_traces
-from .bundle import METADATA, KeyFile, checked_bytes, checked_schema, describe, prepared, write_export
+from .bundle import (
+    METADATA,
+    KeyFile,
+    check_schema,
+    describe,
+    prepare_export,
+    read_checked,
+    write_export,
+)
 from .decision import FIELDS
 from .torchscript import TOLERANCE, ExportedDecision, golden_trace
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
-FAR = 1e9  # where an empty slot waits: no ball reaches it
+FAR = 1e9  # a coordinate that no radius reaches
 OPSET = 18
-CHECKED = 64  # random traces that the file is held against before it is kept
+N_CHECKED = 64  # random traces that a file is checked on before it is kept
 BOUND_TOLERANCE = 1e-6
-EDGE = 2  # another runtime adds in another order: a reference on the ball's very surface may fall on either side
+# References whose distance is the radius may fall on either side: runtimes add in another order.
+N_AT_EDGE = 2
 
 
 def export_onnx(
@@ -51,63 +63,108 @@ def export_onnx(
     key: KeyFile | None = None,
     force: bool = False,
 ) -> Path:
-    """Write `path` and `path`.sha256: the decision of a `DataEngine` or a fitted `ModelPrediction` as ONNX.
+    """Write the decision of an engine, or of a fitted model, as ONNX.
 
-    key : a key's file (`make_key`); the signature comes beside the file, as `path`.sig.
-    Raises ExportError where the engine audits, its rule learns, a part came again, nothing was trained yet, the reducer or
-    the interval has no module, a package is missing, or onnxruntime does not decide as the model does; OutputError where
-    `path` cannot be written. force : as of `export_torchscript`.
+    Parameters
+    ----------
+    engine_or_model, path, trace, key, force
+        As of `export_torchscript`.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    ExportError
+        If the engine audits, has force limits or a rule that learns, or a part came again; if
+        nothing was trained yet; if the reducer or the interval has no module; if a package is
+        missing; and if onnxruntime does not decide as the model does.
+    OutputError
+        If `path` cannot be written.
     """
-    onnx = _package("onnx")
-    source, _ = prepared(engine_or_model, trace, path, force)
-    _refuse_what_changes(source)
+    onnx = _import_package("onnx")
+    source, _ = prepare_export(engine_or_model, trace, path, force)
+    _refuse_unsupported(source)
     metadata = describe(source) | {"format": "onnx", "learns": False}
-    program = _to_onnx(Twin(source).eval(), source.trace)
+    program = _to_onnx(OnnxDecision(source).eval(), source.trace)
     x = golden_trace(source.trace)
-    found = OnnxModel(program.SerializeToString(), metadata).decide(x)
-    golden = {"trace": x.tolist(), "embedding": found.embedding.tolist()}
+    embedding = OnnxModel(program.SerializeToString(), metadata).decide(x).embedding
+    golden = {"trace": x.tolist(), "embedding": embedding.tolist()}
     onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata | {"golden": golden})})
     content = program.SerializeToString()
-    _check(OnnxModel(content, metadata), source.model, source.trace)
+    _check_decisions(OnnxModel(content, metadata), source.model, source.trace)
     return write_export(path, content, force, key, source)
 
 
 def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> "OnnxModel":
-    """Check the sum, load into onnxruntime on one thread, warm up; ExportError for what must not be used.
+    """Check an ONNX file, load it into onnxruntime on one thread, and warm it up.
 
-    key : the key's file that it was signed with; it is checked first. None: no signature is asked for.
+    Parameters
+    ----------
+    path : path-like
+    key : path-like, optional
+        File of the key that it was signed with, which is checked first. None: no signature is asked
+        for.
+
+    Returns
+    -------
+    OnnxModel
+
+    Raises
+    ------
+    ExportError
+        For a file that must not be used, see `read_checked` and `check_schema`.
     """
-    onnx = _package("onnx")
+    onnx = _import_package("onnx")
     target = Path(path)
-    content = checked_bytes(target, key)
-    said = f"{target} is not a dengine export in ONNX, it holds no {METADATA}"
-    with instead(ExportError, said, Exception):  # protobuf's own errors have no common base
+    content = read_checked(target, key)
+    problem = f"{target} is not a dengine export in ONNX, it holds no {METADATA}"
+    with instead(ExportError, problem, Exception):  # protobuf's errors have no common base
         properties = {p.key: p.value for p in onnx.load_from_string(content).metadata_props}
         metadata = json.loads(properties[METADATA])
-    return OnnxModel(content, checked_schema(metadata, target))
+    return OnnxModel(content, check_schema(metadata, target))
 
 
-def _refuse_what_changes(source: Exportable) -> None:
-    rule, repeats = type(source.model.rule), int(source.model.index.repeats)
-    # One of the user's own as well: the twin knows the paper's alone.
-    learns = f"{rule.__name__}, a rule that learns; export torchscript, or set guarantee = 'local' and stops = 'some'"
-    audits = "audits, its integers are not the content hash's; export torchscript, or set audit_rate = 0"
-    votes = f"votes: {repeats} of the references are of parts that were there already; export torchscript"
-    kept = (source.audit_rate > 0.0, rule is not DecisionRule, repeats > 0, len(source.windows) > 0)
-    for what, held in zip((audits, learns, votes, "an operator's windows; export torchscript"), kept, strict=True):
-        if held:
-            raise ExportError(f"ONNX carries no {what}.")
+def _refuse_unsupported(source: Exportable) -> None:
+    """Raise ExportError if the decision needs something that ONNX cannot carry."""
+    rule = type(source.model.rule)
+    n_repeats = int(source.model.index.repeats)
+    use_local = "export torchscript, or set guarantee = 'local' and stops = 'some'"
+    no_audits = "export torchscript, or set audit_rate = 0"
+    problem = ""
+    if source.audit_rate > 0.0:
+        problem = f"audits, its integers are not the content hash's; {no_audits}"
+    elif rule is not DecisionRule:  # a user's own as well: `OnnxDecision` knows the paper's alone
+        problem = f"{rule.__name__}, a rule that learns; {use_local}"
+    elif n_repeats > 0:
+        repeats = f"{n_repeats} of the references are of parts that were there already"
+        problem = f"votes: {repeats}; export torchscript"
+    elif source.windows:
+        problem = "an operator's windows; export torchscript"
+    if problem:
+        raise ExportError(f"ONNX carries no {problem}.")
 
 
 class OnnxModel:
-    """An ONNX decision in onnxruntime; the face of `ExportedModel` without `learn` and `save`."""
+    """An ONNX decision in onnxruntime; it has `decide` as `ExportedModel`, but learns nothing.
+
+    Parameters
+    ----------
+    content : bytes
+        The ONNX program.
+    metadata : dict
+        The file's description of itself.
+    """
 
     def __init__(self, content: bytes, metadata: dict[str, Any]) -> None:
-        runtime = _package("onnxruntime")
+        runtime = _import_package("onnxruntime")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
-        self.session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        providers = ["CPUExecutionProvider"]
+        self.session = runtime.InferenceSession(content, options, providers=providers)
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
         warm = np.linspace(-1.0, 1.0, self.trace.channels * self.trace.samples)
@@ -115,81 +172,122 @@ class OnnxModel:
 
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T); TraceError for a wrong shape."""
-        found = self.session.run(None, {"trace": as_trace(trace, self.trace)})
-        action, reason, lower, upper, n_success, n_failure, z = found
-        whole = int(n_success), int(n_failure)
-        return ExportedDecision(ACTIONS[int(action)], REASONS[int(reason)], float(lower), float(upper), *whole, z)
+        outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
+        action, reason, lower, upper, n_success, n_failure, z = outputs
+        return ExportedDecision(
+            ACTIONS[int(action)],
+            REASONS[int(reason)],
+            float(lower),
+            float(upper),
+            int(n_success),
+            int(n_failure),
+            z,
+        )
 
     def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
-        """Decide on each trace of (n, T) or (n, C, T)."""
+        """Decide on each trace of (n, T) or (n, C, T); as `decide`."""
         return [self.decide(x) for x in as_traces(X, self.trace)]
 
 
-class Twin(nn.Module):
-    """The decision without a branch: trace (C, T) float32 -> the tensors named in `FIELDS`. References do not change."""
+class OnnxDecision(nn.Module):
+    """The decision without a branch, in tensors; the references do not change.
+
+    Parameters
+    ----------
+    source : Exportable
+        Of the paper's rule, without audits and force limits.
+    """
 
     def __init__(self, source: Exportable) -> None:
         super().__init__()
-        model, index, limit = source.model, source.model.index, source.trace.limit
+        model = source.model
+        index = model.index
+        limit = source.trace.limit
         self.rule: DecisionRule = model.rule
         self.radius = float(model.classifier.radius)
         self.limit = float("inf") if limit is None else limit
         self.encoder = model.spaces.module()
         self.novelty = model.gate
         self.register_buffer("scale", torch.from_numpy(model.scale)[:, None])
-        # A reference of space k stands far away in every other space: one subtraction, no gathering.
-        places = np.full((model.n_spaces, index.dim, len(index)), FAR, dtype=np.float32)
-        places[index.column("spaces"), :, np.arange(len(index))] = index.column("points")
-        self.register_buffer("places", torch.from_numpy(places))
-        self.register_buffer("success", torch.from_numpy(index.column("labels").astype(np.int64)))
+        # A reference of space k is far away in every other space: one subtraction, no gathering.
+        points = np.full((model.n_spaces, index.dim, len(index)), FAR, dtype=np.float32)
+        points[index.column("spaces"), :, np.arange(len(index))] = index.column("points")
+        self.register_buffer("points", torch.from_numpy(points))
+        labels = index.column("labels").astype(np.int64)
+        self.register_buffer("labels", torch.from_numpy(labels))
 
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
-        """(C, T) float32 -> action, reason, lower, upper, n_success, n_failure, embedding (K, d)."""
-        low, high = trace.min(), trace.max()
-        finite = (trace.abs() < float("inf")).all()
-        highest = torch.maximum(high, -low)
-        saturated = torch.where(highest >= self.limit, SATURATED, torch.where(highest > LARGEST, TOO_LARGE, 0))
-        fault = torch.where(finite, torch.where(low == high, CONSTANT, saturated), NOT_FINITE)  # as of `TraceGate`
-        good = fault == 0
-        x = torch.where(good, trace, torch.zeros_like(trace))
+        """Decide on one trace (C, T) of float32; returns the tensors named in `FIELDS`.
+
+        They have no dimension, except the embedding (K, d), which is NaN for a faulty trace.
+        """
+        fault = self.fault(trace)
+        is_sound = fault == 0
+        x = torch.where(is_sound, trace, torch.zeros_like(trace))
         z = self.encoder(x.unsqueeze(0))[0] / self.scale  # (K, d)
-        usual = (self.novelty.scores(x) <= 1.0).all()  # what overflowed to NaN is not
-        known = good & usual
-        distances = (self.places - z[:, :, None]).square().sum(1).amin(0)  # (n,): in its own space it is nearest
-        action, lower, upper, n_success, n_failure = self.counted(distances)
-        verify, empty = torch.zeros_like(action), torch.zeros_like(lower)
-        action = torch.where(known, action, verify)
-        certain = torch.where(usual, torch.where(action == 0, UNCERTAIN, CERTAIN), NOVEL)
+        is_usual = (self.novelty.scores(x) <= 1.0).all()  # False for what overflowed to NaN
+        is_counted = is_sound & is_usual
+        # (n,): a reference is nearest in its own space
+        distances = (self.points - z[:, :, None]).square().sum(1).amin(0)
+        action, lower, upper, n_success, n_failure = self.count(distances)
+        zero = torch.zeros_like(action)
+        empty = torch.zeros_like(lower)
+        action = torch.where(is_counted, action, zero)
+        certainty = torch.where(action == 0, UNCERTAIN, CERTAIN)
+        reason = torch.where(is_usual, certainty, NOVEL)
         return (
             action,
-            torch.where(good, certain, fault),
-            torch.where(known, lower, empty),
-            torch.where(known, upper, empty + 1.0),
-            torch.where(known, n_success, verify),
-            torch.where(known, n_failure, verify),
-            torch.where(good, z, float("nan")),
+            torch.where(is_sound, reason, fault),
+            torch.where(is_counted, lower, empty),
+            torch.where(is_counted, upper, empty + 1.0),
+            torch.where(is_counted, n_success, zero),
+            torch.where(is_counted, n_failure, zero),
+            torch.where(is_sound, z, float("nan")),
         )
 
-    def counted(self, distances: Tensor) -> tuple[Tensor, ...]:
-        """action, lower, upper, n_success, n_failure of (n,) squared distances, as of `RadiusNeighbours`."""
-        inside = distances <= self.radius * self.radius
-        n_success = (inside & (self.success == 1)).to(torch.int64).sum()
-        n_failure = (inside & (self.success == 0)).to(torch.int64).sum()
-        lower, upper = ARRAY_LIMITS[self.rule.interval](torch, n_success.double(), n_failure.double(), self.rule.z)
-        accepts, rejects = lower >= self.rule.accept_threshold, upper <= self.rule.reject_threshold
-        return torch.where(accepts, 1, torch.where(rejects, 2, 0)), lower, upper, n_success, n_failure
+    def fault(self, trace: Tensor) -> Tensor:
+        """Return the position in `Reason` of a trace's fault, () int64, as `TraceGate` does."""
+        low = trace.min()
+        high = trace.max()
+        is_finite = (trace.abs() < float("inf")).all()
+        highest = torch.maximum(high, -low)
+        too_large = torch.where(highest > LARGEST, TOO_LARGE, 0)
+        out_of_range = torch.where(highest >= self.limit, SATURATED, too_large)
+        fault = torch.where(low == high, CONSTANT, out_of_range)
+        return torch.where(is_finite, fault, NOT_FINITE)
+
+    def count(self, distances: Tensor) -> tuple[Tensor, ...]:
+        """Return action, lower, upper, n_success and n_failure, as `RadiusNeighbours` does.
+
+        `distances` are the squared distances to the references, (n,).
+        """
+        is_inside = distances <= self.radius * self.radius
+        n_success = (is_inside & (self.labels == 1)).to(torch.int64).sum()
+        n_failure = (is_inside & (self.labels == 0)).to(torch.int64).sum()
+        limits = ARRAY_LIMITS[self.rule.interval]
+        lower, upper = limits(torch, n_success.double(), n_failure.double(), self.rule.z)
+        rejects = torch.where(upper <= self.rule.reject_threshold, 2, 0)
+        action = torch.where(lower >= self.rule.accept_threshold, 1, rejects)
+        return action, lower, upper, n_success, n_failure
 
 
-def _to_onnx(twin: Twin, spec: TraceSpec) -> Any:
-    """By way of torch.export, which does not need TorchScript; silent on every package that it could use and need not."""
-    example = (torch.linspace(-1.0, 1.0, spec.channels * spec.samples).reshape(spec.channels, spec.samples),)
+def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
+    """Return the ONNX program of a decision; ExportError if torch makes none.
+
+    It goes by torch.export, which does not need TorchScript, and silences notices of all packages
+    that it could use and need not.
+    """
+    ramp = torch.linspace(-1.0, 1.0, spec.channels * spec.samples)
+    example = (ramp.reshape(spec.channels, spec.samples),)
     options: dict[str, Any] = {"dynamo": True, "opset_version": OPSET, "verbose": False}
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            program = torch.onnx.export(twin, example, input_names=["trace"], output_names=list(FIELDS), **options)
+            program = torch.onnx.export(
+                decision, example, input_names=["trace"], output_names=list(FIELDS), **options
+            )
     finally:
         logging.disable(level)
     if program is None:
@@ -197,21 +295,29 @@ def _to_onnx(twin: Twin, spec: TraceSpec) -> Any:
     return program.model_proto
 
 
-def _check(found: OnnxModel, model: Any, spec: TraceSpec) -> None:
-    """Hold the file against the model that answers, on random traces of every size."""
+def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None:
+    """Compare an ONNX model with the model that answers, on random traces of every size.
+
+    Raises ExportError if they differ by more than another order of additions explains.
+    """
     rng = np.random.default_rng(0)
-    shape = (CHECKED, spec.channels, spec.samples)
-    X = (rng.normal(size=shape) * 10.0 ** rng.uniform(-2, 2, (CHECKED, 1, 1))).astype(np.float32)
-    X = X if spec.limit is None else np.clip(X, -0.9 * spec.limit, 0.9 * spec.limit)
-    for one, known in zip(found.decide_many(X), model.predict_many(X), strict=True):
-        near = np.allclose(one.embedding, known.embedding, rtol=TOLERANCE, atol=TOLERANCE)
-        moved = abs(one.n_success - known.n_success) + abs(one.n_failure - known.n_failure)
-        apart = abs(one.lower - known.lower) + abs(one.upper - known.upper)
-        if not near or moved > EDGE or (moved == 0 and (one.action != known.action or apart > BOUND_TOLERANCE)):
-            raise ExportError(f"onnxruntime does not decide as the model does: {one} for {known}; export torchscript.")
+    shape = (N_CHECKED, spec.channels, spec.samples)
+    scales = 10.0 ** rng.uniform(-2, 2, (N_CHECKED, 1, 1))
+    X = (rng.normal(size=shape) * scales).astype(np.float32)
+    if spec.limit is not None:
+        X = np.clip(X, -0.9 * spec.limit, 0.9 * spec.limit)
+    for got, expected in zip(onnx_model.decide_many(X), model.predict_many(X), strict=True):
+        is_near = np.allclose(got.embedding, expected.embedding, rtol=TOLERANCE, atol=TOLERANCE)
+        n_moved = abs(got.n_success - expected.n_success) + abs(got.n_failure - expected.n_failure)
+        difference = abs(got.lower - expected.lower) + abs(got.upper - expected.upper)
+        same_counts = got.action == expected.action and difference <= BOUND_TOLERANCE
+        if not is_near or n_moved > N_AT_EDGE or (n_moved == 0 and not same_counts):
+            problem = f"onnxruntime does not decide as the model does: {got} for {expected}"
+            raise ExportError(f"{problem}; export torchscript.")
 
 
-def _package(name: str) -> ModuleType:
+def _import_package(name: str) -> ModuleType:
+    """Import one of the packages in `NEEDED`; ExportError if any of them is missing."""
     missing = [needed for needed in NEEDED if find_spec(needed) is None]
     if missing:
         raise ExportError(f"ONNX needs {', '.join(missing)}; pip install dengine[onnx].")
