@@ -364,11 +364,11 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
         `count(n)` records n finished steps, moves the bar, and raises StepInterruptedError if a
         signal has arrived.
     """
+    from ..serve.retraining import END_SIGNALS
+
     interrupted = False
     n_done = 0
-    names = ("SIGINT", "SIGTERM", "SIGBREAK")
-    signals = [number for number in signal.Signals if number.name in names]
-    previous = {number: signal.getsignal(number) for number in signals}
+    previous = {number: signal.getsignal(number) for number in END_SIGNALS}
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal interrupted

@@ -167,10 +167,10 @@ def _open_engine(
 ) -> "DataEngine":
     """Open or create the engine that the server drives; it logs when safe mode begins or ends."""
     from ..engine.engine import DataEngine
-    from ..serve.server import tell_safe_mode
+    from ..serve.server import log_safe_mode
 
     engine = DataEngine.open_or_create(
-        store, seed, executor=executor, on_safe_mode=tell_safe_mode, **settings
+        store, seed, executor=executor, on_safe_mode=log_safe_mode, **settings
     )
     if shadow:
         engine.set_shadow(True, "dengine serve --shadow")

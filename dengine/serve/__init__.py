@@ -1,1 +1,1 @@
-"""The cell's front: one engine behind HTTP, XML-RPC and OPC UA, and the page that people look at."""
+"""The server of a cell: one engine behind HTTP, XML-RPC and OPC UA, and the web page."""

@@ -1,7 +1,9 @@
-"""The one schema of the server: what requests and answers hold, how they are read and written, and their OpenAPI document.
+"""Requests, responses and the OpenAPI document of the HTTP interface.
 
-A request holds what the function takes that answers it, and is read strictly by msgspec; answers are derived from dengine's
-records. JSON has no NaN: a sample that is null is one that the sensor did not give, a number that is not finite is null.
+A request has the parameters of the function that handles it, and is read strictly by msgspec. A
+response has the fields of a record of dengine. The OpenAPI document is derived from the same types;
+what a field means is said by `msgspec.Meta` at its type. JSON has no NaN: in a request, null is a
+sample that the sensor did not give; in a response, a number that is not finite.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, cached_property, reduce
 from http import HTTPStatus
-from inspect import Parameter, signature
+from inspect import Parameter, getdoc, signature
 from operator import or_
 from types import UnionType
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -44,230 +46,352 @@ from ..history.status import Course, Status
 from ..records import Action, Decision
 from ..representation import to_jsonable
 from ..store.records import Correction, Event, StoredDecision, StoredVersion, VersionError
-from .service import Told
+from .service import ReportResponse
 
 log = logging.getLogger("dengine")
 T = TypeVar("T")
 Json = dict[str, Any]
-JSON, RAW, MSGPACK = "application/json", "application/octet-stream", "application/msgpack"
+JSON = "application/json"
+RAW = "application/octet-stream"
+MSGPACK = "application/msgpack"
 PROBLEM = "application/problem+json"
-LATER = (429, 503)
-RETRY_AFTER = 1  # seconds
-NO_ROUTE = {404: "Expected one of the paths in /openapi.json, got another.", 405: "Expected another method on this path."}
-DECODERS: Mapping[str, Callable[..., Any]] = {JSON: msgspec.json.decode, MSGPACK: msgspec.msgpack.decode}
-STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # of a JSON object; those before a colon are its keys
-FIELD = re.compile(r"(?:^ *|  )((?:\w+, )*\w+) : ", re.MULTILINE)  # "name, name : what it is", in a docstring
+RETRY_LATER = (HTTPStatus.TOO_MANY_REQUESTS, HTTPStatus.SERVICE_UNAVAILABLE)
+RETRY_SECONDS = 1
+NO_ROUTE = {
+    404: "Expected one of the paths in /openapi.json, got another.",
+    405: "Expected another method on this path.",
+}
+DECODERS: Mapping[str, Callable[..., Any]] = {
+    JSON: msgspec.json.decode,
+    MSGPACK: msgspec.msgpack.decode,
+}
+STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # in JSON; a key is followed by a colon
 REF = "#/components/schemas/{name}"
-FEWEST, WILD, SOME = 32, 1e9, 0.025  # words, times the largest of the others, and the share that is so: of float64
-PROBLEMATIC = {PROBLEM: {"schema": {"$ref": REF.format(name="Problem")}}}
-
-# What is asked
-
 Samples = list[float | list[float | None] | None]
 
+# Bytes are taken for float64 from so many words on, if this share of all words are low halves that
+# are larger, by this factor, than the largest high half.
+MIN_WORDS = 32
+LARGE_FACTOR = 1e9
+LARGE_SHARE = 0.025
 
-class Refusal(Exception):  # noqa: N818  # it is an answer, not a fault
-    """A request that is not served. status : of HTTP.  detail : what was expected, what came, what to do."""
+# Requests
+
+
+class Refusal(Exception):  # noqa: N818  # a response, not an error
+    """A request that is not served.
+
+    Parameters
+    ----------
+    status : int
+        HTTP status.
+    detail : str
+        What was expected, what came, what to do.
+    headers : mapping, optional
+        Further headers of the response.
+    """
 
     def __init__(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(detail)
-        self.status, self.detail, self.headers = status, detail, dict(headers or {})
+        self.status = status
+        self.detail = detail
+        self.headers = dict(headers or {})
 
 
-def fields_of(record: type, *without: str) -> Json:
-    """The types of a record's fields but for some."""
-    return {name: kind for name, kind in get_type_hints(record).items() if name not in without}
+def field_types(record: type, *without: str) -> Json:
+    """Return the types of a record's fields by name, without some of them."""
+    hints = get_type_hints(record)
+    return {name: hint for name, hint in hints.items() if name not in without}
 
 
-def _taken(run: Callable[..., Any], fields: Json) -> type[Struct]:
-    """What a function takes, and fields that may be left out, as a struct; `id_` is `id` in a request."""
-    hints, members = get_type_hints(run, include_extras=True), list[tuple[Any, ...]]()
-    for name, each in signature(run).parameters.items():
-        if each.kind is not Parameter.VAR_KEYWORD:
-            members.append((name, hints[name], *([] if each.default is Parameter.empty else [each.default])))
-    members += [(name, kind | UnsetType, UNSET) for name, kind in fields.items()]
-    rules: Json = {"forbid_unknown_fields": True, "kw_only": True, "rename": lambda name: name.rstrip("_")}
-    return msgspec.defstruct(f"{run.__name__.capitalize()}Request", members, namespace={"__doc__": run.__doc__}, **rules)
+def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[Struct]:
+    """Return a struct type of a handler's parameters and of further fields that may be left out.
+
+    The parameter `id_` is the field `id`.
+    """
+    hints = get_type_hints(handler, include_extras=True)
+    members: list[tuple[Any, ...]] = []
+    for name, parameter in signature(handler).parameters.items():
+        if parameter.kind is Parameter.VAR_KEYWORD:
+            continue
+        if parameter.default is Parameter.empty:
+            members.append((name, hints[name]))
+        else:
+            members.append((name, hints[name], parameter.default))
+    members += [(name, hint | UnsetType, UNSET) for name, hint in optional_fields.items()]
+    return msgspec.defstruct(
+        f"{handler.__name__.capitalize()}Request",
+        members,
+        namespace={"__doc__": handler.__doc__},
+        forbid_unknown_fields=True,
+        kw_only=True,
+        rename=lambda name: name.rstrip("_"),
+    )
 
 
 def media_type(request: Request) -> str:
-    """What a request says that its body is, without parameters; "" where it says nothing."""
+    """Return the media type of a request's body without parameters; "" without one."""
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def read_body(request: Request, kind: type[T], *others: str) -> T:
-    """A request's body as a struct. Refusal: 415 for another media type, 400 for what is none, 422 for other fields."""
+async def read_body(request: Request, struct_type: type[T], *other_types: str) -> T:
+    """Decode a request's JSON or MessagePack body into a struct.
+
+    Raises Refusal: 415 for another media type, whose text also names `other_types`; 400 for a body
+    that cannot be decoded; 422 for wrong fields.
+    """
     media = media_type(request)
     if media not in DECODERS:
-        taken = ", ".join((*DECODERS, *others))
-        raise Refusal(415, f"Expected a body of {taken}, got {shortened(media)}.", {"Accept": taken})
+        accepted = ", ".join((*DECODERS, *other_types))
+        raise Refusal(
+            415,
+            f"Expected a body of {accepted}, got {shortened(media)}.",
+            {"Accept": accepted},
+        )
     body = await request.body()
     try:
-        found: T = DECODERS[media](body, type=kind)
+        decoded: T = DECODERS[media](body, type=struct_type)
     except msgspec.ValidationError as error:
         raise Refusal(422, f"{error}.") from error
     except (ValueError, RecursionError) as error:
         raise Refusal(400, f"Expected {media}: {error}.") from error
-    if _keys(media, body) != len(DECODERS[media](body, type=dict[str, msgspec.Raw])):
+    # msgspec takes the last of two equal keys.
+    if _count_keys(media, body) != len(DECODERS[media](body, type=dict[str, msgspec.Raw])):
         raise Refusal(400, "Expected each name once, got one twice.")
-    return found
+    return decoded
 
 
-def _keys(media: str, body: bytes) -> int:
-    """How many keys an object has that holds no other; msgspec lets the last of two equal ones count."""
+def _count_keys(media: str, body: bytes) -> int:
+    """Return how many keys an encoded object without objects in it has, repeated ones included."""
     if media == JSON:
         return sum(map(bool, STRINGS.findall(body)))
-    return body[0] & 0x0F if body[0] < 0xDE else int.from_bytes(body[1 : 3 if body[0] == 0xDE else 5])
+    if body[0] < 0xDE:  # a fixmap: its size stands in the first byte
+        return body[0] & 0x0F
+    return int.from_bytes(body[1 : 3 if body[0] == 0xDE else 5])
 
 
-def read_query(request: Request, kind: type[T], **body: bytes) -> T:
-    """A request's query, what its path names, and a raw body, as a struct; Refusal for another name, or a wrong value."""
+def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
+    """Convert a request's query, the parts of its path, and a raw body, into a struct.
+
+    Raises Refusal for an unknown or repeated name, and a wrong value.
+    """
     pairs = [*request.query_params.multi_items(), *request.path_params.items(), *body.items()]
     try:
         if len(dict(pairs)) < len(pairs):
             raise ValueError("Expected each name of the query once")
-        return msgspec.convert(dict(pairs), kind, strict=False)
+        return msgspec.convert(dict(pairs), struct_type, strict=False)
     except ValueError as error:
         raise Refusal(422, f"{error}, in the query.") from error
 
 
 def as_samples(value: Any, channels: int = 1) -> NDArray[np.float32]:
-    """A trace, (T,) or (channels, T); TraceError for anything else.
+    """Convert a trace as clients send it to an array.
 
-    value : raw float32, little-endian, so many channels one after another; a list of numbers; or one of such lists, a
-        channel each. None becomes NaN, and a number beyond float32 an infinity, both of which are found and reported.
+    Parameters
+    ----------
+    value : bytes, list of float, or list of list of float
+        Bytes are raw float32, little-endian, channel after channel. A nested list has a list for
+        each channel. None becomes NaN, and a number beyond float32 infinity; the engine recognizes
+        both.
+    channels : int
+        Of bytes.
+
+    Returns
+    -------
+    array of float32, shape (T,) or (channels, T)
+
+    Raises
+    ------
+    TraceError
+        For anything else, for no samples, and for bytes that look like float64.
     """
     if isinstance(value, bytes):
         if len(value) % (4 * channels):
-            held = f"float32, little-endian, channel after channel, {channels} of them"
-            raise TraceError(f"Expected {held}, got {len(value)} bytes.")
+            form = f"float32, little-endian, channel after channel, {channels} of them"
+            raise TraceError(f"Expected {form}, got {len(value)} bytes.")
         words = np.frombuffer(value, dtype="<f4")
-        if _are_halves(words):
-            got = f"{len(value)} bytes, twice as many bytes as float32 takes: float64?"
-            raise TraceError(f"Expected raw float32, little-endian, got {got} Convert the trace to float32.")
-        x = words.reshape(channels, -1)
+        if _look_like_float64(words):
+            raise TraceError(
+                f"Expected raw float32, little-endian, got {len(value)} bytes, twice as many bytes "
+                "as float32 takes: float64? Convert the trace to float32."
+            )
+        samples = words.reshape(channels, -1)
     else:
         try:
             with np.errstate(over="ignore"):
-                x = np.array(msgspec.convert(value, Samples), dtype=np.float64).astype(np.float32)
+                wide = np.array(msgspec.convert(value, Samples), dtype=np.float64)
+                samples = wide.astype(np.float32)
         except (ValueError, OverflowError) as error:
-            raise TraceError("Expected numbers in a list, or a list of such lists of one length for channels.") from error
-    if not x.size:
+            raise TraceError(
+                "Expected numbers in a list, or a list of such lists of one length for channels."
+            ) from error
+    if not samples.size:
         raise TraceError("Expected at least one sample, got none.")
-    return x
+    return samples
 
 
-def _are_halves(words: NDArray[np.float32]) -> bool:
-    """Whether these are numbers of float64, read as float32: every other word is the end of a fraction, or nothing."""
-    if len(words) % 2 or len(words) < FEWEST:
+def _look_like_float64(words: NDArray[np.float32]) -> bool:
+    """Return whether words read as float32 are more likely halves of float64 numbers.
+
+    The low halves are then the ends of fractions: bits at random, or zeros.
+    """
+    if len(words) % 2 or len(words) < MIN_WORDS:
         return False
-    low, high = words[0::2], words[1::2]
-    if not low.view(np.uint32).any():  # whole numbers, or halves
+    low = words[0::2]
+    high = words[1::2]
+    if not low.view(np.uint32).any():  # whole numbers, or halves of them
         return bool(high.view(np.uint32).any())
     low = low[np.isfinite(low)]
-    most = float(np.abs(high[np.isfinite(high)]).max(initial=1.0))
-    n_wild = int((np.abs(low) > WILD * most).sum())
-    return n_wild >= SOME * len(words)
+    largest = float(np.abs(high[np.isfinite(high)]).max(initial=1.0))
+    n_large = int((np.abs(low) > LARGE_FACTOR * largest).sum())
+    return n_large >= LARGE_SHARE * len(words)
 
 
-# What is answered
+# Responses
 
 
-def _answer(name: str, about: str, record: type | None = None, without: tuple[str, ...] = (), **more: Any) -> type[Struct]:
-    """The type of an answer: the fields of a record as JSON has them but for some, and more of them."""
-    kinds = {key: kind for key, kind in _members(record).items() if key not in without} if record else {}
-    doc = f"{about}\n{record.__doc__ if record else ''}"
-    return msgspec.defstruct(name, (kinds | more).items(), namespace={"__doc__": doc}, kw_only=True)
+def _response_type(
+    name: str, about: str, record: type | None = None, without: tuple[str, ...] = (), **more: Any
+) -> type[Struct]:
+    """Return a struct type of a record's fields as JSON has them, without some, and of more fields.
+
+    Its description is `about` and the record's docstring.
+    """
+    members = _members(record) if record else {}
+    types = {key: hint for key, hint in members.items() if key not in without}
+    docs = [about, (getdoc(record) or "") if record else ""]
+    doc = "\n\n".join(filter(None, docs))
+    return msgspec.defstruct(name, (types | more).items(), namespace={"__doc__": doc}, kw_only=True)
 
 
 def _members(record: type) -> Json:
-    """A record's fields as `plain` gives them: without those that stand apart, and with those of one that is flat."""
-    hints, found = get_type_hints(record), dict[str, Any]()
-    for each in fields(record):
-        if "flat" in each.metadata:
-            found |= _members(hints[each.name])
-        elif "apart" not in each.metadata:
-            found[each.name] = _shape(hints[each.name])
-    return found
+    """Return the types of a record's fields, under the names that `to_jsonable` gives them.
+
+    Fields that are marked "apart" are left out; one marked "flat" gives its own fields.
+    """
+    hints = get_type_hints(record)
+    members: Json = {}
+    for field_ in fields(record):
+        if "flat" in field_.metadata:
+            members |= _members(hints[field_.name])
+        elif "apart" not in field_.metadata:
+            members[field_.name] = _json_type(hints[field_.name])
+    return members
 
 
 @cache
-def _shape(kind: Any) -> Any:
-    """A type as JSON has it; a number that is not finite is null."""
-    if isinstance(kind, type) and is_dataclass(kind):
-        return _answer(kind.__name__, "", kind)
-    if isinstance(kind, UnionType):
-        return reduce(or_, map(_shape, get_args(kind)))
-    if get_origin(kind) in (list, tuple):
-        return list[_shape(get_args(kind)[0])]  # type: ignore[misc]  # made here
-    return float | None if kind is float else kind
+def _json_type(hint: Any) -> Any:
+    """Return a type as JSON has it: dataclasses as structs, tuples as lists, floats as nullable."""
+    if isinstance(hint, type) and is_dataclass(hint):
+        return _response_type(hint.__name__, "", hint)
+    if isinstance(hint, UnionType):
+        return reduce(or_, map(_json_type, get_args(hint)))
+    if get_origin(hint) in (list, tuple):
+        return list[_json_type(get_args(hint)[0])]  # type: ignore[misc]  # made here
+    return float | None if hint is float else hint
+
+
+def _described(hint: Any, text: str) -> Any:
+    """Return a type with a description for the OpenAPI document."""
+    return Annotated[hint, Meta(description=text)]
 
 
 class Health(Struct):
-    """Whether the engine answers.  store_fault : why the store cannot be written.  waiting : requests in line.
-
-    retrain_fault : that retrains are dropped again and again, and why.
-    """
+    """Whether the engine answers."""
 
     status: Annotated[str, Meta(extra_json_schema={"enum": ["ok", "degraded", "down"]})]
-    store_fault: str
-    retrain_fault: str
-    waiting: int
+    store_fault: Annotated[str, Meta(description="Why the store cannot be written, or empty.")]
+    retrain_fault: Annotated[
+        str, Meta(description="Why retrains are dropped again and again, or empty.")
+    ]
+    waiting: Annotated[int, Meta(description="Requests in the queue.")]
 
 
 class Me(Struct):
-    """Whose token was shown.  name : that the event log gets; "": the one that is said.  operates : else he only looks."""
+    """The owner of the token that a request has."""
 
-    name: str
-    operates: bool
+    name: Annotated[
+        str, Meta(description="For the event log; empty: the author that a request names.")
+    ]
+    operates: Annotated[bool, Meta(description="May report and change; else only read.")]
 
 
 class Problem(Struct):
-    """Why a request is not served, as RFC 9457 has it. A part that got no decision is verified.
-
-    detail : what was expected, what came, what to do.  action : always verify.
-    """
+    """Why a request is not served, as of RFC 9457. A part without a decision is verified."""
 
     title: str
     status: int
-    detail: str
+    detail: Annotated[str, Meta(description="What was expected, what came, what to do.")]
     type: str = "about:blank"
-    action: Action = Action.VERIFY
+    action: Annotated[Action, Meta(description="Always verify.")] = Action.VERIFY
 
 
-LINE = """How the cell is doing.
-
-waiting : requests in line.  late, busy : deadlines exceeded, and requests refused, since the server began.
-deadline : seconds in line, after which the answer is verify.  check_seconds : that a verification takes.
-alarm : what somebody should look at.
-"""
-ARRAYS = """Why a decision came out so.
-
-trace : (channels, samples).  low, median, high : of the band of good parts, likewise; null while there is none.
-bads : the newest bad parts' traces.  corrections : of its label, oldest first.
-"""
-LATE = "late : deadline exceeded in line; recorded as VERIFY.  seconds : from the request to the answer, in the server."
-OLDER = "Newest first.  older : what `before` of the next request says for the ones before these; null: there are none."
-IN_LINE = {"waiting": int, "late": int, "busy": int, "deadline": float, "check_seconds": float}
-HASH, MUCH = ("content_hash",), ("settings", "retrains")  # 64 bits are no JavaScript's; `ever.retrains` counts those
+LINE = {  # attributes of `CellService`
+    "waiting": _described(int, "Requests in the queue."),
+    "late": _described(int, "Decisions past the deadline since the server's start."),
+    "busy": _described(int, "Requests refused because the queue was full, since the start."),
+    "deadline": _described(float, "Seconds in the queue after which a part is verified."),
+    "check_seconds": _described(float, "Duration of a verification."),
+}
 Traces: Any = list[list[float | None]]
-AROUND = {"trace": Traces, **dict.fromkeys(("low", "median", "high"), Traces | None), "bads": list[Traces]}
-Known: Any = _answer("Decision", "trace : where it was asked for.", StoredDecision, HASH, trace=Traces | None)
-SHAPES: dict[type, Any] = {each: list[_shape(each)] for each in (Correction, Event, StoredVersion)}  # type: ignore[misc]
-ANSWERS = {
-    each.__name__: each
-    for each in (
-        _answer("Answer", LATE, Decision, late=bool, seconds=float),
-        _answer("Told", "The label is on the disk.", Told),
-        _answer("Changed", "", Changed),
-        Known,
-        _answer("Decisions", OLDER, decisions=list[Known], older=str | None),
-        _answer("Explanation", ARRAYS, Explanation, **AROUND, corrections=SHAPES[Correction]),
-        _answer("Status", LINE, Status, MUCH, **IN_LINE, alarm=str),
-        _answer("Course", "", Course),
-        _answer("PartMap", "", PartMap),
-        _answer("Events", "Newest first.", events=SHAPES[Event]),
-        _answer("Versions", "Oldest first.", versions=SHAPES[StoredVersion]),
+BAND = {
+    "trace": _described(Traces, "Shape (channels, samples)."),
+    "low": _described(Traces | None, "Lower edge of the band of good parts; null without one."),
+    "median": _described(Traces | None, "Median of the good parts; null without a band."),
+    "high": _described(Traces | None, "Upper edge of the band; null without one."),
+    "bads": _described(list[Traces], "The newest bad parts' traces."),
+}
+LISTS: dict[type, Any] = {
+    record: list[_json_type(record)]  # type: ignore[misc]  # made here
+    for record in (Correction, Event, StoredVersion)
+}
+DecisionResponse: Any = _response_type(
+    "Decision",
+    "A decision with its label.",
+    StoredDecision,
+    without=("content_hash",),  # JavaScript has no integers of 64 bits
+    trace=_described(Traces | None, "Null unless it was requested."),
+)
+RESPONSES = {
+    response.__name__: response
+    for response in (
+        _response_type(
+            "DecideResponse",
+            "The response to a trace.",
+            Decision,
+            late=_described(bool, "The deadline passed; recorded as VERIFY."),
+            seconds=_described(float, "From the request to the response, in the server."),
+        ),
+        _response_type("ReportResponse", "The label is on disk.", ReportResponse),
+        _response_type("Changed", "", Changed),
+        DecisionResponse,
+        _response_type(
+            "Decisions",
+            "Decisions, newest first.",
+            decisions=list[DecisionResponse],
+            older=_described(
+                str | None, "`before` of the request for the next older ones; null: none are left."
+            ),
+        ),
+        _response_type(
+            "Explanation",
+            "Why a decision came out as it did.",
+            Explanation,
+            **BAND,
+            corrections=_described(LISTS[Correction], "Of the label, oldest first."),
+        ),
+        _response_type(
+            "Status",
+            "How the cell is doing.",
+            Status,
+            without=("settings", "retrains"),  # `ever.retrains` counts them
+            **LINE,
+            alarm=_described(str, "What somebody should look at, or empty."),
+        ),
+        _response_type("Course", "", Course),
+        _response_type("PartMap", "", PartMap),
+        _response_type("Events", "Newest first.", events=LISTS[Event]),
+        _response_type("Versions", "Oldest first.", versions=LISTS[StoredVersion]),
         Health,
         Me,
         Problem,
@@ -275,41 +399,51 @@ ANSWERS = {
 }
 
 
-def answer(name: str, record: object = None, **more: Any) -> Json:
-    """An answer: what it has of a record's fields, and more of them."""
-    said = (to_jsonable(record) or {}) | more
-    return {key: said[key] for key in ANSWERS[name].__struct_fields__ if key in said}
+def response_fields(name: str, record: object = None, **more: Any) -> Json:
+    """Return the fields of the response type `name`, from a record and from `more`."""
+    values = (to_jsonable(record) or {}) | more
+    return {key: values[key] for key in RESPONSES[name].__struct_fields__ if key in values}
 
 
-def answered(body: Any, status: int = 200, headers: Mapping[str, str] | None = None, kind: str = JSON) -> Response:
-    """A JSON answer; a number that is not finite is null."""
+def json_response(
+    body: Any, status: int = 200, headers: Mapping[str, str] | None = None, media: str = JSON
+) -> Response:
+    """Return a JSON response; a number that is not finite is null."""
 
     def encoded(value: Any) -> Any:
         return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
-    return Response(msgspec.json.encode(body, enc_hook=encoded), status, headers, kind)
+    return Response(msgspec.json.encode(body, enc_hook=encoded), status, headers, media)
 
 
-def problem(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
-    """The answer of a request that is not served. Whatever is wrong, a part without a decision is verified."""
-    said = ({"Retry-After": str(RETRY_AFTER)} if status in LATER else {}) | dict(headers or {})
+def problem_response(
+    status: int, detail: str, headers: Mapping[str, str] | None = None
+) -> Response:
+    """Return the response to a request that is not served: a `Problem`, on one line, no password.
+
+    It says when to try again if that can help.
+    """
+    retry = {"Retry-After": str(RETRY_SECONDS)} if status in RETRY_LATER else {}
     line = " ".join(without_password(detail).split())
-    return answered(Problem(HTTPStatus(status).phrase, status, line), status, said, PROBLEM)
+    problem = Problem(HTTPStatus(status).phrase, status, line)
+    return json_response(problem, status, retry | dict(headers or {}), PROBLEM)
 
 
-def _refused(request: Request, error: Any) -> Response:
-    """What is not served, by the nearest class of what was raised."""
+def _error_response(request: Request, error: Any) -> Response:
+    """Return the `Problem` of an exception with its status; an unexpected one is logged."""
     if isinstance(error, Refusal):
-        return problem(error.status, error.detail, error.headers)
+        return problem_response(error.status, error.detail, error.headers)
     if isinstance(error, HTTPException):
-        return problem(error.status_code, NO_ROUTE.get(error.status_code, str(error.detail)), error.headers)
-    if isinstance(error, ClientDisconnect):
-        return problem(400, "Expected the whole of the request.")  # which nobody reads
-    for kind, status in STATUSES.items():
-        if isinstance(error, kind):
-            return problem(status, as_options(str(error)))
-    log.error("a request failed: %s %s", request.method, request.scope["path"], exc_info=error)
-    return problem(500, "The server failed at this request; its log says why.")
+        detail = NO_ROUTE.get(error.status_code, str(error.detail))
+        return problem_response(error.status_code, detail, error.headers)
+    if isinstance(error, ClientDisconnect):  # nobody reads it
+        return problem_response(400, "Expected the whole of the request.")
+    for error_type, status in STATUSES.items():
+        if isinstance(error, error_type):
+            return problem_response(status, as_options(str(error)))
+    path = request.scope["path"]
+    log.error("a request failed: %s %s", request.method, path, exc_info=error)
+    return problem_response(500, "The server failed at this request; its log says why.")
 
 
 STATUSES: dict[type[Exception], int] = {  # the first that fits
@@ -322,7 +456,7 @@ STATUSES: dict[type[Exception], int] = {  # the first that fits
     DengineError: 422,
 }
 HANDLERS: Mapping[Any, Callable[[Request, Any], Response]] = dict.fromkeys(
-    (Refusal, HTTPException, ClientDisconnect, *STATUSES, Exception), _refused
+    (Refusal, HTTPException, ClientDisconnect, *STATUSES, Exception), _error_response
 )
 
 # The OpenAPI document
@@ -332,84 +466,101 @@ HANDLERS: Mapping[Any, Callable[[Request, Any], Response]] = dict.fromkeys(
 class Operation:
     """One method on one path.
 
-    run : answers what its parameters name; its docstring says what it does, and what each is.
-    answer : of `ANSWERS`, or a media type.  fields : that `run` takes as well, where they are given.
-    raw : of its parameters, the one that a body of bytes is; the others are a query then.  examples : of the body.
+    Attributes
+    ----------
+    method, path : str
+    handler : callable
+        Called with the request's fields as keyword arguments. Its docstring is the summary.
+    response : str
+        A name in `RESPONSES`, or a media type.
+    optional_fields : dict
+        Types of further fields that the handler takes if they are given.
+    raw_parameter : str
+        The parameter that a body of bytes is; the others are then in the query. "": JSON only.
+    examples : tuple of dict
+        Of the body.
     """
 
     method: str
     path: str
-    run: Callable[..., Awaitable[Json | Response]]
-    answer: str
-    fields: Json = field(default_factory=dict)
-    raw: str = ""
+    handler: Callable[..., Awaitable[Json | Response]]
+    response: str
+    optional_fields: Json = field(default_factory=dict)
+    raw_parameter: str = ""
     examples: tuple[Json, ...] = ()
 
     @cached_property
-    def takes(self) -> type[Struct]:
-        """What stands in the body of a POST, in the query and the path of a GET."""
-        return _taken(self.run, self.fields)
+    def request_type(self) -> type[Struct]:
+        """The fields of a POST's body, or of a GET's query and path."""
+        return _request_type(self.handler, self.optional_fields)
 
     async def serve(self, request: Request) -> Response:
+        """Read a request, call the handler with its fields, and return the response."""
         if self.method == "GET":
-            asked = read_query(request, self.takes)
-        elif self.raw and media_type(request) == RAW:
-            asked = read_query(request, self.takes, **{self.raw: await request.body()})
+            values = read_query(request, self.request_type)
+        elif self.raw_parameter and media_type(request) == RAW:
+            body = {self.raw_parameter: await request.body()}
+            values = read_query(request, self.request_type, **body)
         else:
-            asked = await read_body(request, self.takes, *([RAW] if self.raw else []))
-        given = msgspec.structs.asdict(asked).items()
-        found = await self.run(**{name: value for name, value in given if value is not UNSET})
-        return found if isinstance(found, Response) else answered(found)
+            other_types = [RAW] if self.raw_parameter else []
+            values = await read_body(request, self.request_type, *other_types)
+        given = msgspec.structs.asdict(values).items()
+        result = await self.handler(**{key: value for key, value in given if value is not UNSET})
+        return result if isinstance(result, Response) else json_response(result)
 
-    def described(self, schemas: Json) -> Json:
-        """It, as the document has it. schemas : of all that is asked and answered."""
-        takes, known = schemas[self.takes.__name__], self.answer in ANSWERS
-        schema = {"$ref": REF.format(name=self.answer)} if known else {"type": "string"}
+    def describe(self, schemas: Json) -> Json:
+        """Return the operation as OpenAPI has it; `schemas` has every request type and response."""
+        request_schema = schemas[self.request_type.__name__]
+        is_json = self.response in RESPONSES
+        schema = {"$ref": REF.format(name=self.response)} if is_json else {"type": "string"}
+        media = JSON if is_json else self.response
+        problem = {PROBLEM: {"schema": {"$ref": REF.format(name="Problem")}}}
         responses = {
-            "200": {"description": "Done.", "content": {JSON if known else self.answer: {"schema": schema}}},
-            "default": {"description": "A problem.", "content": PROBLEMATIC},
+            "200": {"description": "Done.", "content": {media: {"schema": schema}}},
+            "default": {"description": "A problem.", "content": problem},
         }
-        said: Json = {"summary": takes["description"], "parameters": [], "responses": responses}
-        if self.method == "GET" or self.raw:
-            for name, kind in takes["properties"].items():
+        parameters: list[Json] = []
+        description: Json = {
+            "summary": request_schema["description"],
+            "parameters": parameters,
+            "responses": responses,
+        }
+        if self.method == "GET" or self.raw_parameter:
+            for name, field_schema in request_schema["properties"].items():
                 place = "path" if f"{{{name}" in self.path else "query"
-                if name != self.raw:
-                    said["parameters"].append({"name": name, "in": place, "required": place == "path", "schema": kind})
+                if name != self.raw_parameter:
+                    required = place == "path"
+                    parameters.append(
+                        {"name": name, "in": place, "required": required, "schema": field_schema}
+                    )
         if self.method == "GET":
-            return said
-        body: Json = {"schema": {"$ref": REF.format(name=self.takes.__name__)}}
-        examples = {"examples": {str(i): {"value": value} for i, value in enumerate(self.examples)}}
-        content = {JSON: body | examples, MSGPACK: body}
-        if self.raw:
-            content[RAW] = {"schema": {"type": "string", "format": "binary", "description": "float32, little-endian."}}
-        return said | {"requestBody": {"required": True, "content": content}}
+            return description
+        body: Json = {"schema": {"$ref": REF.format(name=self.request_type.__name__)}}
+        examples = {str(i): {"value": value} for i, value in enumerate(self.examples)}
+        content = {JSON: body | {"examples": examples}, MSGPACK: body}
+        if self.raw_parameter:
+            text = "float32, little-endian."
+            content[RAW] = {"schema": {"type": "string", "format": "binary", "description": text}}
+        return description | {"requestBody": {"required": True, "content": content}}
 
 
-def _schemas(kinds: Iterable[Any]) -> Json:
-    """The schemas of these types; what a docstring says of a field stands with the field."""
-    _, schemas = msgspec.json.schema_components(list(kinds), ref_template=REF)
-    for schema in schemas.values():
-        about, *told = FIELD.split(schema.get("description", ""))
-        schema["description"] = " ".join(about.split())
-        for names, text in zip(told[::2], told[1::2], strict=True):
-            for name in names.split(", "):
-                if name in schema.get("properties", {}):
-                    schema["properties"][name].setdefault("description", " ".join(text.split()))
-    return schemas
-
-
-def document(operations: Iterable[Operation], version: str) -> Json:
-    """The OpenAPI document of these operations."""
-    schemas, paths = _schemas([*ANSWERS.values(), *(each.takes for each in operations)]), dict[str, Json]()
-    for each in operations:
-        paths.setdefault(each.path.replace(":path", ""), {})[each.method.lower()] = each.described(schemas)
+def openapi_document(operations: Iterable[Operation], version: str) -> Json:
+    """Return the OpenAPI document of these operations."""
+    types = [*RESPONSES.values(), *(operation.request_type for operation in operations)]
+    _, schemas = msgspec.json.schema_components(types, ref_template=REF)
+    paths: dict[str, Json] = {}
+    for operation in operations:
+        path = paths.setdefault(operation.path.replace(":path", ""), {})
+        path[operation.method.lower()] = operation.describe(schemas)
+    schemes = {name: {"type": "http", "scheme": name} for name in ("bearer", "basic")}
     return {
         "openapi": "3.1.0",
-        "info": {"title": "dengine serve", "version": version, "description": "A robot cell's data engine."},
-        "paths": paths,
-        "components": {
-            "schemas": schemas,
-            "securitySchemes": {name: {"type": "http", "scheme": name} for name in ("bearer", "basic")},
+        "info": {
+            "title": "dengine serve",
+            "version": version,
+            "description": "A robot cell's data engine.",
         },
+        "paths": paths,
+        "components": {"schemas": schemas, "securitySchemes": schemes},
         "security": [{}, {"bearer": []}, {"basic": []}],
     }

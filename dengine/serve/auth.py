@@ -26,7 +26,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..errors import SettingError, instead
-from .api import Refusal, problem
+from .api import Refusal, problem_response
 
 log = logging.getLogger("dengine")
 MIN_TOKEN_LENGTH = 16  # characters
@@ -260,7 +260,7 @@ class Guard:
         try:
             self._check(scope)
         except Refusal as refusal:
-            response = problem(refusal.status, refusal.detail, CLOSE | refusal.headers)
+            response = problem_response(refusal.status, refusal.detail, CLOSE | refusal.headers)
             if refusal.status == HTTPStatus.UNAUTHORIZED:
                 # A header of its own: Chromium reads only the first scheme of each.
                 response.headers.append("WWW-Authenticate", 'Bearer realm="dengine"')

@@ -16,9 +16,10 @@ if TYPE_CHECKING:  # both implementations have the names that are used here
 else:  # uses httptools if it is installed, which saves 0.1 ms per request
     from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
-from .api import problem
+from .api import problem_response
 from .auth import LET_IN
 
+CONNECTIONS = 100  # default size of a pool
 MAX_HEAD_BYTES = 1 << 16
 HEAD_SECONDS = 10.0  # from connecting, or the first byte after a response, to the end of the head
 MIN_PER_ADDRESS = 8  # places that one IP address may have, even if that is more than half
@@ -165,7 +166,7 @@ class Connection(AutoHTTPProtocol):
         """Write a response that uvicorn knows nothing of, and close the connection."""
         if self.transport.is_closing():
             return
-        response = problem(status, detail, {"connection": "close"})
+        response = problem_response(status, detail, {"connection": "close"})
         head = b"".join(name + b": " + value + b"\r\n" for name, value in response.raw_headers)
         status_line = f"HTTP/1.1 {status.value} {status.phrase}\r\n".encode("ascii")
         self.transport.write(status_line + head + b"\r\n" + bytes(response.body))

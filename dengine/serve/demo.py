@@ -1,4 +1,8 @@
-"""A cell without a robot: the bundled recordings, decided on through the service as a robot's program would."""
+"""A cell without a robot for `dengine serve --demo`.
+
+It plays the bundled recordings through the service as a robot's program would: insert, ask for a
+decision, report the outcome.
+"""
 
 import asyncio
 import logging
@@ -15,43 +19,62 @@ from ..records import Action, Outcome
 from .service import CellService
 
 log = logging.getLogger("dengine")
-BEFORE = 150  # parts that come at once, but for retrains: no model would be ready before all were verified
-CHECK = 0.4  # of a cycle, after which a verified part's result is there
-READY = 0.05  # seconds between two looks at whether a retrain is done
+N_FAST = 150  # parts that are played without a pause, so that a model is soon ready
+CHECK_SHARE = 0.4  # of a cycle, after which the result of a verification is there
+POLL_SECONDS = 0.05  # between two looks at whether a retrain has ended
 POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 
 
 @asynccontextmanager
-async def playing(service: CellService, data: Any = "insertion", speed: float = 1.0, seed: int = 0) -> AsyncIterator[None]:
-    """Play recordings in a drawn order, beside a server.  speed : parts a second after the first `BEFORE`."""
+async def playing(
+    service: CellService, data: Any = "insertion", speed: float = 1.0, seed: int = 0
+) -> AsyncIterator[None]:
+    """Play recordings in a random order, in a task that lasts as long as the context.
+
+    Parameters
+    ----------
+    service : CellService
+    data : object
+        Anything that `load_dataset` takes.
+    speed : float
+        Parts per second after the first `N_FAST`.
+    seed : int
+        Of the order.
+    """
     cell = ReplayCell(data)
     cell.order = np.random.default_rng(seed).permutation(len(cell.data))
-    driving = asyncio.create_task(drive(service, cell, speed))
+    task = asyncio.create_task(drive(service, cell, speed))
     yield
-    driving.cancel()
-    await asyncio.wait([driving])
+    task.cancel()
+    await asyncio.wait([task])
 
 
 async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
-    """Insert every part of a recording, ask what to do with it, and report what became of it."""
-    loop, run = asyncio.get_running_loop(), uuid.uuid4().hex[:8]
-    due = loop.time()
+    """Insert every part of a recording, ask the service for a decision, and report the outcome.
+
+    An exception is logged and ends the demonstration, not the server.
+    """
+    loop = asyncio.get_running_loop()
+    run = uuid.uuid4().hex[:8]
+    next_start = loop.time()
     try:
         for cycle in range(len(cell.order)):
-            seconds = 0.0 if cycle < BEFORE else 1.0 / speed
-            due = max(due + seconds, loop.time())
-            trace, name = cell.insert(), f"{run}-{cycle + 1}"
+            seconds = 0.0 if cycle < N_FAST else 1.0 / speed
+            next_start = max(next_start + seconds, loop.time())
+            trace = cell.insert()
+            request = f"{run}-{cycle + 1}"
             try:
-                action = (await service.decide(trace, name, f"{cycle + 1:04d}")).decision.action
-            except BusyError:  # as a robot does: the part is verified, and nothing is known of it
+                response = await service.decide(trace, request, f"{cycle + 1:04d}")
+            except BusyError:  # a robot would verify the part, and nothing of it is recorded
                 continue
-            await asyncio.sleep(seconds * CHECK)
+            action = response.decision.action
+            await asyncio.sleep(seconds * CHECK_SHARE)
             stopped = action is Action.ACCEPT and cell.proceed() is Outcome.STOPPED
             if action is Action.VERIFY or stopped:
-                await service.report(name, cell.verify())
-            await asyncio.sleep(due - loop.time())
-            while cycle < BEFORE and service.core.is_retraining:
-                await asyncio.sleep(READY)
+                await service.report(request, cell.verify())
+            await asyncio.sleep(next_start - loop.time())
+            while cycle < N_FAST and service.core.is_retraining:
+                await asyncio.sleep(POLL_SECONDS)
         log.info("all parts of the recording are through; the page stays until Ctrl-C")
     except Exception:
         log.exception("the demonstration stopped")

@@ -1,6 +1,7 @@
-"""HTTP: decide, report, put right, what can be asked of the engine, and the page; the application behind one guard.
+r"""The HTTP interface of a cell, and the Starlette application with XML-RPC and the web page.
 
-curl -d '{"trace": [0.1, 0.3, ...], "request": "order-7"}' -H 'Content-Type: application/json' localhost:8000/decide
+curl -d '{"trace": [0.1, 0.3, ...], "request": "order-7"}' \
+    -H 'Content-Type: application/json' localhost:8000/decide
 app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db"))
 """
 
@@ -40,7 +41,7 @@ from ..records import Action, is_name
 from ..store.records import StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from . import api
-from .api import Json, Operation, Refusal, answer, fields_of
+from .api import Json, Operation, Refusal, field_types, response_fields
 from .auth import CURRENT_TOKEN, Access, Guard
 from .metrics import Metrics
 from .robot_calls import Recorder
@@ -50,20 +51,58 @@ from .xmlrpc import routes as xmlrpc_routes
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
-HUNG = 60.0  # seconds without a sign of the engine's thread, after which the server is not well
-TICK = 5.0  # seconds of quiet, after which who listens is told that the line still stands
-RETRY = 1000  # ms after which a browser that was cut off tries again
-BADS, AMONG = 10, 200  # newest bad parts that an explanation is drawn with, of so many newest labels
+MAX_SILENT = 60.0  # seconds without a sign of the engine's thread, after which the server is down
+TICK = 5.0  # seconds without a change, after which a listener to /changes gets a sign of life
+RECONNECT_MS = 1000  # after which a browser that lost /changes connects again
+N_BADS = 10  # newest bad parts drawn in an explanation
+N_LABELS = 200  # newest labels among which they are looked for
 STATIC = Path(__file__).parent / "page" / "static"
-VIEWS = ("/", "/overview", "/map", "/part", "/history", "/actions")  # one file: its script shows the one that is asked for
-Limit = Annotated[int, Meta(ge=1, le=200)]
-SHORTEST = 0.0003  # hours of a stretch
-Hours = Annotated[float, Meta(ge=0.0, le=1e7)]
+# All are index.html, whose script shows the view of the URL.
+VIEWS = ("/", "/overview", "/map", "/part", "/history", "/actions")
+MIN_SHIFT_HOURS = 0.0003
 Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
+
+# Types of requests' fields
+Id = Annotated[str, Meta(description="Of the decision.")]
+PartNumber = Annotated[
+    str,
+    Meta(description="The part's number, in place of the id, if there is one decision on it."),
+]
+Author = Annotated[
+    str,
+    Meta(
+        description="Who asks, for the event log; may be left out if the token has a name, and "
+        "left out by a robot that reports."
+    ),
+]
+Limit = Annotated[int, Meta(ge=1, le=200, description="How many at most.")]
+ShiftHours = Annotated[
+    float,
+    Meta(ge=0.0, le=1e7, description="Length of a shift, which is then a stretch; 0: no shifts."),
+]
+ShiftStart = Annotated[
+    float, Meta(ge=0.0, le=1e7, description="When a shift begins, in hours since 1970.")
+]
+Batch = Annotated[
+    str,
+    Meta(
+        max_length=9,
+        description="Makes the decisions on one batch a stretch: the number of first characters of "
+        "a part's number that name its batch, or the characters that end the batch's name, as -/.",
+    ),
+]
 
 
 class HttpApi:
-    """What is answered over HTTP; a method's docstring and parameters are what the OpenAPI document says of it."""
+    """The handlers of all HTTP requests.
+
+    A handler's parameters are the request's fields, and its docstring is its summary in the
+    OpenAPI document.
+
+    Parameters
+    ----------
+    service : CellService
+    """
 
     def __init__(self, service: CellService) -> None:
         self.service = service
@@ -72,14 +111,27 @@ class HttpApi:
     @cached_property
     def operations(self) -> list[Operation]:
         """Every path and method."""
-        one: Json = {"trace": [0.1, 1.5, 2.25, None, 0.4], "request": "order-7", "part": "P-1007"}
-        traces = one, {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
-        reports = {"id": "order-7", "success": True}, {"part": "P-1007", "success": False, "author": "Kim"}
-        # A guarantee may be a class by name, and nothing that is asked over the network may have one imported.
-        policy = fields_of(Policy, "guarantee") | {"windows": list[str]}
+        one_channel: Json = {
+            "trace": [0.1, 1.5, 2.25, None, 0.4],
+            "request": "order-7",
+            "part": "P-1007",
+        }
+        two_channels: Json = {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
+        good: Json = {"id": "order-7", "success": True}
+        bad: Json = {"part": "P-1007", "success": False, "author": "Kim"}
+        # A guarantee may name a class, and no request over the network may cause an import.
+        policy = field_types(Policy, "guarantee") | {"windows": list[str]}
+        filter_ = field_types(HistoryFilter, "label")
         return [
-            Operation("POST", "/decide", self.decide, "Answer", raw="trace", examples=traces),
-            Operation("POST", "/report", self.report, "Told", examples=reports),
+            Operation(
+                "POST",
+                "/decide",
+                self.decide,
+                "DecideResponse",
+                raw_parameter="trace",
+                examples=(one_channel, two_channels),
+            ),
+            Operation("POST", "/report", self.report, "ReportResponse", examples=(good, bad)),
             Operation("POST", "/correct", self.correct, "Changed"),
             Operation("POST", "/forget", self.forget, "Changed"),
             Operation("POST", "/rollback", self.rollback, "Changed"),
@@ -87,7 +139,7 @@ class HttpApi:
             Operation("POST", "/retrain", self.retrain, "Changed"),
             Operation("POST", "/export", self.export, "application/zip"),
             Operation("GET", "/status", self.status, "Status"),
-            Operation("GET", "/decisions", self.decisions, "Decisions", fields_of(HistoryFilter, "label")),
+            Operation("GET", "/decisions", self.decisions, "Decisions", filter_),
             Operation("GET", "/decisions/{id:path}", self.decision, "Decision"),
             Operation("GET", "/explanations/{id:path}", self.explanation, "Explanation"),
             Operation("GET", "/course", self.course, "Course"),
@@ -104,209 +156,289 @@ class HttpApi:
 
     async def decide(
         self,
-        trace: bytes | api.Samples,
-        request: str | None = None,
-        part: str | int | None = None,
-        channels: Annotated[int, Meta(ge=1, le=99_999)] = 1,
+        trace: Annotated[
+            bytes | api.Samples,
+            Meta(
+                description="(samples,) or (channels, samples), null for a missing sample; or "
+                "bytes, raw float32, little-endian, channel after channel."
+            ),
+        ],
+        request: Annotated[
+            str | None,
+            Meta(description="The caller's id of this trace, a different one for each trace."),
+        ] = None,
+        part: Annotated[str | int | None, Meta(description="The part's number.")] = None,
+        channels: Annotated[int, Meta(ge=1, le=99_999, description="Of bytes.")] = 1,
     ) -> Json:
-        """Decide on a trace; asked again under its request id, it answers the same. The query is of a raw body alone.
+        """Decide on a trace. The same trace and request id get the same decision.
 
-        trace : (samples,) or (channels, samples), null for a missing sample; or bytes, raw float32, little-endian.
-        request : the caller's id of this trace, once for every trace.  part : the part's number, where one is known.
-        channels : of bytes, one after another.
+        A body of bytes has the other fields in the query.
         """
-        told = await self.service.decide(api.as_samples(trace, channels), request, part)
-        return answer("Answer", told.decision, late=told.late, seconds=told.seconds)
+        samples = api.as_samples(trace, channels)
+        response = await self.service.decide(samples, request, part)
+        return response_fields(
+            "DecideResponse", response.decision, late=response.late, seconds=response.seconds
+        )
 
-    async def report(self, success: bool | float, id_: str = "", part: str = "", author: str = "") -> Json:
-        """Report what became of a part; the label is on the disk when this answers. The same twice is no error.
+    async def report(
+        self,
+        success: Annotated[
+            bool | float,
+            Meta(
+                description="true or 1: good; false or 0: bad, for an accepted part a line stop. "
+                "For a rejected part the result of an inspection."
+            ),
+        ],
+        id_: Id = "",
+        part: PartNumber = "",
+        author: Author = "",
+    ) -> Json:
+        """Report the outcome of a part. The label is on disk when the response comes.
 
-        id : of the decision.  part : its number in the place of that, where there is one decision of it; or the id.
-        success : true, or 1: good; false, or 0: bad, of an accepted part that came back a system stop. Of a rejected part
-            that was looked at afterwards it is an inspection.
-        author : who says so, for the event log, where the token has no name; a robot leaves it out.
+        The same report twice is no error.
         """
-        by = _name(author) if author or CURRENT_TOKEN.get().name else ""
-        return answer("Told", await self.service.report(await self._of(id_, part), success, by))
+        checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
+        decision_id = await self._find_id(id_, part)
+        response = await self.service.report(decision_id, success, checked)
+        return response_fields("ReportResponse", response)
 
-    async def _of(self, id_: str, part: str) -> str:
+    async def _find_id(self, id_: str, part: str) -> str:
+        """Return the id of a decision, given by its id or its part; Refusal for both or neither."""
         if bool(id_) == bool(part):
             raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")
-        return id_ or await self.service.look(lambda store: find_decision_id(store, part))
+        return id_ or await self.service.read(lambda store: find_decision_id(store, part))
 
-    async def correct(self, success: bool, id_: str = "", part: str = "", author: str = "") -> Json:
-        """Put a label right, from the next decision on; what was reported stays on record.
+    async def correct(
+        self,
+        success: Annotated[bool, Meta(description="The right label.")],
+        id_: Id = "",
+        part: PartNumber = "",
+        author: Author = "",
+    ) -> Json:
+        """Correct a label, from the next decision on. What was reported stays on record."""
+        decision_id = await self._find_id(id_, part)
+        return await self._change(
+            author, lambda engine, by: engine.correct(decision_id, success, by)
+        )
 
-        success : what it counts as from now on.  id, part : of the decision, as in /report.
-        author : who asks, for the event log.
-        """
-        found = await self._of(id_, part)
-        return await self._change(author, lambda engine, by: engine.correct(found, success, by))
+    async def forget(
+        self,
+        ids: Annotated[list[str], Meta(description="Of the decisions.")],
+        author: Author = "",
+        reason: Annotated[str, Meta(description="For the event log.")] = "",
+    ) -> Json:
+        """Leave labels out of training and of all counts. /correct takes one in again."""
+        line = " ".join(reason.split())
+        return await self._change(
+            author, lambda engine, by: engine.forget(*ids, author=by, reason=line)
+        )
 
-    async def forget(self, ids: list[str], author: str = "", reason: str = "") -> Json:
-        """Leave labels out of all that is learned and counted; /correct brings one back.
-
-        ids : of the decisions.  author, reason : for the event log.
-        """
-        why = " ".join(reason.split())
-        return await self._change(author, lambda engine, by: engine.forget(*ids, author=by, reason=why))
-
-    async def rollback(self, version: int, author: str = "") -> Json:
-        """Let an earlier version answer again, as a new version.
-
-        version : its number, as /versions lists it.  author : who asks, for the event log.
-        """
+    async def rollback(
+        self,
+        version: Annotated[int, Meta(description="Its number, as /versions lists it.")],
+        author: Author = "",
+    ) -> Json:
+        """Let an earlier version of the model decide again, as a new version."""
         return await self._change(author, lambda engine, by: engine.rollback(version, by))
 
-    async def policy(self, author: str = "", **changes: Any) -> Json:
-        """Decide by other settings from the next decision on; with shadow, verify every part, or end that."""
-        return await self._change(author, lambda engine, by: engine.set_policy(replace(engine.policy, **changes), by))
+    async def policy(self, author: Author = "", **changes: Any) -> Json:
+        """Change settings of the policy, from the next decision on; shadow verifies every part."""
+        return await self._change(
+            author, lambda engine, by: engine.set_policy(replace(engine.policy, **changes), by)
+        )
 
-    async def retrain(self, author: str = "") -> Json:
-        """Begin a retrain on all labels known by now, where none is under way."""
+    async def retrain(self, author: Author = "") -> Json:
+        """Begin a retrain on all labels, unless one is under way."""
 
         def begin(engine: DataEngine, by: str) -> Changed:
-            if core_of(engine).is_retraining:
-                return Changed("retrain", "A retrain is under way already; nothing changed.", None, engine.version)
+            core = core_of(engine)
+            if core.is_retraining:
+                text = "A retrain is under way already; nothing changed."
+                return Changed("retrain", text, None, engine.version)
             engine.store.put_event("retrain", "asked for by hand", author=by)
-            core_of(engine).start_retrain()
-            return Changed("retrain", "The retrain has begun.", engine.store.events(1)[-1].number, engine.version)
+            core.start_retrain()
+            event = engine.store.events(1)[-1]
+            return Changed("retrain", "The retrain has begun.", event.number, engine.version)
 
         return await self._change(author, begin)
 
-    async def export(self, author: str = "") -> Response:
-        """The model that answers now, as a TorchScript file with its checksum, in an archive.
+    async def export(self, author: Author = "") -> Response:
+        """Download the model that decides now: a TorchScript file and its checksum, in a zip.
 
-        An accepted part that waits for its confirmation is not in it: that stays with the engine.
+        An accepted part that waits for its confirmation is not part of it.
         """
 
-        def copied(engine: DataEngine) -> Exportable:
-            found = core_of(engine).exported()
-            return replace(found, model=copy.deepcopy(found.model))  # the engine goes on learning meanwhile
+        def copy_model(engine: DataEngine) -> Exportable:
+            exported = core_of(engine).exported()
+            # The engine goes on learning while the copy is exported.
+            return replace(exported, model=copy.deepcopy(exported.model))
 
-        by, source = _name(author), await self.service.ask(copied)
-        content = await asyncio.to_thread(_packed, source)
-        told = f"version {source.model_version} was downloaded"
-        await self.service.ask(lambda engine: engine.store.put_event("export", told, author=by))
-        headers = {"Content-Disposition": f'attachment; filename="model_{source.model_version}.zip"'}
+        by = _checked_author(author)
+        source = await self.service.call(copy_model)
+        content = await asyncio.to_thread(_zip_export, source)
+        text = f"version {source.model_version} was downloaded"
+        await self.service.call(lambda engine: engine.store.put_event("export", text, author=by))
+        name = f"model_{source.model_version}.zip"
+        headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/zip", headers=headers)
 
-    async def status(self, last: Annotated[int, Meta(ge=1, le=100_000)] = NEWEST, watch: bool = False) -> Json:
-        """How the cell is doing.
+    async def status(
+        self,
+        last: Annotated[
+            int,
+            Meta(ge=1, le=100_000, description="Number of newest decisions counted as `newest`."),
+        ] = NEWEST,
+        watch: Annotated[
+            bool, Meta(description="Include the state of the safe mode's detectors.")
+        ] = False,
+    ) -> Json:
+        """Return how the cell is doing."""
+        status = await self.service.status(last, watch)
+        line = {name: getattr(self.service, name) for name in api.LINE}
+        return response_fields("Status", status, alarm=status.alarm, **line)
 
-        last : the newest so many decisions are looked at apart.  watch : how far the safe mode's detectors are, too.
-        """
-        found, service = await self.service.status(last, watch), self.service
-        line = {name: getattr(service, name) for name in api.IN_LINE}
-        return answer("Status", found, alarm=found.alarm, **line)
-
-    async def decision(self, id_: str, trace: bool = False) -> Json:
-        """One decision with its label.  trace : with its samples too."""
-        known = await self._known(id_)
-        return answer("Decision", known, trace=known.trace if trace else None)
+    async def decision(
+        self,
+        id_: Id,
+        trace: Annotated[bool, Meta(description="Include its samples.")] = False,
+    ) -> Json:
+        """Return one decision with its label."""
+        stored = await self._find(id_)
+        return response_fields("Decision", stored, trace=stored.trace if trace else None)
 
     async def decisions(
         self,
         label: Literal["good", "bad", "none"] | None = None,
-        open_: bool = False,
+        open_: Annotated[
+            bool, Meta(description="Only verified parts whose result was not reported.")
+        ] = False,
         limit: Limit = 20,
-        before: str = "",
+        before: Annotated[
+            str,
+            Meta(description="Only decisions older than this id, `older` of the last response."),
+        ] = "",
         **where: Any,
     ) -> Json:
-        """Decisions, newest first; with open=true verified ones that wait for a label.
+        """Return decisions, newest first.
 
-        limit : how many at most.  before : older ones than this one, by its id, as the answer before said it, `older`.
-        since, until : times in seconds, the first included, the last not.
-        predicted : what the model alone would have done.  part : its number.
+        since and until are times in seconds since 1970; the first is included, the last is not.
+        predicted is what the model alone would have done. part is a part's number.
         """
-        asked, beyond = HistoryFilter(label=label, **where), (await self._known(before)).decision.id if before else None
-        found = await self.service.look(lambda store: _newest(store, asked, limit, beyond, open_))
-        older = found[-1].decision.id if len(found) == limit else None
-        return {"decisions": [answer("Decision", each, trace=None) for each in found], "older": older}
+        selection = HistoryFilter(label=label, **where)
+        before_id = (await self._find(before)).decision.id if before else None
+        stored = await self.service.read(
+            lambda store: _read_newest(store, selection, limit, before_id, open_)
+        )
+        return {
+            "decisions": [response_fields("Decision", item, trace=None) for item in stored],
+            "older": stored[-1].decision.id if len(stored) == limit else None,
+        }
 
-    async def explanation(self, id_: str) -> Json:
-        """Why a decision came out as it did, with its trace, the band of good parts, and some bad ones.
+    async def explanation(
+        self, id_: Annotated[str, Meta(description="Of the decision, or its part's number.")]
+    ) -> Json:
+        """Explain a decision, with its trace, the band of good parts, and some bad parts."""
+        return await self.service.read(lambda store: _read_explanation(store, id_))
 
-        id : of the decision, or its part's number.
+    async def course(
+        self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0, batch: Batch = ""
+    ) -> Json:
+        """Return counts of the decisions in stretches, and the retrains and safe modes meanwhile.
+
+        A stretch is a shift, a batch, or without these a share of the decisions.
         """
-        return await self.service.look(lambda store: _explained(store, id_))
-
-    async def course(self, hours: Hours = 0.0, start: Hours = 0.0, batch: Annotated[str, Meta(max_length=9)] = "") -> Json:
-        """How decisions went from the first to the newest, in stretches, and the retrains and safe modes meanwhile.
-
-        hours : of a shift, which is a stretch then, the newest of them, or 0; start : when one begins, in hours since 1970.
-        batch : likewise what parts' numbers begin with: so many characters, or up to the last of these, "-/".
-        """
-        whole = hours == 0.0 or hours >= SHORTEST
-        expect(whole, f"hours of 0, or of {SHORTEST} or more, a second", hours)
-        recipe, by = self.service.engine.recipe, {"seconds": 3600.0 * hours, "start": 3600.0 * start, "batch": batch}
-        by = by if hours or batch else {}
-        return answer("Course", await self.service.look(lambda store: read_course(store, recipe, AMONG, **by)))
+        expect(
+            hours == 0.0 or hours >= MIN_SHIFT_HOURS,
+            f"hours of 0, or of {MIN_SHIFT_HOURS} or more, a second",
+            hours,
+        )
+        recipe = self.service.engine.recipe
+        by: Json = {}
+        if hours or batch:
+            by = {"seconds": 3600.0 * hours, "start": 3600.0 * start, "batch": batch}
+        course = await self.service.read(lambda store: read_course(store, recipe, N_LABELS, **by))
+        return response_fields("Course", course)
 
     async def embedding(self) -> Json:
-        """Where the known and the newest parts lie for the model that answers."""
+        """Return where the labelled and the newest parts lie in the model's embedding."""
         engine = self.service.engine
-        return answer("PartMap", await self.service.look(lambda store: part_map(store, engine.recipe, engine.version)))
+        parts = await self.service.read(
+            lambda store: part_map(store, engine.recipe, engine.version)
+        )
+        return response_fields("PartMap", parts)
 
     async def versions(self) -> Json:
-        """Every retrain; kept: its model can be rolled back to."""
-        return answer("Versions", versions=await self.service.look(lambda store: store.versions()))
+        """Return every retrain; one that is kept can be rolled back to."""
+        versions = await self.service.read(lambda store: store.versions())
+        return response_fields("Versions", versions=versions)
 
     async def events(self, limit: Limit = 20) -> Json:
-        """What happened beside decisions, and who did it; newest first.  limit : how many at most."""
-        return answer("Events", events=(await self.service.look(lambda store: store.events(limit)))[::-1])
+        """Return the events beside decisions and who caused them, newest first."""
+        events = await self.service.read(lambda store: store.events(limit))
+        return response_fields("Events", events=events[::-1])
 
     async def changes(self) -> Response:
-        """Server-sent events: hello, with the server's version; changed, whenever something has; tick, in quiet."""
+        """Server-sent events: hello with the server's version, changed after changes, tick."""
 
-        async def told() -> AsyncIterator[str]:
-            yield f"retry: {RETRY}\nevent: hello\ndata: {__version__}\n\n"
+        async def event_stream() -> AsyncIterator[str]:
+            yield f"retry: {RECONNECT_MS}\nevent: hello\ndata: {__version__}\n\n"
             async for changed in self.service.changes(TICK):
                 yield f"event: {'changed' if changed else 'tick'}\ndata: -\n\n"
 
-        return StreamingResponse(told(), media_type="text/event-stream")
+        return StreamingResponse(event_stream(), media_type="text/event-stream")
 
     async def me(self) -> Json:
-        """Whose token was shown, and what it may."""
-        return answer("Me", CURRENT_TOKEN.get())
+        """Return the name and the rights of the request's token."""
+        return response_fields("Me", CURRENT_TOKEN.get())
 
     async def metrics(self) -> Response:
-        """What Prometheus reads."""
-        body, kind = self._metrics.text()
-        return Response(body, media_type=kind)
+        """Return the metrics for Prometheus."""
+        body, media = self._metrics.text()
+        return Response(body, media_type=media)
 
     async def healthz(self) -> Response:
-        """Whether the engine answers: ok; degraded (200); down (503). It asks for no token.
+        """Return whether the engine answers: ok; degraded (200); down (503). It needs no token.
 
         Degraded: the store cannot be written, or retrains are dropped again and again.
         """
-        core, alive = self.service.core, self.service.silent < HUNG
-        faults = core.store_fault, core.retrain_fault
-        state = "down" if not alive else "degraded" if any(faults) else "ok"
-        return api.answered(api.Health(state, *faults, self.service.waiting), 200 if alive else 503)
+        core = self.service.core
+        is_alive = self.service.silent_seconds < MAX_SILENT
+        faults = (core.store_fault, core.retrain_fault)
+        state = "degraded" if any(faults) else "ok"
+        if not is_alive:
+            state = "down"
+        health = api.Health(state, *faults, self.service.waiting)
+        return api.json_response(health, 200 if is_alive else 503)
 
     async def openapi(self) -> Json:
-        """The OpenAPI document."""
-        return api.document(self.operations, __version__)
+        """Return the OpenAPI document."""
+        return api.openapi_document(self.operations, __version__)
 
     async def docs(self) -> Response:
-        """The same, to read."""
+        """Return the OpenAPI document as a page."""
         return FileResponse(STATIC / "docs.html")
 
-    async def _known(self, id_: str) -> StoredDecision:
-        known = await self.service.find(id_)
-        if known is None:
+    async def _find(self, id_: str) -> StoredDecision:
+        """Return a stored decision; UnknownDecisionError for an unknown id."""
+        stored = await self.service.find(id_)
+        if stored is None:
             raise unknown_decision(id_)
-        return known
+        return stored
 
     async def _change(self, author: str, work: Callable[[DataEngine, str], Changed]) -> Json:
-        by = _name(author)
-        return answer("Changed", await self.service.ask(lambda engine: work(engine, by)))
+        """Call `work` with the engine and the checked author, and return the `Changed` response."""
+        by = _checked_author(author)
+        changed = await self.service.call(lambda engine: work(engine, by))
+        return response_fields("Changed", changed)
 
 
-def _name(author: str) -> str:
-    """An author's name for the event log, the token's where it has one; Refusal for none, and for another than that."""
-    owner, name = CURRENT_TOKEN.get().name, " ".join(author.split())
+def _checked_author(author: str) -> str:
+    """Return the author for the event log: the token's name if it has one, else the given name.
+
+    Raises Refusal without a name, and for another name than the token's.
+    """
+    owner = CURRENT_TOKEN.get().name
+    name = " ".join(author.split())
     if owner and name not in ("", owner):
         raise Refusal(422, f"Expected author to be {owner}, whose token it is, or to be left out.")
     if not is_name(owner or name):
@@ -314,27 +446,46 @@ def _name(author: str) -> str:
     return owner or name
 
 
-def _newest(store: SqlStore, where: HistoryFilter, limit: int, before: str | None, waiting: bool) -> list[StoredDecision]:
-    """Newest first. A forgotten label is none that is waited for."""
-    where = replace(where, action=Action.VERIFY, label="none") if waiting else where
+def _read_newest(
+    store: SqlStore, where: HistoryFilter, limit: int, before: str | None, unlabelled: bool
+) -> list[StoredDecision]:
+    """Return up to `limit` decisions older than the id `before`, newest first.
+
+    With `unlabelled` only verified ones whose label was never reported; a forgotten label was.
+    """
+    if unlabelled:
+        where = replace(where, action=Action.VERIFY, label="none")
     decisions = iterate_decisions(store, where, limit, before)
-    return list(islice((past for past in decisions if not waiting or past.source is None), limit))
+    if unlabelled:
+        decisions = (stored for stored in decisions if stored.source is None)
+    return list(islice(decisions, limit))
 
 
-def _explained(store: SqlStore, id_: str) -> Json:
-    found, labelled = explain(store, id_), store.labelled(AMONG)
-    trace, band = found.trace, found.envelope
-    bads = labelled.traces[labelled.labels == 0][-BADS:]
-    bads = bads if bads.shape[1:] == trace.shape else np.zeros((0, *trace.shape))
-    finite = np.nan_to_num(trace, posinf=0.0, neginf=0.0).astype(np.float64)  # float32's own range overflows
-    digits = 4 - int(np.log10(np.ptp(finite) or 1.0))  # what lies around is a picture
-    around = {name: getattr(band, name, None) for name in ("low", "median", "high")} | {"bads": bads}
-    drawn = {name: None if each is None else np.round(each.astype(np.float64), digits) for name, each in around.items()}
-    corrections = [each for each in store.corrections() if each.decision_id == found.decision.decision.id]
-    return answer("Explanation", found, trace=trace, corrections=corrections, **drawn)
+def _read_explanation(store: SqlStore, id_: str) -> Json:
+    """Return the explanation of a decision as a response, with the band and bad parts, rounded."""
+    explanation = explain(store, id_)
+    trace = explanation.trace
+    labelled = store.labelled(N_LABELS)
+    bads = labelled.traces[labelled.labels == 0][-N_BADS:]
+    if bads.shape[1:] != trace.shape:
+        bads = np.zeros((0, *trace.shape))
+    # float64, because the range of float32 values can overflow.
+    finite = np.nan_to_num(trace, posinf=0.0, neginf=0.0).astype(np.float64)
+    digits = 4 - int(np.log10(np.ptp(finite) or 1.0))  # enough for a picture
+    arrays = {name: getattr(explanation.envelope, name, None) for name in ("low", "median", "high")}
+    rounded = {
+        name: None if values is None else np.round(values.astype(np.float64), digits)
+        for name, values in (arrays | {"bads": bads}).items()
+    }
+    decision_id = explanation.decision.decision.id
+    corrections = [item for item in store.corrections() if item.decision_id == decision_id]
+    return response_fields(
+        "Explanation", explanation, trace=trace, corrections=corrections, **rounded
+    )
 
 
-def _packed(source: Exportable) -> bytes:
+def _zip_export(source: Exportable) -> bytes:
+    """Return a zip archive of an exported model and its checksum."""
     from ..export import export_torchscript
 
     with TemporaryDirectory(prefix="dengine-export-") as folder:
@@ -343,7 +494,7 @@ def _packed(source: Exportable) -> bytes:
         return Path(make_archive(f"{folder}/packed", "zip", f"{folder}/model")).read_bytes()
 
 
-async def _page(request: Request) -> Response:
+async def _index_page(request: Request) -> Response:
     return FileResponse(STATIC / "index.html")
 
 
@@ -356,30 +507,50 @@ def create_app(
     beside: Sequence[Beside] = (),
     recorder: Recorder | None = None,
 ) -> Starlette:
-    """The application; whoever made the service closes it, once the application has ended.
+    """Create the application. The caller closes the service after it has ended.
 
-    access : who may ask, and how much; None: whoever is on this machine.
-    xmlrpc, page : whether XML-RPC and the live page are served beside HTTP.
-    beside : what runs in the same loop as long as the application does, an OPC UA server for one.
-    recorder : of what a robot's program asks to decide on by `decide_recorded`; whoever made it closes it.
+    Parameters
+    ----------
+    service : CellService
+    access : Access, optional
+        None: everybody on this machine, without a token.
+    xmlrpc, page : bool
+        Whether XML-RPC and the web page are served beside HTTP.
+    beside : sequence of callable
+        Each is called with the service and returns an async context, which lasts as long as the
+        application, in the same event loop: an OPC UA server, for example.
+    recorder : Recorder, optional
+        Of the traces for `decide_recorded`; the caller closes it.
+
+    Returns
+    -------
+    Starlette
     """
-    every: list[BaseRoute] = [Route(each.path, each.serve, methods=[each.method]) for each in HttpApi(service).operations]
-    every += [Mount("/page/static", StaticFiles(directory=STATIC))]  # of /docs too
-    every += xmlrpc_routes(service, recorder) if xmlrpc else []
-    every += [Route(path, _page) for path in VIEWS] if page else []
+    routes: list[BaseRoute] = [
+        Route(operation.path, operation.serve, methods=[operation.method])
+        for operation in HttpApi(service).operations
+    ]
+    routes.append(Mount("/page/static", StaticFiles(directory=STATIC)))  # /docs needs it too
+    if xmlrpc:
+        routes += xmlrpc_routes(service, recorder)
+    if page:
+        routes += [Route(path, _index_page) for path in VIEWS]
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         async with AsyncExitStack() as stack:
             try:
-                for begin in beside:
-                    await stack.enter_async_context(begin(service))
+                for start in beside:
+                    await stack.enter_async_context(start(service))
             except Exception as error:
                 app.state.failure = error  # uvicorn says only that it did not start
                 raise
             yield
 
     guard = Middleware(Guard, access=access or Access())
-    app = Starlette(routes=every, middleware=[guard], exception_handlers=api.HANDLERS, lifespan=lifespan)
-    app.router.redirect_slashes = False  # a robot does not follow; and where to, a request's Host would say
+    app = Starlette(
+        routes=routes, middleware=[guard], exception_handlers=api.HANDLERS, lifespan=lifespan
+    )
+    # A robot does not follow redirects, whose target a request's Host would determine.
+    app.router.redirect_slashes = False
     return app

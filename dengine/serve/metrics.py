@@ -1,60 +1,126 @@
-"""What Prometheus reads: how many decisions of which kind, how long they took, and how the engine stands."""
+"""Prometheus metrics of a server: `GET /metrics` of `dengine serve`.
+
+Histograms count decisions, reports and retrains with their durations; gauges show the state of the
+engine when Prometheus reads them.
+"""
 
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 from prometheus_client import CollectorRegistry, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from ..records import RetrainReport
-from .service import Answer, CellService, Told
+from .service import CellService, ReportResponse, ServiceResponse
 
-QUICK = 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0  # seconds
-SLOW = 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0, 2.0, 5.0, 15.0, 60.0
-HEARD: Mapping[type, tuple[str, str, tuple[str, ...], tuple[float, ...]]] = {  # its labels are its fields' names
-    Answer: ("decide", "From a trace to its answer, in line too.", ("action", "reason"), QUICK),
-    Told: ("report", "From a label to its being on the disk.", ("success", "repeated"), QUICK),
-    RetrainReport: ("retrain", "From the data to the new version answering.", ("accepted",), SLOW),
+# Upper limits of the buckets, in seconds.
+RESPONSE_BUCKETS = 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0
+RETRAIN_BUCKETS = 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0, 2.0, 5.0, 15.0, 60.0
+
+
+class HistogramSpec(NamedTuple):
+    """A histogram of durations; `labels` are names of fields of what is observed."""
+
+    name: str
+    description: str
+    labels: tuple[str, ...]
+    buckets: tuple[float, ...]
+
+
+HISTOGRAMS: Mapping[type, HistogramSpec] = {
+    ServiceResponse: HistogramSpec(
+        "decide",
+        "Seconds from a request for a decision to its response, waiting included.",
+        ("action", "reason"),
+        RESPONSE_BUCKETS,
+    ),
+    ReportResponse: HistogramSpec(
+        "report",
+        "Seconds from a reported outcome until it is on disk.",
+        ("success", "repeated"),
+        RESPONSE_BUCKETS,
+    ),
+    RetrainReport: HistogramSpec(
+        "retrain",
+        "Seconds from taking the data until the new version decides.",
+        ("accepted",),
+        RETRAIN_BUCKETS,
+    ),
 }
 
 
 class Metrics:
-    """Counts what a service answers over every interface, from now on, and reads how it stands when it is asked."""
+    """Counts the responses of a service over every interface, and reads its state on demand.
+
+    Parameters
+    ----------
+    service : CellService
+        `observe` is added to its observers.
+    """
 
     def __init__(self, service: CellService) -> None:
-        self._service, self._registry = service, CollectorRegistry()
-        self._seconds = {
-            kind: Histogram(f"dengine_{name}_seconds", about, labels, buckets=buckets, registry=self._registry)
-            for kind, (name, about, labels, buckets) in HEARD.items()
+        self._service = service
+        self._registry = CollectorRegistry()
+        self._histograms = {
+            kind: Histogram(
+                f"dengine_{spec.name}_seconds",
+                spec.description,
+                spec.labels,
+                buckets=spec.buckets,
+                registry=self._registry,
+            )
+            for kind, spec in HISTOGRAMS.items()
         }
         self._registry.register(self)
         service.observers.append(self.observe)
 
-    def observe(self, news: Answer | Told | RetrainReport) -> None:
-        """Count one of these, and how long it took."""
-        said = news.decision if isinstance(news, Answer) else news
-        labels = [str(getattr(said, name)).lower() for name in HEARD[type(news)][2]]
-        self._seconds[type(news)].labels(*labels).observe(news.seconds)
+    def observe(self, response: ServiceResponse | ReportResponse | RetrainReport) -> None:
+        """Count a response or a retrain in its histogram."""
+        kind = type(response)
+        record = response.decision if isinstance(response, ServiceResponse) else response
+        labels = [str(getattr(record, name)).lower() for name in HISTOGRAMS[kind].labels]
+        self._histograms[kind].labels(*labels).observe(response.seconds)
 
     def text(self) -> tuple[bytes, str]:
-        """All of it, and its content type."""
+        """Return all metrics in Prometheus's text format, and the content type."""
         return generate_latest(self._registry), CONTENT_TYPE_LATEST
 
     def collect(self) -> Iterator[Metric]:
-        """How the service stands, at the moment that Prometheus's registry asks, also while its store is away."""
+        """Yield gauges and counters of the state now; called by the registry.
+
+        It reads no database, so that it works while the store is unavailable.
+        """
         service = self._service
         engine = service.engine
         core = service.core
-        for name, about, value in (
-            ("model_version", "Of the model that answers; 0 before the first retrain.", engine.version),
-            ("safe_mode", "1 while everything is verified for what went wrong.", bool(engine.safe_mode)),
-            ("shadow", "1 while everything is verified, and the model is only asked.", engine.policy.shadow),
-            ("store_fault", "1 while the store or its journal cannot be written.", bool(core.store_fault)),
-            ("store_lag_seconds", "Age of the oldest record that the store has not taken; 0: none.", core.store_lag),
-            ("retraining", "1 while a retrain is under way.", core.is_retraining),
+        gauges = (
+            (
+                "model_version",
+                "Version of the model that decides; 0 before the first retrain.",
+                engine.version,
+            ),
+            ("safe_mode", "1 in safe mode, where every part is verified.", bool(engine.safe_mode)),
+            ("shadow", "1 in shadow mode, where every part is verified.", engine.policy.shadow),
+            (
+                "store_fault",
+                "1 if the store or its journal cannot be written.",
+                bool(core.store_fault),
+            ),
+            (
+                "store_lag_seconds",
+                "Age of the oldest record that is not in the store yet; 0 without one.",
+                core.store_lag,
+            ),
+            ("retraining", "1 during a retrain.", core.is_retraining),
             ("new_labels", "Labels since the last retrain began.", core.new_labels),
-            ("waiting", "Requests in line.", service.waiting),
-        ):
-            yield GaugeMetricFamily(f"dengine_{name}", about, value=float(value))
-        yield CounterMetricFamily("dengine_late", "Decisions verified since a deadline was exceeded.", value=service.late)
-        yield CounterMetricFamily("dengine_busy", "Requests refused since too many waited.", value=service.busy)
+            ("waiting", "Requests in the queue.", service.waiting),
+        )
+        for name, description, value in gauges:
+            yield GaugeMetricFamily(f"dengine_{name}", description, value=float(value))
+        yield CounterMetricFamily(
+            "dengine_late", "Decisions verified because the deadline passed.", value=service.late
+        )
+        yield CounterMetricFamily(
+            "dengine_busy", "Requests refused because the queue was full.", value=service.busy
+        )

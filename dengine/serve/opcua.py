@@ -1,11 +1,12 @@
-"""OPC UA: what a PLC calls and a SCADA reads.
+"""OPC UA: methods for a PLC to call, and variables for a SCADA system to read.
 
     async with opcua_server(service, port=4840):
         ...
 
-One object, Cell, in the namespace `urn:dengine:cell`: the methods Decide and Report, and read-only variables, by NodeIds of
-text that stay as they are (`VARIABLES`). The variables follow the store, at most twice a second. The begin and the end of
-an alarm are events of the Server object as well.
+The namespace `urn:dengine:cell` has one object, Cell, with the methods Decide and Report and
+read-only variables (`VARIABLES`). The text NodeIds do not change between versions. The variables
+follow the store, at most twice a second. The begin and the end of an alarm are events of the Server
+object.
 """
 
 import asyncio
@@ -15,7 +16,7 @@ import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
 from contextlib import asynccontextmanager, suppress
 from functools import wraps
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from asyncua import ua
@@ -35,110 +36,193 @@ from .robot_calls import RobotCalls, one_line
 from .service import CellService
 
 log = logging.getLogger("dengine")
-MOST, CHUNK = 1 << 20, 65535  # bytes of a message, 250,000 samples; and of a message's part
-CONNECTIONS, SUBSCRIPTIONS = 50, 100
+PORT = 4840
+MAX_MESSAGE = 1 << 20  # bytes, 250,000 samples
+CHUNK = 65535  # bytes of a part of a message
+MAX_CONNECTIONS = 50
+MAX_SUBSCRIPTIONS = 100
+MAX_CHANNELS = 1000
 USER = "dengine"
+NAMESPACE = "urn:dengine:cell"
+CELL = "Cell"
+MIN_REFRESH = 0.5  # seconds between two readings of the store
+MAX_REFRESH = 5.0
+ALARM = 700  # severity, of 1 to 1000
+ALARM_ENDED = 100
 
 
-class Users(UserManager):
-    """Who may read and call: everybody on this machine, or who knows a token. Nobody is an administrator.
+class Variable(NamedTuple):
+    """A read-only variable; `key` is its name in `RobotCalls.status`, "" if it is not there."""
 
-    encrypted : only who shows a certificate, as whoever encrypts does: asyncua lets anyone open a channel without security,
-    so that a client can ask what the endpoints are, and would let a session begin on it.
+    type: VariantType
+    key: str
+    description: str
+
+
+class Argument(NamedTuple):
+    """An argument or a result of a method."""
+
+    name: str
+    type: VariantType
+    is_array: bool
+    description: str
+
+
+VARIABLES: Mapping[str, Variable] = {
+    "Decisions": Variable(VariantType.UInt32, "decisions", "decisions so far"),
+    "VerifiedShare": Variable(
+        VariantType.Double, "verified_share", "verified share of the newest 500 decisions, 0 to 1"
+    ),
+    "Accepted": Variable(VariantType.UInt32, "accepted", "parts accepted without a check"),
+    "Rejected": Variable(VariantType.UInt32, "rejected", "parts that the model rejected"),
+    "Bad": Variable(VariantType.UInt32, "bad", "accepted parts that are known to be bad"),
+    "ModelVersion": Variable(
+        VariantType.UInt32, "version", "of the model that decides; 0 before the first retrain"
+    ),
+    "SafeMode": Variable(
+        VariantType.Boolean, "safe_mode", "every part is verified, by the engine's own choice"
+    ),
+    "SafeModeReason": Variable(VariantType.String, "safe_mode", "why; empty outside the safe mode"),
+    "Shadow": Variable(
+        VariantType.Boolean, "shadow", "every part is verified, the model only predicts"
+    ),
+    "Alarm": Variable(VariantType.Boolean, "alarm", "somebody should look"),
+    "AlarmText": Variable(VariantType.String, "alarm", "at what; empty without an alarm"),
+    "Waiting": Variable(VariantType.UInt32, "waiting", "requests in the queue"),
+    "Late": Variable(
+        VariantType.UInt32, "late", "decisions past the deadline since the server's start"
+    ),
+    "Busy": Variable(
+        VariantType.UInt32, "busy", "requests refused because the queue was full, since the start"
+    ),
+    # For the engineer who configures a PLC.
+    "LastRefused": Variable(VariantType.String, "", "why the newest refused call was refused"),
+}
+DECIDE_ARGUMENTS = [
+    Argument("Trace", VariantType.Float, True, "samples, channel by channel"),
+    Argument("Channels", VariantType.UInt32, False, "1, or how many channels the trace has"),
+    Argument(
+        "Request",
+        VariantType.String,
+        False,
+        "an id of the caller's, a different one for each part; empty: a new one",
+    ),
+    Argument("Part", VariantType.String, False, "the part's number; empty: none"),
+]
+DECIDE_RESULTS = [
+    Argument("Action", VariantType.Int32, False, "0 verify, 1 accept, 2 reject"),
+    Argument("Id", VariantType.String, False, "for Report; empty: nothing was recorded, verify"),
+    Argument("Reason", VariantType.String, False, "why, as in Reason; busy: the queue is full"),
+    Argument("Lower", VariantType.Double, False, "lower bound of the success probability"),
+    Argument("Upper", VariantType.Double, False, "upper bound of it"),
+    Argument("ModelVersion", VariantType.UInt32, False, "of the model that decided"),
+]
+REPORT_ARGUMENTS = [
+    Argument("Id", VariantType.String, False, "as Decide returned it"),
+    Argument("Success", VariantType.Boolean, False, "True: good"),
+]
+REPORT_RESULTS = [
+    Argument(
+        "Kept",
+        VariantType.Boolean,
+        False,
+        "False: nothing under this id was recorded, or the server is busy",
+    )
+]
+
+
+class TokenUsers(UserManager):
+    """Who may read and call: the user `dengine` with a token as the password. Nobody administers.
+
+    Parameters
+    ----------
+    tokens : collection of str or None
+        None: everybody.
+    encrypted : bool
+        Only clients with a certificate, which every client that encrypts has. asyncua lets anyone
+        open a channel without security, to ask for the endpoints, and would accept a session on it.
     """
 
     def __init__(self, tokens: Collection[str] | None, encrypted: bool = False) -> None:
-        self._tokens, self._encrypted = tokens, encrypted
+        self._tokens = tokens
+        self._encrypted = encrypted
 
     def get_user(
-        self, iserver: InternalServer, username: str | None = None, password: Any = None, certificate: Any = None
+        self,
+        iserver: InternalServer,
+        username: str | None = None,
+        password: Any = None,
+        certificate: Any = None,
     ) -> User | None:
-        """The user of this name and password; None where there is none."""
+        """Return the user of a new session; None: it is refused."""
         if self._encrypted and not certificate:
             return None
         if self._tokens is None:
             return User(role=UserRole.User, name="anyone")
-        given = password if isinstance(password, bytes) else str(password or "").encode("utf-8", "surrogateescape")
-        same = sum(hmac.compare_digest(given, each.encode()) for each in self._tokens)  # each is compared, whichever it is
-        return User(role=UserRole.User, name=USER) if same and username == USER else None
-
-
-NAMESPACE = "urn:dengine:cell"
-CELL = "Cell"
-EVERY, SELDOM = 0.5, 5.0  # seconds between two looks at the store, at least and at most
-ALARM, ALARM_ENDED = 700, 100  # severities, of 1 to 1000
-MOST_CHANNELS = 1000
-
-VARIABLES: Mapping[str, tuple[VariantType, str, str]] = {  # its type, its name in `RobotCalls.status`, what it is
-    "Decisions": (VariantType.UInt32, "decisions", "decisions since the cell's birth"),
-    "VerifiedShare": (VariantType.Double, "verified_share", "verified share of the newest 500 decisions, 0 to 1"),
-    "Accepted": (VariantType.UInt32, "accepted", "parts accepted without a check"),
-    "Rejected": (VariantType.UInt32, "rejected", "parts that the model rejected"),
-    "Bad": (VariantType.UInt32, "bad", "accepted parts that are known to have been bad"),
-    "ModelVersion": (VariantType.UInt32, "version", "of the model that answers; 0 before the first retrain"),
-    "SafeMode": (VariantType.Boolean, "safe_mode", "everything is verified, by the engine's own choice"),
-    "SafeModeReason": (VariantType.String, "safe_mode", "why; empty where it is not"),
-    "Shadow": (VariantType.Boolean, "shadow", "everything is verified, the model is only asked"),
-    "Alarm": (VariantType.Boolean, "alarm", "somebody should look"),
-    "AlarmText": (VariantType.String, "alarm", "at what; empty where there is nothing"),
-    "Waiting": (VariantType.UInt32, "waiting", "requests in line"),
-    "Late": (VariantType.UInt32, "late", "answers that came too late, since the server's start"),
-    "Busy": (VariantType.UInt32, "busy", "requests that were refused since the line was full, since the start"),
-    "LastRefused": (VariantType.String, "", "why the newest call was refused"),  # for who sets a PLC up
-}
-
-Argument = tuple[str, VariantType, bool, str]  # name, type, an array, what it is
-DECIDE: tuple[list[Argument], list[Argument]] = (
-    [
-        ("Trace", VariantType.Float, True, "samples, channel by channel"),
-        ("Channels", VariantType.UInt32, False, "1, or how many channels the trace has"),
-        ("Request", VariantType.String, False, "an id of the caller's, once for every part; empty: one is made"),
-        ("Part", VariantType.String, False, "the part's number; empty: none"),
-    ],
-    [
-        ("Action", VariantType.Int32, False, "0 verify, 1 accept, 2 reject"),
-        ("Id", VariantType.String, False, "for Report; empty: nothing was recorded, verify"),
-        ("Reason", VariantType.String, False, "why, as in Reason; busy: the line is full"),
-        ("Lower", VariantType.Double, False, "bound on the success probability, from below"),
-        ("Upper", VariantType.Double, False, "and from above"),
-        ("ModelVersion", VariantType.UInt32, False, "of the model that answered"),
-    ],
-)
-REPORT: tuple[list[Argument], list[Argument]] = (
-    [("Id", VariantType.String, False, "as Decide gave it"), ("Success", VariantType.Boolean, False, "True: good")],
-    [("Kept", VariantType.Boolean, False, "False: nothing under this id was recorded, or the server is busy")],
-)
+        if isinstance(password, bytes):
+            secret = password
+        else:
+            secret = str(password or "").encode("utf-8", "surrogateescape")
+        # All are compared, so that the time does not show which one matches.
+        matches = sum(hmac.compare_digest(secret, token.encode()) for token in self._tokens)
+        if matches and username == USER:
+            return User(role=UserRole.User, name=USER)
+        return None
 
 
 @asynccontextmanager
 async def opcua_server(
     service: CellService,
-    port: int = 4840,
+    port: int = PORT,
     host: str = "127.0.0.1",
     tokens: Collection[str] | None = None,
     cert: str | os.PathLike[str] | None = None,
     key: str | os.PathLike[str] | None = None,
 ) -> AsyncIterator[Server]:
-    """Serve the cell over OPC UA in this loop, as long as the context lasts.
+    """Serve a cell over OPC UA in this event loop, as long as the context lasts.
 
-    port : 0 takes a free one, `server.bserver.port`.  tokens : passwords of the user `dengine`; None: anyone may ask.
-    cert, key : PEM or DER files; with them only Basic256Sha256, signed and encrypted, is spoken.
-    SettingError for an address other than this machine's without token, cert and key; OSError for a port in use.
+    Parameters
+    ----------
+    service : CellService
+    port : int
+        0: a free one, `server.bserver.port`.
+    host : str
+    tokens : collection of str, optional
+        Passwords of the user `dengine`; None: everybody may read and call.
+    cert, key : path, optional
+        PEM or DER files. With them the server speaks only Basic256Sha256, signed and encrypted.
+
+    Raises
+    ------
+    SettingError
+        For an address that other machines can reach, without tokens, certificate and key.
+    OSError
+        For a port in use.
     """
-    secure = cert is not None and key is not None
-    if not (is_loopback(host) or (secure and tokens)):
-        raise SettingError(f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on 127.0.0.1.")
-    logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it writes tracebacks of whatever strangers send
-    server = Server(user_manager=Users(tokens, secure))
-    server.limits.max_message_size, server.limits.max_chunk_count = MOST, MOST // CHUNK + 1
-    server.iserver.max_connections, server.iserver.max_subscriptions = CONNECTIONS, SUBSCRIPTIONS
-    server.set_identity_tokens([ua.AnonymousIdentityToken if tokens is None else ua.UserNameIdentityToken])
+    is_secure = cert is not None and key is not None
+    if not (is_loopback(host) or (is_secure and tokens)):
+        raise SettingError(
+            f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on "
+            "127.0.0.1."
+        )
+    # asyncua logs tracebacks of whatever strangers send.
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+    server = Server(user_manager=TokenUsers(tokens, is_secure))
+    server.limits.max_message_size = MAX_MESSAGE
+    server.limits.max_chunk_count = MAX_MESSAGE // CHUNK + 1
+    server.iserver.max_connections = MAX_CONNECTIONS
+    server.iserver.max_subscriptions = MAX_SUBSCRIPTIONS
+    identity = ua.AnonymousIdentityToken if tokens is None else ua.UserNameIdentityToken
+    server.set_identity_tokens([identity])
     await server.init()
     server.allow_remote_admin(False)
     server.set_endpoint(f"opc.tcp://{host_in_url(host)}:{port}/dengine")
     server.set_server_name("dengine")
     await server.set_application_uri("urn:dengine:server")
-    policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt if secure else ua.SecurityPolicyType.NoSecurity
+    if is_secure:
+        policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt
+    else:
+        policy = ua.SecurityPolicyType.NoSecurity
     server.set_security_policy([policy])
     if cert is not None and key is not None:
         await server.load_certificate(os.fspath(cert))
@@ -147,7 +231,7 @@ async def opcua_server(
     await space.build()
     async with server:
         await space.refresh()
-        following = asyncio.create_task(space.follow())
+        following = asyncio.create_task(space.follow_changes())
         try:
             yield server
         finally:
@@ -157,125 +241,192 @@ async def opcua_server(
 
 
 class AddressSpace:
-    """The nodes of one cell."""
+    """The nodes of one cell.
+
+    Parameters
+    ----------
+    server : Server
+        Initialized, not started.
+    service : CellService
+    """
 
     def __init__(self, server: Server, service: CellService) -> None:
-        self._server, self._service, self._calls = server, service, RobotCalls(service)
+        self._server = server
+        self._service = service
+        self._calls = RobotCalls(service)
         self._nodes: dict[str, Node] = {}
         self._alarm = ""
 
     async def build(self) -> None:
-        """Make the object, its variables and methods, and what tells of alarms."""
+        """Create the object with its variables and methods, and the generator of alarm events."""
         self._index = await self._server.register_namespace(NAMESPACE)
-        cell = await self._server.nodes.objects.add_object(self._id(CELL), self._name(CELL))
-        for name, (type_, _, text) in VARIABLES.items():
-            first = ua.get_default_value(type_) if type_ is not VariantType.String else ""
-            node = await cell.add_variable(self._id(f"{CELL}.{name}"), self._name(name), first, type_)
-            await node.write_attribute(AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(text))))
+        objects = self._server.nodes.objects
+        cell = await objects.add_object(self._node_id(CELL), self._browse_name(CELL))
+        for name, variable in VARIABLES.items():
+            first = ""
+            if variable.type is not VariantType.String:
+                first = ua.get_default_value(variable.type)
+            node = await cell.add_variable(
+                self._node_id(f"{CELL}.{name}"), self._browse_name(name), first, variable.type
+            )
+            text = ua.Variant(ua.LocalizedText(variable.description))
+            await node.write_attribute(AttributeIds.Description, ua.DataValue(text))
             self._nodes[name] = node
-        for name, call, (taken, given) in (("Decide", self.decide, DECIDE), ("Report", self.report, REPORT)):
-            checked = self._checked(call, taken, given)
-            arguments = [_argument(*each) for each in taken], [_argument(*each) for each in given]
-            await cell.add_method(self._id(f"{CELL}.{name}"), self._name(name), checked, *arguments)
+        for name, call, arguments, results in (
+            ("Decide", self.decide, DECIDE_ARGUMENTS, DECIDE_RESULTS),
+            ("Report", self.report, REPORT_ARGUMENTS, REPORT_RESULTS),
+        ):
+            await cell.add_method(
+                self._node_id(f"{CELL}.{name}"),
+                self._browse_name(name),
+                self._as_method(call, arguments, results),
+                [_as_ua_argument(argument) for argument in arguments],
+                [_as_ua_argument(result) for result in results],
+            )
         self._events: EventGenerator = await self._server.get_event_generator()
-        self._events.event.SourceNode, self._events.event.SourceName = cell.nodeid, CELL
+        self._events.event.SourceNode = cell.nodeid
+        self._events.event.SourceName = CELL
 
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
-        """Decide on a trace, flat, channel by channel."""
-        if not 1 <= channels <= MOST_CHANNELS or len(trace) % channels or not trace:
-            raise SettingError(f"Expected as many samples of each channel, got {len(trace)} of {channels} channels.")
-        x = np.array(trace, dtype=np.float32).reshape(channels, -1)
-        answer = await self._calls.decide_on(x, request, part)
-        return [answer[name] for name in ("action", "id", "reason", "lower", "upper", "version")]
+        """Decide on a flat trace, channel by channel, and return `DECIDE_RESULTS` in order."""
+        if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
+            raise SettingError(
+                f"Expected as many samples of each channel, got {len(trace)} of {channels} "
+                "channels."
+            )
+        samples = np.array(trace, dtype=np.float32).reshape(channels, -1)
+        result = await self._calls.decide_array(samples, request, part)
+        return [result[key] for key in ("action", "id", "reason", "lower", "upper", "version")]
 
     async def report(self, decision_id: str, success: bool) -> list[Any]:
+        """Report an outcome, and return `REPORT_RESULTS`."""
         return [await self._calls.report(decision_id, success)]
 
-    async def follow(self) -> None:
-        """Bring the variables up to date whenever something has changed, and now and then, for ever."""
-        async for _ in self._service.changes(SELDOM):
+    async def follow_changes(self) -> None:
+        """Refresh the variables after each change, and at least every `MAX_REFRESH` seconds."""
+        async for _ in self._service.changes(MAX_REFRESH):
             await self.refresh()
-            await asyncio.sleep(EVERY)  # what was decided just now is in the store by then
+            await asyncio.sleep(MIN_REFRESH)  # meanwhile the newest decisions reach the store
 
     async def refresh(self) -> None:
-        """Bring the variables up to date; where that cannot be, the values stay, and say that they are old."""
+        """Write the cell's status into the variables.
+
+        If it cannot be read, they keep their values, with a status that says that these are old.
+        """
         try:
-            await self.update(await self._calls.status())
-        except Exception as error:  # the store is away, or the line is full
+            await self.write_status(await self._calls.status())
+        except Exception as error:  # the store is unavailable, or the queue full
             log.warning("the OPC UA variables could not be brought up to date: %s", error)
-            for name in [name for name, (_, key, _) in VARIABLES.items() if key]:
-                old = await self._nodes[name].read_data_value(raise_on_bad_status=False)
-                status = _status(StatusCodes.UncertainLastUsableValue)
-                await self._nodes[name].write_value(ua.DataValue(old.Value, status))
+            status = _status_code(StatusCodes.UncertainLastUsableValue)
+            for name, variable in VARIABLES.items():
+                if variable.key:
+                    node = self._nodes[name]
+                    old = await node.read_data_value(raise_on_bad_status=False)
+                    await node.write_value(ua.DataValue(old.Value, status))
 
-    async def update(self, now: Mapping[str, Any]) -> None:
-        """Write how the cell is doing into the variables; an alarm that begins or ends is an event."""
-        for name, (type_, key, _) in VARIABLES.items():
-            if key:
-                value = bool(now[key]) if type_ is VariantType.Boolean else now[key]
-                await self._nodes[name].write_value(ua.DataValue(ua.Variant(value, type_)))
-        if now["alarm"] != self._alarm:
-            self._events.event.Severity = ALARM if now["alarm"] else ALARM_ENDED
-            await self._events.trigger(message=now["alarm"] or f"Over: {self._alarm}")
-            self._alarm = now["alarm"]
+    async def write_status(self, status: Mapping[str, Any]) -> None:
+        """Write a status into the variables; send an event if an alarm begins or ends."""
+        for name, variable in VARIABLES.items():
+            if variable.key:
+                value = status[variable.key]
+                if variable.type is VariantType.Boolean:
+                    value = bool(value)
+                data = ua.DataValue(ua.Variant(value, variable.type))
+                await self._nodes[name].write_value(data)
+        alarm = status["alarm"]
+        if alarm != self._alarm:
+            self._events.event.Severity = ALARM if alarm else ALARM_ENDED
+            await self._events.trigger(message=alarm or f"Over: {self._alarm}")
+            self._alarm = alarm
 
-    def _checked(
-        self, call: Callable[..., Awaitable[list[Any]]], taken: list[Argument], given: list[Argument]
+    def _as_method(
+        self,
+        call: Callable[..., Awaitable[list[Any]]],
+        arguments: list[Argument],
+        results: list[Argument],
     ) -> Callable[..., Awaitable[Any]]:
-        """A method as asyncua calls it: what is wrong is a status, and a line in LastRefused; nothing is raised."""
-        listed = ", ".join(f"{name} ({kind.name}{' array' if array else ''})" for name, kind, array, _ in taken)
+        """Return a call as asyncua needs a method, which raises nothing.
+
+        It returns the results, or for an error a status code, and then writes a line to
+        LastRefused.
+        """
+        listed = ", ".join(
+            f"{argument.name} ({argument.type.name}{' array' if argument.is_array else ''})"
+            for argument in arguments
+        )
 
         @wraps(call)
-        async def method(parent: ua.NodeId, *arguments: ua.Variant) -> Any:
-            wrong, got = _wrong(arguments, taken)
-            said = f"Expected {listed}{got}."
-            if wrong is None:
+        async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
+            code, got = _argument_error(variants, arguments)
+            line = f"Expected {listed}{got}."
+            if code is None:
                 try:
-                    answer = await call(*map(_value, arguments, taken))
-                    return [ua.Variant(value, type_) for value, (_, type_, _, _) in zip(answer, given, strict=True)]
+                    values = await call(*map(_argument_value, variants, arguments))
+                    return [
+                        ua.Variant(value, result.type)
+                        for value, result in zip(values, results, strict=True)
+                    ]
                 except DengineError as error:
-                    wrong, said = StatusCodes.BadInvalidArgument, as_options(str(error))
-                except Exception:  # ours: the log has it, the caller verifies
+                    code = StatusCodes.BadInvalidArgument
+                    line = as_options(str(error))
+                except Exception:
                     log.exception("a call over OPC UA failed")
-                    wrong, said = StatusCodes.BadInternalError, "The server failed on this call."
-            await self._nodes["LastRefused"].write_value(ua.DataValue(ua.Variant(one_line(said), VariantType.String)))
-            return _status(wrong)
+                    code = StatusCodes.BadInternalError
+                    line = "The server failed on this call."
+            text = ua.Variant(one_line(line), VariantType.String)
+            await self._nodes["LastRefused"].write_value(ua.DataValue(text))
+            return _status_code(code)
 
         return method
 
-    def _id(self, text: str) -> ua.NodeId:
+    def _node_id(self, text: str) -> ua.NodeId:
         return ua.NodeId(ua.String(text), ua.Int16(self._index))
 
-    def _name(self, text: str) -> ua.QualifiedName:
+    def _browse_name(self, text: str) -> ua.QualifiedName:
         return ua.QualifiedName(text, self._index)
 
 
-def _wrong(arguments: tuple[ua.Variant, ...], taken: list[Argument]) -> tuple[int | None, str]:
-    """What is wrong with a call's arguments, a status, and what came; None and "" where nothing is wrong."""
-    if len(arguments) < len(taken):
-        return StatusCodes.BadArgumentsMissing, f", got {len(arguments)} of {len(taken)} arguments"
-    if len(arguments) > len(taken):
-        return StatusCodes.BadTooManyArguments, f", got {len(arguments)} arguments"
-    for given, argument in zip(arguments, taken, strict=True):
-        name, type_, array, _ = argument
-        empty = given.Value is None
-        if empty and type_ is VariantType.String and given.VariantType in (VariantType.String, VariantType.Null):
-            continue  # controllers send an empty text as null
-        if given.VariantType is not type_ or empty or isinstance(given.Value, list) is not array:
-            form = "null" if empty else f"{given.VariantType.name}{' array' * isinstance(given.Value, list)}"
-            return StatusCodes.BadInvalidArgument, f", got {name} as {form}"
+def _argument_error(
+    variants: tuple[ua.Variant, ...], arguments: list[Argument]
+) -> tuple[int | None, str]:
+    """Return a status code and a text for wrong arguments of a call; None and "" for right ones."""
+    n = len(variants)
+    if n < len(arguments):
+        return StatusCodes.BadArgumentsMissing, f", got {n} of {len(arguments)} arguments"
+    if n > len(arguments):
+        return StatusCodes.BadTooManyArguments, f", got {n} arguments"
+    for variant, argument in zip(variants, arguments, strict=True):
+        is_null = variant.Value is None
+        is_list = isinstance(variant.Value, list)
+        # Controllers send an empty text as null.
+        may_be_null = variant.VariantType in (VariantType.String, VariantType.Null)
+        if is_null and argument.type is VariantType.String and may_be_null:
+            continue
+        if is_null or variant.VariantType is not argument.type or is_list is not argument.is_array:
+            form = "null" if is_null else f"{variant.VariantType.name}{' array' * is_list}"
+            return StatusCodes.BadInvalidArgument, f", got {argument.name} as {form}"
     return None, ""
 
 
-def _value(given: ua.Variant, argument: Argument) -> Any:
-    """An argument's value; a null String is an empty one."""
-    return "" if given.Value is None and argument[1] is VariantType.String else given.Value
+def _argument_value(variant: ua.Variant, argument: Argument) -> Any:
+    """Return an argument's value; a null String is an empty one."""
+    if variant.Value is None and argument.type is VariantType.String:
+        return ""
+    return variant.Value
 
 
-def _status(code: int) -> ua.StatusCode:
+def _status_code(code: int) -> ua.StatusCode:
     return ua.StatusCode(ua.UInt32(code))
 
 
-def _argument(name: str, type_: VariantType, array: bool, text: str) -> ua.Argument:
-    rank, dimensions = (ua.ValueRank.OneDimension, [0]) if array else (ua.ValueRank.Scalar, [])
-    return ua.Argument(name, ua.NodeId(ua.Int32(type_.value)), rank, dimensions, ua.LocalizedText(text))
+def _as_ua_argument(argument: Argument) -> ua.Argument:
+    """Return an argument as asyncua describes it to clients."""
+    rank = ua.ValueRank.OneDimension if argument.is_array else ua.ValueRank.Scalar
+    dimensions = [0] if argument.is_array else []
+    return ua.Argument(
+        argument.name,
+        ua.NodeId(ua.Int32(argument.type.value)),
+        rank,
+        dimensions,
+        ua.LocalizedText(argument.description),
+    )

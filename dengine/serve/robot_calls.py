@@ -1,12 +1,16 @@
-"""What a robot's program may call, in the few types that it knows: int, bool, float, string, list, and a struct of these.
-A controller that has base64 sends a trace as bytes, raw float32, little-endian: a tenth of the time that its numbers take.
+"""The methods that a robot's program or a PLC can call, over XML-RPC and OPC UA.
+
+They use only the types that such programs have: int, bool, float, string, list, and a struct of
+these. A controller that has base64 sends a trace as bytes, raw float32, little-endian, in a tenth
+of the time that numbers take.
 
     id = begin()                      # a new part; the recorder waits for its insertion
     answer = decide_recorded(id)      # answer.action: 0 verify, 1 accept, 2 reject
     kept = report(id, True)
 
-What is the world's fault (a full line, a recording that did not come, a store that is away) is answered, by "verify" and by
-False: a fault ends a robot's program. What is the caller's bug (a wrong type, another trace under a known id) is a fault.
+A fault would end a robot's program. So the response to a full queue, a recording that did not come
+or an unavailable store is "verify" or False. Only the caller's errors (a wrong type, another trace
+under a used id) are faults.
 """
 
 import asyncio
@@ -19,54 +23,97 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import BusyError, DengineError, SettingError, StoreError, TraceError, UnknownDecisionError, expect, shortened
+from ..errors import (
+    BusyError,
+    DengineError,
+    SettingError,
+    StoreError,
+    TraceError,
+    UnknownDecisionError,
+    expect,
+    shortened,
+)
 from ..records import ACTIONS, Action, Decision, as_id
 from .api import as_samples
 from .service import CellService
 
 log = logging.getLogger("dengine")
-PATIENCE = 1.0  # seconds that a recording may take to arrive after the insertion
-OPEN = 8  # parts whose pieces are on their way; one more gives up the oldest
-SAMPLES = 200_000  # of all pieces of a part
-BUSY, NOT_RECORDED = "busy", "not_recorded"  # beside the names in `Reason`: nothing of the part is known
+RECORD_SECONDS = 1.0  # for a recording to be complete after the insertion
+MAX_PARTS = 8  # parts whose pieces of a trace are kept; the oldest is given up for one more
+MAX_SAMPLES = 200_000  # of all pieces of a part
+BUSY = "busy"  # reasons beside `Reason`, if nothing was recorded
+NOT_RECORDED = "not_recorded"
 
-CALLS = "begin", "add", "decide", "decide_added", "decide_recorded", "action", "action_added", "action_recorded"
-Answered = dict[str, Any]
+CALLS = (
+    "begin",
+    "add",
+    "decide",
+    "decide_added",
+    "decide_recorded",
+    "action",
+    "action_added",
+    "action_recorded",
+    "report",
+    "status",
+)
+Struct = dict[str, Any]
 Call = Callable[..., Awaitable[Any]]
 
 
 class Recorder(Protocol):
-    """Cuts insertions out of what a robot sends, as `RtdeRecorder` does; its calls may block."""
+    """Cuts insertions out of what a robot sends, as `RtdeRecorder` does. Its methods may block."""
 
     def arm(self) -> None:
-        """Look for an insertion from now on."""
+        """Wait for an insertion from now on."""
 
     def record(self, timeout: float) -> Any:
-        """The next insertion, whose `trace` is (T,) or (C, T), NaN where none came; an error after `timeout` seconds."""
+        """Return the next insertion; raise an error after `timeout` seconds.
+
+        Its `trace` has shape (T,) or (C, T), with NaN for missing samples.
+        """
 
 
 class RobotCalls:
-    """The calls by name, over one service. recorder : of the traces of `decide_recorded`; None: there is none."""
+    """The methods, on one service.
+
+    Parameters
+    ----------
+    service : CellService
+    recorder : Recorder, optional
+        Of the traces for `decide_recorded`, which needs it.
+    """
 
     def __init__(self, service: CellService, recorder: Recorder | None = None) -> None:
-        self._service, self._recorder = service, recorder
+        self._service = service
+        self._recorder = recorder
         self._pieces: OrderedDict[str, list[NDArray[np.float32]]] = OrderedDict()
-        self._armed: str | None = None
-        self._recording = asyncio.Lock()  # one insertion at a time
+        self._armed: str | None = None  # id of the part that is recorded
+        self._recorder_lock = asyncio.Lock()
 
     def table(self) -> dict[str, Call]:
-        """Each call by its name; its signature says which arguments it takes."""
-        return {name: getattr(self, name) for name in (*CALLS, "report", "status")}
+        """Return each method by its name; its signature says which arguments it takes."""
+        return {name: getattr(self, name) for name in CALLS}
 
     async def begin(self, request: Any = "") -> str:
-        """A new part: its id, a new one or the caller's. The recorder waits for its insertion from now on."""
+        """Begin a new part and arm the recorder.
+
+        Parameters
+        ----------
+        request : str
+            The caller's id of the part; "": a new one.
+
+        Returns
+        -------
+        str
+            The id.
+        """
         id_ = uuid.uuid4().hex if request == "" else as_id(request)
         self._pieces.pop(id_, None)
         self._pieces[id_] = []
-        while len(self._pieces) > OPEN:
+        while len(self._pieces) > MAX_PARTS:
             self._pieces.popitem(last=False)
         if self._recorder is not None:
-            async with self._recording:
+            async with self._recorder_lock:
                 self._armed = None
                 try:
                     await asyncio.to_thread(self._recorder.arm)
@@ -76,82 +123,136 @@ class RobotCalls:
         return id_
 
     async def add(self, request: Any, samples: Any) -> int:
-        """A piece of a part's trace, one channel, in order; how many samples there are by now."""
+        """Add a piece to a part's trace of one channel, after the pieces so far.
+
+        Parameters
+        ----------
+        request : str
+            As `begin` returned it.
+        samples : list of float, or bytes
+
+        Returns
+        -------
+        int
+            Number of samples so far.
+        """
         pieces = self._pieces.get(as_id(request))
         if pieces is None:
-            kept = f"the newest {OPEN} parts are kept"
-            raise TraceError(f"Expected begin before add, got pieces of {shortened(request)}; {kept}.")
-        piece = as_samples(samples)[0] if isinstance(samples, bytes) else as_samples(samples)
+            raise TraceError(
+                f"Expected begin before add, got pieces of {shortened(request)}; the newest "
+                f"{MAX_PARTS} parts are kept."
+            )
+        piece = as_samples(samples)
+        if isinstance(samples, bytes):
+            piece = piece[0]
         if piece.ndim != 1:
-            raise TraceError("Expected a piece of one channel, a list of numbers; use decide for several channels.")
+            raise TraceError(
+                "Expected a piece of one channel, a list of numbers; use decide for several "
+                "channels."
+            )
         n = sum(map(len, pieces)) + len(piece)
-        expect(n <= SAMPLES, f"at most {SAMPLES} samples of a part", n, error=TraceError)
+        expect(n <= MAX_SAMPLES, f"at most {MAX_SAMPLES} samples of a part", n, error=TraceError)
         pieces.append(piece)
         return n
 
-    async def decide(self, trace: Any, request: Any = "", part: Any = "") -> Answered:
-        """Decide on a whole trace, (T,) or (channels, T), of lists; or of one channel, as bytes."""
-        return await self.decide_on(as_samples(trace), request, part)
+    async def decide(self, trace: Any, request: Any = "", part: Any = "") -> Struct:
+        """Decide on a whole trace.
 
-    async def decide_added(self, request: Any, part: Any = "") -> Answered:
-        """Decide on the pieces that were added; asked again, the answer is the same."""
-        if (known := await self._known(request)) is not None:
-            return known
+        Parameters
+        ----------
+        trace : list of float, list of list of float, or bytes
+            Of one channel, of several, or of one as float32.
+        request : str
+            The caller's id; "": a new one.
+        part : str or int
+            The part's number; "": none.
+
+        Returns
+        -------
+        struct
+            action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version.
+        """
+        return await self.decide_array(as_samples(trace), request, part)
+
+    async def decide_added(self, request: Any, part: Any = "") -> Struct:
+        """Decide on the pieces of a part's trace, and return the same struct for each call."""
+        if (stored := await self._find(request)) is not None:
+            return stored
         pieces = self._pieces.get(as_id(request))
         if not pieces:
-            raise TraceError(f"Expected begin and add before decide_added, got no pieces of {shortened(request)}.")
-        answer = await self.decide_on(np.concatenate(pieces), request, part)
-        if answer["id"]:
+            raise TraceError(
+                "Expected begin and add before decide_added, got no pieces of "
+                f"{shortened(request)}."
+            )
+        result = await self.decide_array(np.concatenate(pieces), request, part)
+        if result["id"]:
             self._pieces.pop(request, None)
-        return answer
+        return result
 
-    async def decide_recorded(self, request: Any = "", part: Any = "") -> Answered:
-        """Decide on the insertion since `begin`, as the recorder has it; asked again, the answer is the same.
+    async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
+        """Decide on the insertion since `begin`, and return the same struct for each call.
 
-        request : as `begin` gave it; left out, the newest one's.
+        Parameters
+        ----------
+        request : str
+            As `begin` returned it; "": of the newest `begin`.
+        part : str or int
+            The part's number; "": none.
         """
         if self._recorder is None:
-            raise SettingError("Expected a recorder, got none; start the server with --robot, or send the trace.")
-        async with self._recording:
+            raise SettingError(
+                "Expected a recorder, got none; start the server with --robot, or send the trace."
+            )
+        async with self._recorder_lock:
             id_ = self._armed if request == "" else as_id(request)
-            if id_ is not None and (known := await self._known(id_)) is not None:
-                return known
-            if id_ is None or id_ != self._armed:  # another part's, or the server was started anew meanwhile
-                return _unknown(NOT_RECORDED)
+            if id_ is not None and (stored := await self._find(id_)) is not None:
+                return stored
+            # Another part was begun, or the server was restarted meanwhile.
+            if id_ is None or id_ != self._armed:
+                return _unrecorded_verify(NOT_RECORDED)
             try:
-                recording = await asyncio.to_thread(self._recorder.record, PATIENCE)
+                recording = await asyncio.to_thread(self._recorder.record, RECORD_SECONDS)
             except (DengineError, OSError) as error:
                 log.warning("no recording of %s: %s", shortened(id_), error)
-                return _unknown(NOT_RECORDED)
+                return _unrecorded_verify(NOT_RECORDED)
             finally:
                 self._armed = None
-            return await self.decide_on(recording.trace, id_, part)
+            return await self.decide_array(recording.trace, id_, part)
 
     async def action(self, trace: Any, request: Any, part: Any = "") -> int:
-        """`decide`, answered by its action alone, for a controller that knows no structs; so are the next two."""
+        """Return only the action of `decide`, for a controller without structs."""
         return int((await self.decide(trace, request, part))["action"])
 
     async def action_added(self, request: Any, part: Any = "") -> int:
-        """`decide_added`, answered by its action alone."""
+        """Return only the action of `decide_added`."""
         return int((await self.decide_added(request, part))["action"])
 
     async def action_recorded(self, request: Any, part: Any = "") -> int:
-        """`decide_recorded`, answered by its action alone."""
+        """Return only the action of `decide_recorded`."""
         return int((await self.decide_recorded(request, part))["action"])
 
-    async def decide_on(self, trace: ArrayLike, request: Any, part: Any) -> Answered:
-        """Decide on a trace as an array; an empty request or part is none."""
+    async def decide_array(self, trace: ArrayLike, request: Any, part: Any) -> Struct:
+        """Decide on a trace of shape (T,) or (C, T), and return the struct of `decide`.
+
+        If the queue is full or the store unavailable, it is an unrecorded VERIFY.
+        """
         id_ = as_id(request) if request != "" else None
         try:
-            answer = await self._service.decide(trace, id_, None if part == "" else part)
+            response = await self._service.decide(trace, id_, None if part == "" else part)
         except (BusyError, StoreError) as error:
             log.warning("verified without a record: %s", error)
-            return _unknown(BUSY)
-        return _answered(answer.decision)
+            return _unrecorded_verify(BUSY)
+        return _as_struct(response.decision)
 
     async def report(self, decision_id: Any, success: Any) -> bool:
-        """What became of a part, True for good. False: nothing was recorded under this id, or it cannot be kept now."""
-        if decision_id == "":  # as `decide_recorded` gave it
+        """Report the outcome of a part, True for good.
+
+        Returns
+        -------
+        bool
+            False if nothing was recorded under this id, or the report cannot be stored now.
+        """
+        if decision_id == "":  # of an unrecorded VERIFY
             return False
         try:
             await self._service.report(decision_id, success)
@@ -162,38 +263,52 @@ class RobotCalls:
             return False
         return True
 
-    async def status(self) -> Answered:
-        """How the cell is doing, in a dozen plain numbers and texts; no decision waits for it.
+    async def status(self) -> Struct:
+        """Return how the cell is doing, in plain numbers and texts. No decision waits for it.
 
-        verified_share : of the newest decisions; 1 where there is none.  late, busy : deadlines exceeded, requests refused.
-        bad : accepted parts that are known to have been bad.  safe_mode, alarm : why, or "".  waiting : requests in line.
+        Returns
+        -------
+        struct
+            decisions, accepted, rejected, bad (false accepts): so far. verified_share: of the
+            newest decisions, 1 without any. version: of the model. safe_mode, alarm: why, or "".
+            shadow: whether every part is verified. waiting: requests in the queue. late, busy:
+            decisions past the deadline, and requests refused.
         """
-        service, found = self._service, await self._service.status()
-        share, ever = found.newest.verified_share, found.ever
+        service = self._service
+        status = await service.status()
+        share = status.newest.verified_share
+        counts = status.ever
         return {
-            "decisions": ever.decisions,
+            "decisions": counts.decisions,
             "verified_share": 1.0 if share is None else share,
-            "accepted": ever.accepted,
-            "rejected": ever.rejected,
-            "bad": ever.false_accepts,
-            **{name: getattr(found, name) for name in ("version", "safe_mode", "shadow", "alarm")},
-            **{name: getattr(service, name) for name in ("waiting", "late", "busy")},
+            "accepted": counts.accepted,
+            "rejected": counts.rejected,
+            "bad": counts.false_accepts,
+            "version": status.version,
+            "safe_mode": status.safe_mode,
+            "shadow": status.shadow,
+            "alarm": status.alarm,
+            "waiting": service.waiting,
+            "late": service.late,
+            "busy": service.busy,
         }
 
-    async def _known(self, request: Any) -> Answered | None:
+    async def _find(self, request: Any) -> Struct | None:
+        """Return the recorded decision on a request; None without one, or if it cannot be read."""
         try:
-            known = await self._service.find(as_id(request))
+            stored = await self._service.find(as_id(request))
         except (BusyError, StoreError):
             return None
-        return None if known is None else _answered(known.decision)
+        return None if stored is None else _as_struct(stored.decision)
 
 
 def one_line(text: str) -> str:
-    """What is told of a refused call, of characters that print."""
+    """Return a text as one printable line of at most 300 characters."""
     return "".join(c if c.isprintable() else " " for c in text)[:300]
 
 
-def _answered(decision: Decision) -> Answered:
+def _as_struct(decision: Decision) -> Struct:
+    """Return a decision in the types of a robot's program, its action as an integer."""
     return {
         "action": ACTIONS.index(decision.action),
         "id": decision.id,
@@ -204,6 +319,13 @@ def _answered(decision: Decision) -> Answered:
     }
 
 
-def _unknown(reason: str) -> Answered:
-    """Verify; nothing was recorded, so there is no id to report on."""
-    return {"action": ACTIONS.index(Action.VERIFY), "id": "", "reason": reason, "lower": 0.0, "upper": 1.0, "version": 0}
+def _unrecorded_verify(reason: str) -> Struct:
+    """Return the struct of a VERIFY that was not recorded; its id is empty."""
+    return {
+        "action": ACTIONS.index(Action.VERIFY),
+        "id": "",
+        "reason": reason,
+        "lower": 0.0,
+        "upper": 1.0,
+        "version": 0,
+    }

@@ -1,4 +1,8 @@
-"""One process in front of one cell: the port, TLS, the engine, the signals, its log, and how it all ends in order."""
+"""The process that serves one cell: its port, TLS, engine, signals and log, and its orderly end.
+
+`serve` is what `dengine serve` runs. It puts the engine's service, the HTTP application and uvicorn
+together.
+"""
 
 import json
 import logging
@@ -21,32 +25,45 @@ import uvicorn
 from ..engine.engine import DataEngine, frozen_objects
 from ..errors import SettingError, instead, without_password
 from .auth import Access, host_in_url, is_loopback, read_tokens
-from .connections import ConnectionPool
+from .connections import CONNECTIONS, ConnectionPool
 from .http import Beside, create_app
 from .retraining import END_SIGNALS, RetrainingProcess
 from .robot_calls import Recorder
-from .service import DEADLINE, CellService
+from .service import CHECK_SECONDS, DEADLINE, CellService
 
 log = logging.getLogger("dengine")
+KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
+GRACE = 5  # seconds for requests under way when the server ends
+# Seconds after which a thread gives Python's lock to a waiting one. A robot may wait for either of
+# the server's two threads.
+SWITCH_INTERVAL = 0.0005
 
 
-class Lines(logging.Formatter):
-    """A record as one line of time, level, logger and message, as JSON has a text, for a machine to read; no password."""
+class LineFormatter(logging.Formatter):
+    """Formats a record as one line for machines: time, level, logger, and the message as JSON.
+
+    Passwords of database URLs are masked.
+    """
 
     def format(self, record: logging.LogRecord) -> str:
-        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        said = f"message={json.dumps(without_password(record.getMessage()))}"
+        """Return the line of a record, with the traceback of an exception as JSON."""
+        utc = datetime.fromtimestamp(record.created, UTC)
+        time = utc.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        message = f"message={json.dumps(without_password(record.getMessage()))}"
         if record.exc_info:
-            said += f" raised={json.dumps(without_password(self.formatException(record.exc_info)))}"
-        return f"{time} level={record.levelname.lower()} logger={record.name} {said}"
+            traceback = without_password(self.formatException(record.exc_info))
+            message += f" raised={json.dumps(traceback)}"
+        return f"{time} level={record.levelname.lower()} logger={record.name} {message}"
 
 
 @contextmanager
 def log_lines_to(stream: TextIO) -> Iterator[None]:
-    """Have every logger write such lines, ours what it is up to, too."""
-    handler, root = logging.StreamHandler(stream), logging.getLogger()
-    handler.setFormatter(Lines())
-    handlers, level = root.handlers[:], log.level
+    """Write all logs to a stream as of `LineFormatter`, dengine's own from INFO on."""
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(LineFormatter())
+    root = logging.getLogger()
+    handlers = root.handlers[:]
+    level = log.level
     root.handlers[:] = [handler]
     log.setLevel(logging.INFO)
     try:
@@ -54,11 +71,6 @@ def log_lines_to(stream: TextIO) -> Iterator[None]:
     finally:
         root.handlers[:] = handlers
         log.setLevel(level)
-
-
-KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
-GRACE = 5  # seconds in which requests under way are answered when the server ends
-SWITCH = 0.0005  # seconds after which a thread gives Python's lock to one that waits: a robot waits for both of ours
 
 
 def serve(
@@ -75,8 +87,8 @@ def serve(
     deadline: float = DEADLINE,
     largest: int = Access().largest,
     rate: float = Access().rate,
-    connections: int = 100,
-    check_seconds: float = 5.0,
+    connections: int = CONNECTIONS,
+    check_seconds: float = CHECK_SECONDS,
     opcua: int | None = None,
     opcua_cert: Path | None = None,
     opcua_key: Path | None = None,
@@ -84,70 +96,131 @@ def serve(
     recorder: Callable[[], AbstractContextManager[Recorder | None]] = nullcontext,
     **interfaces: bool,
 ) -> None:
-    """Serve a cell until SIGTERM, SIGINT, or Windows' Ctrl-Break; then what is in line is answered, and the engine closed.
+    """Serve a cell until SIGTERM, SIGINT, or Ctrl-Break of Windows.
 
-    make : opens the engine, given the executor that it retrains in.  store : its name, for what only reads.
-    say : told where it listens, once it does.  recorder : makes what records for a robot's program.
-    beside, xmlrpc, page : as of `create_app`.  The others are options of `dengine serve`, under their names.
-    SettingError for a port that is in use, for files that cannot be used, and for an address that other machines reach
-    without a token; what `make` raises.
+    Then the requests in the queue are answered, and the engine is closed. Logs go to stderr.
+
+    Parameters
+    ----------
+    make : callable
+        Opens the engine, given the executor that it retrains in.
+    store : str or None
+        The store's name, for a second connection that only reads.
+    say : callable
+        Called with a line that says where the server listens, once it does.
+    beside : sequence of callable
+        As of `create_app`.
+    recorder : callable
+        Opens the recorder for `RobotCalls.decide_recorded`.
+    **interfaces : bool
+        `xmlrpc` and `page`, as of `create_app`.
+    host, port, ... : optional
+        The options of `dengine serve`, under their names.
+
+    Raises
+    ------
+    SettingError
+        For a port in use, files that cannot be used, and an address that other machines can reach
+        without a token.
+    DengineError
+        What `make` raises.
     """
     if token_file is None and not is_loopback(host):
-        raise SettingError(f"Expected --token-file FILE, for {host} is reached from other machines; or --host 127.0.0.1.")
-    tls, tokens = _tls(cert, key), () if token_file is None else read_tokens(token_file)
-    own = () if is_loopback(host) else (host, socket.gethostname())
-    access = Access(tokens, (*own, *allow_hosts), largest, rate=rate)
-    with bound(host, port) as listening, log_lines_to(sys.stderr), RetrainingProcess() as executor, recorder() as recording:
+        raise SettingError(
+            f"Expected --token-file FILE, for {host} is reached from other machines; or "
+            "--host 127.0.0.1."
+        )
+    tls = _tls_options(cert, key)
+    tokens = () if token_file is None else read_tokens(token_file)
+    own_names = () if is_loopback(host) else (host, socket.gethostname())
+    access = Access(tokens, (*own_names, *allow_hosts), largest, rate=rate)
+    with (
+        bound(host, port) as listening,
+        log_lines_to(sys.stderr),
+        RetrainingProcess() as executor,
+        recorder() as opened_recorder,
+    ):
         service = CellService(lambda: make(executor), store, deadline, check_seconds=check_seconds)
         try:
             if opcua is not None:
                 from .opcua import opcua_server
 
-                operators = [each.secret for each in tokens if each.operates] if tokens else None
-                spoken = partial(opcua_server, port=opcua, host=host, tokens=operators)
-                beside = [*beside, partial(spoken, cert=opcua_cert or cert, key=opcua_key or key)]
-            app = create_app(service, access, beside=beside, recorder=recording, **interfaces)
+                secrets = [token.secret for token in tokens if token.operates] if tokens else None
+                start_opcua = partial(
+                    opcua_server,
+                    port=opcua,
+                    host=host,
+                    tokens=secrets,
+                    cert=opcua_cert or cert,
+                    key=opcua_key or key,
+                )
+                beside = [*beside, start_opcua]
+            app = create_app(service, access, beside=beside, recorder=opened_recorder, **interfaces)
             config = uvicorn.Config(app, **uvicorn_options(connections) | tls)
-            address = f"http{'s' if cert else ''}://{host_in_url(host)}:{listening.getsockname()[1]}"
-            line = f"{service.engine.store.cell_id} is served at {address}{'' if tokens else ', to this machine alone'}."
+            scheme = "https" if cert else "http"
+            address = f"{scheme}://{host_in_url(host)}:{listening.getsockname()[1]}"
+            audience = "" if tokens else ", to this machine alone"
+            line = f"{service.engine.store.cell_id} is served at {address}{audience}."
             server = CellServer(config, service, lambda: say(line))
             try:
                 with quick_switches():
                     server.run([listening])
             except SystemExit:  # as uvicorn says that the application did not start
-                why = SettingError("The server did not start; its log says why.")
-                raise getattr(app.state, "failure", why) from None
+                failure = SettingError("The server did not start; its log says why.")
+                raise getattr(app.state, "failure", failure) from None
         finally:
             service.close()
 
 
-def uvicorn_options(connections: int = 100) -> dict[str, Any]:
-    """What uvicorn is told, whose loop is uvloop where that is installed; what it would log is answered, or told here."""
-    limits = {
+def uvicorn_options(connections: int = CONNECTIONS) -> dict[str, Any]:
+    """Return the options of `uvicorn.Config`: limits of connections, and no logs of its own."""
+    return {
         "http": ConnectionPool(connections).new_connection,
         "timeout_keep_alive": KEEP_ALIVE,
         "timeout_graceful_shutdown": GRACE,
+        "loop": "auto",  # uvloop if that is installed
+        "ws": "none",
+        "lifespan": "on",
+        "server_header": False,
+        "proxy_headers": False,
+        "log_config": None,
+        "log_level": "critical",
+        "access_log": False,
     }
-    plain = {"loop": "auto", "ws": "none", "lifespan": "on", "server_header": False, "proxy_headers": False}
-    return limits | plain | {"log_config": None, "log_level": "critical", "access_log": False}
 
 
 class CellServer(uvicorn.Server):
-    """A uvicorn server that says when it listens, and ends in order with exit code 0."""
+    """A uvicorn server that says when it listens, and ends in order with exit code 0.
 
-    def __init__(self, config: uvicorn.Config, service: CellService, say: Callable[[], object]) -> None:
+    Parameters
+    ----------
+    config : uvicorn.Config
+    service : CellService
+    say : callable
+        Called once the server listens.
+    """
+
+    def __init__(
+        self, config: uvicorn.Config, service: CellService, say: Callable[[], object]
+    ) -> None:
         super().__init__(config)
-        self._service, self._say = service, say
+        self._service = service
+        self._say = say
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start to listen, and call `say`."""
         await super().startup(sockets)
         if not self.should_exit:
             self._say()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """These signals ask for an end; uvicorn would raise them again once it has come."""
-        if threading.current_thread() is not threading.main_thread():  # Python delivers signals to that one alone
+        """Handle the ending signals as a request to end.
+
+        uvicorn would raise them again after the end, which would change the exit code.
+        """
+        # Python delivers signals to the main thread alone.
+        if threading.current_thread() is not threading.main_thread():
             yield
             return
 
@@ -166,9 +239,12 @@ class CellServer(uvicorn.Server):
 
 @contextmanager
 def quick_switches() -> Iterator[None]:
-    """Have threads give each other Python's lock without delay, and Python's collector leave alone what is there now."""
+    """Shorten the switch interval of threads, and exclude present objects from garbage collection.
+
+    Both shorten the time that a decision can wait.
+    """
     before = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH)
+    sys.setswitchinterval(SWITCH_INTERVAL)
     try:
         with frozen_objects():
             yield
@@ -178,32 +254,51 @@ def quick_switches() -> Iterator[None]:
 
 @contextmanager
 def bound(host: str, port: int) -> Iterator[socket.socket]:
-    """A socket that listens there; SettingError, in one line, where it cannot."""
-    said, do = f"Cannot listen at {host}, port {port}", "name another port or address, --port or --host"
-    with instead(SettingError, said, OSError, OverflowError, UnicodeError, do=do):
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    """Open a listening socket, and close it afterwards; SettingError if it cannot be opened."""
+    with instead(
+        SettingError,
+        f"Cannot listen at {host}, port {port}",
+        OSError,
+        OverflowError,
+        UnicodeError,
+        do="name another port or address, --port or --host",
+    ):
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, _, _, _, address = addresses[0]
         listening = socket.create_server(address[:2], family=family, backlog=128)
     with listening:
-        # Its connections inherit it: else an answer's second piece waits 40 ms for word that its first has come.
+        # Its connections inherit this option. Without it the second piece of a response waits 40 ms
+        # for the confirmation of the first.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         yield listening
 
 
-def _tls(cert: Path | None, key: Path | None) -> dict[str, str]:
-    """What uvicorn needs for TLS; SettingError for files that cannot be used, and for a key with a password."""
+def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
+    """Return uvicorn's options for TLS, empty without files.
+
+    Raises SettingError for files that cannot be used, and for a key with a password.
+    """
     if cert is None and key is None:
         return {}
     if cert is None or key is None:
         raise SettingError("Expected --cert and --key together, got one of them.")
 
-    def no_password() -> str:
-        raise SettingError(f"Expected a key without a password, {key} has one; protect the file instead: chmod 600 {key}")
+    def refuse_password() -> str:
+        raise SettingError(
+            f"Expected a key without a password, {key} has one; protect the file instead: "
+            f"chmod 600 {key}"
+        )
 
-    with instead(SettingError, f"Cannot use {cert} and {key} for TLS", OSError):  # ssl.SSLError too
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, no_password)
+    # OSError includes ssl.SSLError.
+    with instead(SettingError, f"Cannot use {cert} and {key} for TLS", OSError):
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(cert, key, refuse_password)
     return {"ssl_certfile": str(cert), "ssl_keyfile": str(key)}
 
 
-def tell_safe_mode(reason: str) -> None:
-    """Log that the safe mode began, or ended."""
-    log.warning("safe mode, every part is verified: %s", reason) if reason else log.info("the safe mode ended")
+def log_safe_mode(reason: str) -> None:
+    """Log that the safe mode began for a reason, or that it ended (an empty reason)."""
+    if reason:
+        log.warning("safe mode, every part is verified: %s", reason)
+    else:
+        log.info("the safe mode ended")

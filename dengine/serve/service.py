@@ -1,9 +1,12 @@
-"""One engine behind every interface: who asks waits in a queue, not for ever, for the one thread that owns it.
+"""The one engine that all interfaces of a server share, and the queue of requests to it.
 
     service = CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db")
-    answer = await service.decide(trace, "order-7")
+    response = await service.decide(trace, "order-7")
 
-What only reads does so by a second connection to the store (`look`), so that no decision waits for it.
+One thread owns the engine. A request waits for it in a queue, at most until the deadline, after
+which the part is verified. What only reads the store does so over a second connection
+(`CellService.read`), so that no decision waits for it. HTTP, XML-RPC, OPC UA and the demonstration
+are built on this module.
 """
 
 from __future__ import annotations
@@ -37,48 +40,82 @@ if TYPE_CHECKING:
 log = logging.getLogger("dengine")
 T = TypeVar("T")
 CLOSING = "The server is closing: verify the part, and ask again when it is back."
-DEADLINE = 0.5  # seconds in line, after which who asked verifies
-MOST = 32  # requests in line
-SOON = 0.0005  # seconds after an answer, in which whoever waits in line is heard first
-IDLE = 0.05  # seconds between two looks at what the engine has to do while nobody asks
+DEADLINE = 0.5  # seconds that a decision waits in the queue before its part is verified
+CHECK_SECONDS = 5.0  # duration of a verification: the paper's height check
+MAX_WAITING = 32  # requests in the queue
+SHORT_WAIT = 0.0005  # seconds that the engine's thread waits for a request before other work
+IDLE_WAIT = 0.05  # the same, if no retrained version is being swapped in
 
 
 class Job(NamedTuple):
-    """Work for the engine's thread: called with the engine, and with whether nobody waits for the answer any more."""
+    """Work for the engine's thread.
+
+    Attributes
+    ----------
+    future : Future
+        Gets the result.
+    work : callable
+        Called with the engine, and with whether the caller has timed out.
+    read_only : bool
+        The work changes nothing, so that listeners are not notified.
+    """
 
     future: Future[Any]
     work: Callable[[DataEngine, bool], Any]
-    looks: bool = False
+    read_only: bool = False
 
     def run(self, engine: DataEngine) -> None:
-        """Do it, also where whoever asked has cancelled the future meanwhile."""
-        wanted = self.future.set_running_or_notify_cancel()
+        """Do the work, even if the caller timed out, and set the future's result or exception.
+
+        Without a caller an exception is logged.
+        """
+        has_caller = self.future.set_running_or_notify_cancel()
         try:
-            result = self.work(engine, not wanted)
-            if wanted:
+            result = self.work(engine, not has_caller)
+            if has_caller:
                 self.future.set_result(result)
-        except BaseException as error:  # whoever asked is told
-            self.future.set_exception(error) if wanted else log.error("a decision that came too late failed: %s", error)
+        except BaseException as error:
+            if has_caller:
+                self.future.set_exception(error)
+            else:
+                log.error("a decision that came too late failed: %s", error)
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """What is answered to a trace.  decision : as it is recorded.  seconds : from the request to the answer."""
+class ServiceResponse:
+    """The response to a request for a decision.
+
+    Attributes
+    ----------
+    decision : Decision
+        As recorded.
+    seconds : float
+        From the request to the response.
+    """
 
     decision: Decision
     seconds: float
 
     @property
     def late(self) -> bool:
-        """Whether it is VERIFY since the line was too long for the deadline; the engine records it as such."""
+        """Whether the decision is VERIFY because the deadline passed while the request waited."""
         return self.decision.reason is Reason.LATE
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """What became of a report.  seconds : from the request to the answer.
+class ReportResponse:
+    """The response to a reported outcome.
 
-    repeated : the same label was reported before, and nothing changed.  retrain : what it set off in line, if anything.
+    Attributes
+    ----------
+    decision_id : str
+    success : bool
+    repeated : bool
+        The same label was reported before, and nothing changed.
+    retrain : RetrainReport or None
+        The retrain in line that the label set off, if any.
+    seconds : float
+        From the request to the response.
     """
 
     decision_id: str
@@ -89,13 +126,31 @@ class Told:
 
 
 class CellService:
-    """The engine, its thread, and the line in front of it.
+    """An engine, the thread that owns it, and the queue of requests.
 
-    make : opens the engine, in the thread that will own it; what it raises is raised here.
-    store : the same store's name, for `reading`; None: the engine remembers in memory.
-    deadline : seconds that a decision may wait in line; then the answer is VERIFY, `Reason.LATE`, and recorded so.
-    most : requests in line; one more is a BusyError, and nothing of it is recorded.
-    check_seconds : that the expensive verification takes, for the time that was saved: the paper's height check.
+    Parameters
+    ----------
+    make : callable
+        Opens the engine, in the thread that will own it. What it raises is raised here.
+    store : str or path, optional
+        Name of the same store, for `read`. None: the engine has a store in memory.
+    deadline : float, default 0.5
+        Seconds that a decision may wait in the queue. Then the response is VERIFY with
+        `Reason.LATE`, and is recorded as such.
+    max_waiting : int, default 32
+        Requests in the queue. One more raises BusyError, and nothing of it is recorded.
+    check_seconds : float, default 5.0
+        Duration of a verification, from which the saved time is computed.
+
+    Attributes
+    ----------
+    engine : DataEngine
+        Its properties may be read in any thread, its methods called only through `call`.
+    late, busy : int
+        Decisions past the deadline, and requests refused because the queue was full, so far.
+    observers : list of callable
+        Each is called with every ServiceResponse, ReportResponse and RetrainReport, in the thread
+        where it arises.
     """
 
     def __init__(
@@ -103,142 +158,203 @@ class CellService:
         make: Callable[[], DataEngine],
         store: str | os.PathLike[str] | None = None,
         deadline: float = DEADLINE,
-        most: int = MOST,
-        check_seconds: float = 5.0,
+        max_waiting: int = MAX_WAITING,
+        check_seconds: float = CHECK_SECONDS,
     ) -> None:
-        self.deadline, self.check_seconds = deadline, check_seconds
-        self.late = self.busy = 0  # answers since it began
-        self.observers: list[Callable[[Answer | Told | RetrainReport], object]] = []  # told of each, in whatever thread
-        self._jobs: queue.Queue[Job | None] = queue.Queue(most)
-        self._using = threading.Lock()  # the engine, by its thread, or by the loop for what waits for nothing
-        self._late = ThreadPoolExecutor(most, "dengine-late")  # of their own: others may be reading a store that is away
+        self.deadline = deadline
+        self.check_seconds = check_seconds
+        self.late = 0
+        self.busy = 0
+        self.observers: list[Callable[[ServiceResponse | ReportResponse | RetrainReport], object]]
+        self.observers = []
+        self._jobs: queue.Queue[Job | None] = queue.Queue(max_waiting)
+        # The engine is used by its thread, or by the event loop for a decision that need not wait.
+        self._in_use = threading.Lock()
+        # The default executor may be full of readers of a store that is unavailable.
+        self._timeout_threads = ThreadPoolExecutor(max_waiting, "dengine-late")
         self._listeners: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
-        self._closing = self._listening_ended = False
-        self._beat = time.monotonic()
+        self._closing = False
+        self._listening_ended = False
+        self._last_active = time.monotonic()
         opened: Future[DataEngine] = Future()
-        self._thread = threading.Thread(target=self._serve, args=(make, opened), name="dengine-engine")
+        self._thread = threading.Thread(
+            target=self._run_jobs, args=(make, opened), name="dengine-engine"
+        )
         self._thread.start()
-        self.engine = opened.result()  # its facts may be read in any thread, its verbs only by `ask`
+        self.engine = opened.result()
         self.core = core_of(self.engine)
-        self.reading = self.engine.store if store is None else open_store(store)
+        self.read_store = self.engine.store if store is None else open_store(store)
 
-    async def decide(self, trace: ArrayLike, request: str | None = None, part: str | int | None = None) -> Answer:
-        """Decide on a trace, (T,) or (channels, T).
+    async def decide(
+        self, trace: ArrayLike, request: str | None = None, part: str | int | None = None
+    ) -> ServiceResponse:
+        """Decide on a trace.
 
-        request : the caller's id, once for every trace; asked again, the answer is the same, also after a restart.
-        TraceError, ReportError as `DataEngine.decide`; BusyError where too many wait.
+        Parameters
+        ----------
+        trace : array, shape (T,) or (C, T)
+        request : str, optional
+            The caller's id, a different one for each trace. The same id and trace get the same
+            decision, after a restart too.
+        part : str or int, optional
+            The part's number.
+
+        Returns
+        -------
+        ServiceResponse
+
+        Raises
+        ------
+        TraceError, ReportError
+            As `DataEngine.decide`.
+        BusyError
+            If the queue is full.
         """
         begin = time.monotonic()
-        if request is None and not (self.waiting or self._closing) and self._using.acquire(blocking=False):
+        is_idle = not (self.waiting or self._closing)
+        if request is None and is_idle and self._in_use.acquire(blocking=False):
             try:
-                at_once = self.core.try_decide(trace, part)
+                decision_now = self.core.try_decide(trace, part)
             finally:
-                self._using.release()
-            if at_once is not None:
-                self._tell()
-                return self._heard(Answer(at_once, time.monotonic() - begin))
+                self._in_use.release()
+            if decision_now is not None:
+                self._notify_listeners()
+                response = ServiceResponse(decision_now, time.monotonic() - begin)
+                return self._notify_observers(response)
         id_ = uuid.uuid4().hex if request is None else as_id(request)
-        # Under an id of its own it has to be on the disk before the answer; a caller that has none cannot ask again.
 
+        # With the caller's id the decision must be on disk before the response: the caller may
+        # send the request again. Without one it cannot.
         def work(engine: DataEngine, late: bool) -> Decision:
-            given = id_ if late or request is not None else None
-            return core_of(engine).decide(trace, part, given, timed_out=late)
+            decision_id = id_ if late or request is not None else None
+            return core_of(engine).decide(trace, part, decision_id, timed_out=late)
 
-        future = self._put(work)
-        answer = asyncio.wrap_future(future)
-        await asyncio.wait([answer], timeout=self.deadline)
-        if answer.done() or not future.cancel():
-            decision = await answer
+        future = self._enqueue(work)
+        pending = asyncio.wrap_future(future)
+        await asyncio.wait([pending], timeout=self.deadline)
+        if pending.done() or not future.cancel():
+            decision = await pending
         else:
             record = partial(self.core.record_timeout, trace, part, decision_id=id_)
-            decision = await asyncio.get_running_loop().run_in_executor(self._late, record)
+            loop = asyncio.get_running_loop()
+            decision = await loop.run_in_executor(self._timeout_threads, record)
             self.late += 1
-        return self._heard(Answer(decision, time.monotonic() - begin))
+        response = ServiceResponse(decision, time.monotonic() - begin)
+        return self._notify_observers(response)
 
-    async def report(self, decision_id: str, success: float, author: str = "") -> Told:
-        """Report what became of a decision; the label is on the disk when this returns. The same label twice is no error.
+    async def report(self, decision_id: str, success: float, author: str = "") -> ReportResponse:
+        """Report the outcome of a decision; the label is on disk when this returns.
 
-        author : of a person's report, for the event log; "": a machine's, which is not an event.
-        ReportError as `DataEngine.report`; BusyError where too many wait.
+        Parameters
+        ----------
+        decision_id : str
+        success : bool or float
+            1 or True: good. The same label twice is no error.
+        author : str
+            Of a person's report, for the event log. "": a machine's, which is not an event.
+
+        Returns
+        -------
+        ReportResponse
+
+        Raises
+        ------
+        ReportError
+            As `DataEngine.report`.
+        BusyError
+            If the queue is full.
         """
-        begin, said = time.monotonic(), as_success(success)
+        begin = time.monotonic()
+        label = as_success(success)
 
         def work(engine: DataEngine) -> tuple[bool, RetrainReport | None]:
-            known = engine.find(decision_id)
-            if known is not None and known.success is said:
+            stored = engine.find(decision_id)
+            if stored is not None and stored.success is label:
                 return True, None
-            retrain = engine.report(decision_id, said)
+            retrain = engine.report(decision_id, label)
             if author:
-                text = f"decision {decision_id} was {'good' if said else 'bad'}"
+                text = f"decision {decision_id} was {'good' if label else 'bad'}"
                 engine.store.put_event("report", text, author=author)
             return False, retrain
 
-        repeated, retrain = await self.ask(work)
+        repeated, retrain = await self.call(work)
         if retrain is not None:
-            self._heard(retrain)
-        return self._heard(Told(decision_id, said, repeated, retrain, time.monotonic() - begin))
+            self._notify_observers(retrain)
+        seconds = time.monotonic() - begin
+        response = ReportResponse(decision_id, label, repeated, retrain, seconds)
+        return self._notify_observers(response)
 
     async def find(self, decision_id: str) -> StoredDecision | None:
-        """A decision with its trace and label; None for an unknown id."""
-        return await self.ask(lambda engine: engine.find(decision_id), looks=True)
+        """Return a decision with its trace and label; None for an unknown id."""
+        return await self.call(lambda engine: engine.find(decision_id), read_only=True)
 
-    async def ask(self, work: Callable[[DataEngine], T], looks: bool = False) -> T:
-        """Do something in the engine's thread, between two decisions; what it raises is raised here.
+    async def call(self, work: Callable[[DataEngine], T], read_only: bool = False) -> T:
+        """Call a function with the engine in its thread, and return or raise what it does.
 
-        looks : it changes nothing, so that nobody who listens to `changes` is told.
+        With `read_only` the function changes nothing, and listeners to `changes` are not notified.
         """
-        return await asyncio.wrap_future(self.submit(work, looks))
+        return await asyncio.wrap_future(self.submit(work, read_only))
 
-    def submit(self, work: Callable[[DataEngine], T], looks: bool = False) -> Future[T]:
-        """As `ask`, from any thread and without waiting."""
-        return self._put(lambda engine, late: work(engine), looks)
+    def submit(self, work: Callable[[DataEngine], T], read_only: bool = False) -> Future[T]:
+        """Put a call as of `call` into the queue, from any thread, and return its future."""
+        return self._enqueue(lambda engine, late: work(engine), read_only)
 
-    async def look(self, work: Callable[[SqlStore], T]) -> T:
-        """Read a store that holds all that was decided so far, in a thread of its own; one in memory in the engine's."""
-        await self.ask(lambda engine: engine.flush(), looks=True)
-        if self.reading is self.engine.store:
-            return await self.ask(lambda engine: work(engine.store), looks=True)
-        return await asyncio.to_thread(work, self.reading)
+    async def read(self, work: Callable[[SqlStore], T]) -> T:
+        """Call a function with a store that has every decision so far, and return its result.
+
+        The function runs in a thread of its own, or in the engine's if the store is in memory.
+        """
+        await self.call(lambda engine: engine.flush(), read_only=True)
+        if self.read_store is self.engine.store:
+            return await self.call(lambda engine: work(engine.store), read_only=True)
+        return await asyncio.to_thread(work, self.read_store)
 
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """How the cell is doing, as `history.status`: by its store, and by what the running engine alone knows."""
-        return self.core.complete_status(await self.look(lambda store: status(store, last, watching)))
+        """Return the status as of `DataEngine.status`, without occupying the engine's thread."""
+        stored = await self.read(lambda store: status(store, last, watching))
+        return self.core.complete_status(stored)
 
     @property
     def waiting(self) -> int:
-        """Requests in line."""
+        """Requests in the queue."""
         return self._jobs.qsize()
 
     @property
-    def silent(self) -> float:
-        """Seconds since the engine's thread last took a job, or looked for one; infinite where it has ended."""
-        return time.monotonic() - self._beat if self._thread.is_alive() else float("inf")
+    def silent_seconds(self) -> float:
+        """Seconds since the engine's thread last took or awaited a job; infinity if it ended."""
+        if not self._thread.is_alive():
+            return float("inf")
+        return time.monotonic() - self._last_active
 
     async def changes(self, quiet: float | None = None) -> AsyncIterator[bool]:
-        """Yield True whenever something has changed since the last yield, at once for the first time.
+        """Yield True at once, and then whenever something has changed since the last yield.
 
-        quiet : seconds without a change, after which False is yielded; None: never.
+        After `quiet` seconds without a change False is yielded; None: never.
         """
-        here = asyncio.get_running_loop(), asyncio.Event()
-        self._listeners.add(here)
+        event = asyncio.Event()
+        listener = (asyncio.get_running_loop(), event)
+        self._listeners.add(listener)
         try:
             changed = True
             while not self._listening_ended:
                 yield changed
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(here[1].wait(), quiet)
-                changed = here[1].is_set()
-                here[1].clear()
+                    await asyncio.wait_for(event.wait(), quiet)
+                changed = event.is_set()
+                event.clear()
         finally:
-            self._listeners.discard(here)
+            self._listeners.discard(listener)
 
     def end_listening(self) -> None:
-        """Let all that listen to `changes` go: the server is about to close."""
+        """End every iteration over `changes`, because the server is about to close."""
         self._listening_ended = True
-        self._tell()
+        self._notify_listeners()
 
     def close(self) -> None:
-        """Answer what is in line, close the engine, and end its thread; a second time does nothing."""
+        """Answer the requests in the queue, close the engine, and end its thread.
+
+        A second call does nothing.
+        """
         if self._closing:
             return
         self._closing = True
@@ -246,15 +362,21 @@ class CellService:
         self._thread.join()
         with suppress(queue.Empty):
             while True:
-                if (job := self._jobs.get_nowait()) is not None and job.future.set_running_or_notify_cancel():
-                    job.future.set_exception(BusyError(CLOSING))  # it came while this began
-        self._late.shutdown()
+                job = self._jobs.get_nowait()
+                # A request may have been queued while the service began to close.
+                if job is not None and job.future.set_running_or_notify_cancel():
+                    job.future.set_exception(BusyError(CLOSING))
+        self._timeout_threads.shutdown()
         self.end_listening()
-        if self.reading is not self.engine.store:
-            self.reading.close()
+        if self.read_store is not self.engine.store:
+            self.read_store.close()
 
-    def _put(self, work: Callable[[DataEngine, bool], T], looks: bool = False) -> Future[T]:
-        job = Job(Future(), work, looks)
+    def _enqueue(self, work: Callable[[DataEngine, bool], T], read_only: bool = False) -> Future[T]:
+        """Put work into the queue and return its future.
+
+        Raises BusyError if the service is closing or the queue is full, which is counted.
+        """
+        job = Job(Future(), work, read_only)
         if self._closing or not self._thread.is_alive():
             raise BusyError(CLOSING)
         try:
@@ -262,18 +384,30 @@ class CellService:
         except queue.Full:
             self.busy += 1
             raise BusyError(
-                f"Expected at most {self._jobs.maxsize} requests in line: verify the part, nothing of it was recorded."
+                f"Expected at most {self._jobs.maxsize} requests in line: verify the part, "
+                "nothing of it was recorded."
             ) from None
         return job.future
 
-    def _heard(self, news: T) -> T:
-        if isinstance(news, RetrainReport):  # decisions and reports are in the store
-            log.info("version %d answers after a retrain of %.2f s: %s", news.version, news.seconds, news.reason)
+    def _notify_observers(self, response: T) -> T:
+        """Pass a response or a retrain to all observers, log a retrain, and return the argument."""
+        # Decisions and reports are in the store: only a retrain needs a line of the log.
+        if isinstance(response, RetrainReport):
+            log.info(
+                "version %d answers after a retrain of %.2f s: %s",
+                response.version,
+                response.seconds,
+                response.reason,
+            )
         for observe in self.observers:
-            observe(news)  # type: ignore[arg-type]  # only what the list is of
-        return news
+            observe(response)  # type: ignore[arg-type]  # only what the list is of
+        return response
 
-    def _serve(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
+    def _run_jobs(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
+        """Open the engine, and run jobs until None comes; the body of the engine's thread.
+
+        Sets `opened` to the engine, or to the exception that opening it raised.
+        """
         try:
             engine = make()
             try:
@@ -281,37 +415,42 @@ class CellService:
             except BaseException:
                 engine.close()
                 raise
-        except BaseException as error:  # raised where the service is made
+        except BaseException as error:
             opened.set_exception(error)
             return
         opened.set_result(engine)
         with engine:
-            while (job := self._next(engine)) is not None:
-                with self._using:
+            while (job := self._next_job(engine)) is not None:
+                with self._in_use:
                     job.run(engine)
-                if not job.looks:
-                    self._tell()
-            self._using.acquire()  # for good
+                if not job.read_only:
+                    self._notify_listeners()
+            self._in_use.acquire()  # never released: the engine is closed from now on
 
-    def _next(self, engine: DataEngine) -> Job | None:
-        """The next one in line; while nobody asks, the engine does what it has to do: a new version is swapped in."""
+    def _next_job(self, engine: DataEngine) -> Job | None:
+        """Return the next job, or None at the end.
+
+        While the queue is empty, retrains are processed: a new version is swapped in by steps.
+        """
         core = core_of(engine)
-        patience = SOON  # right behind an answer, for the next part is farthest away then
+        # The time right after a response is best for other work: the next part is farthest away.
+        timeout = SHORT_WAIT
         while True:
-            self._beat = time.monotonic()
+            self._last_active = time.monotonic()
             with suppress(queue.Empty):
-                return self._jobs.get(timeout=patience)
+                return self._jobs.get(timeout=timeout)
             try:
-                with self._using:
+                with self._in_use:
                     report = core.process_retrains(brief=True)
                 if report is not None:
-                    self._heard(report)
-                    self._tell()
-            except Exception:  # whatever it is, the next request is answered
+                    self._notify_observers(report)
+                    self._notify_listeners()
+            except Exception:  # the next request must still be answered
                 log.exception("what the engine does between requests failed")
-            patience = SOON if core.is_swapping else IDLE
+            timeout = SHORT_WAIT if core.is_swapping else IDLE_WAIT
 
-    def _tell(self) -> None:
-        for loop, changed in tuple(self._listeners):
-            with suppress(RuntimeError):  # its loop has ended
-                loop.call_soon_threadsafe(changed.set)
+    def _notify_listeners(self) -> None:
+        """Wake every iteration over `changes`, in its event loop."""
+        for loop, event in tuple(self._listeners):
+            with suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(event.set)

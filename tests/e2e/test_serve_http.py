@@ -59,7 +59,7 @@ def serving(
     access: Access | None = None, file: Path | None = None, most: int = 32, **limits: Any
 ) -> Iterator[tuple[CellService, Client]]:
     """A service of its own, in memory or in a file, and a client of it."""
-    with a_service(file, most=most) as service, running(service, access, **limits) as client:
+    with a_service(file, max_waiting=most) as service, running(service, access, **limits) as client:
         yield service, client
 
 
@@ -121,7 +121,7 @@ def forms(trace: np.ndarray, request: str) -> dict[str, dict[str, Any]]:
 def test_a_trace_is_the_same_in_every_form(client: Client, service: CellService, stream: Dataset, form: str) -> None:
     answer = client.post("/decide", **forms(stream.X[7], f"form {form}")[form])
     assert answer.status_code == 200, answer.text
-    validate(answer.json(), "Answer", client)
+    validate(answer.json(), "DecideResponse", client)
     known = asyncio.run(service.find(f"form {form}"))
     assert np.array_equal(known.trace[0], stream.X[7])
     assert known.decision.part == "P1"
@@ -175,7 +175,7 @@ def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Da
     assert client.get("/decisions?open=true").json()["decisions"][0]["id"] == "label-0"
     for repeated in (False, True):
         told = client.post("/report", json={"id": "label-0", "success": True}).json()
-        validate(told, "Told", client)
+        validate(told, "ReportResponse", client)
         assert told["repeated"] is repeated
     must_be_problem(client.post("/report", json={"id": "label-0", "success": False}), 409)
     must_be_problem(client.post("/report", json={"id": "nobody", "success": True}), 404)
@@ -440,7 +440,7 @@ def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None
         must_be_problem(answer, 503)
         assert int(answer.headers["retry-after"]) >= 1
         assert service.busy == 1
-    assert service.reading.status()["decisions"] == 0
+    assert service.read_store.status()["decisions"] == 0
     with pytest.raises(BusyError, match="closing"):
         asyncio.run(service.decide(stream.X[0]))
 

@@ -50,7 +50,7 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
 
     with a_service(tmp_path / "cell.db") as service:
         asyncio.run(cell(service))
-        assert (service.reading.status()["decisions"], service.late) == (3, 2)
+        assert (service.read_store.status()["decisions"], service.late) == (3, 2)
 
 
 def test_the_engine_does_what_it_has_to_while_nobody_asks(stream: Dataset) -> None:
@@ -78,7 +78,7 @@ def test_a_model_of_the_users_keeps_the_engines_thread_and_never_the_loop(stream
     async def cell(service: CellService) -> None:
         for i in range(30):
             await service.report((await service.decide(stream.X[i])).decision.id, bool(stream.y[i]))
-        await service.ask(lambda engine: engine.retrain())
+        await service.call(lambda engine: engine.retrain())
         asked = asyncio.create_task(service.decide(stream.X[30]))
         asyncio.get_running_loop().call_later(0.05, looked.set)
         assert (await asked).decision.reason is not Reason.MODEL_ERROR

@@ -18,7 +18,7 @@ from dengine.errors import BusyError
 from dengine.serve import xmlrpc as xml_rpc
 from dengine.serve.auth import Access
 from dengine.serve.http import create_app
-from dengine.serve.robot_calls import SAMPLES, RobotCalls
+from dengine.serve.robot_calls import MAX_SAMPLES, RobotCalls
 from dengine.serve.service import CellService
 from tests.support.serving import PushedTraces, a_service, held, served
 
@@ -105,8 +105,8 @@ def test_a_trace_in_pieces_is_the_same_trace(cell: Cell, stream: Dataset) -> Non
     ):
         with pytest.raises(xmlrpc.client.Fault, match=wrong):
             call()
-    assert [robot.add(ids[-1], [0.0] * 2500) for _ in range(80)][-1] == SAMPLES
-    with pytest.raises(xmlrpc.client.Fault, match=f"at most {SAMPLES} samples"):
+    assert [robot.add(ids[-1], [0.0] * 2500) for _ in range(80)][-1] == MAX_SAMPLES
+    with pytest.raises(xmlrpc.client.Fault, match=f"at most {MAX_SAMPLES} samples"):
         robot.add(ids[-1], [0.0])
 
 
@@ -209,7 +209,7 @@ def test_what_fails_in_the_server_is_a_fault_that_says_nothing_of_it(cell: Cell,
 
     monkeypatch.setattr(cell.service, "decide", broken)
     fault = fault_of(cell.post(call("decide", [1.0] * 60)))
-    assert fault.faultCode == xml_rpc.OURS
+    assert fault.faultCode == xml_rpc.INTERNAL_ERROR
     assert "secret" not in fault.faultString
     assert "a call failed" in caplog.text
 

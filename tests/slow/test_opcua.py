@@ -42,8 +42,8 @@ class Plant:
         return await self.node(f"Cell.{name}").read_data_value(raise_on_bad_status=False)
 
     async def decisions(self) -> int:
-        await self.service.ask(lambda engine: engine.flush())
-        return self.service.reading.status()["decisions"]
+        await self.service.call(lambda engine: engine.flush())
+        return self.service.read_store.status()["decisions"]
 
     async def until(self, name: str, fits: Callable[[Any], bool]) -> Any:
         async with asyncio.timeout(60):
@@ -116,7 +116,10 @@ async def test_the_variables_and_methods_are_as_they_are_described_and_read_only
             await node.write_value(await node.read_value())
     with pytest.raises(ua.UaStatusCodeError):
         await plant.client.nodes.objects.add_folder(plant.index, "mine")
-    for method, (taken, given) in (("Decide", opcua.DECIDE), ("Report", opcua.REPORT)):
+    for method, taken, given in (
+        ("Decide", opcua.DECIDE_ARGUMENTS, opcua.DECIDE_RESULTS),
+        ("Report", opcua.REPORT_ARGUMENTS, opcua.REPORT_RESULTS),
+    ):
         for name, arguments in (("InputArguments", taken), ("OutputArguments", given)):
             node = await plant.node(f"Cell.{method}").get_child(f"0:{name}")
             said = [(each.Name, each.DataType.Identifier, each.ValueRank) for each in await node.read_value()]
@@ -131,8 +134,8 @@ async def test_the_example_client_plays_a_shift_with_a_controllers_types_and_emp
     with a_service(tmp_path / "cell.db", Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7)) as service:
         async with opcua.opcua_server(service, port=0) as server:
             counts, *variables = await play(f"opc.tcp://127.0.0.1:{server.bserver.port}/dengine", 120, empty)
-            await service.ask(lambda engine: engine.flush())
-        known = [past.decision for past in service.reading.decisions(HistoryFilter(), 1000)]
+            await service.call(lambda engine: engine.flush())
+        known = [past.decision for past in service.read_store.decisions(HistoryFilter(), 1000)]
     n = {action: sum(each.action == action for each in known) for action in ("verify", "accept", "reject")}
     assert counts == ", ".join(f"{count} {action}" for action, count in n.items())
     assert (sum(n.values()), n["accept"] > 0) == (120, True)
@@ -207,9 +210,9 @@ async def test_an_alarm_is_a_variable_and_an_event(plant: Plant, stream: Dataset
 
     subscription = await plant.client.create_subscription(50, Listener())
     await subscription.subscribe_events()
-    await plant.service.ask(lambda engine: engine.set_shadow(True, "the operator"))
+    await plant.service.call(lambda engine: engine.set_shadow(True, "the operator"))
     assert await plant.until("Shadow", bool)
-    await plant.service.ask(lambda engine: engine.set_shadow(False, "the operator"))
+    await plant.service.call(lambda engine: engine.set_shadow(False, "the operator"))
     assert not await plant.until("Shadow", lambda on: not on)
     found = await plant.service.status()
     monkeypatch.setattr(plant.service, "status", lambda: asyncio.sleep(0, replace(found, store_fault="disk full")))
@@ -230,7 +233,7 @@ async def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(p
         monkeypatch.setattr(plant.service, "status", stand_in)
         async with asyncio.timeout(60):
             while (read := await plant.read("Decisions")).StatusCode.value != getattr(ua.StatusCodes, status):
-                await plant.service.ask(lambda engine: None)
+                await plant.service.call(lambda engine: None)
                 await asyncio.sleep(0.05)
         assert read.Value.Value == before
 
