@@ -101,7 +101,7 @@ class Feedback:
         return self._settings.now.recipe.policy.stops == "all"
 
     def resume(self) -> None:
-        """Read from the store which checks are pending, and which accepted parts have no outcome."""
+        """Read from the store which checks are pending, and which accepts have no outcome."""
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
         for stored in store.pending_decisions(self._settings.now.evidence.since):

@@ -1,6 +1,4 @@
-"""What the engine drives: the contracts, our own prediction by reducer and radius neighbours, and a
-baseline's adapter.
-"""
+"""What the engine drives: two contracts, dengine's own model, and the adapter of baselines."""
 
 import lazy_loader
 

@@ -30,7 +30,7 @@ Embedding = tuple[tuple[float, ...], ...]  # (K, d)
 
 
 class Prediction(NamedTuple):
-    """What a model says of one trace; fields as in `Decision`."""
+    """A model's prediction for one trace; fields as of `Decision`."""
 
     action: Action
     lower: float
@@ -43,22 +43,23 @@ class Prediction(NamedTuple):
 
 @runtime_checkable
 class Model(Protocol):
-    """What a baseline method must give, and no more.
+    """What a baseline method must implement, and no more.
 
-    X is (n, C, T) float32, y (n,) of 1 = success and 0 = failure.
+    X is an array of float32, shape (n, channels, samples); y is an array of shape (n,) with 1 for
+    success and 0 for failure.
     """
 
     def fit(self, X: Any, y: Any) -> Any:
-        """Train anew on labelled traces."""
+        """Train from scratch on labelled traces."""
 
     def add(self, x: Any, y: Any) -> Any:
-        """Take in one labelled trace (C, T) between two trainings."""
+        """Learn one labelled trace (channels, samples) between two trainings."""
 
     def count(self, X: Any) -> tuple[Any, Any]:
-        """(n_success, n_failure) behind each prediction."""
+        """Return (n_success, n_failure), each (n,): the labels behind each prediction."""
 
     def predict_interval(self, X: Any) -> tuple[Any, Any]:
-        """(lower, upper) of each success probability."""
+        """Return (lower, upper), each (n,): the bounds of each success probability."""
 
     def decide(self, X: Any) -> Any:
         """An `Action` for each trace."""
@@ -337,9 +338,9 @@ class PythonPredictor(nn.Module):
 
 
 def as_engine_model(model: Model) -> EngineModel:
-    """A model as the engine drives it: our own as it is, a baseline adapted.
+    """Return a model as the engine drives it: an `EngineModel` as it is, a baseline adapted.
 
-    SettingError for what is no model.
+    Raises SettingError for an object that lacks a method of `Model`.
     """
     if isinstance(model, EngineModel):
         return model
@@ -351,37 +352,41 @@ def as_engine_model(model: Model) -> EngineModel:
 
 
 class BaselineAdapter(EngineModel):
-    """Makes an `EngineModel` of a baseline.
+    """Makes an `EngineModel` of a baseline, which decides by its own rule.
 
-    It decides by its own rule, and it is trained on a deep copy.
+    A deep copy of the baseline is trained, so the present one goes on answering.
+
+    Parameters
+    ----------
+    model : Model
+        Its settings are its author's affair: a store compares only the name of its class.
     """
 
     keeps_references = False
 
     def __init__(self, model: Model) -> None:
-        self.model = self.user_model = model
-        self.name, self.description = (
-            type(model).__name__,
-            type(model).__qualname__,
-        )  # its settings are its author's affair
+        self.model = model
+        self.user_model = model
+        self.name = type(model).__name__
+        self.description = type(model).__qualname__
 
     def train(self, X: Floats, y: NDArray[Any], *_: object, **__: object) -> Self:
-        self.model.fit(
-            clip_extremes(X).copy(), y
-        )  # the window's own, which a baseline may write to
+        """Train the baseline from scratch on a copy of the traces, which it may write to."""
+        self.model.fit(clip_extremes(X).copy(), y)
         return self
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """The baseline's own decision on one trace (C, T), with its evidence.
+        """Return the baseline's decision on one trace (channels, samples), with its evidence.
 
-        It knows nothing of parts.
+        `hash_` has no effect, because a baseline knows nothing of parts. Raises ValueError for
+        counts that are no whole numbers.
         """
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)
         (n_success,), (n_failure,) = self.model.count(X)
         action = Action(self.model.decide(X)[0])
         reason = Reason.UNCERTAIN if action is Action.VERIFY else Reason.CERTAIN
-        counts = int(n_success), int(n_failure)
+        counts = (int(n_success), int(n_failure))
         if counts != (n_success, n_failure) or not all(0 <= n < 2**63 for n in counts):
             raise ValueError(
                 "Expected whole numbers of labels below 2**63, "
@@ -414,11 +419,24 @@ class BaselineAdapter(EngineModel):
 class Exportable:
     """What an exporter starts from.
 
-    model : fitted.  trace : the contract of its traces.  audit_rate, seed : of the audits' coin.
-    windows : an operator's, as they act.  stops_all : whether silence until the next decision
-    confirms an accepted part. model_version, recipe : what the file says of the engine; 0 and ""
-    without one. note : takes what is to be remembered of the export, a kind and a text, as
-    `SqlStore.put_event`; None: nobody remembers.
+    Attributes
+    ----------
+    model : ModelPrediction
+        Fitted.
+    trace : TraceSpec
+        The trace contract.
+    audit_rate : float
+        Share of the certain decisions that are verified as audits.
+    seed : int
+        Of the coin that draws audits.
+    stops_all : bool
+        Whether silence until the next decision confirms an accepted part.
+    windows : tuple of ForceLimits
+        As they act on traces.
+    model_version, recipe
+        What the file says of the engine; 0 and "" without one.
+    note : callable, optional
+        Called with the kind and the text of an event, to record the export.
     """
 
     model: Any
@@ -432,5 +450,5 @@ class Exportable:
     note: Callable[[str, str], object] | None = None
 
     def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """Itself, as of what exports it; trace : another contract."""
+        """Return itself, or a copy with another contract: exporters call this on any source."""
         return self if trace is None else replace(self, trace=trace)

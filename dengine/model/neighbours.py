@@ -1,13 +1,11 @@
-"""The model prediction: reducer, references and rule together, with honest counting.
-
-And the module that answers.
+"""dengine's own model, `ModelPrediction`: reducer, references and rule, with honest counting.
 
 A label may be counted for a query only in an embedding that never saw that label. So the reducer
 spans K spaces, fold k's references live in space k, a query is embedded in all K, and its counts
 are summed.
 
-`Predictor` is what the engine asks, and what export saves: `export.decision` puts the trace gate
-before it and the audits' coin behind it.
+The engine and the exporters ask a `Decider` around `Predictor`, a module of the fitted parts that
+compiles to TorchScript. Compiled deciders are copied from templates, because scripting takes long.
 """
 
 import copy
@@ -57,10 +55,10 @@ from .base import Embedding, EngineModel, Exportable, Prediction
 log = logging.getLogger("dengine")
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
 NEIGHBOURS = 10
-# A nearest neighbour within this share of the distance to the tenth one is a near repeat; of distinct
-# parts about one in two hundred is as near.
+# A nearest neighbour within this share of the distance to the tenth one is a near repeat; of
+# distinct parts about one in two hundred is as near.
 NEAR = 0.12
-# More near repeats are reported; among 100 to 500 insertions of distinct parts up to 15 were counted.
+# More near repeats are reported; among 100 to 500 insertions of distinct parts there were up to 15.
 SUSPICIOUS = 25
 NOVEL = REASONS.index(Reason.NOVEL)
 KINDS = 16  # compiled modules that a process keeps
@@ -117,21 +115,21 @@ class Predictor(nn.Module):
 
 
 class InPython(nn.Module):
-    """The embedding of a reducer that has no module, umap-learn for one."""
+    """Embeds by calling a reducer that has no module, such as umap-learn, in Python."""
 
     def __init__(self, reducer: Reducer) -> None:
         super().__init__()
         self.reducer = reducer
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) -> (B, K, d)."""
+        """Return the embeddings (B, K, d) of traces (B, C, T)."""
         return torch.from_numpy(self.reducer.embed(x.numpy()))
 
 
-CONSTANTS = bool, int, float, str, list, tuple, dict, FunctionType, type(None)
-_COMPILED: dict[
-    Any, Any
-] = {}  # a module of each structure: to script takes 24 ms and more, a copy of one 1 ms
+# Types of attributes that TorchScript compiles into the code.
+CONSTANTS = (bool, int, float, str, list, tuple, dict, FunctionType, type(None))
+# A compiled decider for each structure: scripting takes 24 ms and more, copying a template 1 ms.
+_COMPILED: dict[Any, Any] = {}
 
 
 def template_of(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
@@ -153,64 +151,61 @@ def template_of(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
 
 
 def structure_of(eager: nn.Module) -> tuple[Any, ...]:
-    """Everything that scripting compiles into a module: classes, attributes and shapes, but not the
-    tensors' values.
+    """Return everything that scripting compiles into a module, as a key to compare by.
 
-    The classes themselves are part of it, not their names: a notebook cell that is run again
-    defines another class.
+    That is classes, attributes and shapes, but not the tensors' values. The classes themselves are
+    part of it, not their names: a notebook cell that is run again defines another class.
     """
-    return tuple(
-        (
-            name,
-            type(module),
-            *sorted(
-                (key, _as_key(value))
-                for key, value in vars(module).items()
-                if is_compiled_in(key, value)
-            ),
-            *(
-                (key, None if isinstance(module, ForceLimitsGate) else tuple(tensor.shape))
-                for key, tensor in _tensors_of(module)
-            ),
-        )
-        for name, module in eager.named_modules()
+    return tuple((name, *_own_structure(module)) for name, module in eager.named_modules())
+
+
+def _own_structure(module: nn.Module) -> tuple[Any, ...]:
+    """Return the class, the compiled attributes and the tensors' shapes of one module."""
+    attributes = sorted(
+        (name, _as_key(value))
+        for name, value in vars(module).items()
+        if is_compiled_in(name, value)
     )
+    # Force limits may change in number without a new module.
+    is_limits = isinstance(module, ForceLimitsGate)
+    shapes = [
+        (name, None if is_limits else tuple(tensor.shape)) for name, tensor in _tensors_of(module)
+    ]
+    return (type(module), *attributes, *shapes)
 
 
 def is_compiled_in(name: str, value: object) -> bool:
-    """Whether scripting compiles an attribute into the code, as it does with plain values and
-    functions.
-    """
+    """Return whether scripting compiles an attribute into the code: a plain value or a function."""
     return not name.startswith("_") and isinstance(value, CONSTANTS)
 
 
 def _as_key(value: object) -> object:
-    """A value to compare by; a function itself, for another may later have its address."""
+    """Return the text of a value, or a function itself, because another may get its address."""
     return value if isinstance(value, FunctionType) else repr(value)
 
 
 def _compiles(*modules: nn.Module) -> bool:
-    """Whether TorchScript compiles these as they are now.
+    """Return whether TorchScript compiles these modules as their code is now; log where not.
 
-    What it compiled before it was changed answers in Python.
+    It keeps what it compiled first. A class whose code was changed since then runs in Python.
     """
     changed = [type(module).__name__ for module in modules if is_code_changed(module)]
     if changed:
-        do = "start Python anew to have it compiled"
         log.warning(
-            "the code of %s was changed after it was compiled: it answers in Python; %s",
+            "the code of %s was changed after it was compiled: it answers in Python; "
+            "start Python anew to have it compiled",
             listed(changed),
-            do,
         )
     return not changed
 
 
 def _tensors_of(module: nn.Module, recurse: bool = False) -> list[tuple[str, Tensor]]:
+    """Return a module's parameters and buffers by name; with `recurse` its submodules' as well."""
     return [*module.named_parameters(recurse=recurse), *module.named_buffers(recurse=recurse)]
 
 
 def compiled(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
-    """A scripted module with another one's tensors, shared, not copied."""
+    """Return a compiled decider that shares the tensors of an eager one."""
     module = copy.deepcopy(template_of(eager, trace_shape))
     for name, tensor in _tensors_of(eager, recurse=True):
         *path, leaf = name.split(".")
@@ -219,20 +214,37 @@ def compiled(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
 
 
 class ModelPrediction(EngineModel):
-    """Reducer + references + rule, from traces.
-
-    reducer : a name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned,
-    never fitted itself. classifier : a `WilsonRadiusClassifier` holding radius and policy; it is
-    cloned, never fitted itself.
-        None: of the reducer's own radius.
-    folds : K, for a label-using transformer that does not cross-fit by itself.
-    rule : what turns counts into an action; None: the classifier's policy.
-    novelty : how far beyond its references a trace may lie, as in `Recipe`; 0: anywhere.
+    """Predicts from traces: reducer, references and decision rule together.
 
     Embeddings are scaled space by space to a root mean square radius of 1, so that one `radius`
-    means the same in every reducer; the scale of space k comes from fold k's traces, whose labels
-    that space never saw. One whose axis has a unit of its own (`Reducer.own_unit`) is left as it
-    is: where probabilities hardly differ, they are not to be spread.
+    means the same for every reducer. The scale of space k comes from fold k's traces, whose labels
+    that space never saw. A space with a unit of its own (`Reducer.own_unit`), such as a
+    probability, is not scaled, so that small differences stay small.
+
+    Parameters
+    ----------
+    reducer : str, Reducer or object
+        A name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned, never
+        fitted itself.
+    classifier : WilsonRadiusClassifier, optional
+        Holds radius and policy; it is cloned, never fitted itself. None: with the reducer's radius.
+    folds : int
+        Number of folds K for a transformer that uses labels and does not cross-fit by itself.
+    rule : DecisionRule, optional
+        Turns counts into an action; None: the rule of the classifier's policy.
+    novelty : float
+        How far beyond its references a trace may lie, as in `Recipe`; 0: anywhere.
+
+    Attributes
+    ----------
+    spaces : Reducer
+        The fitted reducer, cross-fitted where it uses labels.
+    index : RadiusIndex
+        The references; set by `fit`.
+    scale : array of float32, shape (K,)
+        Each space is divided by its scale; set by `fit`.
+    gate : NoveltyGate
+        Set by `fit`.
     """
 
     def __init__(
@@ -244,46 +256,60 @@ class ModelPrediction(EngineModel):
         novelty: float = NOVELTY,
     ) -> None:
         self.novelty = novelty
+        self.folds = folds
         self.reducer = make_reducer(reducer) if isinstance(reducer, str) else reducer
         self.classifier = classifier or WilsonRadiusClassifier(
             own_default(self.reducer, "default_radius")
         )
-        self.folds, self.name = folds, type(self.reducer).__name__
+        self.name = type(self.reducer).__name__
         self.rule = rule or self.classifier.policy().rule()
         self.spaces: Reducer = as_reducer(clone(self.reducer), folds)
         self._note = ""
 
     @classmethod
     def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
-        """The untrained model that a recipe describes."""
+        """Return the untrained model that a recipe describes; `seed` is the reducer's."""
         policy = recipe.policy
-        own = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
-        classifier = WilsonRadiusClassifier(recipe.radius, **own, capacity=recipe.window)
-        return cls(
-            recipe.make_reducer(seed), classifier, recipe.folds, policy.rule(), recipe.novelty
+        classifier = WilsonRadiusClassifier(
+            recipe.radius,
+            alpha=policy.alpha,
+            lower_bound=policy.lower_bound,
+            interval=policy.interval,
+            capacity=recipe.window,
         )
+        reducer = recipe.make_reducer(seed)
+        return cls(reducer, classifier, recipe.folds, policy.rule(), recipe.novelty)
 
     @property
-    def user_model(self) -> "ModelPrediction":  # itself: an attribute would be a circle
+    def user_model(self) -> "ModelPrediction":  # an attribute would be a reference circle
         return self
 
     @property
-    def description(self) -> str:  # type: ignore[override]  # asked when the rule may be another
-        own = f"{describe_estimator(self.reducer)} under {describe_estimator(self.classifier)}"
-        return f"{own}, {self.folds} folds, {type(self.rule).__name__}"
+    def description(self) -> str:  # type: ignore[override]  # the rule may change
+        reducer = describe_estimator(self.reducer)
+        classifier = describe_estimator(self.classifier)
+        return f"{reducer} under {classifier}, {self.folds} folds, {type(self.rule).__name__}"
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
         """Return the recipe with this model's classifier settings, folds and novelty."""
-        own = self.classifier
+        classifier = self.classifier
         policy = replace(
-            recipe.policy, alpha=own.alpha, lower_bound=own.lower_bound, interval=own.interval
+            recipe.policy,
+            alpha=classifier.alpha,
+            lower_bound=classifier.lower_bound,
+            interval=classifier.interval,
         )
         return replace(
-            recipe, radius=own.radius, policy=policy, folds=max(2, self.folds), novelty=self.novelty
+            recipe,
+            radius=classifier.radius,
+            policy=policy,
+            folds=max(2, self.folds),
+            novelty=self.novelty,
         )
 
     @property
     def n_spaces(self) -> int:
+        """Number of spaces K: one for a reducer that uses no labels."""
         return self.spaces.n_spaces
 
     @property
@@ -292,21 +318,34 @@ class ModelPrediction(EngineModel):
 
     @property
     def report(self) -> FitReport:
-        own = self.spaces.report
-        return replace(own, note="; ".join(filter(None, (own.note, self._note))))
+        report = self.spaces.report
+        return replace(report, note="; ".join(filter(None, (report.note, self._note))))
 
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
-        """Train the reducer afresh, and make every trace a reference.
+        """Train the reducer from scratch, and make every trace a reference.
 
-        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.trace_hash`
-        of each, or None: of their content. Raises SettingError where the reducer cannot be trained
-        on this (one class only, too few traces).
+        Parameters
+        ----------
+        X : array, shape (n, samples) or (n, channels, samples)
+        y : array of int, shape (n,)
+            1 is success, 0 is failure.
+        hashes : array of int64, shape (n,), optional
+            `folds.trace_hash` of each trace; None: of its content.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        SettingError
+            Where the reducer cannot be trained: one class only, or too few traces.
         """
-        X, y = as_traces(X), as_labels(y)
+        X = as_traces(X)
+        y = as_labels(y)
+        hashes = content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64)
         self.spaces = as_reducer(clone(self.reducer), self.folds)
-        return self.train(
-            X, y, content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64)
-        )
+        return self.train(X, y, hashes)
 
     def train(
         self,
@@ -316,60 +355,65 @@ class ModelPrediction(EngineModel):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Self:
-        """Train the reducer, warm where it can be, and make every trace a reference."""
-        X, y = clip_extremes(X), y.astype(np.int64)
+        """Train the reducer, from its last training where it can, and make every trace a reference.
+
+        Parameters and result as of `EngineModel.train`.
+        """
+        X = clip_extremes(X)
+        y = y.astype(np.int64)
         folds = fold_of(hashes, self.n_spaces)
         points = self.spaces.train(X, y, folds, stop, numbers)
         self.trace_shape = X.shape[1:]
-        own_unit = self.spaces.own_unit
-        self.scale = (
-            np.ones(self.n_spaces, np.float32)
-            if own_unit
-            else space_scale(points, folds, self.n_spaces)
-        )
+        if self.spaces.own_unit:
+            self.scale = np.ones(self.n_spaces, np.float32)
+        else:
+            self.scale = space_scale(points, folds, self.n_spaces)
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
         self.index.add(points / self.scale[folds, None], y, folds, hashes, numbers)
         self.index.estimate_agreement()
         self._note = repeats_note(X, hashes)
-        self.gate = (
-            fit_novelty(X, self.novelty, hashes) if self.novelty else NoveltyGate(*self.trace_shape)
-        )
-        self._decider = None  # built by `prepare`, or when it is asked
+        if self.novelty:
+            self.gate = fit_novelty(X, self.novelty, hashes)
+        else:
+            self.gate = NoveltyGate(*self.trace_shape)
+        self._decider = None  # built by `prepare`, or when it is used first
         return self
 
     def warm_up(self) -> None:
         self.spaces.warm_up()
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Let the reducer compute in advance.
+        """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
-        Before the first training also compile the predictor's template.
+        Before the first training, a template of the decider is compiled as well: the first retrain
+        has no time for that.
         """
         X = clip_extremes(X)
-        blank = self.spaces.untrained_module(X)
-        with ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,)) as pool:
-            ahead = pool.submit(self.spaces.precompute, X, numbers)
-            if (
-                blank is not None
-                and self.rule.scriptable
-                and "index" not in vars(self)
-                and _compiles(self.rule, blank)
-            ):
-                shape, own = X.shape[1:], self.classifier
-                gate = NoveltyGate(*shape)
-                gate.disabled = not self.novelty
-                around = own.neighbours_over(
-                    RadiusIndex(blank.dim, own.capacity), self.rule, self.spaces.scores
-                )
-                predictor = Predictor(blank, torch.ones(self.n_spaces), gate, around)
-                conditions = DecisionConditions(TraceSpec(channels=shape[0], samples=shape[1]))
-                decider = Decider(predictor, conditions, (self.n_spaces, blank.dim))
-                template_of(decider.eval(), shape)
-            ahead.result()
+        encoder = self.spaces.untrained_module(X)
+        with ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,)) as pool:
+            computing = pool.submit(self.spaces.precompute, X, numbers)
+            is_untrained = "index" not in vars(self)
+            is_scriptable = encoder is not None and self.rule.scriptable
+            if is_untrained and is_scriptable and _compiles(self.rule, encoder):
+                self._compile_template(encoder, X.shape[1:])
+            computing.result()
+
+    def _compile_template(self, encoder: Any, trace_shape: tuple[int, ...]) -> None:
+        """Compile the decider's template for traces of this shape (C, T), with empty references."""
+        channels, samples = trace_shape
+        gate = NoveltyGate(channels, samples)
+        gate.disabled = not self.novelty
+        references = RadiusIndex(encoder.dim, self.classifier.capacity)
+        neighbours = self.classifier.neighbours_over(references, self.rule, self.spaces.scores)
+        predictor = Predictor(encoder, torch.ones(self.n_spaces), gate, neighbours)
+        conditions = DecisionConditions(TraceSpec(samples, channels=channels))
+        decider = Decider(predictor, conditions, (self.n_spaces, encoder.dim))
+        template_of(decider.eval(), trace_shape)
 
     def prepare(self, previous: EngineModel) -> None:
-        """Take over the rule of the previous model, stale or not, and compile the predictor unless
-        that is done.
+        """Take over the rule of the previous model, stale or not, and build the decider.
+
+        A decider that was built with that rule is kept.
         """
         if not isinstance(previous, ModelPrediction):
             return
@@ -426,7 +470,10 @@ class ModelPrediction(EngineModel):
         return self._decider
 
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
-        """Take in one labelled trace, (T,) or (C, T), as a reference."""
+        """Make one labelled trace, shape (samples,) or (channels, samples), a reference.
+
+        `y` is 1 for success, 0 for failure. Returns self.
+        """
         X = as_traces(np.asarray(x)[None])
         hash_ = int(content_hash(X)[0])
         self.add_reference(X[0], int(as_success(np.asarray(y))), hash_)
@@ -454,8 +501,9 @@ class ModelPrediction(EngineModel):
         return point
 
     def _reference_point(self, x: Floats, hash_: int, embedding: Embedding | None) -> Floats:
-        """Return the scaled point (d,) of a trace in the space of its fold, computed where
-        `embedding` is None.
+        """Return the scaled point (d,) of a trace in the space of its fold.
+
+        It is taken from `embedding` (K, d), or computed where that is None.
         """
         if embedding is not None:
             return np.array(embedding[self._fold(hash_)], dtype=np.float32)
@@ -469,6 +517,7 @@ class ModelPrediction(EngineModel):
         return self.index.relabel(number, hash_, y)
 
     def _fold(self, hash_: int) -> int:
+        """Return the fold of a hash, which is also the space of its reference."""
         return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
 
     def update_rule(
@@ -500,8 +549,9 @@ class ModelPrediction(EngineModel):
         self.rule_is_stale = was_stale
 
     def reset_rule(self, safe_mode: int) -> None:
-        """Reset the rule in place, because the compiled module shares its tensors, and start it in
-        a safe mode.
+        """Make the rule forget every outcome and start in this safe mode.
+
+        It is reset in place, because the compiled module shares its tensors.
         """
         self.rule.load_state_dict(self.rule.clone().state_dict())
         self.rule.start_in_safe_mode(safe_mode)
@@ -525,9 +575,10 @@ class ModelPrediction(EngineModel):
         return SAFE_MODES[self.rule.safe_mode()]
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """The whole prediction on one trace (C, T).
+        """Predict one trace (channels, samples).
 
-        The part with this hash, if it is known, has no vote.
+        References of the part with this hash have no vote; 0 excludes none. Raises RuntimeError
+        where the rule is stale.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -553,76 +604,68 @@ class ModelPrediction(EngineModel):
             raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
 
     def predict_many(self, X: ArrayLike) -> list[Prediction]:
-        """The prediction on each trace of (n, T) or (n, C, T)."""
+        """Predict each trace of X, shape (n, samples) or (n, channels, samples)."""
         return [self.predict_one(x) for x in as_traces(X)]
 
     def count(self, X: ArrayLike) -> Counts:
-        """(n_success, n_failure), each (n,): labels in the balls around each trace, summed over the
-        K spaces.
+        """Count the labels in the neighbourhood of each trace, summed over the K spaces.
+
+        Returns (n_success, n_failure), each an array of int64, shape (n,).
         """
-        found = self.predict_many(X)
-        return np.array([p.n_success for p in found], dtype=np.int64), np.array(
-            [p.n_failure for p in found], np.int64
-        )
+        predictions = self.predict_many(X)
+        n_success = np.array([prediction.n_success for prediction in predictions], dtype=np.int64)
+        n_failure = np.array([prediction.n_failure for prediction in predictions], dtype=np.int64)
+        return n_success, n_failure
 
     def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(lower, upper), each (n,): the bound on each trace's success probability."""
-        found = self.predict_many(X)
-        return np.array([p.lower for p in found]), np.array([p.upper for p in found])
+        """Return (lower, upper), each of shape (n,): the bounds of each success probability."""
+        predictions = self.predict_many(X)
+        lower = np.array([prediction.lower for prediction in predictions])
+        upper = np.array([prediction.upper for prediction in predictions])
+        return lower, upper
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:
-        """(n,) array of `Action`."""
-        return np.array([p.action for p in self.predict_many(X)], dtype=object)
+        """Return an array of `Action`, shape (n,): what the model would do with each trace."""
+        return np.array([prediction.action for prediction in self.predict_many(X)], dtype=object)
 
     def successor(self) -> "ModelPrediction":
-        """A model to train next, warm from this one.
-
-        All but the rule is its own, so this one goes on answering.
-        """
-        new = copy.copy(self)
-        new.spaces, new._decider, new._note = copy.deepcopy(self.spaces), None, ""
-        return new
+        """Return a model to train next, starting from this one; only the rule is shared."""
+        model = copy.copy(self)
+        model.spaces = copy.deepcopy(self.spaces)
+        model._decider = None
+        model._note = ""
+        return model
 
     def defect(self) -> str:
-        return (
-            ""
-            if np.isfinite(self.index.column("points")).all()
-            else "the embedding of a reference is not finite"
-        )
+        is_finite = np.isfinite(self.index.column("points")).all()
+        return "" if is_finite else "the embedding of a reference is not finite"
 
     def get_state(self) -> State:
-        """Plain arrays: references always.
+        """Return the state as arrays by name.
 
-        The reducer's and the rule's own where they have any ("reducer.", "rule.").
+        References and scale are always there; "reducer.", "rule." and "novelty." begin the names of
+        what these parts have. A stale rule is left out.
         """
-        state = {
-            "trace_shape": np.array(self.trace_shape),
-            "scale": self.scale,
-        } | self.index.get_state()
+        state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
+        state |= self.index.get_state()
         if self.rule_is_stale:
-            state["rule_is_stale"] = np.array(
-                True
-            )  # an engine that opens the store rebuilds the rule
+            state["rule_is_stale"] = np.array(True)  # an engine that opens the store rebuilds it
         else:
-            state |= {
-                f"rule.{name}": buffer.numpy().copy()
-                for name, buffer in self.rule.state_dict().items()
-            }
+            state |= _module_state(self.rule, "rule.")
         if not self.gate.disabled:
-            state |= {
-                f"novelty.{name}": buffer.numpy().copy()
-                for name, buffer in self.gate.state_dict().items()
-            }
-        return state | {
-            f"reducer.{name}": value for name, value in (self.spaces.get_state() or {}).items()
-        }
+            state |= _module_state(self.gate, "novelty.")
+        reducer_state = self.spaces.get_state() or {}
+        return state | {f"reducer.{name}": values for name, values in reducer_state.items()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        """Restore the state that `get_state` returned; returns self.
+
+        Raises StoreError for a reducer of that name that has another kind of state.
+        """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
-        elif (
-            self.spaces.get_state() is not None
-        ):  # another reducer of that name, whose points lie elsewhere
+        elif self.spaces.get_state() is not None:
+            # Another reducer of that name, which would embed traces elsewhere.
             raise incompatible_model_error(f"{type(self.spaces).__name__} has no state")
         self.trace_shape = tuple(int(n) for n in state["trace_shape"])
         self.scale = np.asarray(state["scale"])
@@ -636,7 +679,7 @@ class ModelPrediction(EngineModel):
         return self
 
     def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
-        """Whether the reducer gave no arrays of its own."""
+        """Return whether the reducer has no state there, so that it must be fitted again."""
         return not arrays_with_prefix(state, "reducer.")
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
@@ -644,47 +687,67 @@ class ModelPrediction(EngineModel):
             raise ExportError(
                 "Nothing was trained yet; report labels until the first retrain, then export."
             )
-        return Exportable(
-            self, trace or TraceSpec(channels=self.trace_shape[0], samples=self.trace_shape[1])
-        )
+        channels, samples = self.trace_shape
+        return Exportable(self, trace or TraceSpec(samples, channels=channels))
 
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.
         return self.__dict__ | {"_decider": None}
 
 
+def _module_state(module: nn.Module, prefix: str) -> State:
+    """Return copies of a module's tensors as arrays, by their names behind the prefix."""
+    return {
+        f"{prefix}{name}": tensor.numpy().copy() for name, tensor in module.state_dict().items()
+    }
+
+
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
-    """How many of the newest traces (n, C, T) nearly repeat one of another part; parts (n,) hashes.
+    """Count the newest traces that nearly repeat a trace of another part.
 
     Labels are counted as independent trials, so a part that is inserted again must be known as such
-    (`part=`). This notices the plain cases where it is not; it changes no decision. More repeats
-    than `NEIGHBOURS` are not seen.
+    (`part=`). This notices the plain cases where it is not; it changes no decision. A trace with
+    more than `NEIGHBOURS` near repeats is not noticed.
+
+    Parameters
+    ----------
+    traces : array of float32, shape (n, channels, samples)
+        Oldest first; the newest `NEWEST` are compared.
+    parts : array of int64, shape (n,)
+        Hash of each trace's part.
+
+    Returns
+    -------
+    int
+        0 for fewer than 100 traces.
     """
-    x, own = traces[-NEWEST:], parts[-NEWEST:]
-    if len(x) < 100:
+    traces = traces[-NEWEST:]
+    parts = parts[-NEWEST:]
+    if len(traces) < 100:
         return 0
-    n, channels, samples = x.shape
-    length = max(1, samples // 50)  # means of equal stretches: the sensor's noise is no difference
-    whole = x[:, :, : samples // length * length].astype(np.float64)
-    means = whole.reshape(n, channels, -1, length).mean(3)
+    n, channels, samples = traces.shape
+    # Means of equal stretches, so that the sensor's noise makes no difference.
+    length = max(1, samples // 50)
+    stretches = traces[:, :, : samples // length * length].astype(np.float64)
+    means = stretches.reshape(n, channels, -1, length).mean(3)
     scale = means.std((0, 2), keepdims=True)
-    rows = torch.from_numpy(
-        ((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1)
-    )
+    scaled = (means - means.mean(0)) / np.where(scale > 0, scale, 1.0)
+    rows = torch.from_numpy(scaled.reshape(n, -1))
     distances = torch.cdist(rows, rows)
-    distances[torch.from_numpy(own[:, None] == own)] = torch.inf
-    tenth = np.partition(distances.numpy(), NEIGHBOURS)[
-        :, NEIGHBOURS
-    ]  # a quarter of the time of `kthvalue`
-    return int(((distances.numpy().min(1) < NEAR * tenth) & (tenth > 1e-6)).sum())
+    distances[torch.from_numpy(parts[:, None] == parts)] = torch.inf
+    nearest = distances.numpy().min(1)
+    # A quarter of the time of `kthvalue`.
+    tenth = np.partition(distances.numpy(), NEIGHBOURS)[:, NEIGHBOURS]
+    return int(((nearest < NEAR * tenth) & (tenth > 1e-6)).sum())
 
 
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
-    """What to say of near repeats; "" where there are few."""
-    n, looked_at = near_repeats(traces, parts), min(len(traces), NEWEST)
-    if n <= SUSPICIOUS:
+    """Return a note for the retrain's report where many traces nearly repeat; "" where few do."""
+    n_repeats = near_repeats(traces, parts)
+    if n_repeats <= SUSPICIOUS:
         return ""
+    n_compared = min(len(traces), NEWEST)
     return (
-        f"{n} of the newest {looked_at} traces nearly repeat another: "
+        f"{n_repeats} of the newest {n_compared} traces nearly repeat another: "
         "if parts come twice, give their numbers (part=)"
     )
