@@ -470,7 +470,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             # A cell may know its parts' numbers.
             decision = self.decide(trace, getattr(cell, "part", None))
             seconds = self._core.clock() - begin
-        outcome, success, source = None, None, None
+        outcome = None
+        success = None
+        source = None
         if decision.action is Action.VERIFY:
             success = as_success(cell.verify(), f"decision {decision.id}, by verify()")
         elif decision.action is Action.ACCEPT:

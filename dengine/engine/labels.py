@@ -142,9 +142,9 @@ class ProductLabels:
         """Count again after the window was filled anew: forgotten labels count no more, restored
         ones do.
         """
-        own = {number for number, is_own in self._since if is_own}
+        own_numbers = {number for number, is_own in self._since if is_own}
         newer = self._window.newer(self._trained_to)
-        self._since = [(number, number in own) for number in newer]
+        self._since = [(number, number in own_numbers) for number in newer]
 
     def count_learned(self) -> None:
         """Do nothing: a label counts when it enters the window."""
@@ -208,7 +208,7 @@ class ProductLabels:
         self._references_to = references_to
         self._add_waiting(model)
         self._trained_to = counts_from
-        self._since = [(number, own) for number, own in self._since if number > counts_from]
+        self._since = [(number, is_own) for number, is_own in self._since if number > counts_from]
 
     def _add_waiting(self, model: EngineModel) -> None:
         """Make this cell's waiting labels references, but for those that the version's references

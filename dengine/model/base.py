@@ -326,11 +326,12 @@ class PythonPredictor(nn.Module):
 
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
         """Return what the model predicts for one trace (C, T), as `Predicted`."""
-        found = self.model.predict_one(x.numpy(), part)
-        action = ACTIONS.index(found.action)
-        reason = REASONS.index(found.reason)
-        counts = (found.n_success, found.n_failure)
-        return action, reason, found.lower, found.upper, *counts, self.embed(x)
+        prediction = self.model.predict_one(x.numpy(), part)
+        action = ACTIONS.index(prediction.action)
+        reason = REASONS.index(prediction.reason)
+        counts = (prediction.n_success, prediction.n_failure)
+        bounds = (prediction.lower, prediction.upper)
+        return action, reason, *bounds, *counts, self.embed(x)
 
     def embed(self, x: Tensor) -> Tensor:
         """Return an empty embedding, shape (0, 0): the model has none."""

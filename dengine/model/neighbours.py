@@ -590,6 +590,10 @@ class ModelPrediction(EngineModel):
         )
 
     def decide_one(self, x: Floats, part: int, conditions: DecisionConditions) -> Verdict:
+        """Decide on one trace by the compiled decider; arguments as of `EngineModel.decide_one`.
+
+        Raises RuntimeError where the rule is stale and the trace has no fault.
+        """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
         with torch._C._InferenceMode(True):
@@ -683,6 +687,10 @@ class ModelPrediction(EngineModel):
         return not arrays_with_prefix(state, "reducer.")
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
+        """Return what an exporter starts from, by its own contract where `trace` is None.
+
+        Raises ExportError before the first training.
+        """
         if "trace_shape" not in vars(self):
             raise ExportError(
                 "Nothing was trained yet; report labels until the first retrain, then export."
