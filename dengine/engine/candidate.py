@@ -1,5 +1,4 @@
-"""A trained version on its way to answering: it catches up on labels, is stored, and waits for
-that.
+"""A trained version that does not answer yet: it catches up on labels and is stored first.
 
 `learner.Learner` takes a candidate through these steps, either to the end or one short step between
 two cycles.
@@ -105,9 +104,7 @@ class Candidate:
         return self.report
 
     def begin_storing(self, storing: Future[int], seconds: float) -> None:
-        """Note that the version's commit has begun, which a step does not wait for until so many
-        seconds are over.
-        """
+        """Note that the version's commit has begun, and how many seconds it may take to begin."""
         self.storing = storing
         self._store_until = time.monotonic() + seconds
 
@@ -119,8 +116,9 @@ class Candidate:
         return storing.running() or time.monotonic() < self._store_until
 
     def number(self, version: int) -> None:
-        """Take the number that the store gave the version, because a peer's came before it.
+        """Take the number that the store gave the version; 0 keeps the number that it has.
 
-        0 leaves it as it is.
+        The two differ where a peer's version was stored first.
+
         """
         self.report = replace(self.report, version=version or self.report.version)

@@ -1,5 +1,4 @@
-"""What `DataEngine` is made of: its objects are composed here, and a decision and a report walk
-through them.
+"""The inside of `DataEngine`: composes its objects, and takes decisions and reports through them.
 
 `DataEngine` is the public face of `EngineCore`. `dengine serve` uses the core itself, by
 `engine.core_of`, for what only a server needs: a decision that must not wait, one that came too
@@ -178,11 +177,10 @@ class EngineCore:
         decision_id: str | None = None,
         timed_out: bool = False,
     ) -> Decision:
-        """Decide on one trace and record the decision; arguments, result and errors as of
-        `DataEngine.decide`.
+        """Decide on one trace and record the decision.
 
-        With `timed_out` the caller waits no more and verifies, so the decision is VERIFY,
-        `Reason.LATE`.
+        Arguments, result and errors are those of `DataEngine.decide`. With `timed_out` the caller
+        waits no more and verifies, so the decision is VERIFY, `Reason.LATE`.
         """
         self.outbox.check_usable()
         with self.exclusive:
@@ -230,11 +228,9 @@ class EngineCore:
     ) -> Decision:
         """Record VERIFY, `Reason.LATE`, for a caller that timed out, without asking the model.
 
-        In any thread.
-
-        The decision is on disk when this returns, and an id that has a decision keeps it. With a
-        store in memory, and before the first trace, it is returned unrecorded: `decide` must record
-        it, with `timed_out`. Errors as of `DataEngine.decide`.
+        It may be called in any thread. The decision is on disk when this returns, and an id that
+        has a decision keeps it. With a store in memory, and before the first trace, it is returned
+        unrecorded: `decide` must record it, with `timed_out`. Errors as of `DataEngine.decide`.
         """
         self.outbox.check_usable()
         id_ = as_id(decision_id)
@@ -314,11 +310,10 @@ class EngineCore:
     # The contract of traces
 
     def set_trace_spec(self, spec: TraceSpec, inferred: bool = False) -> TraceSpec:
-        """Set the contract of traces where none is set yet, in the store as well.
+        """Set the trace contract, in the store as well, where none is set; return the one in force.
 
-        Returns the one in force.
-
-        A product's peers may have set one before. `inferred` says that it comes from a first trace.
+        A contract that peers of the product have set comes before `spec`. `inferred` says that
+        `spec` comes from a first trace.
         """
         if self.settings.now.trace is not None:
             return self.settings.now.trace
@@ -379,7 +374,7 @@ class EngineCore:
     ) -> StoredDecision:
         """Record the accept behind a line stop whose decision was lost.
 
-        UnknownDecisionError without its trace.
+        Raises UnknownDecisionError without its trace.
         """
         if trace is None or success:
             raise UnknownDecisionError(
@@ -400,15 +395,14 @@ class EngineCore:
             return self.learner.retrain()
 
     def start_retrain(self) -> RetrainReport | None:
-        """Begin to retrain in the executor, and return None.
+        """Begin to retrain in the executor and return None; without one, retrain in line.
 
-        Without one retrain in line and return the report.
+        Returns the report of a retrain in line.
         """
         return self.learner.start_retrain()
 
     def process_retrains(self, brief: bool = False) -> RetrainReport | None:
-        """Swap in a trained version, retrain where one is due, and announce safe mode: between two
-        parts.
+        """Do between two parts what is due: swap in a trained version, retrain, announce safe mode.
 
         With `brief` a version that an executor has trained comes one step further, a few
         milliseconds, and not to the end. Returns the report of the newest retrain, once; None
@@ -423,8 +417,10 @@ class EngineCore:
     # The store
 
     def load_decision_ids(self) -> None:
-        """Load the ids of all decisions (a second for a million), so that `decide` looks up no new
-        id in the store.
+        """Load the ids of all decisions, so that `decide` need not look up a new id in the store.
+
+        It takes a second for a million decisions.
+
         """
         self.flush()
         self.outbox.load_ids()
@@ -432,7 +428,7 @@ class EngineCore:
     def flush(self, wait: float | None = None) -> None:
         """Return when everything is on disk.
 
-        NotTakenError after `wait` seconds, None: the store's own limit.
+        Raises NotTakenError after `wait` seconds, None: the store's own limit.
         """
         self.feedback.store_pending()
         self.outbox.flush(wait)
@@ -495,22 +491,16 @@ class EngineCore:
 
     @property
     def store_lag(self) -> float:
-        """Age in seconds of the oldest record in the journal that the store has not taken; 0.0
-        where it has all.
-        """
+        """Age in seconds of the oldest journal record that is not in the store; 0.0 if none."""
         return self.outbox.lag
 
     @property
     def retrain_fault(self) -> str:
-        """Why nothing new is learned where retrains are dropped again and again; "" where they are
-        not.
-        """
+        """What is wrong if retrains are dropped again and again; "" if they are not."""
         return retrain_fault(self.learner.dropped, self.live.version)
 
     def complete_status(self, status: Status) -> Status:
-        """Return a status that was read from the store with the fields that only the running engine
-        knows.
-        """
+        """Return a status read from the store, completed with what only the engine knows."""
         return replace(
             status,
             version=self.live.version,

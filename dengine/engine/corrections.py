@@ -272,7 +272,7 @@ class Corrections:
     def _find_labelled(self, decision_ids: Sequence[Any]) -> list[StoredDecision]:
         """Return decisions that have labels.
 
-        ReportError for an unknown id, and for a decision without a label.
+        Raises ReportError for an unknown id, and for a decision without a label.
         """
         self._make_ready()
         decisions = []

@@ -100,9 +100,10 @@ def uncollected() -> Iterator[None]:
 
 
 def core_of(engine: DataEngine) -> EngineCore:
-    """Return the internal interface of an engine, which `dengine serve` and the tests use.
+    """Return the internal interface of an engine, which may change with any release.
 
-    It may change.
+    `dengine serve` and the tests use it.
+
     """
     return engine._core
 
@@ -306,8 +307,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         allow_import: bool = False,
         **settings: Any,
     ) -> Self:
-        """Go on with a used store, or start on a new one: the same line at every start of a
-        program.
+        """Go on with a used store, or start on a new one; a program calls it at every start.
 
         Parameters
         ----------
@@ -527,14 +527,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._corrections.set_policy(policy, author)
 
     def set_shadow(self, on: bool, author: str = "") -> Changed:
-        """Verify every part from the next decision on, or end that: `set_policy` with another
-        `shadow`.
-        """
+        """Begin or end the shadow mode, in which every part is verified; see `set_policy`."""
         return self.set_policy(replace(self.policy, shadow=on), author)
 
     def certificate(self) -> Certificate:
-        """Return what can be said, with confidence 1 - alpha, of what was decided unchecked under
-        this policy.
+        """Return bounds, at confidence 1 - alpha, on the errors of unchecked decisions.
+
+        Decisions since the last change of policy count.
+
         """
         self.flush()
         policy = self.policy
@@ -558,7 +558,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def model(self) -> Any:
         """The model that answers, a baseline as its author knows it.
 
-        None before the first retrain.
+        Returns None before the first retrain.
         """
         answering = self._core.live.answering
         return None if answering is None else answering.user_model
@@ -570,15 +570,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def safe_mode(self) -> str:
-        """Why every part is verified until fresh evidence keeps the tolerance again; "" outside a
-        safe mode.
-        """
+        """Why every part is verified until fresh evidence keeps the tolerance; "" if none is."""
         return self._core.live.newest.safe_mode
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision with its trace, and with its label where it has one.
 
-        None for an unknown id.
+        Returns None for an unknown id.
         """
         return self._core.outbox.find_decision(as_id(decision_id))
 
@@ -595,15 +593,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return history(self.store, last, **where)
 
     def history_frame(self, last: int | None = None, **where: Any) -> pd.DataFrame:
-        """Return `history` as a DataFrame: a row for each decision by its id, with its label and a
-        datetime.
-        """
+        """Return `history` as a DataFrame with a row for each decision, indexed by its id."""
         return as_frame(self.history(last, **where))
 
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
         """Explain a decision by its nearest references, `neighbours` of them.
 
-        ReportError for an unknown id.
+        Raises ReportError for an unknown id.
         """
         return explain(self.store, decision_id, neighbours)
 

@@ -37,9 +37,7 @@ ALL_NOVEL = (
 
 
 class Remedy(Enum):
-    """What must be done, once the store has every label, because something that was learned did not
-    happen.
-    """
+    """What must be done, once the store has every label, after a wrong label was learned."""
 
     REBUILD_RULE = "rebuild the rule"
     CORRECT = "apply the stored correction, and rebuild the rule"
@@ -118,9 +116,7 @@ class Feedback:
                 self._unreported[id_] = accepted
 
     def record_decision(self, stored: StoredDecision) -> None:
-        """Note a decision whose outcome is pending, and record an event where nearly every trace is
-        novel.
-        """
+        """Note a decision with a pending outcome; record an event if nearly all are novel."""
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
             self._awaiting_check[decision.id] = stored
@@ -136,8 +132,10 @@ class Feedback:
         self._novelty_reported = self._novel_share > limit
 
     def confirm_silent(self) -> None:
-        """Take accepted parts without an outcome as confirmed or unobserved, because the next trace
-        has come.
+        """Count accepted parts without an outcome as confirmed, or as unobserved.
+
+        It is called when the next trace has come.
+
         """
         if not self._unreported:
             return
@@ -151,8 +149,7 @@ class Feedback:
             self.store_pending()
 
     def take_in(self, stored: StoredDecision, success: bool) -> bool:
-        """Learn a reported label and hand it to the outbox, unless the same report was learned
-        before.
+        """Learn a reported label and hand it to the outbox; a report that is repeated does nothing.
 
         Returns whether the part counted as confirmed until now and was not. Raises ReportError
         where another label was reported for it.
@@ -244,9 +241,7 @@ class Feedback:
         return True
 
     def number_labels(self) -> None:
-        """Give labels that the store has numbered to the training window, and count overdue checks
-        as wrong decisions.
-        """
+        """Add labels that the store has numbered to the window, and count overdue checks."""
         self._count_overdue()
         for id_, seq in self._outbox.pop_label_numbers():
             learned = self._live.assign_number(id_, seq)
@@ -275,15 +270,12 @@ class Feedback:
         self.remedy = remedy
 
     def begin_policy(self) -> None:
-        """Go on under another policy: parts accepted under the last one and not reported stay
-        without an outcome.
-        """
+        """Forget which accepted parts have no outcome, because another policy begins."""
         self._unreported.clear()
         self._unobserved = 0
 
     def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
-        """Record that a safe mode began or ended, and call `on_safe_mode`, where it did since the
-        last call.
+        """Record that a safe mode began or ended since the last call, and call `on_safe_mode`.
 
         It comes last in every cycle, because either may fail and must cost no label; a failure is
         logged.

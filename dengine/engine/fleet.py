@@ -72,8 +72,7 @@ class Peers:
         return self._clock() - self._asked >= NEWS_SECONDS
 
     def fetch_news(self) -> tuple[ProductNews, bool]:
-        """Return the labels after the window's newest, at most `MOST`, and whether a peer's version
-        is newer.
+        """Return new labels of the product, at most `MOST`, and whether a peer's version is newer.
 
         Raises StoreError where the store gives no answer in time.
         """
@@ -88,7 +87,7 @@ class Peers:
     def fetch_version(self) -> ModelVersion | None:
         """Return the newest version of the product.
 
-        StoreError where the store gives no answer in time.
+        Raises StoreError where the store gives no answer in time.
         """
         return self._outbox.call_store(self._outbox.store.last_version)
 

@@ -1,5 +1,4 @@
-"""The guard of an engine's calls into its model: an exception inside a model is logged and never
-reaches the cell.
+"""Guards an engine's calls of its model: an exception is logged and never reaches the cell.
 
 `live_model.LiveModel`, `resume` and the training make these calls. A prediction that fails is
 guarded where decisions are made, because its reason is recorded with the decision.
@@ -39,10 +38,7 @@ class GuardedModel:
         self.model = model
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute in advance what a training on traces (n, channels, samples) begins with.
-
-        Nothing where it fails.
-        """
+        """Compute in advance what a training on traces (n, channels, samples) begins with."""
         with logged_failure("computing in advance of a retrain failed"):
             self.model.precompute(X, numbers)
 
@@ -73,8 +69,10 @@ class GuardedModel:
         embedding: Embedding | None = None,
         point: NDArray[Any] | None = None,
     ) -> Floats | None:
-        """Make a labelled trace a reference and return its point (d,); None, and no reference,
-        where it fails.
+        """Make a labelled trace a reference and return its point (d,).
+
+        Returns None, and adds no reference, where it fails.
+
         """
         with logged_failure(
             "the model cannot take a labelled trace; the next version learns it from the store"

@@ -1,5 +1,4 @@
-"""How labels enter the training window, and how many came since the last retrain began: for one
-cell, and for a product.
+"""Adds labels to the training window, and counts those since the last retrain began.
 
 `CellLabels` is for a cell that learns alone. `ProductLabels` is for a cell that shares a product
 with others, whose labels have one sequence in the store. `feedback.Feedback` adds labels;
@@ -21,8 +20,7 @@ Trace = NDArray[np.float32]  # (channels, samples)
 
 
 class CellLabels:
-    """Labels of a cell that learns alone: each one counts when it is learned, before the store has
-    numbered it.
+    """Labels of a cell that learns alone; each one counts as soon as it is learned.
 
     Parameters
     ----------
@@ -84,8 +82,7 @@ class CellLabels:
 
 
 class ProductLabels:
-    """Labels of all cells of a product, which enter the window in the order of their sequence in
-    the store.
+    """Labels of all cells of a product, added to the window in the order of the store.
 
     A label of this cell is a reference at once, and waits for the peers' labels before it until it
     enters the window.
@@ -139,9 +136,7 @@ class ProductLabels:
         self._updated_to = self._window.newest_seq
 
     def recount(self, counts_from: int) -> None:
-        """Count again after the window was filled anew: forgotten labels count no more, restored
-        ones do.
-        """
+        """Count again after the window was filled anew, without labels that were forgotten."""
         own_numbers = {number for number, is_own in self._since if is_own}
         newer = self._window.newer(self._trained_to)
         self._since = [(number, number in own_numbers) for number in newer]
@@ -163,9 +158,7 @@ class ProductLabels:
             self.admit(trace, label, hash_, seq)
 
     def admit(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
-        """Add the next label of the product to the window, and a peer's label to the references as
-        well.
-        """
+        """Add the next label of the product to the window; a peer's label becomes a reference."""
         is_own = self._waiting.pop(seq, None) is not None
         self._window.add(trace, label, hash_, seq)
         if seq > self._trained_to:
@@ -193,15 +186,12 @@ class ProductLabels:
         """Do nothing after a dropped retrain: the next one is the turn of whichever cell is due."""
 
     def complete(self, model: EngineModel) -> None:
-        """Add this cell's waiting labels to a version that it trained, which has those of the
-        window only.
-        """
+        """Make this cell's waiting labels references of a version that it trained."""
         self._references_to = 0
         self._add_waiting(model)
 
     def take_over(self, model: EngineModel, references_to: int, counts_from: int) -> None:
-        """Add this cell's waiting labels to a peer's version, and count from the label that it
-        counts from.
+        """Make waiting labels references of a peer's version, and count from `counts_from`.
 
         The version's references hold every label up to `references_to` already.
         """
@@ -211,16 +201,12 @@ class ProductLabels:
         self._since = [(number, is_own) for number, is_own in self._since if number > counts_from]
 
     def _add_waiting(self, model: EngineModel) -> None:
-        """Make this cell's waiting labels references, but for those that the version's references
-        hold.
-        """
+        """Make waiting labels references of a version, except those up to `_references_to`."""
         guarded = GuardedModel(model)
         for seq, (trace, label, hash_) in self._waiting.items():
             if seq > self._references_to:
                 guarded.add_reference(trace, label, hash_, seq)
 
     def get_state(self) -> State:
-        """Return, for a stored version, the number up to which this cell's labels have updated the
-        rule.
-        """
+        """Return, for the store, the number of the newest label that updated the rule."""
         return {"rule_last_seq": np.array(self._updated_to)}

@@ -114,9 +114,7 @@ class Learner:
         return 0 if trained_on is None else trained_on.counts_from
 
     def _precompute(self, labelled: LabelledTraces) -> None:
-        """Begin, in a thread, to compute what a retrain on these labels starts with: opening does
-        not wait for it.
-        """
+        """Begin to compute, in a thread, what the next retrain starts with."""
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
         model = GuardedModel(self.live.newest)
         self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)
@@ -137,9 +135,7 @@ class Learner:
         self._feedback.announce_safe_mode()
 
     def catch_up(self) -> None:
-        """Do what had to wait for the store: number its labels, and put right what was learned and
-        did not happen.
-        """
+        """Add labels that the store has taken to the window, and do a remedy that waited for that."""
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
@@ -167,7 +163,7 @@ class Learner:
     def _drain_labels(self) -> None:
         """Wait until the store has the labels that are in the journal.
 
-        StoreError where it is away.
+        Raises StoreError where it is away.
         """
         if self._outbox.request_label_drain():
             self._outbox.drain()
@@ -193,7 +189,8 @@ class Learner:
     def start_retrain(self) -> RetrainReport | None:
         """Begin to train in the executor, unless it trains already, and return None.
 
-        Retrain in line without one.
+        Without an executor, retrain in line and return the report.
+
         """
         self.collect()
         if self.is_busy:
@@ -206,8 +203,7 @@ class Learner:
         return self.retrain()
 
     def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
-        """Retrain, or begin to, where the recipe says so, there are enough labels, and the store is
-        there.
+        """Retrain, or begin to, if the recipe says so and the store is available.
 
         `once` leaves a training that lacks steps as it is until the report of the last one was
         taken. Returns the report of a retrain in line; None without one.
@@ -230,8 +226,7 @@ class Learner:
 
     @property
     def _lacks_steps(self) -> bool:
-        """Whether the answering version lacks training steps, as after many labels were imported at
-        once.
+        """Whether the answering version lacks training steps, as after a large import.
 
         Not where the last retrain was dropped: its labels wait for the next one. Nor where cells
         share a product: each of them would train the same version.
@@ -241,9 +236,7 @@ class Learner:
 
     @property
     def is_swapping(self) -> bool:
-        """Whether a trained version is on its way to answering, a step each time that the engine is
-        called.
-        """
+        """Whether a trained version is being swapped in, one step with each call of the engine."""
         return self._candidate is not None
 
     @property
@@ -268,15 +261,11 @@ class Learner:
             self._advance(to_the_end)
 
     def _as_candidate_of(self, trained: Trained) -> Candidate:
-        """Return the outcome of a training as a candidate, prepared to answer in place of the
-        present version.
-        """
+        """Return the outcome of a training as a candidate, ready to predict."""
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
 
     def _begin_retrain(self) -> None:
-        """Know all that can be known before a training, and count the labels of the next one from
-        here.
-        """
+        """Take in all news before a training, and count new labels from zero."""
         if self._precomputed is not None:
             self._precomputed.result()
             self._precomputed = None
@@ -345,9 +334,7 @@ class Learner:
         return self.live.get_state(model, trained_on) | self.labels.get_state()
 
     def _waits_for_labels(self, candidate: Candidate, to_the_end: bool) -> bool:
-        """Return whether labels are on their way into the store and the cell need not wait for
-        that.
-        """
+        """Return whether the candidate should wait another step for labels to be stored."""
         has_lost_patience = candidate.lose_patience()
         return not to_the_end and not has_lost_patience and self._outbox.request_label_drain()
 
@@ -392,10 +379,7 @@ class Learner:
     # News of a product
 
     def _is_due(self, retrain_every: int) -> bool:
-        """Return whether a retrain is due.
-
-        Where a product is shared, news is taken in before it is said to be.
-        """
+        """Return whether a retrain is due, after the news of the product, if any, was taken in."""
         if self._peers is not None and self._peers.is_news_due:
             self._take_in_news(self._peers)
         if not self.labels.is_due(retrain_every):
@@ -404,10 +388,7 @@ class Learner:
         return self.labels.is_due(retrain_every)
 
     def _take_in_all_news(self) -> None:
-        """Take in the peers' news until there is no more, in a few rounds.
-
-        Nothing where no product is shared.
-        """
+        """Take in the peers' news until there is no more, in a few rounds, if there are peers."""
         peers = self._peers
         if peers is None:
             return
@@ -447,11 +428,9 @@ class Learner:
     # What people put right
 
     def make_ready(self) -> None:
-        """Bring in every version, label and news that is under way.
+        """Bring in every version, label and news that is under way, before a person's change.
 
-        StoreError where that cannot be.
-
-        A change by a person comes after all that was known before.
+        Raises StoreError where that cannot be.
         """
         self.collect(HUNG)
         self.store_labels()
@@ -482,8 +461,7 @@ class Learner:
             self.retrain()
 
     def roll_back(self, number: int, event: Change) -> None:
-        """Let an earlier version answer again, as a new one, with the labels that came since among
-        its references.
+        """Let an earlier version answer again, as a new one, with all later labels as references.
 
         Raises StoreError for a version that is not kept, and where a trace that it was trained on
         is damaged.

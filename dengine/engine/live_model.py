@@ -1,5 +1,4 @@
-"""The model that answers, and what it learns from outcomes: its references, its rule, and their
-numbers in the store.
+"""The model that answers, and how its references and its rule learn from outcomes.
 
 `LiveModel` knows the store and the training window below it. Which version answers, and when, is up
 to `learner.Learner`; outcomes come from `feedback.Feedback`.
@@ -180,9 +179,7 @@ class LiveModel:
         return point if model.keeps_references else None
 
     def unlearn(self, stored: StoredDecision) -> None:
-        """Remove the reference of a label that the store has not numbered, because the part was
-        confirmed wrongly.
-        """
+        """Remove the reference of a part that was confirmed wrongly, before the store has it."""
         *_, number = self._unnumbered.pop(stored.decision.id)
         if number:
             self.newest.change_reference(number, stored.content_hash, None)
@@ -201,9 +198,7 @@ class LiveModel:
         return stored, success
 
     def count_overdue(self, decision: Decision) -> None:
-        """Update the rule as if the decision was wrong, whichever it was: its check was not
-        reported in time.
-        """
+        """Update the rule as if a decision was wrong: its check was not reported in time."""
         if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
         for outcome in overdue_outcomes(decision):
@@ -215,9 +210,10 @@ class LiveModel:
         self.overdue_to = max(number, self.overdue_to)
 
     def clear_overdue(self, decision_id: str) -> bool:
-        """Count a decision as overdue no more.
+        """Count a decision as overdue no more, because its check was reported.
 
-        Returns whether it was counted so, and the rule must be rebuilt.
+        Returns whether it was counted so; then the rule must be rebuilt.
+
         """
         if decision_id not in self.overdue:
             return False
@@ -227,7 +223,7 @@ class LiveModel:
     def rebuild_rule(self) -> None:
         """Reset the rule and update it with every stored outcome.
 
-        StoreError where the store is away.
+        Raises StoreError where the store is away.
         """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
@@ -238,9 +234,7 @@ class LiveModel:
     def _rebuild_rule_of(
         self, model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]
     ) -> None:
-        """Reset a model's rule to the safe mode of the policy's start and update it with the
-        outcomes.
-        """
+        """Reset a model's rule and update it with the outcomes that `read_outcomes` returns."""
         model.reset_rule(self.evidence.began_in)
         _update_rule(model, read_outcomes)
 
@@ -252,7 +246,7 @@ class LiveModel:
     def apply_corrections(self) -> bool:
         """Apply the store's newest corrections to the references.
 
-        False where the model must be trained again.
+        Returns False where the model must be trained again.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
@@ -265,9 +259,7 @@ class LiveModel:
     def with_policy(
         self, policy: Policy, evidence: EvidenceWindow
     ) -> tuple[EngineModel, EngineModel | None]:
-        """Return the template and the answering model under another policy, with rules that start
-        anew.
-        """
+        """Return template and answering model under another policy, with a new rule."""
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)
         if self.answering is None:

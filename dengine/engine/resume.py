@@ -1,5 +1,4 @@
-"""Restoring a stored version bit for bit: its model, the labels and the corrections that came after
-it was stored.
+"""Restores a stored version bit for bit: its model, later labels and corrections.
 
 `live_model.LiveModel` uses these functions when a store is opened, `learner.Learner` for a
 rollback, and `fleet.Peers` when another cell's version is taken over.
@@ -29,7 +28,7 @@ def restore_model(
 ) -> EngineModel | None:
     """Return the model of a stored state.
 
-    None where it must be trained again and one of its traces is damaged.
+    Returns None where it must be trained again and one of its traces is damaged.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -73,17 +72,14 @@ def newest_reference(version: ModelVersion) -> int:
 
 
 def newest_correction(version: ModelVersion) -> int:
-    """Return the number of the newest correction that a version's references had when it was
-    stored.
-    """
+    """Return the number of the newest correction that a stored version has."""
     return int(version.state.get("corrected_to", 0))
 
 
 def add_labels_since(
     model: EngineModel, store: SqlStore, version: ModelVersion, window: TrainingWindow
 ) -> int:
-    """Add to a version's model the labels and corrections that came after it was stored, in their
-    order.
+    """Add the labels and corrections that came after a version was stored to its model.
 
     Returns the number of the newest correction.
     """

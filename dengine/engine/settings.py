@@ -335,7 +335,7 @@ def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[st
 def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
     """Return the trace contract of a product's other cells.
 
-    None where there is none, or no product.
+    Returns None where there is none, or no product.
     """
     specs = map(stored_trace_spec, store.peers_settings().values())
     return next(filter(None, specs), None)

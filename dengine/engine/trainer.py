@@ -262,7 +262,7 @@ class Retrainer:
     def collect(self, wait: float = 0.0) -> Trained | None:
         """Return the outcome of the training in the executor, once.
 
-        None where there is none or it is not done.
+        Returns None where there is none or it is not done.
 
         With `wait` above 0 a training that is not done after so many seconds is given up, and its
         outcome is dropped. So is one that takes longer than `HUNG`.

@@ -1,5 +1,4 @@
-"""The two contracts of a model: `Model`, which a baseline method implements, and `EngineModel`,
-which the engine drives.
+"""The two contracts of a model: `Model` for baselines, `EngineModel` for the engine.
 
 `BaselineAdapter` makes an `EngineModel` of a baseline. dengine's own `neighbours.ModelPrediction`
 implements both. Calls that must not raise into the cell go through `engine.guard.GuardedModel`.
@@ -109,9 +108,7 @@ class EngineModel(ABC):
     _conditions: DecisionConditions | None = None
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with this model's own settings in place of those that have no effect on
-        it.
-        """
+        """Return the recipe with this model's own settings in place of those without effect."""
         return recipe
 
     @abstractmethod
@@ -146,9 +143,7 @@ class EngineModel(ABC):
         """Load the libraries that the first training needs; called in a thread of its own."""
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default
-        """Compute in advance, and keep, what a training on these traces (n, channels, samples)
-        begins with.
-        """
+        """Compute in advance, and keep, what a training on traces (n, C, T) begins with."""
 
     @abstractmethod
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
@@ -225,9 +220,7 @@ class EngineModel(ABC):
         return False
 
     def with_policy(self, policy: Policy) -> Self:
-        """Return a model under another policy that shares the references and whose rule has learned
-        nothing yet.
-        """
+        """Return a model with the same references and a new rule of another policy."""
         return self
 
     def update_rule(  # noqa: B027  # a default: no rule that learns
@@ -261,14 +254,13 @@ class EngineModel(ABC):
     def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
         """Make the rule forget every outcome and start in a safe mode, a position in `SAFE_MODES`.
 
-        0 is none.
+        Position 0 is no safe mode.
+
         """
 
     @abstractmethod
     def successor(self) -> EngineModel:
-        """Return a model to train next, starting from this one, that shares nothing which training
-        changes.
-        """
+        """Return a model to train next, starting from this one, which is not changed by that."""
 
     def prepare(self, previous: EngineModel) -> None:  # noqa: B027  # a default: nothing to prepare
         """Take over the previous model's rule, stale or not, and be ready to predict at once."""
@@ -279,9 +271,7 @@ class EngineModel(ABC):
         return ""
 
     def defect(self) -> str:
-        """Return why the trained model must not answer, for reasons that read no label; "" where
-        there is none.
-        """
+        """Return why the trained model must not answer; "" if it may. It must read no label."""
         return ""
 
     @property
@@ -298,9 +288,7 @@ class EngineModel(ABC):
         return self
 
     def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
-        """Return whether the model must be trained on the very traces of that state before
-        `set_state`.
-        """
+        """Return whether `set_state` needs a model that was trained on the state's own traces."""
         return True
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
