@@ -135,7 +135,7 @@ class Learner:
         self._feedback.announce_safe_mode()
 
     def catch_up(self) -> None:
-        """Add labels that the store has taken to the window, and do a remedy that waited for that."""
+        """Add labels that the store has taken to the window, and do a remedy that waited for it."""
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
