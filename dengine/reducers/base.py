@@ -217,7 +217,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     def embed_references(self, X: Floats, folds: Ints) -> Floats:
         """Embed traces (n, C, T) as references; return (n, d), row i in space ``folds[i]``."""
-        return points_in_own_space(self.embed(X), folds)
+        return points_in_fold_space(self.embed(X), folds)
 
     def module(self) -> "nn.Module | None":
         """Return the embedding as a module that TorchScript can compile, (B, C, T) -> (B, K, d).
@@ -316,7 +316,7 @@ def as_rows(traces: Floats) -> Floats:
     return traces.reshape(n, channels * samples)
 
 
-def points_in_own_space(Z: Floats, folds: Ints) -> Floats:
+def points_in_fold_space(Z: Floats, folds: Ints) -> Floats:
     """Return (n, d) of an embedding (n, K, d): row i in space ``folds[i]`` or the only space."""
     spaces = np.asarray(folds) if Z.shape[1] > 1 else np.zeros(len(Z), dtype=np.int64)
     return np.ascontiguousarray(Z[np.arange(len(Z)), spaces])

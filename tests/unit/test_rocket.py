@@ -17,19 +17,17 @@ from dengine.engine.engine import core_of
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule
+from dengine.reducers.logistic_heads import fit_heads, masked_loss
 from dengine.reducers.preprocessing import averaging
 from dengine.reducers.rocket import (
-    FIRST_STEPS,
-    LEADING,
-    MANY,
-    PAIRS,
-    SHARES,
-    VARIANCES,
-    RocketEncoder,
-    fit_heads,
-    masked_loss,
-    products,
+    MIN_FIRST_STEPS,
+    N_LEADING,
+    N_SHARES,
+    PRODUCT_VARIANCE,
+    TOWER_VARIANCES,
+    pairwise_products,
 )
+from dengine.reducers.rocket_features import PARALLEL_TRACES, RocketEncoder
 
 
 def traces(n=160, channels=1, samples=152, seed=0):
@@ -122,7 +120,7 @@ def test_a_first_model_that_comes_too_late_has_learned_something_all_the_same():
     X, y = traces()
     late = RocketReducer()
     late.train(X, y, content_fold(X, 5), StopRule(deadline=-1.0, clock=lambda: 0.0))
-    assert late.n_iter_ == FIRST_STEPS
+    assert late.n_iter_ == MIN_FIRST_STEPS
     apart = late.embed(X)[..., 0].mean(1)
     assert apart[y == 1].mean() > apart[y == 0].mean() + 0.5
 
@@ -221,10 +219,10 @@ def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_to
     X, y = traces(100)
     reducer = kind(folds=3).fit(X, y)
     with torch.no_grad():
-        f, logits = reducer.net_.features(torch.from_numpy(X)), []
-        seen = [f[:, columns] for columns in reducer.net_.features.towers]
-        seen.append(products(reducer.towers_[0].components(seen[0])[:, :LEADING]))
-        variances = (*VARIANCES[: len(reducer.net_.features.towers)], PAIRS)
+        f, logits = reducer.net_.encoder(torch.from_numpy(X)), []
+        seen = [f[:, columns] for columns in reducer.net_.encoder.towers]
+        seen.append(pairwise_products(reducer.towers_[0].components(seen[0])[:, :N_LEADING]))
+        variances = (*TOWER_VARIANCES[: len(reducer.net_.encoder.towers)], PRODUCT_VARIANCE)
         for tower, own, variance in zip(reducer.towers_, seen, variances, strict=False):
             g = own.double() @ tower.axes.double() + tower.centre
             logits.append((g @ tower.w[:, :-1].T + tower.w[:, -1]).numpy())
@@ -232,7 +230,7 @@ def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_to
     for k, said in enumerate(reducer.embed(X)[..., 0].T):
         mixed = [logits[0][:, k]]
         for each in logits[1:]:
-            mixed = [each[:, k] + share * (one - each[:, k]) for one in mixed for share in np.linspace(0.0, 1.0, SHARES)]
+            mixed = [each[:, k] + share * (one - each[:, k]) for one in mixed for share in np.linspace(0.0, 1.0, N_SHARES)]
         assert min(np.abs(expit(one) - said).max() for one in mixed) < 1e-5
 
 
@@ -264,14 +262,14 @@ def test_where_a_trace_is_flat_every_kernel_of_a_group_counts_alike() -> None:
     encoder.learn(torch.from_numpy(X), np.random.default_rng(0))
     flat = torch.full((1, 1, X.shape[-1]), float(X.mean()))
     flat[..., 0] += 1e-6  # as rounding would have it
-    assert encoder.raw(flat)[0, encoder.towers[1]].reshape(-1, 8).min() > 0.7
+    assert encoder.raw_features(flat)[0, encoder.towers[1]].reshape(-1, 8).min() > 0.7
 
 
 def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkeypatch) -> None:
     X, y = traces(90)
     reducer, folds, computed, found = RocketReducer(), content_fold(X, 5), [], []
-    raw = RocketEncoder.raw
-    monkeypatch.setattr(RocketEncoder, "raw", lambda self, x: (computed.append(len(x)), raw(self, x))[1])
+    raw = RocketEncoder.raw_features
+    monkeypatch.setattr(RocketEncoder, "raw_features", lambda self, x: (computed.append(len(x)), raw(self, x))[1])
     for first, last in ((0, 60), (30, 90), (30, 90), (0, 60)):
         reducer.train(X[first:last], y[first:last], folds[first:last], numbers=np.arange(1 + first, 1 + last))
         found.append(sum(computed))
@@ -280,7 +278,7 @@ def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkey
 
 
 def test_features_of_very_many_traces_are_those_of_each_to_the_bit() -> None:
-    X, features = traces(MANY + 50)[0], RocketReducer(folds=2).fit(*traces(100)).raw_features
+    X, features = traces(PARALLEL_TRACES + 50)[0], RocketReducer(folds=2).fit(*traces(100)).raw_features
     assert torch.equal(features(X), torch.cat([features(X[i : i + 7]) for i in range(0, len(X), 7)]))
 
 
@@ -290,7 +288,7 @@ def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(cha
     encoder = RocketEncoder(channels, samples, 1, kernels, dilations, 3, 0)
     a = torch.randn(5, channels, samples, generator=torch.Generator().manual_seed(0))
     encoder.learn_filters(a, np.random.default_rng(0))
-    found = torch.bmm(encoder.kernel, encoder.windows(encoder.seen(a), dilations)).view(dilations, kernels, -1, 5)
+    found = torch.bmm(encoder.kernel, encoder.as_windows(encoder.read_taps(a), dilations)).view(dilations, kernels, -1, 5)
     middle = encoder.taps.view(dilations, 9, -1)[:, 4]
     for d, spread in enumerate((1, 2, 7)):  # 2 ** 0, and up to the length over 8
         weight = encoder.kernel[d].reshape(kernels, channels, 9)
@@ -316,7 +314,7 @@ def test_traces_of_any_shape_have_finite_features_the_same_when_scripted(samples
     encoder = RocketEncoder(channels, samples, averaging(X), 28, 5, 3, 2).eval()
     with torch.no_grad():
         encoder.learn(X, rng)
-        encoder.standardise(encoder.raw(X))
+        encoder.learn_feature_scales(encoder.raw_features(X))
         assert torch.isfinite(encoder(X)).all()
         np.testing.assert_allclose(script(encoder)(X[:1]), encoder(X[:1]), atol=1e-6)
 
@@ -332,13 +330,13 @@ def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(tmp_path,
                 core_of(engine).process_retrains()
     else:
         import_labelled(url, Dataset(X[:, 0], y), recipe)
-    where, raw = set(), RocketEncoder.raw
+    where, raw = set(), RocketEncoder.raw_features
 
     def told(self, x):
         where.add(threading.current_thread().name)
         return raw(self, x)
 
-    monkeypatch.setattr(RocketEncoder, "raw", told)
+    monkeypatch.setattr(RocketEncoder, "raw_features", told)
     with DataEngine.open(url, replaying=True) as engine:
         assert engine.retrain().accepted
     assert where == {"dengine-ahead_0"}  # neither in the opening nor in the retrain

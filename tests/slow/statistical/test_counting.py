@@ -89,7 +89,7 @@ def members_of_all_folds(patch: pytest.MonkeyPatch) -> None:
 
 
 def heads_of_all_folds(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(rocket.RocketReducer, "trained_on", lambda self, folds: np.ones((self.folds, len(folds)), dtype=np.bool_))
+    patch.setattr(rocket.RocketReducer, "training_masks", lambda self, folds: np.ones((self.folds, len(folds)), dtype=np.bool_))
 
 
 def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
@@ -105,7 +105,7 @@ def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
 
 
 def references_at_the_mean_of_heads(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(rocket, "points_in_own_space", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
+    patch.setattr(rocket, "points_in_fold_space", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
 
 
 def one_gate_for_all_heads(patch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,241 @@
+"""Cross-fitted logistic heads for `RocketReducer`: K ridge regressions that are fitted at once.
+
+Head k is fitted on the rows outside fold k. With the heads come their leave-one-out logits, by
+which `RocketReducer` weighs its towers, without a row having trained the logit that it gets.
+
+References
+----------
+Rad and Maleki (2020), A scalable estimate of the out-of-sample prediction error via approximate
+leave-one-out cross-validation, JRSS B 82(4).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
+
+from .base import StopRule
+
+BIAS_RIDGE = 1e-3  # the base rate is hardly shrunk
+TOLERANCE = 2e-4  # of a weight: a head whose next step would be smaller has converged
+HALVINGS = 6  # of a step that raises the objective
+
+
+class HeadsFit(NamedTuple):
+    """K fitted heads.
+
+    Attributes
+    ----------
+    w : Tensor of float64, shape (K, W + 1)
+        Weights, the bias last.
+    left_out : Tensor of float64, shape (K, n)
+        Leave-one-out logit of each row by each head.
+    at_base_rate : list of int
+        Heads that predict their base rate.
+    n_steps : int
+        Newton steps that were taken.
+    """
+
+    w: Tensor
+    left_out: Tensor
+    at_base_rate: list[int]
+    n_steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class RidgeProblem:
+    """K ridge logistic regressions on the same features, each on rows of its own.
+
+    Attributes
+    ----------
+    g32, g : Tensor of float32 and of float64, shape (n, W + 1)
+        Features, with a column of ones.
+    y : Tensor of float64, shape (n,)
+        Labels, 1 or 0.
+    mask : Tensor of float64, shape (K, n)
+        1 for the rows that train head k, else 0.
+    ridge : Tensor of float64, shape (K, W + 1)
+        Ridge of each weight.
+    """
+
+    g32: Tensor
+    g: Tensor
+    y: Tensor
+    mask: Tensor
+    ridge: Tensor
+
+    @classmethod
+    def of(cls, g: Tensor, y: Tensor, outside: Tensor, l2: float) -> Self:
+        """Return the problem of features (n, W), labels (n,) and masks (K, n)."""
+        g32 = torch.cat([g, torch.ones(len(g), 1)], 1)
+        ridge = torch.full((len(outside), g32.size(1)), l2, dtype=torch.float64)
+        ridge[:, -1] = BIAS_RIDGE
+        return cls(g32, g32.double(), y.double(), outside.double(), ridge)
+
+    def objective(self, w: Tensor) -> Tensor:
+        """Compute the sum of log losses plus the ridge of heads (K, W + 1): (K,)."""
+        logits = w @ self.g.T
+        losses = (self.mask * (F.softplus(logits) - self.y * logits)).sum(1)
+        return losses + 0.5 * (self.ridge * w * w).sum(1)
+
+    def gradient(self, w: Tensor, p: Tensor) -> Tensor:
+        """Compute the gradient of the objective at heads that predict p (K, n): (K, W + 1)."""
+        return (self.mask * (p - self.y)) @ self.g + self.ridge * w
+
+    def cholesky_of_hessian(self, k: int, p: Tensor) -> Tensor:
+        """Factor the Hessian of head k, which predicts p (n,): (W + 1, W + 1)."""
+        curvature = (self.mask[k] * p * (1.0 - p)).float()
+        product = (self.g32 * curvature[:, None]).T @ self.g32  # a step need not be exact
+        factor: Tensor = torch.linalg.cholesky(product.double() + torch.diag(self.ridge[k]))
+        return factor
+
+
+def fit_heads(
+    g: Tensor,
+    y: Tensor,
+    outside: Tensor,
+    w: Tensor,
+    l2: float,
+    max_iter: int,
+    stop: StopRule | None,
+    min_steps: int = 0,
+) -> HeadsFit:
+    """Fit K ridge logistic regressions by Newton's method with a line search.
+
+    Each minimises its log loss plus ``l2 / 2 * |w| ** 2``. That is convex, so it ends at the same
+    weights wherever it starts. A head whose leave-one-out loss is above that of its base rate
+    predicts the base rate. Each head decides this alone: a common decision would let the labels
+    of fold k choose head k.
+
+    Parameters
+    ----------
+    g : Tensor of float32, shape (n, W)
+        Features.
+    y : Tensor of int64, shape (n,)
+        Labels, 1 or 0.
+    outside : Tensor of bool, shape (K, n)
+        Which rows train head k.
+    w : Tensor of float64, shape (K, W + 1)
+        Where the heads start, the bias last.
+    l2 : float
+        Ridge.
+    max_iter : int
+        Largest number of steps.
+    stop : StopRule, optional
+        Asked before each step after the first `min_steps`.
+    min_steps : int, default 0
+        Steps that are taken even after the deadline.
+
+    Returns
+    -------
+    HeadsFit
+    """
+    problem = RidgeProblem.of(g, y, outside, l2)
+    # Every head takes part in every product, whether it has converged or not: a product of another
+    # shape rounds differently, and would so let the labels of fold k reach head k. For the same
+    # reason each head decides alone when its factor is computed anew.
+    converged = torch.zeros(len(w), dtype=torch.bool)
+    loss = problem.objective(w)
+    step = 0
+    factors = [
+        problem.cholesky_of_hessian(k, torch.sigmoid(w[k] @ problem.g.T)) for k in range(len(w))
+    ]
+    stale = converged
+    last_size = torch.ones(len(w), dtype=torch.float64)
+    while step < max_iter and not converged.all():
+        if stop is not None and stop.exhausted(step, min_steps):
+            break
+        p = torch.sigmoid(w @ problem.g.T)
+        for k in stale.nonzero().flatten().tolist():
+            factors[k] = problem.cholesky_of_hessian(k, p[k])
+        gradient = problem.gradient(w, p)
+        change = torch.cholesky_solve(gradient[..., None], torch.stack(factors))[..., 0]
+        change[converged] = 0.0
+        for _ in range(HALVINGS):
+            new_loss = problem.objective(w - change)
+            rises = new_loss > loss + 1e-9 * loss.abs()
+            if not rises.any():
+                break
+            change[rises] /= 2.0
+        change[rises] = 0.0
+        w = w - change
+        loss = torch.where(rises, loss, new_loss)
+        step += 1
+        size = change.abs().amax(1)
+        next_size = size * (size / last_size).clamp(max=1.0)  # about that of the next step
+        # A head whose step failed with an old factor has not converged.
+        converged |= (next_size < TOLERANCE) & (stale | (step == 1) | ~rises)
+        # A step with an old factor costs a tenth: a new one only where the old one is of no use.
+        stale = ~converged & (rises | (size > (last_size / 4.0).clamp(max=0.3)))
+        last_size = size
+    left_out = leave_one_out(problem, w @ problem.g.T, torch.stack(factors))
+    return HeadsFit(*base_rate_if_better(w, left_out, problem.y, problem.mask), step)
+
+
+def base_rate_if_better(
+    w: Tensor, left_out: Tensor, y: Tensor, mask: Tensor
+) -> tuple[Tensor, Tensor, list[int]]:
+    """Set heads to their base rate where that has the smaller log loss on held-out labels.
+
+    Parameters
+    ----------
+    w : Tensor of float64, shape (K, W + 1)
+        Heads, the bias last; they stay as they are.
+    left_out : Tensor of float64, shape (K, n)
+        Their leave-one-out logits.
+    y : Tensor of float64, shape (n,)
+        Labels, 1 or 0.
+    mask : Tensor of float64, shape (K, n)
+        1 for the rows that train head k, else 0.
+
+    Returns
+    -------
+    w, left_out : Tensor
+        As the arguments, with the base rate where it is better.
+    at_base_rate : list of int
+        The heads that were set to it.
+    """
+    rate = torch.logit((mask @ y) / mask.sum(1))[:, None].expand_as(left_out)
+    worse = masked_loss(left_out, y, mask) > masked_loss(rate, y, mask)
+    w = torch.where(worse[:, None], 0.0, w)
+    w[worse, -1] = rate[worse, 0]
+    left_out = torch.where(worse[:, None], rate, left_out)
+    return w, left_out, worse.nonzero().flatten().tolist()
+
+
+def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Tensor:
+    """Approximate the logit of every row by each head that was fitted without the row.
+
+    Parameters
+    ----------
+    problem : RidgeProblem
+        Features and labels.
+    logits : Tensor of float64, shape (K, n)
+        By the heads that were fitted with the row.
+    factors : Tensor of float64, shape (K, W + 1, W + 1)
+        Cholesky factors of the heads' Hessians.
+
+    Returns
+    -------
+    Tensor of float64, shape (K, n)
+        Exact to first order.
+
+    References
+    ----------
+    Rad and Maleki (2020).
+    """
+    p = torch.sigmoid(logits)
+    inverses = torch.cholesky_inverse(factors).float()
+    x = problem.g32
+    leverage = torch.stack([((x @ inverse) * x).sum(1) for inverse in inverses])
+    return logits + leverage * (p - problem.y) / (1.0 - leverage * p * (1.0 - p)).clamp(min=0.05)
+
+
+def masked_loss(logits: Tensor, y: Tensor, mask: Tensor) -> Tensor:
+    """Compute mean log losses, in nats, of the rows of a mask.
+
+    logits (..., K, n), labels y (n,), mask (K, n) of 1 and 0. Returns (..., K).
+    """
+    return (mask * (F.softplus(logits) - y * logits)).sum(-1) / mask.sum(1)

@@ -1,0 +1,383 @@
+"""The features of `RocketReducer`: convolution kernels that are drawn, not trained.
+
+    x (B, C, T) -> means of a few samples each, channels of one scale            (B, C, L)
+    tower 1     -> F kernels of 9 taps at each of D dilations, at P places       (D, F, P * B)
+                -> a ramp from 0 to 1 around a threshold
+                -> its mean over R regions, plus twice that over all regions     (B, D * F * R)
+    tower 2     -> G groups of 8 kernels at each dilation, at Q places of the
+                   trace and of its differences                                  (2D * G, 8, Q * B)
+                -> how often each kernel of a group answers most, and least      (B, 4D * G * 8)
+
+As in MiniRocket, the kernels of tower 1 have fixed weights, and their thresholds are drawn from
+what they give on the first traces. Instead of the share of positive values, a ramp two deviations
+wide is averaged. Tower 1 tells how large a force is, and when. In tower 2 kernels compete, as in
+Hydra. A kernel that answers nearly most counts in part, so that rounding does not decide who wins
+where a trace is flat. Tower 2 tells which shapes are frequent.
+
+A convolution is computed as a matrix product, at the places alone. A module reads no global
+constant in a method that TorchScript compiles, so constants are copied to attributes.
+
+References
+----------
+Dempster, Schmidt and Webb (2021), MiniRocket, KDD, arXiv:2012.08791: kernels, dilations and
+thresholds. Dempster, Schmidt and Webb (2023), Hydra, Data Min. Knowl. Disc. 37: competing kernels.
+Tan, Dempster, Bergmeir and Webb (2022), MultiRocket, Data Min. Knowl. Disc. 36: several channels
+and differences.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import combinations, pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ..decision.scripting import script
+from ..errors import SettingError
+from .base import Floats
+
+TAPS = 9  # of a kernel; MiniRocket has 84 = 9 choose 3 ways to place three 2s among -1s
+GROUP_SIZE = 8  # kernels that compete with each other
+COMPETITION_WIDTH = 1.0  # deviations below the largest answer at which a kernel counts no more
+MAX_PLACES = 600, 100  # of each tower: on traces that oscillate, fewer places tell less
+WHOLE_TRACE_WEIGHT = 2.0  # of the mean over the whole trace: kernels also count where time does not
+FEATURE_CLIP = 4.0  # deviations; an outlier may not carry a score by itself
+SCALE_TRACES = 256  # from which the scales of the channels are read
+FILTER_TRACES = 64  # from which thresholds and widths of ramps are read
+CHUNK = 32  # traces that are computed at once: what they need stays in the cache
+PARALLEL_TRACES = 3200  # from which on a second core is used
+PARALLEL_CHUNK = 512  # traces that a thread takes at once
+
+
+class RocketEncoder(nn.Module):
+    """Compute the features of both towers from raw traces: (B, C, T) -> (B, P).
+
+    Parameters
+    ----------
+    channels, samples : int
+        C and T.
+    average : int
+        Samples that are averaged to one; see `averaging`.
+    kernels, dilations, regions : int
+        F, D and R of the first tower; short traces have fewer dilations.
+    groups : int
+        G, groups of competing kernels; 0 leaves the second tower out.
+
+    Attributes
+    ----------
+    towers : list of slice
+        Columns of each tower among the P features.
+    """
+
+    shift: Tensor
+    scale: Tensor
+    offset: Tensor
+    gain: Tensor
+    taps: Tensor
+    region_mean: Tensor
+    region_mix: Tensor
+    kernel: Tensor
+    threshold: Tensor
+    competing_kernel: Tensor
+    zero: Tensor
+    place_mean: Tensor
+
+    def __init__(
+        self,
+        channels: int,
+        samples: int,
+        average: int,
+        kernels: int,
+        dilations: int,
+        regions: int,
+        groups: int,
+    ) -> None:
+        super().__init__()
+        if samples < 2:
+            got = f"{samples} (n_features = {channels * samples})"
+            raise SettingError(f"Expected at least 2 samples, got {got}.")
+        frames = samples // average
+        places = max(1, min(frames, MAX_PLACES[0]) // regions) * regions
+        sparse_places = min(frames, MAX_PLACES[1])
+        taps = tap_positions(frames, dilations, places)
+        widths = len(taps) * regions * kernels, 4 * len(taps) * groups * GROUP_SIZE
+        ends = np.cumsum([0, *(widths if groups else widths[:1])]).tolist()
+        self.towers = [slice(first, end) for first, end in pairwise(ends)]
+        self.average = average
+        self.skipped = samples % average  # at the start: the end of an insertion tells most
+        self.n_dilations = len(taps)
+        self.n_regions = regions
+        self.n_kernels = kernels
+        self.n_places = places
+        self.n_groups = groups
+        self.group_size = GROUP_SIZE
+        self.kernel_size = TAPS
+        self.n_sparse_places = sparse_places
+        self.feature_clip = FEATURE_CLIP
+        self.n_dense_taps = taps.size  # of the first tower
+        if groups:  # the differences stand behind the trace
+            sparse = tap_positions(frames, dilations, sparse_places)
+            of_differences = np.where(sparse < frames - 1, frames + sparse, 2 * frames - 1)
+            taps = np.concatenate([taps.ravel(), sparse.ravel(), of_differences.ravel()])
+        self.whole_weight = WHOLE_TRACE_WEIGHT / regions
+        self.region_length = places // regions
+        learned = {
+            # A channel becomes scale * x + shift, a feature gain * f + offset: one pass each.
+            "shift": torch.zeros(channels, 1),
+            "scale": torch.ones(channels, 1),
+            "offset": torch.zeros(ends[-1]),
+            "gain": torch.ones(ends[-1]),
+            "taps": torch.from_numpy(taps.ravel()),
+            "kernel": torch.zeros(self.n_dilations, kernels, channels * TAPS),
+            "threshold": torch.zeros(self.n_dilations, kernels, 1),
+            "competing_kernel": torch.zeros(
+                2 * self.n_dilations, groups * GROUP_SIZE, channels * TAPS
+            ),
+        }
+        constants = {
+            "region_mean": torch.full((self.region_length,), 1.0 / self.region_length),
+            "region_mix": torch.eye(regions) + self.whole_weight,
+            "place_mean": torch.full((sparse_places,), 1.0 / sparse_places),
+            "zero": torch.zeros(1, channels, 1),
+        }
+        for name, value in learned.items():
+            self.register_buffer(name, value)
+        for name, value in constants.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T) raw traces -> (B, P) scaled features."""
+        return self.scale_features(self.raw_features(x))
+
+    def raw_features(self, x: Tensor) -> Tensor:
+        """(B, C, T) raw traces -> (B, P) features that are not scaled yet."""
+        values = self.read_taps(self.average_samples(x))
+        n_dense = self.n_dense_taps
+        batch = x.size(0)
+        dense = self.as_windows(values.narrow(1, 0, n_dense), self.n_dilations)
+        ramps = self.ramp_features(dense, batch)
+        if self.n_groups == 0:
+            return ramps
+        n_sparse = values.size(1) - n_dense
+        sparse = self.as_windows(values.narrow(1, n_dense, n_sparse), 2 * self.n_dilations)
+        return torch.cat([ramps, self.competition_features(sparse, batch)], 1)
+
+    def scale_features(self, raw: Tensor) -> Tensor:
+        """Standardise raw features (B, P) and clip them at 4 deviations: (B, P)."""
+        scaled = torch.addcmul(self.offset, raw, self.gain)
+        return scaled.clamp_(-self.feature_clip, self.feature_clip)
+
+    def average_samples(self, x: Tensor) -> Tensor:
+        """(B, C, T) raw traces -> (B, C, L) averaged, with channels of one scale."""
+        if self.average > 1:
+            x = x[..., self.skipped :] if self.skipped > 0 else x
+            # In half the time of a mean over an axis.
+            x = nn.functional.avg_pool2d(x, [1, self.average])
+        # Without the limits products of huge values would overflow.
+        return torch.addcmul(self.shift, x, self.scale).clamp_(-1e6, 1e6)
+
+    def read_taps(self, x: Tensor) -> Tensor:
+        """Read the value at each tap of averaged traces (B, C, L): (C, taps, B).
+
+        The batch is the last axis, so that reading a tap copies a row of it.
+        """
+        batch = x.size(0)
+        differences = x[:, :, 1:] - x[:, :, :-1]
+        rows = torch.cat([x, differences, self.zero.expand(batch, -1, -1)], 2)
+        if rows.size(0) * rows.size(1) == 1:  # one trace at a time, as a cell decides
+            return rows.view(-1).index_select(0, self.taps).view(1, -1, 1)
+        return rows.permute(1, 2, 0).contiguous().index_select(1, self.taps)
+
+    def as_windows(self, values: Tensor, n: int) -> Tensor:
+        """Arrange values (C, n * 9 * P, B) of n dilations as windows (n, C * 9, P * B).
+
+        A window is what a kernel sees at a place, so that a convolution is a product.
+        """
+        channels = values.size(0)
+        taps = self.kernel_size
+        columns = values.size(1) // (n * taps) * values.size(2)  # -1 cannot be inferred for n = 0
+        if channels == 1:
+            return values.reshape(n, taps, columns)
+        by_dilation = values.reshape(channels, n, taps, columns).transpose(0, 1)
+        return by_dilation.reshape(n, channels * taps, columns)
+
+    def ramp_features(self, windows: Tensor, batch: int) -> Tensor:
+        """Compute tower 1 from windows (D, C * 9, P * B): (B, D * F * R).
+
+        A feature is how far a kernel is above its threshold, in the mean over a region.
+        """
+        h = torch.baddbmm(self.threshold, self.kernel, windows).clamp_(0.0, 1.0)  # (D, F, P * B)
+        if batch == 1:  # one product whose columns are the regions takes four times as long
+            means = torch.mv(h.view(-1, self.region_length), self.region_mean)
+            return torch.mm(means.view(-1, self.n_regions), self.region_mix).view(1, -1)
+        h = h.view(self.n_dilations, self.n_kernels, self.n_regions, self.region_length, batch)
+        h = h.sum(3) / self.region_length  # (D, F, R, B)
+        h = h + self.whole_weight * h.sum(2, keepdim=True)  # as `region_mix` does
+        return h.reshape(self.n_dilations * self.n_kernels * self.n_regions, batch).t()
+
+    def competition_features(self, windows: Tensor, batch: int) -> Tensor:
+        """Compute tower 2 from windows (2D, C * 9, Q * B): (B, 4D * G * 8).
+
+        A feature is the root of the share of places where a kernel answers most of its group; the
+        second half is of those where it answers least. `learn_filters` has divided the kernels by
+        `COMPETITION_WIDTH`, so that a kernel counts in part within a distance of 1.
+        """
+        n_groups = 2 * self.n_dilations * self.n_groups
+        size = self.group_size
+        h = torch.bmm(self.competing_kernel, windows)
+        h = h.view(n_groups, size, self.n_sparse_places * batch)
+        wins = torch.empty(2, n_groups, size, h.size(2))
+        torch.sub(h, h.amax(1, keepdim=True) - 1.0, out=wins[0])
+        torch.sub(h.amin(1, keepdim=True) + 1.0, h, out=wins[1])
+        wins.clamp_(min=0.0)
+        if batch == 1:
+            means = torch.mv(wins.view(-1, self.n_sparse_places), self.place_mean)
+            return means.sqrt_().view(1, -1)
+        sums = wins.view(2 * n_groups * size, self.n_sparse_places, batch).sum(1)
+        return sums.mul_(1.0 / self.n_sparse_places).sqrt_().t()
+
+    def learn(self, X: Tensor, rng: np.random.Generator) -> None:
+        """Set the scales of the channels and the filters from traces (n, C, T).
+
+        It is done once, so that the features of a trace never change.
+        """
+        if len(X) > SCALE_TRACES:
+            X = X[torch.from_numpy(rng.permutation(len(X))[:SCALE_TRACES])]
+        double = X.double()
+        mean = double.mean((0, 2))
+        deviation = double.std((0, 2), unbiased=False)
+        scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
+        self.scale.copy_(scale[:, None])
+        self.shift.copy_((-mean * scale)[:, None])
+        sample = X[torch.from_numpy(rng.permutation(len(X))[:FILTER_TRACES])]
+        self.learn_filters(torch.addcmul(self.shift, sample, self.scale), rng)
+
+    def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
+        """Draw the kernels, and set thresholds and widths of ramps from what they give on traces.
+
+        x : Tensor of float32, shape (n, C, T), with scaled channels.
+        """
+        # `x` is scaled already; averaging is linear, so the scale is taken out again.
+        values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)
+        kernels = draw_kernels(x.size(1), self.n_kernels, rocket_kernels(), rng)
+        # Low-discrepancy quantiles, as in MiniRocket; none at the very ends.
+        n = self.n_dilations * self.n_kernels
+        quantiles = 0.05 + 0.9 * (np.arange(1, n + 1) * (np.sqrt(5.0) + 1.0) / 2.0 % 1.0)
+        dense = self.as_windows(values[:, : self.n_dense_taps], self.n_dilations)
+        for d, windows in enumerate(dense):  # (C * 9, P * n)
+            answers = (kernels @ windows).numpy()
+            of_dilation = quantiles[d * self.n_kernels : (d + 1) * self.n_kernels]
+            ranks = (of_dilation * (answers.shape[1] - 1)).astype(np.int64)
+            pairs = zip(answers, ranks, strict=True)
+            thresholds = [np.partition(row, rank)[rank] for row, rank in pairs]
+            slope = 1.0 / (2.0 * torch.from_numpy(answers.std(1)) + 1e-6)  # two deviations wide
+            self.kernel[d] = kernels * slope[:, None]
+            self.threshold[d, :, 0] = 0.5 - torch.tensor(thresholds) * slope
+        if self.n_groups:
+            sparse = self.as_windows(values[:, self.n_dense_taps :], 2 * self.n_dilations)
+            for d, windows in enumerate(sparse):  # (C * 9, Q * n)
+                weights = rng.standard_normal((self.competing_kernel.size(1), TAPS))
+                weights -= weights.mean(1, keepdims=True)  # so that offsets do not matter
+                choices = torch.from_numpy(weights).float()
+                kernels = draw_kernels(x.size(1), len(weights), choices, rng)
+                width = COMPETITION_WIDTH * (kernels @ windows).std() + 1e-6
+                self.competing_kernel[d] = kernels / width
+
+    def learn_feature_scales(self, raw: Tensor) -> None:
+        """Set the mean and deviation by which features are scaled, from raw ones (n, P).
+
+        The features of the second tower share one deviation.
+        """
+        deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
+        for tower in self.towers[1:]:  # of shares, those that vary more tell more
+            deviation[tower] = deviation[tower].square().mean().sqrt()
+        floor = 1e-3 * deviation.median() + 1e-12  # or a feature that never varied would explode
+        self.gain.copy_(1.0 / (deviation + floor))
+        self.offset.copy_(-mean / (deviation + floor))
+
+
+class ChunkedFeatures(nn.Module):
+    """Compute the raw features of many traces, chunk by chunk, into a given tensor.
+
+    Compiled, it releases Python's lock, so that an engine can open or compile at the same time.
+    """
+
+    def __init__(self, encoder: RocketEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.chunk = CHUNK
+
+    def forward(self, x: Tensor, out: Tensor) -> None:
+        """Write the features of x (n, C, T) to `out` (n, P); n is a multiple of the chunk."""
+        for i in range(0, x.size(0), self.chunk):
+            out[i : i + self.chunk] = self.encoder.raw_features(x[i : i + self.chunk])
+
+
+def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
+    """Compute the raw features of traces (n, C, T): (n, P).
+
+    A trace has the same features to the bit whatever other traces are with it, since every chunk
+    is full; the last one is filled up with zeros. From `PARALLEL_TRACES` on two threads compute.
+    """
+    x = torch.from_numpy(traces)
+    n = len(traces)
+    n_whole = n // CHUNK * CHUNK
+    out = torch.empty(n, len(encoder.gain))
+    rest = torch.zeros(CHUNK, *x.shape[1:])
+    rest[: n - n_whole] = x[n_whole:]
+    out[n_whole:] = encoder.raw_features(rest)[: n - n_whole]
+    if n < PARALLEL_TRACES:
+        ChunkedFeatures(encoder)(x[:n_whole], out[:n_whole])
+        return out
+    compute = script(ChunkedFeatures(encoder))
+    for _ in range(2):  # TorchScript's first calls compile
+        compute(x[:CHUNK], out[:CHUNK])
+    starts = range(0, n_whole, PARALLEL_CHUNK)
+    parts = [slice(i, min(i + PARALLEL_CHUNK, n_whole)) for i in starts]
+    with ThreadPoolExecutor(2, "dengine-features", torch.set_num_threads, (1,)) as pool:
+        list(pool.map(lambda part: compute(x[part], out[part]), parts))
+    return out
+
+
+def rocket_kernels() -> Tensor:
+    """Return MiniRocket's kernels (84, 9): every way to place three 2s among -1s.
+
+    Each kernel sums to zero, so that offsets do not matter.
+    """
+    places = torch.tensor(list(combinations(range(TAPS), 3)))
+    return torch.full((84, TAPS), -1.0).scatter_(1, places, 2.0)
+
+
+def dilation_steps(samples: int, n: int) -> list[int]:
+    """Return at most n dilations, from 1 to that at which a kernel spans `samples` samples."""
+    widest = np.log2((samples - 1) / (TAPS - 1)) if samples > TAPS else 0.0
+    return [int(d) for d in np.unique(np.floor(2.0 ** np.linspace(0.0, widest, n)))]
+
+
+def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
+    """Return the frame that each tap reads, int64 (D, 9, P), for P places in a trace.
+
+    A tap beyond the ends of the trace reads position ``2 * frames - 1``, where a zero stands.
+    """
+    steps = np.array(dilation_steps(frames, dilations), dtype=np.int64)
+    middle = ((np.arange(places) + 0.5) / places * frames).astype(np.int64)
+    taps = middle + steps[:, None, None] * (np.arange(TAPS) - TAPS // 2)[:, None]
+    return np.where((taps < 0) | (taps >= frames), 2 * frames - 1, taps)
+
+
+def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generator) -> Tensor:
+    """Draw n kernels from `choices` (N, 9), and the channels that each reads: (n, C * 9).
+
+    No kernel is drawn twice before all were drawn. A kernel reads between one and all channels,
+    and has unit size.
+    """
+    drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)
+    kernels = choices[torch.from_numpy(drawn)]
+    weights = torch.zeros(n, channels)
+    for row in range(n):
+        order = rng.permutation(channels)
+        selected = order[: int(2.0 ** rng.uniform(0.0, np.log2(channels + 1)))]
+        weights[row, torch.from_numpy(selected)] = len(selected) ** -0.5
+    units = kernels / kernels.square().sum(1, keepdim=True).sqrt()
+    return torch.flatten(weights[:, :, None] * units[:, None], 1)
