@@ -149,7 +149,7 @@ def test_labels_that_came_late_stand_where_they_came(make_data: Callable[..., Da
         ("a-5", True, False),
         ("a-4", True, True),
     ]
-    assert (journal.sum, journal.cut, journal.waits) == ("0123", 0, None)
+    assert (journal.sum, journal.cut, journal.pending) == ("0123", 0, None)
 
 
 @pytest.mark.parametrize("stops", ["some", "all"])
@@ -188,8 +188,8 @@ def test_a_changed_missing_moved_or_doubled_line_is_named_and_those_before_are_t
         for some in (changed[: number - 1], changed):
             path.write_bytes(b"\n".join([*some, b""]))
             found.append(read_journal(path, TraceSpec(100)))
-        assert f"line {number} of" in found[1].aside
-        assert "does not hold line 11, which its head knows" in found[0].aside
+        assert f"line {number} of" in found[1].set_aside
+        assert "does not hold line 11, which its head knows" in found[0].set_aside
         told = [[(line.decision.id, line.label, line.late) for line in journal.lines] for journal in found]
         assert told[0] == told[1]
 

@@ -135,7 +135,7 @@ def test_a_missing_swapped_or_doubled_line_is_refused_and_what_is_before_it_is_i
     with Program(programs, file, "--journal", journal) as cell:
         cell.must_refuse(f"is damaged in line {number}, or a line before it is missing")
     with pytest.raises(DataError, match=f"The checksum of line {number} of") if number == 2 else nullcontext():
-        assert f"The checksum of line {number} of" in read_journal(journal, TraceSpec(SAMPLES)).aside
+        assert f"The checksum of line {number} of" in read_journal(journal, TraceSpec(SAMPLES)).set_aside
 
 
 def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
