@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from dengine import DataEngine
 from tests.support.faults import read_faults
 
 REPO = Path(__file__).resolve().parents[2]
@@ -64,6 +65,11 @@ def test_no_base_of_ours_has_a_single_subclass() -> None:
     alone = {base: names[0] for base, names in subclasses.items() if len(names) == 1 and base not in aside}
     told = ", ".join(f"{base} (of {name})" for base, name in alone.items())
     assert not alone, f"{len(alone)} bases have one subclass; make the two one class, or compose them: {told}"
+
+
+def test_the_engine_keeps_a_public_face_of_at_most_25_members() -> None:
+    public = [name for name in dir(DataEngine) if not name.startswith("_")]
+    assert len(public) <= 25, f"{len(public)} public members; what only a server needs belongs to `EngineCore`: {public}"
 
 
 def test_no_module_is_imported_by_a_string() -> None:
