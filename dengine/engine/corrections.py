@@ -260,7 +260,7 @@ class Corrections:
         self._core.learner.set_policy(policy if starts_anew else None, evidence, event)
         self._core.settings.change(settings)
         self._core.feedback.begin_policy()
-        return self._done(event, "the rule of the policy in force has none")
+        return self._done(event, "the rule of the new policy has no safe mode")
 
     def _make_ready(self) -> None:
         """Bring in all that is under way, because a correction comes after everything that was
@@ -294,7 +294,7 @@ class Corrections:
         return self._done(change)
 
     def _done(
-        self, change: Change, reason_ended: str = "what was told anew keeps the tolerance"
+        self, change: Change, reason_ended: str = "the corrected outcomes keep the tolerance"
     ) -> Changed:
         """Announce a safe mode that the change began or ended, for this reason, and return what was
         done.

@@ -360,7 +360,7 @@ def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wron
     assert [each[:2] for each in told] == [("safe mode", ""), ("correct", "Kim"), ("safe mode ended", "")]
     assert told[0][2] == "accepted parts failed more often than the tolerance"
     assert last in told[1][2]
-    assert told[2][2] == "what was told anew keeps the tolerance"
+    assert told[2][2] == "the corrected outcomes keep the tolerance"
 
 
 def test_what_is_said_of_several_channels_is_said_by_their_names(browser: Browser, tmp_path: Path, stream: Dataset) -> None:

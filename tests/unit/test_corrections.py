@@ -377,7 +377,7 @@ def test_safe_mode_outlasts_a_change_of_policy_until_fresh_evidence(tmp_path: Pa
     engine.correct(stopped[-1], True)  # told anew: it still began in safe mode
     assert engine.safe_mode == why
     engine.set_policy(replace(engine.policy, stops="some"))  # the paper's rule has no safe mode
-    assert (engine.safe_mode, engine.store.events(1)[0].text) == ("", "the rule of the policy in force has none")
+    assert (engine.safe_mode, engine.store.events(1)[0].text) == ("", "the rule of the new policy has no safe mode")
 
 
 def test_silence_under_an_earlier_policy_never_becomes_a_success(data: Dataset) -> None:
