@@ -114,9 +114,10 @@ def run(
 
     With a store that exists the engine continues where it was. The simulated cell then makes new
     parts, and a recording continues after its last part that was labelled or accepted: no part is
-    learned from twice. A robot runs training/ur_cell.script, or a program with the same handshake;
-    --trigger and --samples say what is recorded of it. If too much goes wrong, or if traces look
-    like nothing known, every part is verified until fresh evidence shows otherwise: safe mode.
+    learned from twice. A robot runs dengine/cells/ur/ur_cell.script, or a program with the same
+    handshake; --trigger and --samples say what is recorded of it. If too much goes wrong, or if
+    traces look like nothing known, every part is verified until fresh evidence shows otherwise:
+    safe mode.
     Ctrl-C or SIGTERM ends the run after the current cycle and shows what was done; a second one
     ends it at once.
     """

@@ -317,7 +317,7 @@ def test_what_is_wrong_with_a_robot_is_one_line(words: str, expected: str) -> No
 def test_the_robots_program_of_the_repository_keeps_to_the_same_handshake(repo: Path) -> None:
     assert divmod(encode_message(12, Verb.PROCEED), 10) == (12, Verb.PROCEED)
     assert encode_message(MAX_NUMBER, ResultCode.FAILED) < 2**31  # as a register holds it
-    text = (repo / "training" / "ur_cell.script").read_text(encoding="utf-8")
+    text = (repo / "dengine" / "cells" / "ur" / "ur_cell.script").read_text(encoding="utf-8")
     for name in (ORDER, ANSWER, PHASE):
         way, _, number = name.partition("_int_register_")
         verb = "read_input" if way == "input" else "write_output"

@@ -24,7 +24,7 @@ from dengine.serve.http import create_app
 from dengine.store.views import HistoryFilter
 from tests.support.serving import PushedTraces, a_service, held, served
 
-SCRIPT = Path(__file__).parents[2] / "training" / "ur_xmlrpc_cell.script"
+SCRIPT = Path(__file__).parents[2] / "dengine" / "cells" / "ur" / "ur_xmlrpc_cell.script"
 TEXT = SCRIPT.read_text(encoding="utf-8")
 CODE = [line.partition("#")[0].rstrip() for line in TEXT.splitlines()]
 SAMPLES = 60
@@ -101,7 +101,7 @@ class Robot:
         names |= {"run": self.run, "kill": lambda thread: None, "textmsg": lambda *text: self.said.append("".join(text))}
         source = as_python(CODE).replace("192.168.1.20:8000/RPC2/TOKEN", f"127.0.0.1:{self.port}/RPC2")
         source = source.replace('HOST = "192.168.1.20"', 'HOST = "127.0.0.1"').replace("PORT = 8000", f"PORT = {self.port}")
-        source = source.replace("MOST_S = 3.0", f"MOST_S = {self.patience}").replace("while True:", "while next_part():")
+        source = source.replace("MAX_S = 3.0", f"MAX_S = {self.patience}").replace("while True:", "while next_part():")
         with pytest.raises(EndOfShiftError):
             exec(compile(source, str(SCRIPT), "exec"), names | {"next_part": self.next_part})
 
@@ -168,8 +168,8 @@ def test_what_is_not_answered_in_time_is_checked(cell: SimpleNamespace, make_dat
     with held(cell.service):
         robot.play()
     assert robot.checked == [0, 1]
-    assert sum("no answer" in said for said in robot.said) == 2
-    assert sum("a label was not kept" in said for said in robot.said) == 2
+    assert sum("no response" in said for said in robot.said) == 2
+    assert sum("a label was not stored" in said for said in robot.said) == 2
 
 
 def test_a_part_that_was_left_in_the_fixture_is_checked_first(cell: SimpleNamespace, make_data) -> None:

@@ -9,8 +9,8 @@ dengine and the robot's program exchange numbers in integer registers. dengine w
 so that neither side can read half of one. Each order has a number of its own, so that an order
 that is sent twice is carried out once, and an old result is recognised. While the robot inserts,
 `output_int_register_25` holds the order's number, which triggers the recording. A program that
-starts anew writes the result code VOID for an order that it finds. `training/ur_cell.script` is
-such a program.
+starts anew writes the result code VOID for an order that it finds. `ur_cell.script` beside this
+file is such a program.
 """
 
 from contextlib import AbstractContextManager
@@ -228,7 +228,7 @@ class UrCell(AbstractContextManager["UrCell"]):
             problem = waiting if is_playing else "its program does not run"
         if not problem:
             raise self._timeout_error("to send its state")
-        do = "start training/ur_cell.script, or your own program of the same handshake, on it"
+        do = "start ur_cell.script of dengine/cells/ur, or your own program of its handshake, on it"
         where = f"the robot at {self.recorder.stream.where}"
         raise CellError(
             f"Expected {where} to be ready within {self.start_timeout:g} s, {problem}; {do}."
