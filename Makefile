@@ -14,23 +14,27 @@ AUDITED = 30
 
 define COUNT_AUDITED
 import json, pathlib, sys
-path, least = pathlib.Path(sys.argv[1]), int(sys.argv[2])
-known = json.loads(path.read_text())["dependencies"] if path.exists() else []
-audited = [each for each in known if "skip_reason" not in each]
-bad = [(each, flaw) for each in audited for flaw in each["vulns"]]
-for each, flaw in bad:
-    print(each["name"], each["version"], flaw["id"], "fixed in:", ", ".join(flaw["fix_versions"]) or "no version yet")
-print(f"{len(audited)} packages were audited, {len(bad)} vulnerabilities found; expected at least {least} packages.")
-sys.exit(len(audited) < least or bool(bad))
+path = pathlib.Path(sys.argv[1])
+least = int(sys.argv[2])
+packages = json.loads(path.read_text())["dependencies"] if path.exists() else []
+audited = [package for package in packages if "skip_reason" not in package]
+flaws = [(package, flaw) for package in audited for flaw in package["vulns"]]
+for package, flaw in flaws:
+    versions = ", ".join(flaw["fix_versions"]) or "no version yet"
+    print(package["name"], package["version"], flaw["id"], "fixed in:", versions)
+print(f"Audited {len(audited)} packages, found {len(flaws)} vulnerabilities; expected at least {least} packages.")
+sys.exit(len(audited) < least or bool(flaws))
 endef
 export COUNT_AUDITED
 
 define LOCKED
 import json, sys
-found = [(each["metadata"], each["download_info"].get("archive_info", {})) for each in json.load(sys.stdin)["install"]]
-for about, archive in sorted(found, key=lambda each: each[0]["name"].lower()):
-    if "hashes" in archive:
-        print(f"{about['name']}=={about['version']} --hash=sha256:{archive['hashes']['sha256']}")
+packages = json.load(sys.stdin)["install"]
+for package in sorted(packages, key=lambda package: package["metadata"]["name"].lower()):
+    metadata = package["metadata"]
+    hashes = package["download_info"].get("archive_info", {}).get("hashes")
+    if hashes:
+        print(f"{metadata['name']}=={metadata['version']} --hash=sha256:{hashes['sha256']}")
 endef
 export LOCKED
 REPEATS ?= 200

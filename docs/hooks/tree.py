@@ -1,6 +1,6 @@
-"""Where things are, from the package itself: the tree of the README.
+"""Writes the tree of the README, which says where things are, from the package itself.
 
-python docs/hooks/tree.py        # writes it anew after a module came, went or changed its first words
+python docs/hooks/tree.py        # after a module was added, removed or got other first words
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from pathlib import Path
 
 REPO = Path(__file__).resolve().parents[2]
 README = REPO / "README.md"
-TREE = re.compile(r"(?<=^```text\n)dengine/ .*?(?=^```$)", flags=re.S | re.M)
-BESIDE = {
+TREE = re.compile(r"(?<=^```text\n)dengine/ .*?(?=^```$)", flags=re.DOTALL | re.MULTILINE)
+OTHER_FOLDERS = {
     "docs/": "tutorials, how-to, reference, explanation; `make docs` builds the site into site/",
     "models/": "recipes/*.toml, and trained files with their cards",
     "training/": "scripts over dengine: train, compare, export, measure",
@@ -22,27 +22,31 @@ BESIDE = {
 
 
 def clause(module: Path) -> str:
-    """The first clause of a module's docstring."""
+    """Return the first clause of a module's docstring."""
     text = ast.get_docstring(ast.parse(module.read_text(encoding="utf-8"))) or ""
-    return re.split(r"[.:;](?:\s|$)", " ".join(text.split("\n\n")[0].split()), maxsplit=1)[0].replace("`", "")
+    paragraph = " ".join(text.split("\n\n")[0].split())
+    return re.split(r"[.:;](?:\s|$)", paragraph, maxsplit=1)[0].replace("`", "")
 
 
 def rows() -> dict[str, str]:
-    """What stands in the repository: the package's modules in one row, each family with its first words, what is beside."""
+    """Return the rows, name -> text: the modules in one row, the families, other folders."""
     package = REPO / "dengine"
-    modules = [file.stem for file in sorted(package.glob("*.py")) if not file.stem.startswith("__")]
-    families = {f"  {file.parent.name}/": clause(file) for file in sorted(package.glob("*/__init__.py"))}
-    return {"dengine/": ", ".join(modules)} | families | BESIDE
+    modules = sorted(path.stem for path in package.glob("[!_]*.py"))
+    families = sorted(package.glob("*/__init__.py"))
+    clauses = {f"  {path.parent.name}/": clause(path) for path in families}
+    return {"dengine/": ", ".join(modules)} | clauses | OTHER_FOLDERS
 
 
 def tree() -> str:
-    """The rows as text."""
+    """Return the tree as text."""
     return "".join(f"{name:<16}{words}".rstrip() + "\n" for name, words in rows().items())
 
 
 def main() -> None:
     """Write the tree into the README."""
-    README.write_text(TREE.sub(lambda _: tree(), README.read_text(encoding="utf-8")), encoding="utf-8")
+    README.write_text(
+        TREE.sub(lambda _: tree(), README.read_text(encoding="utf-8")), encoding="utf-8"
+    )
 
 
 if __name__ == "__main__":
