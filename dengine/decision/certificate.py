@@ -99,8 +99,8 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
     do = "0.02 looks at one part in fifty"
     expect(0.0 <= propensity <= 1.0, "0 <= propensity <= 1", propensity, do)
     if not 0 <= n_bad <= n:
-        got = f"n_bad = {n_bad} of n = {n}"
-        raise ValueError(f"Expected 0 <= n_bad <= n, got {got}; count each part once.")
+        actual = f"n_bad = {n_bad} of n = {n}"
+        raise ValueError(f"Expected 0 <= n_bad <= n, got {actual}; count each part once.")
     enough = math.log(1.0 / alpha)
     if propensity == 0.0 or log_evidence(n, n_bad, 1.0, propensity) < enough:
         return 1.0

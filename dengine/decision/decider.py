@@ -133,8 +133,8 @@ class Decider(nn.Module):
             action = 2 * (outside - 1)
             propensity = float(2 - outside)
             return 0, content, action, 0, self.outside_reason, 0.0, 1.0, 0, 0, z, propensity
-        own = part if part != 0 else content
-        predicted, reason, lower, upper, n_success, n_failure, z = self.predictor(x, own)
+        own_part = part if part != 0 else content
+        predicted, reason, lower, upper, n_success, n_failure, z = self.predictor(x, own_part)
         action = predicted
         propensity = 1.0
         if predicted != 0:

@@ -268,9 +268,11 @@ def _beta_interval(
 
     normal_quantile(alpha)  # checks alpha
     successes, failures = _as_counts(n_success, n_failure)
-    a, b = np.maximum(successes + prior, 0.5), failures + other_prior
+    a = np.maximum(successes + prior, 0.5)
+    b = failures + other_prior
     lower = np.where(successes > 0, betaincinv(a, b, alpha / 2.0), 0.0)
-    a, b = successes + other_prior, np.maximum(failures + prior, 0.5)
+    a = successes + other_prior
+    b = np.maximum(failures + prior, 0.5)
     upper = np.where(failures > 0, betaincinv(a, b, 1.0 - alpha / 2.0), 1.0)
     return _as_floats(*_clip_limits(np, lower, upper, successes, failures))
 
@@ -280,8 +282,8 @@ def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, 
     successes = np.asarray(n_success, dtype=np.float64)
     failures = np.asarray(n_failure, dtype=np.float64)
     if successes.shape != failures.shape:
-        got = f"{successes.shape} successes and {failures.shape} failures"
-        raise ValueError(f"Expected counts of one shape, got {got}.")
+        actual = f"{successes.shape} successes and {failures.shape} failures"
+        raise ValueError(f"Expected counts of one shape, got {actual}.")
     if np.any(successes < 0) or np.any(failures < 0):
         raise ValueError("Expected counts of zero or more, got a negative one.")
     return successes, failures

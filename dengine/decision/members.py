@@ -51,7 +51,8 @@ def max_recent_errors(tolerance: float) -> int:
     More are wrong with a probability of at most `TAIL_PROBABILITY` where each is wrong with the
     probability `tolerance`.
     """
-    tail, k = 1.0, -1
+    tail = 1.0
+    k = -1
     while tail > TAIL_PROBABILITY:
         k += 1
         tail -= math.comb(N_RECENT, k) * tolerance**k * (1.0 - tolerance) ** (N_RECENT - k)

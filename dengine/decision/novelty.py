@@ -303,8 +303,9 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
         content = np.array([numbers.setdefault(x.tobytes(), len(numbers)) for x in samples])
         if len(numbers) == len(traces):
             break
-    own = content if parts is None else parts
-    same = (content[:, None] == content) | (own[:, None] == own)
+    part = content if parts is None else parts
+    same_part = part[:, None] == part
+    same = (content[:, None] == content) | same_part
     return torch.from_numpy(same), int((~np.tril(same, -1).any(1)).sum())
 
 

@@ -59,8 +59,10 @@ def label_agreement(
         Upper confidence bound on the intraclass correlation, from 0 to 1; 1 if fewer than
         `FEWEST_PARTS` parts came twice.
     """
-    points, labels = points[-SAMPLE:], labels[-SAMPLE:]
-    spaces, parts = spaces[-SAMPLE:], parts[-SAMPLE:]
+    points = points[-SAMPLE:]
+    labels = labels[-SAMPLE:]
+    spaces = spaces[-SAMPLE:]
+    parts = parts[-SAMPLE:]
     _, part, n_times = np.unique(parts, return_inverse=True, return_counts=True)
     repeated = (n_times[part] > 1) & (parts != 0)
     if len(np.unique(part[repeated])) < FEWEST_PARTS:
@@ -243,10 +245,10 @@ class RadiusIndex(nn.Module):
         Tensor of float32, shape (n,)
         """
         n = self.size()
-        own = z.t()  # (d, K)
+        query = z.t()  # (d, K)
         if z.size(0) > 1:
-            own = own.index_select(1, self.spaces[:n])  # (d, n): the query in each point's space
-        distances = (self.points.narrow(1, 0, n) - own).square_().sum(0)
+            query = query.index_select(1, self.spaces[:n])  # (d, n): in each point's own space
+        distances = (self.points.narrow(1, 0, n) - query).square_().sum(0)
         # The filter spares nearly all queries of new parts the comparison with every point.
         if part != 0 and bool(self.part_filter[part & self.filter_mask].item()):
             distances.masked_fill_(self.parts[:n] == part, float("inf"))
@@ -336,22 +338,22 @@ class RadiusIndex(nn.Module):
         y = np.array(labels, dtype=np.float32)
         zeros = np.zeros(len(z), np.int64)
         k = zeros if spaces is None else np.array(spaces, dtype=np.int64)
-        own = zeros if parts is None else np.array(parts, dtype=np.int64)
+        hashes = zeros if parts is None else np.array(parts, dtype=np.int64)
         n = (len(z),)
-        if z.ndim != 2 or z.shape[1] != self.dim or {y.shape, k.shape, own.shape} != {n}:
+        if z.ndim != 2 or z.shape[1] != self.dim or {y.shape, k.shape, hashes.shape} != {n}:
             wanted = f"points (n, {self.dim}) with n labels, n spaces and n parts"
-            got = f"{z.shape}, {y.shape}, {k.shape} and {own.shape}"
-            raise ValueError(f"Expected {wanted}, got {got}.")
+            actual = f"{z.shape}, {y.shape}, {k.shape} and {hashes.shape}"
+            raise ValueError(f"Expected {wanted}, got {actual}.")
         total = int(self.total)
         newest = slice(max(0, len(z) - self.capacity), None)
         slots = (total + np.arange(len(z))[newest]) % self.capacity
         self.points[:, slots] = torch.from_numpy(z[newest].T)
         self.labels[1, slots] = torch.from_numpy(y[newest])
         self.spaces[slots] = torch.from_numpy(k[newest])
-        self.parts[slots] = torch.from_numpy(own[newest])
+        self.parts[slots] = torch.from_numpy(hashes[newest])
         self.numbers[slots] = 0 if numbers is None else np.asarray(numbers)[newest]
         self.total.fill_(total + len(z))
-        if own.any() or int(self.repeats) > 0:
+        if hashes.any() or int(self.repeats) > 0:
             self._index_parts()
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
@@ -375,7 +377,8 @@ class RadiusIndex(nn.Module):
         slots = np.flatnonzero(self.column("numbers") == number)
         if not len(slots):
             return True
-        slot, n = int(slots[0]), len(self)
+        slot = int(slots[0])
+        n = len(self)
         if int(self.parts[slot]) != part:
             return False
         if label is not None:

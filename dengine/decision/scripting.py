@@ -77,6 +77,6 @@ def incompatible_model_error(defect: str) -> StoreError:
 
     `defect` says what does not fit, as in "ConvReducer has other sizes".
     """
-    got = f"one whose {defect}; its labels are whole"
+    actual = f"one whose {defect}; its labels are whole"
     do = "learn from them anew, by `dengine train --data OLD.db --store NEW.db`"
-    return StoreError(f"Expected a model of this version of dengine, got {got}: {do}.")
+    return StoreError(f"Expected a model of this version of dengine, got {actual}: {do}.")

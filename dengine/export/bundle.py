@@ -130,9 +130,9 @@ def prepare_export(
     try:
         source: Exportable = exporter.exported(trace)
     except AttributeError as error:
-        got = type(engine_or_model).__name__
+        actual = type(engine_or_model).__name__
         wanted = "Expected a DataEngine or a ModelPrediction to export"
-        raise ExportError(f"{wanted}, got {got}; a baseline stays in Python.") from error
+        raise ExportError(f"{wanted}, got {actual}; a baseline stays in Python.") from error
     model = source.model
     encoder = model.spaces.module()
     if not model.rule.scriptable:
@@ -289,9 +289,9 @@ def read_checked(path: Path, key: KeyFile | None = None) -> bytes:
         problem = f"{path}.sha256 holds no SHA-256 sum of {path.name}"
         raise ExportError(f"{problem}; copy it again together with {path.name}.")
     content = _read(path)
-    found = hashlib.sha256(content).hexdigest()
-    if found != expected:
-        sums = f"its SHA-256 is {found[:12]}…, expected {expected[:12]}…"
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != expected:
+        sums = f"its SHA-256 is {digest[:12]}…, expected {expected[:12]}…"
         raise ExportError(f"{path} is damaged or truncated: {sums}; copy it again.")
     if key is not None:
         signed = signature(content, key)
@@ -342,7 +342,7 @@ def check_schema(metadata: Any, path: Path) -> dict[str, Any]:
     fields = metadata if isinstance(metadata, dict) else {}
     if fields.get("schema") != SCHEMA:
         writer = f"dengine {fields.get('dengine', 'of an unknown version')}"
-        got = f"schema {fields.get('schema')}, written by {writer}"
+        actual = f"schema {fields.get('schema')}, written by {writer}"
         do = "export it anew, or load it with the dengine that wrote it"
-        raise ExportError(f"{path} has {got}; this one reads schema {SCHEMA}: {do}.")
+        raise ExportError(f"{path} has {actual}; this one reads schema {SCHEMA}: {do}.")
     return fields

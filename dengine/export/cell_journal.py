@@ -207,10 +207,13 @@ def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
     padded = [*words[:N_DECISION_WORDS], *[""] * (N_DECISION_WORDS - len(words))]
     id_, label, part, *decided = padded
     with instead(DataError, f"The decision in {where} cannot be read", ValueError):
-        action, predicted = Action(decided[0]), Action(decided[1])
+        action = Action(decided[0])
+        predicted = Action(decided[1])
         reason = Reason(decided[2])
-        lower, upper = float(decided[3]), float(decided[4])
-        n_success, n_failure = int(decided[5]), int(decided[6])
+        lower = float(decided[3])
+        upper = float(decided[4])
+        n_success = int(decided[5])
+        n_failure = int(decided[6])
     has_counts = 0 <= min(n_success, n_failure) <= max(n_success, n_failure) < LARGEST_COUNT
     is_valid = 0.0 <= lower <= upper <= 1.0 and has_counts
     wanted = f"bounds between 0 and 1 and counts in {where}"
@@ -293,9 +296,9 @@ def import_journal(
         exports = {event.text.split()[0] for event in opened.events() if event.kind == EXPORTED}
         if exports and journal.sum not in exports and not any_model:
             wanted = "Expected a journal of a model that was exported from this store"
-            got = f"{path} belongs to {journal.sum[:12]}…, which is none of its exports"
+            actual = f"{path} belongs to {journal.sum[:12]}…, which is none of its exports"
             do = "name the store that it came from, or say --any-model if it is right"
-            raise DataError(f"{wanted}, {got}; {do}.")
+            raise DataError(f"{wanted}, {actual}; {do}.")
         lines = _with_known_outcomes(journal, policy.stops)
         parts = [(line.decision, line.trace, line.label) for line in lines]
         report = import_parts(opened, parts, spec, policy)

@@ -177,16 +177,22 @@ class DecisionModule(nn.Module):
         x = self.as_trace(trace)
         fault, content = self.decider.check(x)
         if fault == 0:
-            own = part if part != 0 else content
+            part_or_content = part if part != 0 else content
             is_pending = self.pending_action != self.none_pending
-            if is_pending and self.pending_part == own and self.pending_content == content:
+            if (
+                is_pending
+                and self.pending_part == part_or_content
+                and self.pending_content == content
+            ):
                 self.learn_pending(success)
             else:
                 (
                     _, _, action, predicted, reason, lower, upper, _, _, z, _,
                 ) = self.decider(x, part)  # fmt: skip
                 novel = reason == self.novel_reason
-                self.learn_outcome(lower, upper, novel, z, own, success, action, predicted)
+                self.learn_outcome(
+                    lower, upper, novel, z, part_or_content, success, action, predicted
+                )
         return self.n_references()
 
     @torch.jit.export

@@ -306,13 +306,15 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
     X = (rng.normal(size=shape) * scales).astype(np.float32)
     if spec.limit is not None:
         X = np.clip(X, -0.9 * spec.limit, 0.9 * spec.limit)
-    for got, expected in zip(onnx_model.decide_many(X), model.predict_many(X), strict=True):
-        is_near = np.allclose(got.embedding, expected.embedding, rtol=TOLERANCE, atol=TOLERANCE)
-        n_moved = abs(got.n_success - expected.n_success) + abs(got.n_failure - expected.n_failure)
-        difference = abs(got.lower - expected.lower) + abs(got.upper - expected.upper)
-        same_counts = got.action == expected.action and difference <= BOUND_TOLERANCE
+    for actual, expected in zip(onnx_model.decide_many(X), model.predict_many(X), strict=True):
+        is_near = np.allclose(actual.embedding, expected.embedding, rtol=TOLERANCE, atol=TOLERANCE)
+        n_moved = abs(actual.n_success - expected.n_success) + abs(
+            actual.n_failure - expected.n_failure
+        )
+        difference = abs(actual.lower - expected.lower) + abs(actual.upper - expected.upper)
+        same_counts = actual.action == expected.action and difference <= BOUND_TOLERANCE
         if not is_near or n_moved > N_AT_EDGE or (n_moved == 0 and not same_counts):
-            problem = f"onnxruntime does not decide as the model does: {got} for {expected}"
+            problem = f"onnxruntime does not decide as the model does: {actual} for {expected}"
             raise ExportError(f"{problem}; export torchscript.")
 
 
