@@ -1,4 +1,4 @@
-"""Cells that an engine drives: the contract, a recording played back, a simulated cell, and a UR robot's."""
+"""Cells that an engine drives: the protocol, recordings, a simulation, Universal Robots."""
 
 import lazy_loader
 

@@ -1,1 +1,1 @@
-"""A robot cell in MuJoCo: bin, gripper, compliant wrist, chamfered fixture, force sensor, height check."""
+"""A robot cell simulated in MuJoCo: gripper, wrist, fixture, force sensor, height check."""

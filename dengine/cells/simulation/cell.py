@@ -62,9 +62,8 @@ def read_sensor(
         In newtons.
     """
     keep = float(np.exp(-2 * np.pi * parameters.bandwidth_hz / RATE_HZ))
-    true: NDArray[np.float64] = lfilter(
-        [1 - keep], [1, -keep], force
-    )  # the first-order low-pass in the sensor
+    # The sensor has a low-pass filter of first order.
+    true: NDArray[np.float64] = lfilter([1 - keep], [1, -keep], force)
     samples = len(true)
     time_s = np.arange(samples) / RATE_HZ
     # Six of each are drawn and one is used, so that the bundled traces can be made again.
@@ -121,7 +120,7 @@ def insert_once(
     world_rng, sensor_rng, _ = _streams(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
     pushed = push(conditions, time_step_s)
-    # The sensor's faults have a random stream of their own, so that they tell nothing of the outcome.
+    # The faults of the sensor have a stream of their own, so that they do not reveal the outcome.
     ranges = [getattr(parameters, field.name) for field in fields(SensorFaults)]
     faults = SensorFaults(*(float(sensor_rng.uniform(*limits)) for limits in ranges))
     faults = replace(faults, bias_n=faults.bias_n + parameters.bias_offset_n)
@@ -142,9 +141,7 @@ def _cause(conditions: Conditions, pushed: Push) -> str:
 
     It is the fault that was drawn, if it had an effect, else follows from where the part stopped.
     """
-    tip_mm = (
-        pushed.height_mm - conditions.extra_length_mm
-    )  # height of the part's tip above the seat
+    tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):
         return conditions.fault
     if tip_mm >= DEPTH_MM - conditions.chamfer_mm:
@@ -159,7 +156,7 @@ def _cause(conditions: Conditions, pushed: Push) -> str:
 def _streams(
     seed: int, cycle: int
 ) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
-    """Return independent generators of one cycle: for the world, the sensor, and the line after it."""
+    """Return independent generators of one cycle: for the world, the sensor, and the line."""
     world, sensor, line = np.random.SeedSequence(entropy=seed, spawn_key=(cycle,)).spawn(3)
     return np.random.default_rng(world), np.random.default_rng(sensor), np.random.default_rng(line)
 

@@ -1,4 +1,8 @@
-"""What varies from one simulated insertion to the next: settings with their units, one cycle's draw, and scenarios."""
+"""Conditions of a simulated insertion: the cell's settings, one cycle's draw, and scenarios.
+
+`CellParameters` says from which ranges `draw_conditions` draws the `Conditions` of a cycle; a
+scenario changes the parameters in the course of a run. Units are in the names.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -18,35 +22,67 @@ _SIGNED = {"bias_n", "drift_n", "bias_offset_n"}
 
 @dataclass(frozen=True, slots=True)
 class CellParameters:
-    """Every setting of the simulated cell. A `Range` is drawn uniformly each cycle, a `_sd` normally around zero.
+    """Settings of the simulated cell.
 
-    **Times of the line** (seconds)
-    cycle_s, verify_s, stop_s : one pick and insertion; one height check; one system stop, operator included.
-    **What the cell notices** (probabilities)
-    silent_share : a failed part that was passed on and does not stop the system.
-    confirm_share : a good part that was passed on and is confirmed as good later in the line.
-    **Height check** (millimetres)
-    height_tolerance_mm : a part whose top is this close to its nominal height is a success.
-    **Grasp**
-    offset_sd_mm, tilt_sd_deg, yaw_sd_deg : where the part sits in the gripper, laterally and in rotation.
-    protrusion_sd_mm : how far it sticks out, about the nominal.
-    grip_n : pull at which the part slips in the gripper; weak_grip_n : the same, for a poor grasp.
-    **Part and fixture**
-    part_mass_kg, length_sd_mm : of a right part.
-    clearance_mm : hole width less part width. chamfer_mm : width of the hole's 45 degree chamfer.
-    friction : Coulomb coefficient between part and fixture.
-    extra_length_mm, extra_width_mm : how a wrong part differs, before the sign is drawn.
-    debris_mm : thickness of what lies on the fixture's floor.
-    **Robot**
-    gap_mm : from part to rim when the recording starts. delay_s : from then until the robot moves.
-    speed_mm_s, force_limit_n, overtravel_mm : of the push; overtravel is how far below the seat it aims.
-    lateral_n_mm, axial_n_mm, angular_nm_rad : springs of the wrist.
-    **Faults** (probability that a cycle is drawn with this fault; what comes of it is up to the physics)
-    missed_grasp, weak_grip, debris, wrong_part.
-    **Sensor**
-    noise_n, ripple_n, ripple_hz : white noise and gear ripple. bias_n, drift_n : offset, and its change over a trace.
-    step_n : quantisation. dropped_share : samples lost, the last one is held. bandwidth_hz : low-pass filter.
-    bias_offset_n : a constant on top of every bias; zero but in the `bias_jump` scenario.
+    A `Range` (low, high) is drawn uniformly in each cycle; a value named `_sd` is the standard
+    deviation of a normal draw around zero. Probabilities are from 0 to 1.
+
+    Parameters
+    ----------
+    cycle_s, verify_s, stop_s : float
+        Seconds for a pick and insertion, for a height check, and for a line stop, operator
+        included.
+    silent_share : float
+        Probability that a bad part which was passed on does not stop the line.
+    confirm_share : float
+        Probability that a good part which was passed on is confirmed as good later.
+    height_tolerance_mm : float
+        A part is good if the height of its top differs from the nominal one by at most this.
+    offset_sd_mm, tilt_sd_deg, yaw_sd_deg : float
+        Lateral offset and rotations of the part in the gripper.
+    protrusion_sd_mm : float
+        Deviation from the length by which a part nominally sticks out of the gripper.
+    grip_n, weak_grip_n : Range
+        Push at which the part slips in the gripper, and the same for a poor grasp.
+    part_mass_kg, length_sd_mm : Range, float
+        Mass of a part, and deviation of a correct part's length.
+    clearance_mm : Range
+        Width of the hole minus width of the part.
+    chamfer_mm : Range
+        Width of the hole's chamfer of 45 degrees.
+    friction : Range
+        Coulomb coefficient between part and fixture.
+    extra_length_mm, extra_width_mm : Range
+        Deviations of a wrong part, without their signs, which are drawn too.
+    debris_mm : Range
+        Thickness of debris on the fixture's floor.
+    gap_mm : Range
+        Distance from the part to the rim at the start of the recording.
+    delay_s : Range
+        Time from then until the robot moves.
+    speed_mm_s, force_limit_n, overtravel_mm : Range
+        Speed and limit of the push, and how far below the seat its target is.
+    lateral_n_mm, axial_n_mm, angular_nm_rad : Range
+        Stiffness of the wrist.
+    missed_grasp, weak_grip, debris, wrong_part : float
+        Probabilities of the faults. Whether a fault makes a bad part follows from the physics.
+    noise_n, ripple_n, ripple_hz : Range
+        White noise of the sensor, and ripple of the gears.
+    bias_n, drift_n : Range
+        Offset of the sensor, and its change during a trace.
+    step_n : Range
+        Quantisation.
+    dropped_share : Range
+        Share of the samples that are lost; the last one is held.
+    bandwidth_hz : float
+        Of the sensor's low-pass filter.
+    bias_offset_n : float
+        Added to every bias; zero but in the scenario "bias_jump".
+
+    Raises
+    ------
+    SettingError
+        For a range, a probability or a size that cannot be.
     """
 
     cycle_s: float = 47.0
@@ -99,7 +135,7 @@ class CellParameters:
     bias_offset_n: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in (each.name for each in fields(self)):
+        for name in (field.name for field in fields(self)):
             value = getattr(self, name)
             low, high = value if isinstance(value, tuple) else (value, value)
             expect(low <= high, f"{name} as (low, high) with low <= high", value, "swap them")
@@ -117,10 +153,20 @@ class CellParameters:
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What one insertion meets. Units are in the names; `fault` is what was drawn, not what came of it.
+    """Conditions of one insertion, as drawn.
 
-    debris_x_mm, debris_y_mm : where the debris lies, from the hole's centre. debris_softness_s : contact time constant.
-    extra_length_mm, extra_width_mm : of this part against the nominal one.
+    Attributes
+    ----------
+    fault : str
+        The fault that was drawn, one of `FAULTS`, or "none". It need not have an effect.
+    extra_length_mm, extra_width_mm : float
+        Deviations of this part from the nominal one.
+    debris_x_mm, debris_y_mm : float
+        Position of the debris, from the hole's centre.
+    debris_softness_s : float
+        Time constant of the contact with the debris.
+
+    The other fields are values of the settings of `CellParameters` with the same name.
     """
 
     fault: str
@@ -151,7 +197,7 @@ class Conditions:
     angular_nm_rad: float
 
 
-# What is drawn by a setting of another name, or in a range of its own; all else goes by its own name.
+# Fields of `Conditions` that are drawn by a setting of another name, or in a fixed range.
 _DRAWN_BY: dict[str, str | Range] = {
     **dict.fromkeys(("offset_x_mm", "offset_y_mm"), "offset_sd_mm"),
     **dict.fromkeys(("tilt_x_deg", "tilt_y_deg"), "tilt_sd_deg"),
@@ -164,21 +210,26 @@ _DRAWN_BY: dict[str, str | Range] = {
 
 
 def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Conditions:
-    """Draw one insertion. Every quantity is drawn in every cycle, so a change of one leaves the others as they were."""
+    """Draw the conditions of one insertion.
+
+    Every quantity is drawn in every cycle, so that a change of one does not change the others.
+    """
     p = parameters
 
-    def drawn(setting: str | Range) -> float:
+    def draw(setting: str | Range) -> float:
+        """Draw a value by a setting of the parameters, or in a range."""
         value = getattr(p, setting) if isinstance(setting, str) else setting
         return float(rng.uniform(*value) if isinstance(value, tuple) else rng.normal(0.0, value))
 
-    usual = {"fault": "none", "extra_width_mm": 0.0, "debris_mm": 0.0}
-    names = [
-        each.name for each in fields(Conditions) if each.name not in usual
-    ]  # in the order in which they are drawn
-    right = Conditions(**usual, **{name: drawn(_DRAWN_BY.get(name, name)) for name in names})  # type: ignore[arg-type]
-    weak_grip_n, debris_mm = drawn("weak_grip_n"), drawn("debris_mm")
-    extra_length_mm = drawn("extra_length_mm") * float(rng.choice((-1, 1)))
-    extra_width_mm = drawn("extra_width_mm") * float(rng.choice((-1, 1)))
+    without_fault = {"fault": "none", "extra_width_mm": 0.0, "debris_mm": 0.0}
+    # The values are drawn in the order of the fields.
+    names = [field.name for field in fields(Conditions) if field.name not in without_fault]
+    values = {name: draw(_DRAWN_BY.get(name, name)) for name in names}
+    normal = Conditions(**without_fault, **values)  # type: ignore[arg-type]
+    weak_grip_n = draw("weak_grip_n")
+    debris_mm = draw("debris_mm")
+    extra_length_mm = draw("extra_length_mm") * float(rng.choice((-1, 1)))
+    extra_width_mm = draw("extra_width_mm") * float(rng.choice((-1, 1)))
     changes: dict[str, dict[str, float]] = {
         "weak_grip": {"grip_n": weak_grip_n},
         "debris": {"debris_mm": debris_mm},
@@ -186,27 +237,27 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
     }
     shares = [p.missed_grasp, p.weak_grip, p.debris, p.wrong_part]
     fault = str(rng.choice(["none", *FAULTS], p=[1 - sum(shares), *shares]))
-    return replace(right, fault=fault, **changes.get(fault, {}))
+    return replace(normal, fault=fault, **changes.get(fault, {}))
 
 
-# (parameters, cycle, cycles) -> the parameters of that cycle
+# Called with the parameters, a cycle and the number of cycles; returns the parameters of the cycle.
 Scenario = Callable[[CellParameters, int, int], CellParameters]
 
 
 def nominal(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Nothing changes."""
+    """Return the parameters unchanged."""
     return parameters
 
 
 def wear(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """The tool wears: friction grows in proportion to the cycles done, by 0.35 in all."""
+    """Return the parameters with more friction as the tool wears: linear, by 0.35 in all."""
     low, high = parameters.friction
     grown = 0.35 * min(1.0, cycle / max(1, cycles - 1))
     return replace(parameters, friction=(low + grown, high + grown))
 
 
 def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Half way a new part variant comes: heavier, a tighter fit, a smaller chamfer."""
+    """Return from half way on a variant of the part: heavier, a tighter fit, a smaller chamfer."""
     if cycle < cycles // 2:
         return parameters
     low, high = parameters.part_mass_kg
@@ -219,12 +270,10 @@ def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
 
 
 def bias_jump(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Half way the force sensor's offset jumps by 8 N and stays; the world is as it was."""
-    return (
-        parameters
-        if cycle < cycles // 2
-        else replace(parameters, bias_offset_n=parameters.bias_offset_n + 8.0)
-    )
+    """Return from half way on a force sensor with 8 N more offset; all else is unchanged."""
+    if cycle < cycles // 2:
+        return parameters
+    return replace(parameters, bias_offset_n=parameters.bias_offset_n + 8.0)
 
 
 SCENARIOS: dict[str, Scenario] = {
@@ -236,6 +285,6 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 def find_scenario(name: str) -> Scenario:
-    """The scenario of this name."""
+    """Return the scenario of this name; SettingError for an unknown one."""
     expect(name in SCENARIOS, f"a scenario of {', '.join(SCENARIOS)}", name, "choose one of these")
     return SCENARIOS[name]

@@ -118,20 +118,30 @@ def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str
     return f"""
 <mujoco model="simulated insertion">
   <compiler angle="radian" autolimits="true"/>
-  <option timestep="{time_step_s}" cone="elliptic" impratio="10" integrator="implicitfast" iterations="30"/>
-  <default><geom solref="0.002 1" solimp="0.99 0.999 0.0001" friction="{c.friction} 0.001 0.0001" condim="3"/></default>
+  <option timestep="{time_step_s}" cone="elliptic" impratio="10" integrator="implicitfast"
+          iterations="30"/>
+  <default>
+    <geom solref="0.002 1" solimp="0.99 0.999 0.0001" friction="{c.friction} 0.001 0.0001"
+          condim="3"/>
+  </default>
   <worldbody>
     {_fixture(c)}
     <body name="carriage" pos="0 0 {tool_z}" gravcomp="1">
       <joint name="drive" type="slide" axis="0 0 1" damping="20"/>
       <inertial pos="0 0 0" mass="4" diaginertia="0.02 0.02 0.02"/>
       <body name="wrist" gravcomp="1">
-        <joint type="slide" axis="1 0 0" stiffness="{k_lateral}" damping="{_damping(k_lateral, 1.0)}"/>
-        <joint type="slide" axis="0 1 0" stiffness="{k_lateral}" damping="{_damping(k_lateral, 1.0)}"/>
-        <joint type="slide" axis="0 0 1" stiffness="{k_axial}" damping="{_damping(k_axial, 1.0)}"/>
-        <joint type="hinge" axis="1 0 0" stiffness="{k_angular}" damping="{_damping(k_angular, 0.004)}"/>
-        <joint type="hinge" axis="0 1 0" stiffness="{k_angular}" damping="{_damping(k_angular, 0.004)}"/>
-        <joint type="hinge" axis="0 0 1" stiffness="{k_angular}" damping="{_damping(k_angular, 0.004)}"/>
+        <joint type="slide" axis="1 0 0" stiffness="{k_lateral}"
+               damping="{_damping(k_lateral, 1.0)}"/>
+        <joint type="slide" axis="0 1 0" stiffness="{k_lateral}"
+               damping="{_damping(k_lateral, 1.0)}"/>
+        <joint type="slide" axis="0 0 1" stiffness="{k_axial}"
+               damping="{_damping(k_axial, 1.0)}"/>
+        <joint type="hinge" axis="1 0 0" stiffness="{k_angular}"
+               damping="{_damping(k_angular, 0.004)}"/>
+        <joint type="hinge" axis="0 1 0" stiffness="{k_angular}"
+               damping="{_damping(k_angular, 0.004)}"/>
+        <joint type="hinge" axis="0 0 1" stiffness="{k_angular}"
+               damping="{_damping(k_angular, 0.004)}"/>
         <inertial pos="0 0 0" mass="0.2" diaginertia="0.0003 0.0003 0.0003"/>
         <body name="tool" gravcomp="1">
           <inertial pos="0 0 -0.03" mass="0.6" diaginertia="0.0006 0.0006 0.0003"/>
@@ -165,16 +175,19 @@ def _part(c: Conditions) -> str:
     tip = -(PROTRUSION_MM + c.extra_length_mm / 2) / 1000
     tilt_x, tilt_y, yaw = (math.radians(angle) for angle in (c.tilt_x_deg, c.tilt_y_deg, c.yaw_deg))
     return f"""
-          <body name="part" pos="{c.offset_x_mm / 1000} {c.offset_y_mm / 1000} -0.06" euler="{tilt_x} {tilt_y} {yaw}">
-            <joint name="in_hand" type="slide" axis="0 0 1" frictionloss="{c.grip_n}" range="-0.012 0.012" damping="20"
-                   solreffriction="0.002 1" solimpfriction="0.9999 0.9999 0.001" solreflimit="0.002 1"/>
-            <geom type="box" size="{half} {half} {length / 2}" pos="0 0 {tip + length / 2}" mass="{c.part_mass_kg}"/>
+          <body name="part" pos="{c.offset_x_mm / 1000} {c.offset_y_mm / 1000} -0.06"
+                euler="{tilt_x} {tilt_y} {yaw}">
+            <joint name="in_hand" type="slide" axis="0 0 1" frictionloss="{c.grip_n}"
+                   range="-0.012 0.012" damping="20" solreffriction="0.002 1"
+                   solimpfriction="0.9999 0.9999 0.001" solreflimit="0.002 1"/>
+            <geom type="box" size="{half} {half} {length / 2}" pos="0 0 {tip + length / 2}"
+                  mass="{c.part_mass_kg}"/>
             <site name="top" pos="0 0 {tip + length}"/>
           </body>"""
 
 
 def _fixture(c: Conditions) -> str:
-    """Return the MJCF of the fixture: four walls with a chamfer of 45 degrees, a floor, and debris."""
+    """Return the MJCF of the fixture: four walls with a 45 degree chamfer, a floor, and debris."""
     half = (WIDTH_MM + c.clearance_mm) / 2000
     depth = DEPTH_MM / 1000
     chamfer = c.chamfer_mm / 1000
@@ -185,7 +198,8 @@ def _fixture(c: Conditions) -> str:
         position = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + chip}"
         soft = f"{c.debris_softness_s} 1"
         parts.append(
-            f'<geom type="box" size="0.003 0.003 {chip}" pos="{position}" solref="{soft}" priority="1"/>'
+            f'<geom type="box" size="0.003 0.003 {chip}" pos="{position}" solref="{soft}" '
+            'priority="1"/>'
         )
     return "\n".join(parts)
 
@@ -204,7 +218,10 @@ def _wall(side: int, half: float, chamfer: float, depth: float) -> str:
     low = (depth - chamfer) / 2
     return f"""
     <body euler="0 0 {side * math.pi / 2}">
-      <geom type="box" size="{(reach - half) / 2} {reach} {low}" pos="{(reach + half) / 2} 0 {-chamfer - low}"/>
-      <geom type="box" size="{wall / 2} {reach} {chamfer / 2}" pos="{reach - wall / 2} 0 {-chamfer / 2}"/>
-      <geom type="box" size="{face} {half + chamfer} {thick}" pos="{slope_x} 0 {slope_z}" euler="0 {-math.pi / 4} 0"/>
+      <geom type="box" size="{(reach - half) / 2} {reach} {low}"
+            pos="{(reach + half) / 2} 0 {-chamfer - low}"/>
+      <geom type="box" size="{wall / 2} {reach} {chamfer / 2}"
+            pos="{reach - wall / 2} 0 {-chamfer / 2}"/>
+      <geom type="box" size="{face} {half + chamfer} {thick}" pos="{slope_x} 0 {slope_z}"
+            euler="0 {-math.pi / 4} 0"/>
     </body>"""
