@@ -8,6 +8,7 @@ from .decision.intervals import INTERVALS as INTERVALS
 from .decision.intervals import binomial_interval as binomial_interval
 from .decision.intervals import clopper_pearson_interval as clopper_pearson_interval
 from .decision.intervals import jeffreys_interval as jeffreys_interval
+from .decision.intervals import wald_interval as wald_interval
 from .decision.intervals import wilson_interval as wilson_interval
 from .decision.policy import Policy as Policy
 from .decision.rule import DecisionRule as DecisionRule
