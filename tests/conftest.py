@@ -78,7 +78,7 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip(message)
     sources, build = REPO / "build" / "cell_sources", REPO / "build" / "cell"
     written = export_sources(tmp_path_factory.mktemp("cell") / "sources")
-    for file in (each for each in written.rglob("*") if each.is_file()):
+    for file in (path for path in written.rglob("*") if path.is_file()):
         kept = sources / file.relative_to(written)
         if not kept.exists() or kept.read_bytes() != file.read_bytes():  # what has not changed is not compiled again
             kept.parent.mkdir(parents=True, exist_ok=True)
@@ -142,9 +142,9 @@ def url_of(kind: str, directory: Path) -> str | None:
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SqlStore]:
     """A new store of each kind."""
     cell_id = uuid.uuid4().hex  # one PostgreSQL database serves every test
-    made = SqlStore(url_of(request.param, tmp_path), cell_id)
-    yield made
-    made.close()
+    created = SqlStore(url_of(request.param, tmp_path), cell_id)
+    yield created
+    created.close()
 
 
 @pytest.fixture(params=DATABASES)

@@ -47,7 +47,7 @@ def test_a_baseline_meets_the_model_contract_repeats_by_its_seed_and_is_right_on
     baseline = new(name).fit(X[:120], y[:120])
     assert isinstance(baseline, Model)
     (lower, upper), counts, actions = baseline.predict_interval(X[120:]), baseline.count(X[120:]), baseline.decide(X[120:])
-    assert {each.shape for each in (lower, upper, *counts, actions)} == {(40,)}
+    assert {item.shape for item in (lower, upper, *counts, actions)} == {(40,)}
     assert ((lower >= 0) & (lower <= upper) & (upper <= 1)).all()
     assert all(n.dtype.kind == "i" and n.min() >= 0 for n in counts)
     assert all(isinstance(action, Action) for action in actions)
@@ -137,16 +137,16 @@ def test_the_threshold_parts_the_confident_from_the_wrong() -> None:
     assert guaranteed_threshold(np.empty(0), np.empty(0, dtype=bool), 0.1, 0.1) == np.inf
     confidence = np.linspace(0.5, 1.0, 256)
     wrong = confidence < 0.75
-    found = guaranteed_threshold(confidence, wrong, 0.1, 0.1)
-    beyond = confidence >= found
-    assert 0.7 < found <= 0.76
+    result = guaranteed_threshold(confidence, wrong, 0.1, 0.1)
+    beyond = confidence >= result
+    assert 0.7 < result <= 0.76
     assert risk_bound(int(wrong[beyond].sum()), int(beyond.sum()), 0.1 / 8) < 0.1  # log2(256) = 8 looks
 
 
 def test_a_risk_above_the_tolerance_is_vouched_for_in_no_more_than_delta_of_all_sets() -> None:
     rng = np.random.default_rng(1)
-    found = [guaranteed_threshold(rng.random(200), rng.random(200) < 0.12, 0.1, 0.2) < np.inf for _ in range(500)]
-    assert np.mean(found) <= 0.2
+    results = [guaranteed_threshold(rng.random(200), rng.random(200) < 0.12, 0.1, 0.2) < np.inf for _ in range(500)]
+    assert np.mean(results) <= 0.2
 
 
 @every_baseline

@@ -219,11 +219,11 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
     if first:
         learn(range(150))
     reports = [engine.retrain() for _ in range(3)]
-    assert [each.reason for each in reports if not each.accepted] == []
-    said = [engine.decide(x) for x in X[160:]]
-    assert not {Reason.MODEL_ERROR, Reason.NOVEL} & {each.reason for each in said}
+    assert [report.reason for report in reports if not report.accepted] == []
+    texts = [engine.decide(x) for x in X[160:]]
+    assert not {Reason.MODEL_ERROR, Reason.NOVEL} & {report.reason for report in texts}
     middle = [
-        np.mean([each.n_success - each.n_failure for each, good in zip(said, y[160:], strict=True) if good == k])
+        np.mean([report.n_success - report.n_failure for report, good in zip(texts, y[160:], strict=True) if good == k])
         for k in (0, 1)
     ]
     assert middle[0] < middle[1]

@@ -34,10 +34,10 @@ def test_a_decision_is_found_as_it_was_put(store: SqlStore) -> None:
     given = Decision("a", Action.VERIFY, Action.ACCEPT, 0.9, 1.0, 40, 0, None, 3, Reason.AUDIT, True, 0.02, "Stück 7\\0")
     put_decision(store, given, values, -(2**63), False)
     put_decision(store, decision("flat"), values[0], 1, False)
-    found = store.get_decision("a")
-    assert (found.decision, found.content_hash, found.quarantined) == (given, -(2**63), False)
-    assert (found.success, found.source) == (None, None)
-    np.testing.assert_array_equal(found.trace, values)
+    result = store.get_decision("a")
+    assert (result.decision, result.content_hash, result.quarantined) == (given, -(2**63), False)
+    assert (result.success, result.source) == (None, None)
+    np.testing.assert_array_equal(result.trace, values)
     assert store.get_decision("flat").trace.shape == (1, 30)
 
 
@@ -51,10 +51,10 @@ def test_any_trace_returns_bit_for_bit(store: SqlStore, values: np.ndarray, cont
     name = uuid.uuid4().hex
     put_decision(store, decision(name), values, content_hash, quarantined)
     store.flush()
-    found = store.get_decision(name)
-    assert found.trace.tobytes() == values.tobytes()
-    assert found.trace.shape == values.shape
-    assert (found.content_hash, found.quarantined) == (content_hash, quarantined)
+    result = store.get_decision(name)
+    assert result.trace.tobytes() == values.tobytes()
+    assert result.trace.shape == values.shape
+    assert (result.content_hash, result.quarantined) == (content_hash, quarantined)
 
 
 def test_labels_in_one_batch_are_numbered_in_the_order_given(store: SqlStore) -> None:
@@ -66,7 +66,7 @@ def test_labels_in_one_batch_are_numbered_in_the_order_given(store: SqlStore) ->
     assert put_labels(store, *batch) == [2, 3, 4]
     assert store.labelled().labels.tolist() == [1, 0, 1, 0]
     assert (store.get_decision("c").success, store.get_decision("c").source) == (False, Source.STOP)
-    (added,) = (each for each in store.past_labels(0) if each.point is not None)
+    (added,) = (past_label for past_label in store.past_labels(0) if past_label.point is not None)
     assert (added.seq, added.model_version, added.point.tolist()) == (2, 3, [0.5, 1.5])
 
 
@@ -98,8 +98,8 @@ def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: S
 
 @pytest.mark.parametrize("limit", [None, 0, 5])
 def test_an_empty_store_has_empty_arrays(store: SqlStore, limit: int | None) -> None:
-    found = store.labelled(limit)
-    assert (found.seq.shape, found.traces.shape) == ((0,), (0, 0, 0))
+    result = store.labelled(limit)
+    assert (result.seq.shape, result.traces.shape) == ((0,), (0, 0, 0))
     assert (store.last_version(), store.retrains()) == (None, [])
     assert (store.unreported_accepts(), store.silent_total(), store.tally().outcomes) == ([], 0, Outcomes())
 
@@ -118,22 +118,22 @@ def test_what_is_imported_is_labelled_and_numbered_after_what_was_there(store: S
     put_label(store, "a", True, Source.VERIFICATION, 0, None)
     traces, hashes, labels = trace(1, (3, 2, 30)), [5, -5, 6], [1, 0, 1]
     decisions = [replace(decision(name), part=part) for name, part in zip("bcd", ["x", None, "z"], strict=True)]
-    for made, x, hash_, good in zip(decisions, traces, hashes, labels, strict=True):
-        assert len(store.apply_records(labelled(StoredDecision(made, x, hash_, False, 1.0), good))) == 1
+    for created, x, hash_, good in zip(decisions, traces, hashes, labels, strict=True):
+        assert len(store.apply_records(labelled(StoredDecision(created, x, hash_, False, 1.0), good))) == 1
     assert [store.get_decision(name).decision for name in "bcd"] == decisions
-    found = store.labelled(3)
-    np.testing.assert_array_equal(found.traces, traces)
-    assert (found.seq.tolist(), found.hashes.tolist(), found.labels.tolist()) == ([2, 3, 4], hashes, labels)
+    result = store.labelled(3)
+    np.testing.assert_array_equal(result.traces, traces)
+    assert (result.seq.tolist(), result.hashes.tolist(), result.labels.tolist()) == ([2, 3, 4], hashes, labels)
 
 
 def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_quarantined(store: SqlStore) -> None:
     for i, quarantined in enumerate([False, True, False, False]):
-        made = decision(str(i), reason=Reason.NOVEL if i == 3 else Reason.CERTAIN)
-        put_decision(store, replace(made, lower=0.1 * i, upper=0.2 * i), trace(i), i, quarantined)
+        created = decision(str(i), reason=Reason.NOVEL if i == 3 else Reason.CERTAIN)
+        put_decision(store, replace(created, lower=0.1 * i, upper=0.2 * i), trace(i), i, quarantined)
         put_label(store, str(i), i % 2 == 0, Source.VERIFICATION, 1, None, silent=i)
-    found = store.outcomes_since(1)
-    assert found == [(3, 0.2, 0.4, True, False, 2, 0, 1.0), (4, 0.1 * 3, 0.2 * 3, False, True, 3, 0, 1.0)]
-    assert [type(each) for each in found[0]] == [int, float, float, bool, bool, int, int, float]  # for compiled code
+    result = store.outcomes_since(1)
+    assert result == [(3, 0.2, 0.4, True, False, 2, 0, 1.0), (4, 0.1 * 3, 0.2 * 3, False, True, 3, 0, 1.0)]
+    assert [type(item) for item in result[0]] == [int, float, float, bool, bool, int, int, float]  # for compiled code
     assert store.silent_total() == 0 + 2 + 3
     assert store.outcomes_since(4) == []
 
@@ -242,13 +242,13 @@ def test_status_counts_what_was_put(store: SqlStore) -> None:
 
 def test_in_memory_a_label_has_its_number_before_anything_is_written() -> None:
     store = SqlStore()
-    made = [StoredDecision(decision(name), trace(), 1, False, 1.0) for name in "abcd"]
-    store.apply_records(labelled(made[0], True)[:1])
-    assert store.apply_records(labelled(made[0], True)[1:]) == [("a", 1)]
-    assert store.apply_records(labelled(made[1], False) + labelled(made[2], True)) == [("b", 2), ("c", 3)]
+    items = [StoredDecision(decision(name), trace(), 1, False, 1.0) for name in "abcd"]
+    store.apply_records(labelled(items[0], True)[:1])
+    assert store.apply_records(labelled(items[0], True)[1:]) == [("a", 1)]
+    assert store.apply_records(labelled(items[1], False) + labelled(items[2], True)) == [("b", 2), ("c", 3)]
     assert store.labelled().labels.tolist() == [1, 0, 1]
-    assert store.apply_records([*labelled(made[3], True), *labelled(made[1], False)]) == [("d", 4), ("b", 2)]
-    assert store.apply_records(labelled(made[3], False)) == []  # a second label, which is set aside
+    assert store.apply_records([*labelled(items[3], True), *labelled(items[1], False)]) == [("d", 4), ("b", 2)]
+    assert store.apply_records(labelled(items[3], False)) == []  # a second label, which is set aside
     assert store.labelled().seq.tolist() == [1, 2, 3, 4]
     assert [event.kind for event in store.events()] == ["dead letter"]
 
@@ -297,7 +297,7 @@ def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str])
         assert [(event.number, event.text) for event in other.events()] == [(1, "other's")]
         assert (other.settings(), other.last_version(), other.retrains()) == ({}, None, [])
         assert other.labelled().labels.tolist() == [0]
-        assert [each.point.tolist() for each in other.past_labels(0)] == [[1.0, 1.0]]
+        assert [past_label.point.tolist() for past_label in other.past_labels(0)] == [[1.0, 1.0]]
         assert other.status()["labels"] == 1
         np.testing.assert_array_equal(other.get_decision("a").trace, trace(2))
 
@@ -311,14 +311,14 @@ def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_
             seqs.append(put_label(store, f"{prefix}{i}", True, Source.VERIFICATION, 0, None))
             store.put_event("note", f"{prefix}{i}")
 
-    with SqlStore(*place) as one, SqlStore(*place) as two:
+    with SqlStore(*place) as first, SqlStore(*place) as two:
         with ThreadPoolExecutor(2) as pool:
-            list(pool.map(label, (one, two), "xy"))
+            list(pool.map(label, (first, two), "xy"))
         assert sorted(seqs) == list(range(1, 31))
-        assert one.labelled().seq.tolist() == list(range(1, 31))
+        assert first.labelled().seq.tolist() == list(range(1, 31))
         assert [event.number for event in two.events()] == list(range(1, 31))
-        found = verify_history(*place)
-        assert (found.ok, found.cells[0].rows) == (True, 120)  # one chain
+        result = verify_history(*place)
+        assert (result.ok, result.cells[0].rows) == (True, 120)  # one chain
 
 
 def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None:
@@ -334,15 +334,15 @@ def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
     with SqlStore(str(tmp_path / "a.db")) as store:
         put(store, "a")
         put_label(store, "a", True, Source.VERIFICATION, 0, None)
-        with plans(tmp_path / "a.db") as found:
+        with plans(tmp_path / "a.db") as result:
             store.labelled(100)
             store.get_decision("a")
             store.outcomes_since(0)
             store.silent_total()
             store.events(5)
             put_label(store, "a", True, Source.VERIFICATION, 0, None)
-    assert len(found) >= 7
-    for statement, plan in found:
+    assert len(result) >= 7
+    for statement, plan in result:
         assert plan
         assert not [step for step in plan if "SCAN" in step or "TEMP B-TREE" in step], (statement, plan)
 

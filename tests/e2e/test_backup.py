@@ -44,9 +44,9 @@ def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_ve
 ) -> None:
     copy, n = tmp_path / "elsewhere" / "copy.db", IN_STORE + IN_JOURNAL
     copy.parent.mkdir()
-    made = document("backup", tmp_path / "engine.db", "--out", copy)
-    assert (made["decisions"], made["labels"], made["without_journal"]) == (n, n, [])
-    assert made["from_journals"] >= 2 * IN_JOURNAL
+    result = document("backup", tmp_path / "engine.db", "--out", copy)
+    assert (result["decisions"], result["labels"], result["without_journal"]) == (n, n, [])
+    assert result["from_journals"] >= 2 * IN_JOURNAL
     assert list(copy.parent.iterdir()) == [copy]  # one file, and nothing beside it
     assert labels_of(copy) == data.y[:n].tolist()
     assert verify_history(str(copy)).ok

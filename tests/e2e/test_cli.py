@@ -143,7 +143,7 @@ def test_every_verb_is_listed_with_its_whole_sentence_speaks_json_and_explains_e
     assert not [line for line in shown.splitlines()[1:] if line.endswith("...")]
     for verb in VERBS:
         assert f"  {verb} " in shown
-        options = [each for each in main.commands[verb].params if isinstance(each, click.Option)]
+        options = [param for param in main.commands[verb].params if isinstance(param, click.Option)]
         assert ("--json" in {name for option in options for name in option.opts}) == (verb != "serve")
         assert not {option.name for option in options if not option.help}
 
@@ -177,19 +177,19 @@ def test_the_papers_grid_writes_its_tables_its_figures_and_its_findings(data: Pa
     page = (tmp_path / "tables.md").read_text(encoding="utf-8")
     assert page.count("| alpha / LB | 80 % | 90 % | 95 % |") == 2
     assert "[36.9 / 1019.8]" in page
-    assert {each.name for each in tmp_path.glob("grid_*")} == {"grid_pca_wilson.png", "grid_pca_binomial.png"}
+    assert {path.name for path in tmp_path.glob("grid_*")} == {"grid_pca_wilson.png", "grid_pca_binomial.png"}
     assert "of 9 cells, at most" in shown
     assert "18 replays" in shown
 
 
 def test_baselines_are_compared_under_their_names_which_the_help_says_and_leave_no_map(data: Path, tmp_path: Path) -> None:
-    found = document(*compare(data, "--reducers pca,always,never --repeats 2"), "--out", tmp_path)
-    rows = {row["recipe"]: row for row in found["rows"]}
+    result = document(*compare(data, "--reducers pca,always,never --repeats 2"), "--out", tmp_path)
+    rows = {row["recipe"]: row for row in result["rows"]}
     assert rows["always"]["certain"] == 0
     assert set(BASELINES) <= set(re.findall(r"\w+", succeed("compare", "--help")))
     assert rows["never"]["accepted"] == 60 - 50  # all but those before the first retrain
     assert [path.name for path in tmp_path.glob("map_*")] == ["map_pca.png"]
-    assert found["costs"]["core_seconds"] > 0
+    assert result["costs"]["core_seconds"] > 0
 
 
 def test_a_character_that_the_screen_has_not_is_a_question_mark(trained: Path, tmp_path: Path) -> None:
@@ -336,9 +336,9 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
     for part in (*sentences, "guarantee pooled, stops all", "audit rate 10.0 %", "safe mode too many traces were novel"):
         assert part in out
     assert re.search(r"safe mode time \d{4}-\d\d-\d\d ", out)
-    held = document("status", store)
-    assert (held["certificate"], held["safe_mode"]) == (shown["certificate"], "too many traces were novel")
-    assert held["ever"]["novel"] == held["reasons"]["novel"] == sum(part["novel"] for part in shown["stretches"])
+    result = document("status", store)
+    assert (result["certificate"], result["safe_mode"]) == (shown["certificate"], "too many traces were novel")
+    assert result["ever"]["novel"] == result["reasons"]["novel"] == sum(part["novel"] for part in shown["stretches"])
     ended = well(*words[:-2], "--cycles", 380)
     assert re.findall(r"^After cycle \d+: safe mode.*$", ended.stdout, flags=re.M)[-1].endswith("safe mode ended.")
     assert "safe mode ended." in ended.stderr
@@ -374,7 +374,7 @@ def test_an_interrupted_import_says_how_far_it_came_and_keeps_that(data: Path, t
     monkeypatch.setattr(importing, "import_labelled", interrupted)
     result = dengine("train", "--data", data, "--store", tmp_path / "e.db", "--reducer", "conv")
     assert result.exit_code == INTERRUPTED
-    told = re.search(r"Interrupted: (\d+) of 160 traces are in .*the same command", " ".join(result.stderr.split()))
-    held = document("status", tmp_path / "e.db")
-    assert (held["version"], held["labels"]) == (0, int(told[1]))
+    match = re.search(r"Interrupted: (\d+) of 160 traces are in .*the same command", " ".join(result.stderr.split()))
+    stored = document("status", tmp_path / "e.db")
+    assert (stored["version"], stored["labels"]) == (0, int(match[1]))
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

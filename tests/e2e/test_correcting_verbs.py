@@ -39,8 +39,8 @@ def ids(store: Path) -> list[str]:
 
 def labels(store: Path) -> dict[int, int]:
     with DataEngine.open(store) as engine:
-        found = engine.store.labelled()
-    return dict(zip(found.seq.tolist(), found.labels.tolist(), strict=True))
+        labelled = engine.store.labelled()
+    return dict(zip(labelled.seq.tolist(), labelled.labels.tolist(), strict=True))
 
 
 def test_a_label_is_corrected_and_the_line_says_what_it_was(store: Path) -> None:
@@ -52,8 +52,8 @@ def test_a_label_is_corrected_and_the_line_says_what_it_was(store: Path) -> None
     assert labels(store)[1] == 1 - before
     assert "already; nothing changed." in said("correct", store, first, now)
     assert said("retrain", store).startswith("Version 3 answers. 1 retrain, the worst in ")
-    found = document("retrain", store, "--author", "kim")
-    assert (found["retrain"]["version"], found["retrain"]["accepted"], found["author"]) == (4, True, "kim")
+    result = document("retrain", store, "--author", "kim")
+    assert (result["retrain"]["version"], result["retrain"]["accepted"], result["author"]) == (4, True, "kim")
     with DataEngine.open(store) as engine:  # and a retrain by hand learns it
         assert engine.store.last_version().state["labels"][0] == 1 - before
         assert engine.store.events(1)[0].kind == "retrain"
@@ -76,8 +76,8 @@ def test_a_part_is_found_and_reported_by_its_number(store: Path, make_data) -> N
     assert "'P-9', which is unknown" in dengine("explain", store, "P-9").stderr
     assert "'P-9', which is unknown" in dengine("report", store, "P-9", "good").stderr
     assert said("report", store, "P-7", "bad", "--author", "kim").endswith(" was bad. Event 4, by kim.")
-    (found,) = document("history", store, "--part", "P-7")["decisions"]
-    assert (found["part"], found["label"]) == ("P-7", "bad")
+    (result,) = document("history", store, "--part", "P-7")["decisions"]
+    assert (result["part"], result["label"]) == ("P-7", "bad")
 
 
 def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store: Path) -> None:
@@ -104,8 +104,8 @@ def test_an_earlier_version_answers_again(store: Path) -> None:
 
 
 def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path, tmp_path: Path, monkeypatch) -> None:
-    found = document("policy", store, "--alpha", 0.2, "--lower-bound", 0.8, "--stops", "all", "--audit-rate", 0.1)
-    assert found["policy"] == document("policy", store, "--alpha", 0.2)["policy"] == document("policy", store)["policy"]
+    result = document("policy", store, "--alpha", 0.2, "--lower-bound", 0.8, "--stops", "all", "--audit-rate", 0.1)
+    assert result["policy"] == document("policy", store, "--alpha", 0.2)["policy"] == document("policy", store)["policy"]
     with DataEngine.open(store) as engine:
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
         assert engine.certificate().alpha == 0.2
@@ -125,8 +125,8 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path, tmp_path: P
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
     assert "guarantee local -> own_rule:Mine" in said("policy", store, "--guarantee", "own_rule:Mine", "--shadow", "off")
-    found = document("status", store)
-    assert (found["shadow"], found["recipe"]["policy"]["guarantee"]) == (False, "own_rule:Mine")
+    result = document("status", store)
+    assert (result["shadow"], result["recipe"]["policy"]["guarantee"]) == (False, "own_rule:Mine")
 
 
 @pytest.mark.parametrize("words", ["policy STORE --alpha 2", "correct STORE x maybe", "forget STORE", "rollback STORE two"])

@@ -35,8 +35,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_path: Path) -> None:
     result = well("data", folder, "--channel", "FZ_Base,FX_Base", "--out", tmp_path / "out")
     words = " ".join(result.stdout.replace("│", " ").split())
-    said = "traces 77|names FZ_Base, FX_Base|rates low 500,|Left out 3 of 80|Expected 13 columns, got 12"
-    assert [word for word in said.split("|") if word not in words] == []
+    text = "traces 77|names FZ_Base, FX_Base|rates low 500,|Left out 3 of 80|Expected 13 columns, got 12"
+    assert [word for word in text.split("|") if word not in words] == []
     assert (tmp_path / "out" / "data.png").stat().st_size > 10_000
     played = well("replay", "--data", folder, "--channel", "FZ_Base", "--reducer", "pca", "--cycles", 60, "--repeats", 1)
     assert played.stderr.count("Left out 3 of 80 recordings of cell_3:") == 1
@@ -70,10 +70,10 @@ def test_each_plants_recordings_are_replayed_by_one_command_or_as_the_errors_say
     source: str, folder: Path, monkeypatch
 ) -> None:
     monkeypatch.chdir(folder.parent)
-    found = document("data", source, *shlex.split(PLANTS[source]))["survey"]
+    survey = document("data", source, *shlex.split(PLANTS[source]))["survey"]
     good = int(load_dataset("insertion").y[np.random.default_rng(0).permutation(1503)[:60]].sum())
-    assert (found["traces"], found["samples"], found["good"], found["faults"]) == (60, 200, good, [])
-    assert found["rate_hz"] == (None if source in ("wide", "lab") else 100.0)
+    assert (survey["traces"], survey["samples"], survey["good"], survey["faults"]) == (60, 200, good, [])
+    assert survey["rate_hz"] == (None if source in ("wide", "lab") else 100.0)
     done, _ = as_advised("replay", "--data", source, "--reducer", "pca", "--repeats", "1", "--cycles", "60")
     assert "pca on" in done.stdout
     assert ("read as Windows-1252" in done.stderr) == (source == "latin")
@@ -81,12 +81,12 @@ def test_each_plants_recordings_are_replayed_by_one_command_or_as_the_errors_say
 
 def as_advised(*asked: str) -> tuple[Result, dict[str, str]]:
     """What a command comes to where one types what its errors say, one by one; and what that was."""
-    told = dict[str, str]()
-    while (done := dengine(*asked, *(word for pair in told.items() for word in pair))).exit_code:
+    answer = dict[str, str]()
+    while (done := dengine(*asked, *(word for pair in answer.items() for word in pair))).exit_code:
         advice = re.findall(r"(--[a-z-]+) ('[^']*'|\S+?)(?=[.,;]?(?:\s|$))", done.stderr)
-        assert set(dict(advice)) - set(told), done.stderr
-        told |= {name: shlex.split(value)[0] for name, value in advice}
-    return done, {name.strip("-").replace("-", "_"): value for name, value in told.items()}
+        assert set(dict(advice)) - set(answer), done.stderr
+        answer |= {name: shlex.split(value)[0] for name, value in advice}
+    return done, {name.strip("-").replace("-", "_"): value for name, value in answer.items()}
 
 
 def long(X: np.ndarray, good: np.ndarray) -> pd.DataFrame:
@@ -110,7 +110,7 @@ FORMS: dict[str, Callable[..., Any]] = {  # what writes a day's file
     "last.csv": lambda X, good, path: at_last(long(X, good)).to_csv(path, index=False),
     "last.parquet": lambda X, good, path: at_last(long(X, good)).to_parquet(path),
     "tags.csv": lambda X, good, path: pd.concat(
-        [long(each, good).assign(tag=tag) for tag, each in (("FZ", X), ("MX", -X))]
+        [long(item, good).assign(tag=tag) for tag, item in (("FZ", X), ("MX", -X))]
     ).to_csv(path, index=False),
     "wide.parquet": lambda X, good, path: wide(X, good).to_parquet(path),
     "wide.csv": lambda X, good, path: wide(X, good, "FZ [{}]").to_csv(path, index=False),
@@ -126,9 +126,9 @@ def test_a_folder_of_several_files_of_one_form_is_one_set(form: str, make_data, 
     data = make_data(30, samples=40)
     for day, rows in DAYS.items():
         FORMS[form](data.X[rows], data.y[rows] == 1, tmp_path / f"{day}{Path(form).suffix}")
-    found = load_dataset(tmp_path, **as_advised("data", str(tmp_path))[1])
-    np.testing.assert_array_equal(found.X, data.X)
-    assert (found.y.tolist(), found.faults) == (data.y.tolist(), ())
+    dataset = load_dataset(tmp_path, **as_advised("data", str(tmp_path))[1])
+    np.testing.assert_array_equal(dataset.X, data.X)
+    assert (dataset.y.tolist(), dataset.faults) == (data.y.tolist(), ())
 
 
 @pytest.mark.parametrize("form", ["wide.csv", "plain.npz"])
@@ -150,9 +150,9 @@ def test_what_a_recorder_writes_around_the_header_is_no_data(above: str, make_da
         rows = [f"{t / 100};{value}" for t, value in enumerate(x.tolist())]
         text = "\n".join([above.format("Zeit;Kraft"), *rows]).replace(".", ",")
         (tmp_path / f"{i:02d}_{'OK' if ok else 'NOK'}.csv").write_text(text)
-    found = load_dataset(tmp_path)
-    np.testing.assert_array_equal(found.X, data.X)
-    assert (found.rate_hz, found.channels, found.faults) == (100.0, ("Kraft",), ())
+    dataset = load_dataset(tmp_path)
+    np.testing.assert_array_equal(dataset.X, data.X)
+    assert (dataset.rate_hz, dataset.channels, dataset.faults) == (100.0, ("Kraft",), ())
 
 
 def test_labels_apart_are_advised_and_given_to_arrays_in_their_order(make_data, tmp_path: Path) -> None:
@@ -160,9 +160,9 @@ def test_labels_apart_are_advised_and_given_to_arrays_in_their_order(make_data, 
     np.savez(tmp_path / "force.npz", force=data.X.T)
     table = pd.DataFrame({"row": range(30), "verdict": np.where(data.y == 1, "heil", "Riss")})
     table.to_csv(tmp_path / "checks.csv", index=False)
-    found = load_dataset(tmp_path, **as_advised("data", str(tmp_path))[1])
-    np.testing.assert_array_equal(found.X, data.X)
-    assert abs(found.y.mean() - 0.5) == abs(data.y.mean() - 0.5)  # which word is the good one, a person has to say
+    dataset = load_dataset(tmp_path, **as_advised("data", str(tmp_path))[1])
+    np.testing.assert_array_equal(dataset.X, data.X)
+    assert abs(dataset.y.mean() - 0.5) == abs(data.y.mean() - 0.5)  # which word is the good one, a person has to say
     table.iloc[::-1].to_csv(tmp_path / "checks.csv", index=False)
     refused = dengine("data", tmp_path, "--channel", "force", "--labels", tmp_path / "checks.csv")
     assert "in their order, got [29, 28" in refused.stderr
@@ -185,8 +185,8 @@ def test_python_objects_are_not_read_unasked_and_the_error_says_what_to_type(
     np.savez("runs.npz", X=X, y=np.where(data.y == 1, "OK", "NOK").astype(object))
     command = shlex.split(re.findall(r"python -c \".*\"", dengine("data", "runs.npz").stderr)[0])
     subprocess.run([sys.executable, *command[1:]], check=True)
-    found = load_dataset("runs.csv")
-    assert (found.y.tolist(), found.lengths.tolist()) == (data.y.tolist(), [30 + i % 10 for i in range(30)])
+    dataset = load_dataset("runs.csv")
+    assert (dataset.y.tolist(), dataset.lengths.tolist()) == (data.y.tolist(), [30 + i % 10 for i in range(30)])
 
 
 @pytest.mark.parametrize(
@@ -199,9 +199,9 @@ def test_words_are_told_apart_by_the_map_that_the_error_says(good: str, bad: str
         (folder := tmp_path / "files" / (good if data.y[i] else bad)).mkdir(parents=True, exist_ok=True)
         pd.DataFrame({"FZ": x}).to_csv(folder / f"p{i}.csv", index=False)
     for source in (tmp_path / "files", tmp_path / "table.csv"):
-        found = load_dataset(source, **as_advised("data", str(source))[1])
-        assert {int(found.y.sum()), 41 - int(found.y.sum())} == {int(data.y.sum()), 41 - int(data.y.sum())}
-        assert found.faults == ()
+        dataset = load_dataset(source, **as_advised("data", str(source))[1])
+        assert {int(dataset.y.sum()), 41 - int(dataset.y.sum())} == {int(data.y.sum()), 41 - int(data.y.sum())}
+        assert dataset.faults == ()
 
 
 def file_each(folder: Path, data: Dataset, name: str, **columns: Callable[[int], Any]) -> None:
@@ -256,13 +256,13 @@ def test_what_an_error_advises_gets_further_as_it_stands_and_no_label_is_wrong(
     data = make_data(30, samples=40)
     MISTAKES[mistake](tmp_path, data)
     asked = ASKED.get(mistake, [])
-    _, told = as_advised("data", str(tmp_path), *asked)
+    _, answer = as_advised("data", str(tmp_path), *asked)
     given = {name.strip("-"): value for name, value in zip(asked[::2], asked[1::2], strict=True)}
-    found = load_dataset(tmp_path, **told, **given)
+    dataset = load_dataset(tmp_path, **answer, **given)
     by_trace = {x.tobytes(): y for x, y in zip(data.X, data.y.tolist(), strict=True)}
-    agree = [by_trace[x.tobytes()] == y for x, y in zip(found.X, found.y.tolist(), strict=True)]
-    assert (len(found), len(set(agree))) == (30, 1)  # which of two words is the good one a person has to say
-    assert agree[0] or "label_map" in told
+    agree = [by_trace[x.tobytes()] == y for x, y in zip(dataset.X, dataset.y.tolist(), strict=True)]
+    assert (len(dataset), len(set(agree))) == (30, 1)  # which of two words is the good one a person has to say
+    assert agree[0] or "label_map" in answer
 
 
 @pytest.mark.parametrize(
@@ -273,10 +273,10 @@ def test_a_column_tells_the_labels_of_a_folders_files_whatever_else_is_said(
 ) -> None:
     data = make_data(30, samples=40)
     file_each(tmp_path, data, "{i}/run_{k}.csv", success=bool)
-    found = document("data", tmp_path, *options)
-    assert (found["survey"]["traces"], found["survey"]["good"]) == (30, int(data.y.sum()))
-    assert found["survey"]["names"] == ["FZ"]
-    assert any("in column success of each file" in note for note in found["notes"])
+    result = document("data", tmp_path, *options)
+    assert (result["survey"]["traces"], result["survey"]["good"]) == (30, int(data.y.sum()))
+    assert result["survey"]["names"] == ["FZ"]
+    assert any("in column success of each file" in note for note in result["notes"])
 
 
 def test_without_labels_nothing_is_advised_that_cannot_be_typed(make_data, tmp_path: Path) -> None:
@@ -284,9 +284,9 @@ def test_without_labels_nothing_is_advised_that_cannot_be_typed(make_data, tmp_p
     file_each(tmp_path / "cell" / "data", data, "insertion_{i}.csv")
     (tmp_path / "cell" / "sizes.csv").write_text("name\n" + "\n".join(f"insertion_{i}" for i in range(30)))
     long(data.X, data.y == 1).drop(columns="verdict").to_csv(tmp_path / "long.csv", index=False)
-    said = " ".join(dengine("data", tmp_path / "cell").stderr.split())
-    assert "of 31 have none" in said
-    assert re.findall(r"--[a-z-]+ ?[\w'./]*", said) == ["--label", "--labels"]
+    text = " ".join(dengine("data", tmp_path / "cell").stderr.split())
+    assert "of 31 have none" in text
+    assert re.findall(r"--[a-z-]+ ?[\w'./]*", text) == ["--label", "--labels"]
     wide(data.X, data.y == 1).drop(columns=["day", "Urteil"]).to_csv(tmp_path / "wide.csv", index=False)
     assert "--label" not in dengine("data", tmp_path / "wide.csv").stderr
     np.savez(tmp_path / "cell.npz", force=data.X)
@@ -328,9 +328,9 @@ def test_a_part_without_a_verdict_is_counted_as_unlabelled_and_left_out(empty: s
     sources = {"wide.csv": [], "long.csv": ["--part", "serial", "--time", "time"], "column": [], "x.npz": []}
     sources["plain"] = ["--labels", tmp_path / "labels.csv"]
     for source, options in sources.items():
-        found = document("data", tmp_path / source, *options)["survey"]
-        assert (found["traces"], found["unlabelled"], found["faults"]) == (10, 20, []), source
-        assert found["good"] == int(data.y[::3].sum())
+        survey = document("data", tmp_path / source, *options)["survey"]
+        assert (survey["traces"], survey["unlabelled"], survey["faults"]) == (10, 20, []), source
+        assert survey["good"] == int(data.y[::3].sum())
         assert "20 of 30" in well("data", tmp_path / source, *options).stdout
     played = well("replay", "--data", tmp_path / "wide.csv", "--reducer", "pca", "--cycles", 10, "--repeats", 1)
     assert "20 of 30 recordings of wide have no label yet: they are left out." in played.stderr
@@ -339,9 +339,9 @@ def test_a_part_without_a_verdict_is_counted_as_unlabelled_and_left_out(empty: s
 def test_numbers_that_are_missing_in_an_array_of_labels_are_unlabelled_and_other_numbers_are_refused(make_data) -> None:
     data = make_data(30, samples=40)
     y = np.where(np.arange(30) % 3 == 0, data.y, np.nan)
-    for labels in (y, pd.Series(y), [None if np.isnan(each) else bool(each) for each in y]):
-        found = load_dataset((data.X, labels))
-        assert (found.y.tolist(), found.unlabelled) == (data.y[::3].tolist(), 20)
+    for labels in (y, pd.Series(y), [None if np.isnan(item) else bool(item) for item in y]):
+        dataset = load_dataset((data.X, labels))
+        assert (dataset.y.tolist(), dataset.unlabelled) == (data.y[::3].tolist(), 20)
     with pytest.raises(DataError, match=r"labels 1 \(success\) and 0 \(failure\)"):
         load_dataset((data.X, 2 * data.y - 1))
 
@@ -382,12 +382,12 @@ def test_an_error_shows_the_character_that_is_wrong(cell: str, shown: str, make_
 
 def test_a_row_a_signal_and_an_array_of_channels_are_the_traces_that_they_were(make_data, tmp_path: Path) -> None:
     data = make_data(30, samples=40)
-    said, times = np.where(data.y, "heil", "ab"), [f"02.03.2026 06:00:00,{t:03d}" for t in range(0, 400, 10)] * 30
-    rows = {"zeitstempel": times, "teil": np.repeat(np.arange(30), 40), "urteil": np.repeat(said, 40)}
+    text, times = np.where(data.y, "heil", "ab"), [f"02.03.2026 06:00:00,{t:03d}" for t in range(0, 400, 10)] * 30
+    rows = {"zeitstempel": times, "teil": np.repeat(np.arange(30), 40), "urteil": np.repeat(text, 40)}
     tags = [pd.DataFrame(rows | {"tag": tag, "value": scale * data.X.ravel()}) for tag, scale in (("Z", 1), ("X", -2))]
     asked = {"label": "urteil", "label_map": "heil=good,ab=bad"}
     table = load_dataset(pd.concat(tags), part="teil", time="zeitstempel", channel="Z,X", **asked)
-    np.savez(tmp_path / "lab.npz", data=table.X, urteil=said)
+    np.savez(tmp_path / "lab.npz", data=table.X, urteil=text)
     lab, X = load_dataset(tmp_path, channel="data", **asked), np.stack([data.X, -2 * data.X], axis=1)
     np.testing.assert_array_equal(lab.X, X)
     assert (table.rate_hz, table.y.tolist()) == (100.0, data.y.tolist())
@@ -400,18 +400,18 @@ def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset])
     X[50], y[50] = X[10], y[10]
     X[51], y[51] = X[11], 1 - y[11]
     X[52:60] = X[20:28] + np.float32(1e-3)
-    found = survey_dataset(replace(data, X=X, y=y))
-    assert (found.not_finite, found.constant, found.too_large) == (1, 1, 1)
-    assert (found.duplicates, found.contradicting) == (2, 1)
-    assert 14 <= found.near_repeats <= 20
-    assert found.looked_at == 117
-    assert (found.good + found.bad, found.lengths) == (120, None)
+    survey = survey_dataset(replace(data, X=X, y=y))
+    assert (survey.not_finite, survey.constant, survey.too_large) == (1, 1, 1)
+    assert (survey.duplicates, survey.contradicting) == (2, 1)
+    assert 14 <= survey.near_repeats <= 20
+    assert survey.looked_at == 117
+    assert (survey.good + survey.bad, survey.lengths) == (120, None)
     assert survey_dataset(make_data(120, samples=60)).near_repeats <= 3
 
 
 def test_drift_is_seen_where_there_is_some_and_only_there(make_data: Callable[..., Dataset]) -> None:
     data = make_data(300, samples=60)
-    still = {each.name: each for each in survey_dataset(data).drift}
+    still = {item.name: item for item in survey_dataset(data).drift}
     assert still["good"].p > 0.01
     assert still["channel 1"].p > 0.01
     rng = np.random.default_rng(1)

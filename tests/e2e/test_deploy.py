@@ -118,8 +118,8 @@ def test_a_token_that_systemd_hands_over_is_taken_though_its_acl_shows_as_a_righ
     if handed:
         monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
     with nullcontext() if taken else pytest.raises(SettingError, match="its owner's alone"):
-        found = read_tokens(token_file(tmp_path, mode))
-        assert [(each.operates, each.name) for each in found] == [(True, ""), (False, "Line display")]
+        tokens = read_tokens(token_file(tmp_path, mode))
+        assert [(item.operates, item.name) for item in tokens] == [(True, ""), (False, "Line display")]
 
 
 def test_the_unit_starts_serve_with_the_options_of_its_file_and_its_token_as_a_credential() -> None:
@@ -138,15 +138,15 @@ def test_the_unit_starts_serve_with_the_options_of_its_file_and_its_token_as_a_c
 
 def test_dashboard_and_alerts_ask_for_metrics_that_there_are_and_for_their_labels() -> None:
     with a_service() as service:
-        known = set(re.findall(r"^# TYPE (\w+)", Metrics(service).text()[0].decode(), flags=re.M))
+        names = set(re.findall(r"^# TYPE (\w+)", Metrics(service).text()[0].decode(), flags=re.M))
     dashboard = json.loads((DEPLOY / "grafana.json").read_text(encoding="utf-8"))
     asked = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
     asked += re.findall(
         r"expr: (?:>-)?\s*(.+?)\n +(?:for|annotations|labels):", (DEPLOY / "alerts.yml").read_text(), flags=re.S
     )
-    assert {re.sub("_(count|bucket)$", "", name) for name in re.findall(r"dengine_\w+", " ".join(asked))} <= known
-    said = re.findall(r'(?:action|reason)="(\w+)"', " ".join(asked))
-    assert {"accept", "novel", "outside"} <= set(said) <= {each.value for each in (*Action, *Reason)}
+    assert {re.sub("_(count|bucket)$", "", name) for name in re.findall(r"dengine_\w+", " ".join(asked))} <= names
+    text = re.findall(r'(?:action|reason)="(\w+)"', " ".join(asked))
+    assert {"accept", "novel", "outside"} <= set(text) <= {item.value for item in (*Action, *Reason)}
     assert set(re.findall(r'(\w+)=~?"', " ".join(asked))) == {"instance", "action", "repeated", "reason", "accepted", "job"}
 
 

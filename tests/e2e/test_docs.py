@@ -74,7 +74,7 @@ class Block(NamedTuple):
 
 def blocks(page: Path) -> list[Block]:
     fenced = r'^```(sh|python)(?: title="([^"]+)")?\n(.*?)^```$'
-    return [Block(*each) for each in re.findall(fenced, page.read_text(encoding="utf-8"), flags=re.S | re.M)]
+    return [Block(*match) for match in re.findall(fenced, page.read_text(encoding="utf-8"), flags=re.S | re.M)]
 
 
 def name(page: Path) -> str:
@@ -122,13 +122,13 @@ def shell(command: str, desk: Path) -> None:
 
 def python(words: list[str], desk: Path) -> None:
     """Run a script or `dengine` in a fork of a process that has imported torch already: eighty would wait for it."""
-    said, typed = desk / "said.txt", REPO / "tests" / "support" / "typed.py"
-    given = {"WHERE": str(desk), "ARGV": words, "SAID": str(said)}
+    text, typed = desk / "said.txt", REPO / "tests" / "support" / "typed.py"
+    given = {"WHERE": str(desk), "ARGV": words, "SAID": str(text)}
     process = FORKS.Process(target=runpy.run_path, args=(str(typed),), kwargs={"init_globals": given, "run_name": "typed"})
     process.start()
     process.join(300)
     process.kill()
-    assert process.exitcode == 0, f"{' '.join(words)}\n{said.read_text(encoding='utf-8')[-4000:]}"
+    assert process.exitcode == 0, f"{' '.join(words)}\n{text.read_text(encoding='utf-8')[-4000:]}"
 
 
 def smaller(command: str) -> str:
@@ -194,6 +194,6 @@ def test_each_page_has_stores_and_folders_of_its_own() -> None:
     written = (
         r"[\w./-]+\.db\b|(?<=--out )(?!recordings\b|screw_driving)\S+|(?<=--keep )\S+"  # two are made alike by several
     )
-    names = {name(page): set(re.findall(written, "\n".join(each.text for each in blocks(page)))) for page in PAGES}
+    names = {name(page): set(re.findall(written, "\n".join(block.text for block in blocks(page)))) for page in PAGES}
     twice = [(a, b, names[a] & names[b]) for a in names for b in names if a < b and names[a] & names[b]]
     assert twice == []

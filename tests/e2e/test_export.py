@@ -46,18 +46,18 @@ def test_the_file_decides_exactly_as_the_engine(make_data, many: np.ndarray, tmp
     with trained(make_data(400, SAMPLES), audit_rate=0.3, **settings) as engine:
         exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
         decisions = [engine.decide(x) for x in many]
-    found = exported.decide_many(many)
-    assert [row(d) for d in found] == [row(d) for d in decisions]
-    for ours, theirs in zip(found, decisions, strict=True):
+    result = exported.decide_many(many)
+    assert [row(d) for d in result] == [row(d) for d in decisions]
+    for ours, theirs in zip(result, decisions, strict=True):
         if theirs.embedding is None:
             assert np.isnan(ours.embedding).all()
         else:
             np.testing.assert_array_equal(ours.embedding, np.array(theirs.embedding, dtype=np.float32))
-    reasons = {d.reason for d in found}
-    outside = {d.action for d in found if d.reason is Reason.OUTSIDE}
+    reasons = {d.reason for d in result}
+    outside = {d.action for d in result if d.reason is Reason.OUTSIDE}
     assert outside == ({Action.VERIFY, Action.REJECT} if "windows" in settings else set())
     assert reasons >= {Reason.CERTAIN, Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
-    assert {d.action for d in found} == set(Action)
+    assert {d.action for d in result} == set(Action)
 
 
 def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[tuple[np.ndarray, bool, str | int | None]]:
@@ -92,8 +92,8 @@ def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fi
     page = (repo / "docs" / "howto" / "controller.md").read_text("utf-8")
     table = page.partition("### By torch alone")[2].partition("\n## ")[0]
     assert [name for name in (*FIELDS, *METHODS) if f"`{name}" not in table] == []
-    for known in (ACTIONS, REASONS):
-        assert ", ".join(f"{i} {each}" for i, each in enumerate(known)) in " ".join(table.split())
+    for expected in (ACTIONS, REASONS):
+        assert ", ".join(f"{i} {item}" for i, item in enumerate(expected)) in " ".join(table.split())
 
 
 @pytest.mark.parametrize(
@@ -111,31 +111,31 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
         engine.retrain()
         exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
         for i, (x, y, part) in enumerate(a_stream(make_data, 1500, 2)):
-            known, found = engine.decide(x, part), exported.decide(x, part)
-            assert row(found) == row(known)
-            if known.embedding is not None:
-                np.testing.assert_array_equal(found.embedding, np.array(known.embedding, dtype=np.float32))
+            decision, result = engine.decide(x, part), exported.decide(x, part)
+            assert row(result) == row(decision)
+            if decision.embedding is not None:
+                np.testing.assert_array_equal(result.embedding, np.array(decision.embedding, dtype=np.float32))
             heard = False
-            if known.action is Action.VERIFY and rng.random() < 0.9:
+            if decision.action is Action.VERIFY and rng.random() < 0.9:
                 heard = exported.learn(x, y, part) > 0
-            elif known.action is Action.ACCEPT and not y and (stops == "all" or rng.random() < 0.5):
+            elif decision.action is Action.ACCEPT and not y and (stops == "all" or rng.random() < 0.5):
                 heard = exported.stop(x, part) > 0
-            elif known.action is Action.ACCEPT and y and rng.random() < 0.1:
+            elif decision.action is Action.ACCEPT and y and rng.random() < 0.1:
                 heard = exported.learn(x, True, part) > 0
             if heard:
-                engine.report(known.id, y)
-            happened[f"{known.action}, {'heard' if heard else 'silent'}"] += 1
-            happened[known.reason] += 1
+                engine.report(decision.id, y)
+            happened[f"{decision.action}, {'heard' if heard else 'silent'}"] += 1
+            happened[decision.reason] += 1
             assert exported.safe_mode == engine.safe_mode
             modes.add(engine.safe_mode)
-            if i > 600 and not saved and known.action is Action.ACCEPT and not heard:  # one that waits
+            if i > 600 and not saved and decision.action is Action.ACCEPT and not heard:  # one that waits
                 exported, saved = load_exported(exported.save(tmp_path / "later.ts")), True
         model = engine.model
-        mine = {f"references.{name}": t for name, t in model.index.state_dict().items()}
-        mine |= model.rule.state_dict()
+        ours = {f"references.{name}": t for name, t in model.index.state_dict().items()}
+        ours |= model.rule.state_dict()
         kept = {".".join(name.split(".")[-2:]): t for name, t in exported.module.named_buffers()}
-        for name in mine.keys() & kept.keys():  # what can change; freezing made constants of the rest
-            torch.testing.assert_close(kept[name], mine[name], rtol=0, atol=0)
+        for name in ours.keys() & kept.keys():  # what can change; freezing made constants of the rest
+            torch.testing.assert_close(kept[name], ours[name], rtol=0, atol=0)
         assert {"references.points", "references.parts", "references.repeats", "references.total"} <= kept.keys()
         assert (
             type(model.rule) is DecisionRule
@@ -149,15 +149,15 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
 
 def test_what_waits_is_kept_apart_from_what_is_told_out_of_turn(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     exported = load_exported(export_torchscript(lenient_engine(make_data), tmp_path / "model.ts"))
-    new, held = make_data(6, SAMPLES, seed=4).X, 300
+    new, stored = make_data(6, SAMPLES, seed=4).X, 300
     assert exported.decide(new[0]).action is Action.ACCEPT
-    assert exported.learn(new[1], False) == held + 1  # not the one that waits
+    assert exported.learn(new[1], False) == stored + 1  # not the one that waits
     exported.decide(new[2])
-    assert exported.module.n_references() == held + 2  # the first one is confirmed
+    assert exported.module.n_references() == stored + 2  # the first one is confirmed
     exported.module.drop()
     exported.decide(new[3])
-    assert exported.module.n_references() == held + 2
-    assert exported.stop(new[3]) == held + 3
+    assert exported.module.n_references() == stored + 2
+    assert exported.stop(new[3]) == stored + 3
     assert not exported.module.settle()
 
 
@@ -181,8 +181,8 @@ def test_several_channels_are_exported_too(make_data: Callable[..., Dataset], tm
     exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
     assert exported.trace.channels == 3
     new = make_data(100, 40, 3, seed=1).X  # a reference that is asked about itself has no vote in the file
-    known = model.predict_many(new)
-    assert [d[2:6] for d in exported.decide_many(new)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
+    expected = model.predict_many(new)
+    assert [d[2:6] for d in exported.decide_many(new)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in expected]
 
 
 def test_a_wrong_shape_says_what_was_expected(file: Path) -> None:
@@ -324,7 +324,7 @@ def test_a_missing_file_or_sum_is_named(copy: Path) -> None:
 def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Dataset, tmp_path: Path) -> None:
     missed = fitted(data)
     missed.rule_is_stale = True
-    for what, words in (
+    for value, words in (
         (fitted(data, PCA(2)), r"PCA cannot be exported, for it has no module: give it `module\(\)`, .* nn\.Module"),
         (fitted(data, interval="jeffreys"), "use wilson or binomial"),
         (missed, "missed what became of a part"),
@@ -333,7 +333,7 @@ def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Datase
         (type("Thing", (), {"model": object()})(), "a baseline stays in Python"),
     ):
         with pytest.raises(ExportError, match=words):
-            export_torchscript(what, tmp_path / "model.ts")
+            export_torchscript(value, tmp_path / "model.ts")
     with pytest.raises(OutputError, match="choose a folder that exists"):
         export_torchscript(fitted(data), tmp_path / "nowhere" / "model.ts")
     assert list(tmp_path.iterdir()) == []

@@ -43,8 +43,8 @@ def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(s
 def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
     asked = {"action": "accept", "reason": "certain", "label": "bad", "predicted": "accept"}
     words = [word for name, value in asked.items() for word in (f"--{name.replace('predicted', 'model')}", value)]
-    found = document("history", store, "--last", 1000, *words)["decisions"]
-    assert {tuple(each[name] for name in asked) for each in found} == {tuple(asked.values())}
+    decisions = document("history", store, "--last", 1000, *words)["decisions"]
+    assert {tuple(item[name] for name in asked) for item in decisions} == {tuple(asked.values())}
     assert document("history", store, "--since", "1h", "--last", 1000)["decisions"]
     assert document("history", store, "--since", "2100-01-01")["decisions"] == []
     assert succeed("history", store, "--since", "2100-01-01") == "No decision of that kind.\n"
@@ -69,13 +69,13 @@ def test_a_wrong_word_is_a_wrong_call(verb: str, words: str, expected: str, stor
 
 def ids(store: Path) -> dict[str, str]:
     """The newest decision of each reason."""
-    return {each["reason"]: each["id"] for each in document("history", store, "--last", 1000)["decisions"]}
+    return {decision["reason"]: decision["id"] for decision in document("history", store, "--last", 1000)["decisions"]}
 
 
 def test_every_reason_is_explained_in_80_columns_with_a_picture(store: Path, tmp_path: Path) -> None:
-    known = ids(store)
-    assert {"certain", "uncertain", "audit", "novel", "safe_mode", "no_model", "not_finite"} <= set(known)
-    for reason, id_ in known.items():
+    ids_by_reason = ids(store)
+    assert {"certain", "uncertain", "audit", "novel", "safe_mode", "no_model", "not_finite"} <= set(ids_by_reason)
+    for reason, id_ in ids_by_reason.items():
         out = tmp_path / f"{reason}.png"
         shown = succeed("explain", store, id_, "--out", out)
         assert id_ in shown
@@ -84,39 +84,39 @@ def test_every_reason_is_explained_in_80_columns_with_a_picture(store: Path, tmp
 
 
 def test_an_explanations_document_is_its_record(store: Path) -> None:
-    found = document("explain", store, ids(store)["certain"], "--neighbours", 4)
-    assert found["decision"]["id"] == ids(store)["certain"]
-    assert len(found["neighbours"]) == 4
-    assert all(each["decision_id"] and "trace" not in each for each in found["neighbours"])
-    assert found["bound"]["n_success"] == found["decision"]["n_success"]
-    widths = [each["widths"] for each in found["envelope"]["excesses"]]
+    result = document("explain", store, ids(store)["certain"], "--neighbours", 4)
+    assert result["decision"]["id"] == ids(store)["certain"]
+    assert len(result["neighbours"]) == 4
+    assert all(item["decision_id"] and "trace" not in item for item in result["neighbours"])
+    assert result["bound"]["n_success"] == result["decision"]["n_success"]
+    widths = [item["widths"] for item in result["envelope"]["excesses"]]
     assert widths == sorted(widths, reverse=True)
-    assert found["sentences"][0].endswith("the bound meets the policy.")
+    assert result["sentences"][0].endswith("the bound meets the policy.")
     newest = document("history", store, "--last", 1)["decisions"][0]
     assert document("explain", store, "last")["decision"] | {"label": newest["label"]} == newest
 
 
 def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
-    found = document("status", store, "--last", 200)
-    newest, ever = found["newest"], found["ever"]
+    result = document("status", store, "--last", 200)
+    newest, ever = result["newest"], result["ever"]
     decisions = document("history", store, "--last", 1000)["decisions"]
     for span, some in ((newest, decisions[-200:]), (ever, decisions)):
         assert span["decisions"] == len(some)
         for name in ("accept", "reject"):
-            assert span[f"{name}ed"] == sum(each["action"] == name for each in some)
-        assert span["verified"] == sum(each["action"] == "verify" for each in some)
-        assert span["novel"] == sum(each["reason"] == "novel" for each in some)
-        assert span["audits"] == sum(each["audit"] for each in some)
-        accepted = [each["label"] for each in some if each["action"] == "accept"]
+            assert span[f"{name}ed"] == sum(item["action"] == name for item in some)
+        assert span["verified"] == sum(item["action"] == "verify" for item in some)
+        assert span["novel"] == sum(item["reason"] == "novel" for item in some)
+        assert span["audits"] == sum(item["audit"] for item in some)
+        accepted = [item["label"] for item in some if item["action"] == "accept"]
         bad, good = accepted.count("bad"), accepted.count("good")
         lower, upper = wilson_interval(good, bad, 0.2)
         assert (span["bad_accepts"]["n_known"], span["bad_accepts"]["n_wrong"]) == (good + bad, bad)
         assert (span["bad_accepts"]["lower"], span["bad_accepts"]["upper"]) == pytest.approx((1 - upper, 1 - lower))
     assert newest["quarantined"] == ever["quarantined"] == 1
-    assert newest["retrains"] < ever["retrains"] == len(found["retrains"])
-    assert found["last"] == 200
-    assert set(found["watch"]) == {"accepts", "rejects", "novelty"}
-    assert 0 <= found["new_labels"] <= found["recipe"]["retrain_every"] == 50
+    assert newest["retrains"] < ever["retrains"] == len(result["retrains"])
+    assert result["last"] == 200
+    assert set(result["watch"]) == {"accepts", "rejects", "novelty"}
+    assert 0 <= result["new_labels"] <= result["recipe"]["retrain_every"] == 50
 
 
 def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reasons(tmp_path: Path) -> None:
@@ -136,7 +136,9 @@ def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reas
 def test_known_escapes_stand_first_in_status_which_never_says_that_none_is_known(stream: Dataset, tmp_path: Path) -> None:
     with DataEngine(recipe=RECIPE, store=(store := tmp_path / "engine.db")) as engine:
         cycles = drive(engine, stream, 0, 300)
-        accepted = next(each for each in reversed(cycles) if each.decision.action is Action.ACCEPT and each.success is None)
+        accepted = next(
+            cycle for cycle in reversed(cycles) if cycle.decision.action is Action.ACCEPT and cycle.success is None
+        )
         engine.report(accepted.decision.id, False)
     words = " ".join(succeed("status", store).split())
     assert (words.split("│")[1].strip(), document("status", store)["ever"]["false_accepts"]) == ("accepted, and bad", 1)
@@ -168,27 +170,27 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
         engine.set_shadow(True)
         cycles = drive(engine, stream, 30, 300)
     certain = [cycle for cycle in cycles if cycle.decision.audit]
-    told = document("status", store)
-    assert told["shadow"] is True
+    result = document("status", store)
+    assert result["shadow"] is True
     for name, action in (("would_accept", Action.ACCEPT), ("would_reject", Action.REJECT)):
         true = [cycle.success for cycle in certain if cycle.decision.predicted is action]
         wrong = true.count(action is Action.REJECT)
-        span = told["ever"][name]
+        span = result["ever"][name]
         lower, upper = wilson_interval(len(true) - wrong, wrong, 0.05)  # whatever the policy's alpha
         assert (span["n"], span["n_wrong"]) == (len(true), wrong)
         assert (span["lower"], span["upper"]) == pytest.approx((1 - upper, 1 - lower))
-    accept, certified = told["ever"]["would_accept"], told["certificate"]
+    accept, certified = result["ever"]["would_accept"], result["certificate"]
     assert (accept["n"] > 50, accept["verdict"], certified["accepted"]["shadowed"]) == (True, "kept", True)
     assert f"Of {accept['n']} parts that the model would accept, each of which was checked," in certified["sentence"]
     n, words = len(certain), said("status", store, "--check-seconds", "60")
-    assert f"It would have decided {n} of the {told['ever']['verified']} parts that were verified: {60 * n} s of" in words
+    assert f"It would have decided {n} of the {result['ever']['verified']} parts that were verified: {60 * n} s of" in words
     assert "shadow yes" in said("status", store)
-    assert told["ever"]["bad_accepts"]["n_known"] == 0  # nothing was accepted, so none of it is known to be bad
+    assert result["ever"]["bad_accepts"]["n_known"] == 0  # nothing was accepted, so none of it is known to be bad
     words = said("status", store)
     assert f"certain but checked {n} {n}" in words
     assert words.count("bad accepts none was accepted none was accepted") == 1
     assert "audits" not in words
-    assert f"reasons uncertain {told['reasons']['uncertain']}" in words
+    assert f"reasons uncertain {result['reasons']['uncertain']}" in words
     assert f"certain but checked {n}, " in words
 
 

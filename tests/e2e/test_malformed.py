@@ -42,10 +42,12 @@ def refusal(text: str) -> str:
 def test_a_setting_of_any_type_is_taken_or_refused_by_its_name(key: str, text: str) -> None:
     refused = 0
     for value in VALUES:
-        said = refusal(text.replace("{}", value, 1))
-        assert len(said) < 2000
-        assert not said or key in said or "not TOML" in said or "module:Class" in said or "has no parameter" in said, said
-        refused += said != ""
+        output = refusal(text.replace("{}", value, 1))
+        assert len(output) < 2000
+        assert (
+            not output or key in output or "not TOML" in output or "module:Class" in output or "has no parameter" in output
+        ), output
+        refused += output != ""
     assert refused > len(VALUES) // 3
 
 
@@ -57,16 +59,16 @@ def test_a_parameter_of_another_type_is_refused_before_any_retrain_fails_by_it(k
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "text"),
     [
         (b"radius = 0.3 # \xe9", r"mine\.toml is not UTF-8 text: .* at byte \d+; save it as UTF-8"),
         (b"#" * (2**20 + 1), "at most 1 MB"),
     ],
     ids=["Latin-1", "many megabytes"],
 )
-def test_a_recipe_that_is_no_text_or_too_much_says_so(tmp_path: Path, content: bytes, said: str) -> None:
+def test_a_recipe_that_is_no_text_or_too_much_says_so(tmp_path: Path, content: bytes, text: str) -> None:
     (tmp_path / "mine.toml").write_bytes(content)
-    with pytest.raises(SettingError, match=said):
+    with pytest.raises(SettingError, match=text):
         Recipe.load(tmp_path / "mine.toml")
 
 
@@ -114,9 +116,9 @@ ARCHIVES = {
 
 @pytest.mark.parametrize("name", ARCHIVES)
 def test_an_archive_that_cannot_be_what_it_says_is_a_data_error(tmp_path: Path, name: str) -> None:
-    content, said = ARCHIVES[name]
+    content, text = ARCHIVES[name]
     (tmp_path / "data.npz").write_bytes(content)
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=text):
         load_dataset(tmp_path / "data.npz")
 
 

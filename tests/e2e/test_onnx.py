@@ -31,20 +31,20 @@ def file(make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFac
 @pytest.mark.parametrize("ball", BALLS)
 def test_both_formats_decide_alike(make_data: Callable[..., Dataset], tmp_path: Path, ball: dict[str, Any]) -> None:
     model = fitted(make_data(300), **ball)
-    one = load_onnx(export_onnx(model, tmp_path / "model.onnx", trace=SPEC))
+    first = load_onnx(export_onnx(model, tmp_path / "model.onnx", trace=SPEC))
     two = load_exported(export_torchscript(model, tmp_path / "model.ts", trace=SPEC))
     bad = make_data(5, seed=1).X
     bad[0, 3], bad[1, 5], bad[2, 0], bad[3], bad[4] = np.nan, -np.inf, 1e30, 2.5, np.nan
     novel = 3.0 * make_data(50, seed=8).X
     X = np.concatenate([make_data(200, seed=9).X, make_data(50, seed=7, noise=3.0).X, novel, bad])
-    for found, expected in zip(one.decide_many(X), two.decide_many(X), strict=True):
-        assert found[:2] == expected[:2]
-        assert found[2:4] == pytest.approx(expected[2:4], abs=1e-6)
-        assert found[4:6] == expected[4:6]
-        np.testing.assert_allclose(found.embedding, expected.embedding, rtol=1e-4, atol=1e-5)
-    assert {Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED} <= {d.reason for d in one.decide_many(bad)}
-    assert {d.reason for d in one.decide_many(novel)} == {Reason.NOVEL}
-    assert Action.ACCEPT in {d.action for d in one.decide_many(X)}
+    for result, expected in zip(first.decide_many(X), two.decide_many(X), strict=True):
+        assert result[:2] == expected[:2]
+        assert result[2:4] == pytest.approx(expected[2:4], abs=1e-6)
+        assert result[4:6] == expected[4:6]
+        np.testing.assert_allclose(result.embedding, expected.embedding, rtol=1e-4, atol=1e-5)
+    assert {Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED} <= {d.reason for d in first.decide_many(bad)}
+    assert {d.reason for d in first.decide_many(novel)} == {Reason.NOVEL}
+    assert Action.ACCEPT in {d.action for d in first.decide_many(X)}
 
 
 class OwnRule(DecisionRule):

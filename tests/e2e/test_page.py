@@ -92,17 +92,17 @@ def looking(browser: Browser, **options: Any) -> Iterator[Page]:
     context.on("request", lambda request: asked.append(request.url))
     page.on("dialog", lambda dialog: dialogs.append(dialog.message))
     yield page
-    own = page.url.partition("://")[2].partition("/")[0]
+    custom = page.url.partition("://")[2].partition("/")[0]
     context.close()
     assert dialogs == []
-    assert [url for url in asked if f"://{own}/" not in url] == []
+    assert [url for url in asked if f"://{custom}/" not in url] == []
 
 
 @pytest.fixture
 def page(browser: Browser) -> Iterator[Page]:
     complaints = list[str]()
     with looking(browser) as page:
-        page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+        page.on("console", lambda text: complaints.append(text.text) if text.type in ("error", "warning") else None)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         yield page
     assert complaints == []
@@ -114,8 +114,8 @@ PHONE = {"viewport": {"width": 390, "height": 844}}
 def must_suit_a_phone(page: Page, view: str) -> None:
     """The rules of axe pass, and nobody needs to scroll sideways."""
     assert page.evaluate("document.documentElement.scrollWidth") <= 390, view
-    found = Axe().run(page)
-    assert found.violations_count == 0, f"{view}: {found.generate_report()}"
+    completed = Axe().run(page)
+    assert completed.violations_count == 0, f"{view}: {completed.generate_report()}"
 
 
 def opened(page: Page, demo: DemoCell, view: str = "") -> None:
@@ -278,8 +278,8 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
                 opened(page, demo, nothing)
                 expect(page.locator("h1")).to_have_text("That cannot be shown")
     with demo.store() as store:
-        told = [(event.kind, event.author) for event in store.events(4)]
-    assert told == [("report", "Kim"), ("shadow", "Kim"), ("shadow", "Kim"), ("policy", "Kim")]  # nobody typed a name
+        answers = [(event.kind, event.author) for event in store.events(4)]
+    assert answers == [("report", "Kim"), ("shadow", "Kim"), ("shadow", "Kim"), ("policy", "Kim")]  # nobody typed a name
 
 
 def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
@@ -356,11 +356,11 @@ def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wron
         expect(page.locator("#banner")).to_be_empty(timeout=PATIENT)
         expect(page.locator("#mode")).to_contain_text("Decides")
     with demo.store() as store:
-        told = [(event.kind, event.author, event.text) for event in store.events(3)]
-    assert [each[:2] for each in told] == [("safe mode", ""), ("correct", "Kim"), ("safe mode ended", "")]
-    assert told[0][2] == "accepted parts failed more often than the tolerance"
-    assert last in told[1][2]
-    assert told[2][2] == "the corrected outcomes keep the tolerance"
+        answers = [(event.kind, event.author, event.text) for event in store.events(3)]
+    assert [item[:2] for item in answers] == [("safe mode", ""), ("correct", "Kim"), ("safe mode ended", "")]
+    assert answers[0][2] == "accepted parts failed more often than the tolerance"
+    assert last in answers[1][2]
+    assert answers[2][2] == "the corrected outcomes keep the tolerance"
 
 
 def test_what_is_said_of_several_channels_is_said_by_their_names(browser: Browser, tmp_path: Path, stream: Dataset) -> None:

@@ -32,10 +32,10 @@ def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_ar
     x = torch.arange(60_000.0).reshape(300, 200)
     sent = x, x.t()[3:, 5:], torch.empty(0), torch.nn.Linear(3, 4).weight, x.numpy()[:, ::2]
     with RetrainingProcess() as process:
-        for got, was in zip(process.submit(copy.copy, sent).result(300), sent, strict=True):
-            assert np.array_equal(torch.as_tensor(got).detach(), torch.as_tensor(was).detach())
+        for received, was in zip(process.submit(copy.copy, sent).result(300), sent, strict=True):
+            assert np.array_equal(torch.as_tensor(received).detach(), torch.as_tensor(was).detach())
             with torch.no_grad():
-                got[:1] = 7.0
+                received[:1] = 7.0
         assert process.submit(os.getpid).result(300) != os.getpid()
         with pytest.raises(ZeroDivisionError):
             process.submit(divmod, 17, 0).result(300)
@@ -61,7 +61,7 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(data: Dataset) -> 
             engine = DataEngine(recipe=CONV, replaying=True, executor=executor)
             learn_and_settle(engine, data)
             assert engine.version == 1
-            decided.append([(each.embedding, each.lower, each.upper) for each in map(engine.decide, data.X[40:60])])
+            decided.append([(item.embedding, item.lower, item.upper) for item in map(engine.decide, data.X[40:60])])
     assert decided[0] == decided[1]  # bit for bit
 
 

@@ -65,8 +65,8 @@ def serving(
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CellService]:
-    with a_service(tmp_path_factory.mktemp("serve") / "cell.db") as made:
-        yield made
+    with a_service(tmp_path_factory.mktemp("serve") / "cell.db") as created:
+        yield created
 
 
 @pytest.fixture(scope="module")
@@ -85,12 +85,12 @@ def must_be_problem(answer: Any, status: int) -> dict[str, Any]:
     """A problem as RFC 9457 has it, with what the cell does all the same, and nothing of the server's inside."""
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == PROBLEM
-    said: dict[str, Any] = answer.json()
-    assert set(said) == {"type", "title", "status", "detail", "action"}
-    assert (said["status"], said["action"]) == (status, "verify")
+    text: dict[str, Any] = answer.json()
+    assert set(text) == {"type", "title", "status", "detail", "action"}
+    assert (text["status"], text["action"]) == (status, "verify")
     assert "Traceback" not in answer.text
-    assert said["detail"].isprintable()
-    return said
+    assert text["detail"].isprintable()
+    return text
 
 
 def test_a_cell_over_http_is_the_cell_without_it(client: Client, stream: Dataset) -> None:
@@ -100,18 +100,18 @@ def test_a_cell_over_http_is_the_cell_without_it(client: Client, stream: Dataset
             assert [there[name] for name in COUNTED] == [getattr(here, name) for name in COUNTED]
             if here.action == "verify":
                 engine.report(here.id, bool(stream.y[i]))
-                told = client.post("/report", json={"id": there["id"], "success": bool(stream.y[i])})
-                assert told.json()["success"] is bool(stream.y[i])
+                response = client.post("/report", json={"id": there["id"], "success": bool(stream.y[i])})
+                assert response.json()["success"] is bool(stream.y[i])
         assert engine.version == client.get("/status").json()["version"] == 1
 
 
 def forms(trace: np.ndarray, request: str) -> dict[str, dict[str, Any]]:
     """The same trace as each form has it."""
-    raw, said = trace.astype("<f4").tobytes(), {"request": request, "part": "P1"}
-    packed, headers = [msgpack.encode({"trace": each, **said}) for each in (trace.tolist(), raw)], {"content-type": MSGPACK}
+    raw, text = trace.astype("<f4").tobytes(), {"request": request, "part": "P1"}
+    packed, headers = [msgpack.encode({"trace": item, **text}) for item in (trace.tolist(), raw)], {"content-type": MSGPACK}
     return {
-        "JSON": {"json": {"trace": trace.tolist(), **said}},
-        "float32": {"content": raw, "params": said | {"channels": 1}, "headers": {"content-type": RAW}},
+        "JSON": {"json": {"trace": trace.tolist(), **text}},
+        "float32": {"content": raw, "params": text | {"channels": 1}, "headers": {"content-type": RAW}},
         "MessagePack": {"content": packed[0], "headers": headers},
         "MessagePack of float32": {"content": packed[1], "headers": headers},
     }
@@ -122,9 +122,9 @@ def test_a_trace_is_the_same_in_every_form(client: Client, service: CellService,
     answer = client.post("/decide", **forms(stream.X[7], f"form {form}")[form])
     assert answer.status_code == 200, answer.text
     validate(answer.json(), "DecideResponse", client)
-    known = asyncio.run(service.find(f"form {form}"))
-    assert np.array_equal(known.trace[0], stream.X[7])
-    assert known.decision.part == "P1"
+    completed = asyncio.run(service.find(f"form {form}"))
+    assert np.array_equal(completed.trace[0], stream.X[7])
+    assert completed.decision.part == "P1"
 
 
 @pytest.mark.parametrize("form", ["whole", "fine", "of float32", "integers"])
@@ -138,8 +138,8 @@ def test_bytes_of_float64_are_named_whatever_the_contract_takes(stream: Dataset,
         "of float32": stream.X[0].astype(np.float64),
         "integers": np.round(stream.X[0].astype(np.float64)),
     }[form]
-    made = CellService(lambda: DataEngine(recipe=RECIPE, trace=spec), None, 60.0)
-    with closing(made) as service, running(service) as client:
+    created = CellService(lambda: DataEngine(recipe=RECIPE, trace=spec), None, 60.0)
+    with closing(created) as service, running(service) as client:
         answer = client.post("/decide", content=x.astype("<f8").tobytes(), headers={"content-type": RAW})
         assert "twice as many bytes as float32 takes: float64?" in must_be_problem(answer, 422)["detail"]
         answer = client.post("/decide", content=x.astype("<f4").tobytes(), headers={"content-type": RAW})
@@ -174,14 +174,14 @@ def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Da
     client.post("/decide", json={"trace": (stream.X[2] * 9).tolist(), "request": "label-0"})
     assert client.get("/decisions?open=true").json()["decisions"][0]["id"] == "label-0"
     for repeated in (False, True):
-        told = client.post("/report", json={"id": "label-0", "success": True}).json()
-        validate(told, "ReportResponse", client)
-        assert told["repeated"] is repeated
+        answer = client.post("/report", json={"id": "label-0", "success": True}).json()
+        validate(answer, "ReportResponse", client)
+        assert answer["repeated"] is repeated
     must_be_problem(client.post("/report", json={"id": "label-0", "success": False}), 409)
     must_be_problem(client.post("/report", json={"id": "nobody", "success": True}), 404)
     must_be_problem(client.post("/report", json={"id": "label-0", "success": "OK"}), 422)
     must_be_problem(client.post("/report", json={"id": "", "success": True}), 422)
-    assert "label-0" not in [each["id"] for each in client.get("/decisions?open=true").json()["decisions"]]
+    assert "label-0" not in [decision["id"] for decision in client.get("/decisions?open=true").json()["decisions"]]
     assert client.get("/decisions/label-0").json()["source"] == "verification"
     packed = msgpack.encode({"id": "label-0", "success": True})
     assert client.post("/report", content=packed, headers={"content-type": MSGPACK}).json()["repeated"]
@@ -217,7 +217,7 @@ def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another
         client.post("/report", json={"id": "found-1", "success": False})
 
         def found(**query: Any) -> list[str]:
-            return [each["id"] for each in client.get("/decisions", params=query).json()["decisions"]]
+            return [decision["id"] for decision in client.get("/decisions", params=query).json()["decisions"]]
 
         assert found(part="F0") == ["found-6", "found-0"]
         assert found(part="F1", label="bad", action="verify") == ["found-1"]
@@ -225,14 +225,14 @@ def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another
         pages, older = [], None
         while older is not None or not pages:
             page = client.get("/decisions", params={"limit": 3} | ({"before": older} if older else {})).json()
-            pages += [each["id"] for each in page["decisions"]]
+            pages += [decision["id"] for decision in page["decisions"]]
             older = page["older"]
         assert len(pages) == len(set(pages)) == client.get("/status").json()["ever"]["decisions"]
         # An accepted part that comes back is reported by its number; one with several decisions needs the id.
         problem = must_be_problem(client.post("/report", json={"part": "F0", "success": False}), 409)
         assert "found-6, found-0" in problem["detail"]
-        told = client.post("/report", json={"part": "F2", "success": False, "author": "Kim"}).json()
-        assert (told["decision_id"], told["success"]) == ("found-2", False)
+        answer = client.post("/report", json={"part": "F2", "success": False, "author": "Kim"}).json()
+        assert (answer["decision_id"], answer["success"]) == ("found-2", False)
         assert client.get("/events?limit=1").json()["events"][0]["author"] == "Kim"
         assert client.post("/report", json={"part": "found-3", "success": True}).json()["decision_id"] == "found-3"
         must_be_problem(client.post("/report", json={"part": "nobody", "success": False}), 404)
@@ -247,8 +247,8 @@ def test_a_rejected_part_that_was_found_good_is_reported_corrected_and_explained
         decided = client.post("/decide", json={"trace": stream.X[1].tolist(), "request": "r", "part": "R1"}).json()
         assert decided["action"] == "reject"
         assert client.post("/report", json={"part": "R1", "success": True}).json()["decision_id"] == "r"
-        (found,) = client.get("/decisions", params={"part": "R1"}).json()["decisions"]
-        assert (found["success"], found["source"]) == (True, "inspection")
+        (result,) = client.get("/decisions", params={"part": "R1"}).json()["decisions"]
+        assert (result["success"], result["source"]) == (True, "inspection")
         assert client.get("/status").json()["sources"]["inspection"] == 1
         assert client.get("/explanations/R1").json()["decision"]["id"] == "r"
         assert client.post("/report", json={"part": "R1", "success": True}).json()["repeated"] is True
@@ -276,8 +276,8 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(st
             assert changed["event"] is not None
             assert client.post(f"/{path}", json=asked | {"author": "Kim Lee"}).json()["event"] is None
         events = client.get("/events").json()["events"]
-        assert [each["kind"] for each in events] == ["shadow", "policy", "policy", "forget", "correct"]
-        assert {each["author"] for each in events} == {"Kim Lee"}
+        assert [event["kind"] for event in events] == ["shadow", "policy", "policy", "forget", "correct"]
+        assert {event["author"] for event in events} == {"Kim Lee"}
         assert (service.engine.policy.alpha, service.engine.policy.shadow) == (0.2, True)
         assert [client.get(f"/decisions/wrong-{i}").json()["success"] for i in range(3)] == [False, None, None]
 
@@ -351,8 +351,8 @@ def test_the_page_is_files_that_may_ask_nobody_else(hasty: Client) -> None:
 
 def test_the_document_names_every_route_and_every_example_is_served(service: CellService, client: Client) -> None:
     document = client.get("/openapi.json").json()
-    served_here = [each for each in create_app(service, xmlrpc=False, page=False).routes if isinstance(each, Route)]
-    routes = {(each.path.replace(":path", ""), m) for each in served_here for m in each.methods - {"HEAD"}}
+    served_here = [route for route in create_app(service, xmlrpc=False, page=False).routes if isinstance(route, Route)]
+    routes = {(route.path.replace(":path", ""), m) for route in served_here for m in route.methods - {"HEAD"}}
     assert routes == {(path, m.upper()) for path, methods in document["paths"].items() for m in methods}
     for path, methods in document["paths"].items():
         for content in methods.get("post", {}).get("requestBody", {}).get("content", {}).values():
@@ -370,11 +370,13 @@ def test_prometheus_reads_what_was_answered(stream: Dataset) -> None:
             client.post("/decide", **forms(stream.X[i], f"m-{i}")["JSON"])
         client.post("/report", json={"id": "m-0", "success": True})
         text = client.get("/metrics").text
-    found = {(s.name, *sorted(s.labels.values())): s.value for f in text_string_to_metric_families(text) for s in f.samples}
-    assert found["dengine_decide_seconds_count", "no_model", "verify"] == 3
-    assert found["dengine_report_seconds_count", "false", "true"] == found["dengine_new_labels",] == 1
-    assert found["dengine_late_total",] == found["dengine_safe_mode",] == found["dengine_store_fault",] == 0
-    assert 0 <= found["dengine_store_lag_seconds",] < 60
+    result = {
+        (s.name, *sorted(s.labels.values())): s.value for f in text_string_to_metric_families(text) for s in f.samples
+    }
+    assert result["dengine_decide_seconds_count", "no_model", "verify"] == 3
+    assert result["dengine_report_seconds_count", "false", "true"] == result["dengine_new_labels",] == 1
+    assert result["dengine_late_total",] == result["dengine_safe_mode",] == result["dengine_store_fault",] == 0
+    assert 0 <= result["dengine_store_lag_seconds",] < 60
 
 
 def typed(content: bytes, kind: str, **params: Any) -> dict[str, Any]:
@@ -447,13 +449,13 @@ def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None
 
 def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks(stream: Dataset) -> None:
     with serving(Access((Token(TOKEN, name="Kim"), Token("a-viewer-s-password", operates=False)))) as (_, client):
-        for said in ("", "Bearer other", "Basic !", f"Bearer {TOKEN}x", TOKEN):
-            refused = client.get("/status", headers={"authorization": said} if said else {})
+        for text in ("", "Bearer other", "Basic !", f"Bearer {TOKEN}x", TOKEN):
+            refused = client.get("/status", headers={"authorization": text} if text else {})
             must_be_problem(refused, 401)
             asked = refused.headers.get_list("www-authenticate")
-            assert [each.split()[0] for each in asked] == ["Basic", "Bearer"]  # a line each, or no browser asks for it
+            assert [item.split()[0] for item in asked] == ["Basic", "Bearer"]  # a line each, or no browser asks for it
         assert client.get("/me", auth=("anybody", TOKEN)).json() == {"name": "Kim", "operates": True}
-        kim, viewer = ({"authorization": f"Bearer {each}"} for each in (TOKEN, "a-viewer-s-password"))
+        kim, viewer = ({"authorization": f"Bearer {item}"} for item in (TOKEN, "a-viewer-s-password"))
         for asked, headers, status in (({}, kim, 200), ({"author": "Robin"}, kim, 422), ({"author": "Kim"}, viewer, 403)):
             assert client.post("/policy", json={"shadow": True} | asked, headers=headers).status_code == status
         (event,) = client.get("/events", headers=viewer).json()["events"]
@@ -481,7 +483,7 @@ def test_sizes_connections_and_rates_are_limited(stream: Dataset) -> None:
         must_be_problem(client.post("/decide", **typed(b"0" * 4001, RAW)), 413)
         must_be_problem(client.post("/decide", content=iter([b"0" * 3000] * 2), headers={"content-type": RAW}), 413)
         at = client.base_url.host, client.base_url.port
-        fulls = [read_all(each) for each in [socket.create_connection(at, timeout=60) for _ in range(4)]]
+        fulls = [read_all(item) for item in [socket.create_connection(at, timeout=60) for _ in range(4)]]
         assert [full[:13] for full in fulls] == [b"HTTP/1.1 503 ", *[b"HTTP/1.1 408 "] * 3]  # the oldest gives way
         while (answer := client.get("/healthz")).status_code == 200:
             pass
@@ -492,10 +494,10 @@ def test_sizes_connections_and_rates_are_limited(stream: Dataset) -> None:
 @pytest.mark.parametrize("addresses", [1, 20])
 def test_connections_without_a_token_keep_nobody_out_who_has_one(tmp_path: Path, addresses: int, stream: Dataset) -> None:
     make_token(tmp_path)
-    asked, known = b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n", {"authorization": f"Bearer {TOKEN}"}
+    asked, headers = b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n", {"authorization": f"Bearer {TOKEN}"}
     with started(tmp_path, "--token-file", "token", "--no-page", "--reducer", "pca") as process, ExitStack() as others:
         here = {"base_url": f"http://127.0.0.1:{process.port}", "timeout": 60, "trust_env": False}
-        robot = others.enter_context(httpx.Client(headers=known, **here))  # it came first, and keeps its connection
+        robot = others.enter_context(httpx.Client(headers=headers, **here))  # it came first, and keeps its connection
         assert robot.get("/status").status_code == 200
         for i in range(150):
             at = (f"127.0.0.{1 + i % addresses}", 0)
@@ -503,7 +505,7 @@ def test_connections_without_a_token_keep_nobody_out_who_has_one(tmp_path: Path,
             other.sendall(asked)
             assert other.recv(1000).startswith(b"HTTP/1.1 200 ")
         for i, x in enumerate(stream.X[:20]):
-            with httpx.Client(headers=known, **here) as new:
+            with httpx.Client(headers=headers, **here) as new:
                 assert new.post("/decide", json={"trace": x.tolist(), "request": str(i)}).json()["reason"] == "no_model"
         assert robot.get("/status").json()["ever"]["decisions"] == 20
         assert robot.get("/status", headers={"authorization": "Bearer wrong"}).status_code == 401
@@ -547,21 +549,21 @@ def test_half_a_request_is_answered_before_its_connection_is_closed(hasty: Clien
         if ended:  # then no more comes, and nobody waits for a head
             raw.shutdown(socket.SHUT_WR)
             wanted = 400 if wanted == 408 and b"\r\n\r\n" not in sent else wanted
-        said = read_all(raw)
-    (status,) = re.findall(rb"HTTP/1\.1 (\d{3}) ", said)
-    assert int(status) in ([wanted] if wanted else [400, 408]), said
-    head, _, body = said.partition(b"\r\n\r\n")
+        text = read_all(raw)
+    (status,) = re.findall(rb"HTTP/1\.1 (\d{3}) ", text)
+    assert int(status) in ([wanted] if wanted else [400, 408]), text
+    head, _, body = text.partition(b"\r\n\r\n")
     assert b"connection: close" in head
     assert set(json.loads(body)) == {"type", "title", "status", "detail", "action"}
 
 
 def read_all(connection: socket.socket) -> bytes:
     """What comes until the other side closes."""
-    found = b""
+    result = b""
     with connection:
         while piece := connection.recv(65536):
-            found += piece
-    return found
+            result += piece
+    return result
 
 
 def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_store(tmp_path, stream, monkeypatch) -> None:
@@ -569,13 +571,13 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
     make_token(tmp_path)
     words = ("--shadow", "--host", "0.0.0.0", "--token-file", "token", "--cert", "cert.pem", "--key", "key.pem")
     monkeypatch.delenv("DENGINE_STORE_WAIT", raising=False)  # as a cell waits for its store: the tests' own wait is long
-    trusted, said = ssl.create_default_context(cafile=str(tmp_path / "cert.pem")), {"authorization": f"Bearer {TOKEN}"}
+    trusted, output = ssl.create_default_context(cafile=str(tmp_path / "cert.pem")), {"authorization": f"Bearer {TOKEN}"}
     with started(tmp_path, "--reducer", "pca", *words) as process:
         how: dict[str, Any] = {"verify": trusted, "timeout": 60, "trust_env": False}
         with httpx.Client(base_url=f"https://localhost:{process.port}", **how) as client:
             assert client.get("/healthz").json()["status"] == "ok"
             must_be_problem(client.get("/status"), 401)
-            client.headers.update(said)
+            client.headers.update(output)
             assert client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()["action"] == "verify"
             assert client.get("/status").json()["shadow"] is True
             for store, at, text in (("cell.db", "0", "cell.db"), ("b.db", process.port, "already in use")):
@@ -659,8 +661,8 @@ def test_whatever_number_a_query_holds_it_is_answered_or_refused_with_its_name(p
         for i, x in enumerate(stream.X[:30]):
             client.post("/decide", **forms(x, f"order-{i}")["JSON"]).raise_for_status()
         asked = [{"hours": "1", name: value} if name == "start" else {name: value} for name in names for value in NUMBERS]
-        answers = [(each, client.get(path, params=each)) for each in asked]
-        assert [(each, found.text) for each, found in answers if found.status_code not in (200, 422)] == []
+        answers = [(answer, client.get(path, params=answer)) for answer in asked]
+        assert [(answer, result.text) for answer, result in answers if result.status_code not in (200, 422)] == []
         refused = must_be_problem(client.get("/course", params={"hours": "5e-324"}), 422)
         assert "hours" in refused["detail"]
 
@@ -687,6 +689,6 @@ def test_a_trace_of_any_finite_numbers_is_explained(stream: Dataset) -> None:
                 trace[9] = size
                 id_ = f"{name} {form}"
                 client.post("/decide", **forms(trace.astype(np.float32), id_)["float32"]).raise_for_status()
-                found = client.get(f"/explanations/{id_}")
-                assert found.status_code == 200, (id_, found.text)
-                assert len(found.json()["trace"][0]) == len(x)
+                response = client.get(f"/explanations/{id_}")
+                assert response.status_code == 200, (id_, response.text)
+                assert len(response.json()["trace"][0]) == len(x)

@@ -35,19 +35,19 @@ def parts(make_data) -> Dataset:
 def until(true: Callable[[], Any], wait: float = WAIT) -> Any:
     """What this returns, once it is anything."""
     end = time.monotonic() + wait
-    while not (found := true()):
+    while not (result := true()):
         assert time.monotonic() < end, "it did not come in time"
         time.sleep(0.02)
-    return found
+    return result
 
 
 def children(pid: int) -> list[int]:
     """Processes below this one."""
     try:
-        own = [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        custom = [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     except FileNotFoundError:
         pytest.skip("this system does not say which processes are whose")
-    return [*own, *(deeper for each in own for deeper in children(each))]
+    return [*custom, *(deeper for word in custom for deeper in children(word))]
 
 
 def is_alive(pid: int) -> bool:
@@ -67,9 +67,9 @@ class Robots:
     labels: dict[str, bool] = field(default_factory=dict)
 
     def start(self, n: int = 3) -> list[threading.Thread]:
-        threads = [threading.Thread(target=self.work, args=(each,)) for each in range(n)]
-        for each in threads:
-            each.start()
+        threads = [threading.Thread(target=self.work, args=(item,)) for item in range(n)]
+        for item in threads:
+            item.start()
         return threads
 
     def work(self, robot: int) -> None:
@@ -95,8 +95,8 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
         until(lambda: process.ask("/status")["retraining"])
         below = until(lambda: children(process.process.pid))
         code = process.end(getattr(signal, name), group=name == "SIGINT")
-        for each in threads:
-            each.join(WAIT)
+        for thread in threads:
+            thread.join(WAIT)
     assert code == 0
     assert "Traceback" not in process.said
     lines = process.said.splitlines()
@@ -107,8 +107,8 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
     with DataEngine.open(tmp_path / "cell.db") as engine:
         assert {id_: engine.find(id_).success for id_ in robots.labels} == robots.labels
         for id_, answer in robots.answers.items():
-            known = engine.find(id_)
-            assert [getattr(known.decision, name) for name in NAMES] == [answer[name] for name in NAMES]
+            match = engine.find(id_)
+            assert [getattr(match.decision, name) for name in NAMES] == [answer[name] for name in NAMES]
 
 
 @pytest.mark.parametrize("at_work", [False, True], ids=["at its start", "in a retrain"])
@@ -122,8 +122,8 @@ def test_a_server_that_is_killed_leaves_no_retraining_process_behind(tmp_path: P
         below = until(lambda: children(process.process.pid))
         process.process.kill()
         until(lambda: not any(map(is_alive, below)), WAIT / 4)
-    for each in threads if at_work else ():
-        each.join(WAIT)
+    for thread in threads if at_work else ():
+        thread.join(WAIT)
 
 
 class Insertions:
@@ -175,17 +175,17 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
                 assert (answer["action"], answer["reason"]) == (0, "no_model")
                 assert robot.decide_recorded(answer["id"]) == answer  # asked again
                 assert robot.report(answer["id"], bool(parts.y[i])) is True
-                known = process.ask(f"/decisions/{answer['id']}?trace=true")
-                assert known["success"] is bool(parts.y[i])
-                np.testing.assert_array_equal(np.float32(known["trace"]).ravel(), parts.X[i])  # as it was sent
+                record = process.ask(f"/decisions/{answer['id']}?trace=true")
+                assert record["success"] is bool(parts.y[i])
+                np.testing.assert_array_equal(np.float32(record["trace"]).ravel(), parts.X[i])  # as it was sent
             fake.close()
             unknown = robot.decide_recorded(robot.begin())
             assert (unknown["action"], unknown["id"], unknown["reason"]) == (0, "", "not_recorded")
             assert robot.report(unknown["id"], True) is False
             with FakeController(program, port=fake.port):
                 answer = inserted(robot, program, parts.X[2])
-                known = process.ask(f"/decisions/{answer['id']}?trace=true")
-                np.testing.assert_array_equal(np.float32(known["trace"]).ravel(), parts.X[2])
+                record = process.ask(f"/decisions/{answer['id']}?trace=true")
+                np.testing.assert_array_equal(np.float32(record["trace"]).ravel(), parts.X[2])
                 assert process.ask("/status")["ever"]["decisions"] >= 3
             assert process.end() == 0
     assert "no recording of" in process.said
@@ -214,5 +214,5 @@ def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(tmp_p
         exec(node, scope)
         url = f"http://127.0.0.1:{server.port}"
         asked = (url, token), (url, "another"), ("http://127.0.0.1:1", token)
-        assert [scope["decide"](x, "P-1", *each) for each in asked] == ["accept", "verify", "verify"]
+        assert [scope["decide"](x, "P-1", *item) for item in asked] == ["accept", "verify", "verify"]
         assert action[1] == b"accept"

@@ -33,8 +33,8 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
                 await service.decide(stream.X[2], "order-0")  # in time or late, an answer is to one trace
             with pytest.raises(TraceError, match="60"):
                 await service.decide(stream.X[0][:10], "order-3")
-            said = late.late, late.decision.action, late.decision.reason, broken.decision.reason
-            assert said == (True, "verify", Reason.LATE, Reason.NOT_FINITE)
+            text = late.late, late.decision.action, late.decision.reason, broken.decision.reason
+            assert text == (True, "verify", Reason.LATE, Reason.NOT_FINITE)
             free.set()
             assert await read
             (tmp_path / "killed").mkdir()  # as a process that is killed now leaves it
@@ -62,9 +62,9 @@ def test_the_engine_does_what_it_has_to_while_nobody_asks(stream: Dataset) -> No
             await asyncio.wait_for(anext(changes), 60)
         await changes.aclose()
 
-    with ThreadPoolExecutor(1) as pool, closing(CellService(lambda: DataEngine(recipe=RECIPE, executor=pool))) as made:
-        made.deadline = WAIT
-        asyncio.run(cell(made))
+    with ThreadPoolExecutor(1) as pool, closing(CellService(lambda: DataEngine(recipe=RECIPE, executor=pool))) as created:
+        created.deadline = WAIT
+        asyncio.run(cell(created))
 
 
 def test_a_model_of_the_users_keeps_the_engines_thread_and_never_the_loop(stream: Dataset) -> None:
@@ -84,8 +84,8 @@ def test_a_model_of_the_users_keeps_the_engines_thread_and_never_the_loop(stream
         assert (await asked).decision.reason is not Reason.MODEL_ERROR
         assert looked.is_set()
 
-    with closing(CellService(lambda: DataEngine(model=Slow()), deadline=WAIT)) as made:
-        asyncio.run(cell(made))
+    with closing(CellService(lambda: DataEngine(model=Slow()), deadline=WAIT)) as created:
+        asyncio.run(cell(created))
 
 
 def test_a_decision_without_an_id_is_what_the_thread_would_say_and_verify_where_that_is_held(stream: Dataset) -> None:

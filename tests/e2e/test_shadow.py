@@ -55,10 +55,10 @@ def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_onc
     command = [sys.executable, "-c", KILLED, str(tmp_path / "x.npy"), str(file)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    told = [line.split() for line in done.stdout.splitlines()]
-    assert len(told) == 20
+    answers = [line.split() for line in done.stdout.splitlines()]
+    assert len(answers) == 20
     with DataEngine.open(file) as engine:
-        for x, (id_, action, reason) in zip(stream.X, told, strict=False):
+        for x, (id_, action, reason) in zip(stream.X, answers, strict=False):
             again = engine.decide(x, decision_id=id_)
             assert (again.id, again.action, again.reason) == (id_, action, reason)
         assert engine.store.status()["decisions"] == 20

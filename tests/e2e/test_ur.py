@@ -41,9 +41,9 @@ def nan_places(part: int, trace: np.ndarray) -> set[tuple[int, int]]:
 def test_packages_come_whole_from_pieces_of_any_size() -> None:
     sent = [Package(PackageType.DATA, bytes(range(n))) for n in (0, 1, 40)]
     for size in (1, 2, 7, 100):
-        stream, packages = b"".join(each.to_bytes() for each in sent), PackageReader()
+        stream, packages = b"".join(item.to_bytes() for item in sent), PackageReader()
         pieces = [stream[i : i + size] for i in range(0, len(stream), size)]
-        assert [found for piece in pieces for found in packages.feed(piece)] == sent
+        assert [result for piece in pieces for result in packages.feed(piece)] == sent
 
 
 @pytest.mark.parametrize("kind", TYPES)
@@ -62,7 +62,7 @@ def test_a_data_package_is_bytes_as_the_guide_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("refused", "column", "said"),
+    ("refused", "column", "text"),
     [
         (PackageType.VERSION, FORCE, "protocol version 2"),
         (PackageType.START, FORCE, "refuses"),
@@ -73,9 +73,9 @@ def test_a_data_package_is_bytes_as_the_guide_says() -> None:
     ],
 )
 def test_what_a_controller_refuses_or_does_not_have_is_said_at_once(
-    refused: PackageType | str, column: str, said: str
+    refused: PackageType | str, column: str, text: str
 ) -> None:
-    with FakeController(speed=None, refuses=[refused]) as fake, pytest.raises(DengineError, match=said):
+    with FakeController(speed=None, refuses=[refused]) as fake, pytest.raises(DengineError, match=text):
         RtdeClient(fake.host, fake.port, (column,), (ORDER,))
 
 
@@ -174,7 +174,7 @@ def test_a_recorder_cuts_several_channels_by_any_trigger_with_samples_from_befor
 def decisions(cell: Cell, n: int) -> list[dict]:
     with DataEngine("pca", retrain_every=10, policy=Policy(0.3, 0.6), seed=0) as engine:
         cycles = list(engine.run(cell, n))
-    return [asdict(each.decision) | {"id": "", "outcome": each.outcome, "success": each.success} for each in cycles]
+    return [asdict(cycle.decision) | {"id": "", "outcome": cycle.outcome, "success": cycle.success} for cycle in cycles]
 
 
 @pytest.mark.parametrize("confirm", [False, True])
@@ -184,18 +184,20 @@ def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(ma
         assert isinstance(cell, Cell)
         live = decisions(cell, 120)
     assert live == decisions(ReplayCell(data, confirm=confirm), 120)
-    assert {told["action"] for told in live} == {"verify", "accept", "reject"}
+    assert {answer["action"] for answer in live} == {"verify", "accept", "reject"}
 
 
 @pytest.mark.parametrize(
-    ("what", "said"),
+    ("value", "text"),
     [
         ("is deaf", r"to answer order 1 \(insert\) in time, it did not"),
         ("has stopped", "its program has stopped"),
         ("is started anew", "started anew"),
     ],
 )
-def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(parts: Dataset, what: str, said: str) -> None:
+def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
+    parts: Dataset, value: str, text: str
+) -> None:
     program = RobotProgram(parts)
 
     def start_anew() -> None:
@@ -204,13 +206,13 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(pa
 
     with FakeController(program, speed=20.0) as fake, cell_of(fake) as cell:
         program.step = lambda inputs: program.outputs  # it answers nothing
-        if what == "is deaf":
+        if value == "is deaf":
             cell.order_timeout = 0.3
-        elif what == "has stopped":
+        elif value == "has stopped":
             program.outputs[RUNTIME] = Runtime.STOPPED
         else:
             threading.Timer(0.2, start_anew).start()
-        with pytest.raises(CellError, match=said):
+        with pytest.raises(CellError, match=text):
             cell.insert()
 
 
@@ -272,10 +274,10 @@ def run_on(fake: FakeController, store: Path) -> tuple[object, ...]:
 def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dataset, tmp_path: Path) -> None:
     store = tmp_path / "cell.db"
     with FakeController(RobotProgram(parts), speed=None, troubles=[Trouble(3, 9, "drop", 2)]) as fake:
-        told = document(*run_on(fake, store), "--reducer", "pca", "--cycles", 12)
+        result = document(*run_on(fake, store), "--reducer", "pca", "--cycles", 12)
         shown = said(*run_on(fake, store), "--cycles", 3)
-    assert (told["total"]["verified"], told["cell"]["incomplete"]) == (12, 1)
-    assert told["cell"]["missing"] >= 2
+    assert (result["total"]["verified"], result["cell"]["incomplete"]) == (12, 1)
+    assert result["cell"]["missing"] >= 2
     assert "incomplete 0" in shown
     with DataEngine.open(store) as engine:
         kept = engine.store.labelled().traces[:, 0]  # of a trace with a gap the label is counted, not the trace

@@ -38,16 +38,16 @@ MANUAL = {  # of the script manual of e-Series, version 5
 
 def test_every_block_has_its_end_and_every_function_is_known() -> None:
     assert sum(bool(BLOCK.match(line)) for line in CODE) == sum(line.strip() == "end" for line in CODE)
-    own = set(re.findall(r"(?:def|thread) (\w+)\(", "\n".join(CODE)))
+    names = set(re.findall(r"(?:def|thread) (\w+)\(", "\n".join(CODE)))
     called = set(re.findall(r"(?<![.\w])(\w+)\(", "\n".join(CODE))) - {"and", "or", "not", "while", "if", "elif"}
-    assert called - own == MANUAL
+    assert called - names == MANUAL
 
 
 def test_remote_calls_are_made_in_threads_alone() -> None:
     inside = ""
     for line in CODE:
-        if found := re.match(r"  (def|thread) (\w+)\(", line):
-            inside = found[1]
+        if match := re.match(r"  (def|thread) (\w+)\(", line):
+            inside = match[1]
         assert "dengine." not in line or inside == "thread", line
 
 
@@ -62,8 +62,8 @@ def as_python(code: list[str]) -> str:
         if line.strip() == "end" or not line.strip():
             continue
         lines.append(line)
-        if found := re.match(r"^(\s*)def ", line):
-            lines.append(f"{found[1]}  global {', '.join(names)}")
+        if match := re.match(r"^(\s*)def ", line):
+            lines.append(f"{match[1]}  global {', '.join(names)}")
     return "\n".join(lines)
 
 
@@ -150,16 +150,16 @@ def test_a_shift_of_the_program_decides_checks_and_reports(cell: SimpleNamespace
     robot = Robot(data, len(data), cell)
     robot.play()
     asked = cell.service.submit(lambda engine: (engine.flush(), engine.store.decisions(HistoryFilter(), 1000))[1])
-    found = asked.result(60)
-    assert len(found) == len(data)
-    actions = [each.decision.action for each in found]
+    result = asked.result(60)
+    assert len(result) == len(data)
+    actions = [item.decision.action for item in result]
     assert {Action.VERIFY, Action.ACCEPT} <= set(actions)
     assert robot.checked == [i for i, action in enumerate(actions) if action is Action.VERIFY]
-    for i, each in enumerate(found):
-        if each.decision.action is Action.VERIFY:
-            assert each.success is bool(data.y[i])
-        elif each.decision.action is Action.ACCEPT:
-            assert each.success is (None if data.y[i] else False)  # a stop is told, silence is not
+    for i, item in enumerate(result):
+        if item.decision.action is Action.VERIFY:
+            assert item.success is bool(data.y[i])
+        elif item.decision.action is Action.ACCEPT:
+            assert item.success is (None if data.y[i] else False)  # a stop is told, silence is not
     assert robot.said == []
 
 
@@ -168,8 +168,8 @@ def test_what_is_not_answered_in_time_is_checked(cell: SimpleNamespace, make_dat
     with held(cell.service):
         robot.play()
     assert robot.checked == [0, 1]
-    assert sum("no response" in said for said in robot.said) == 2
-    assert sum("a label was not stored" in said for said in robot.said) == 2
+    assert sum("no response" in text for text in robot.said) == 2
+    assert sum("a label was not stored" in text for text in robot.said) == 2
 
 
 def test_a_part_that_was_left_in_the_fixture_is_checked_first(cell: SimpleNamespace, make_data) -> None:

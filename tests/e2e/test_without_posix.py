@@ -75,17 +75,17 @@ def test_names_that_differ_in_capitals_alone_have_a_journal_each_where_files_do_
     monkeypatch.setattr(journal, "IGNORES_CASE", True)
     url = make_url("sqlite:///line.db")
     names = ["a", "A", "%41", "b:B", "B:b", "é", "É"]
-    found = [journal_path(url, name).name for name in names]
-    assert len({each.lower() for each in found}) == len(names)
-    assert found[0] == "line.db.a.journal"
-    assert not set('<>:"/\\|?*') & set("".join(found))
+    results = [journal_path(url, name).name for name in names]
+    assert len({item.lower() for item in results}) == len(names)
+    assert results[0] == "line.db.a.journal"
+    assert not set('<>:"/\\|?*') & set("".join(results))
 
 
 @pytest.mark.merge
 def test_the_store_and_the_process_that_retrains_keep_their_contract() -> None:
     tests = ("tests/contract/test_store.py", "tests/unit/test_incoming.py", "tests/e2e/test_retraining_process.py")
-    said = python("-m", "pytest", "-q", "-p", "no:cacheprovider", *(REPO / each for each in tests))
-    assert "passed" in said or "[100%]" in said
+    text = python("-m", "pytest", "-q", "-p", "no:cacheprovider", *(REPO / test for test in tests))
+    assert "passed" in text or "[100%]" in text
 
 
 @pytest.mark.parametrize("lock", ["0", "1"], ids=["no lock of Python's", "the lock of Windows"])
@@ -108,8 +108,8 @@ def test_a_killed_engine_gives_its_cell_free_and_loses_no_label(
     assert "StoreError" in refused
     assert len(lines) == 40
     text = "engine = DataEngine.open(sys.argv[1]); print(*[engine.find(each).success for each in sys.argv[2:]])"
-    found = python("-c", f"import sys; from dengine import DataEngine; {text}", store, *(id_ for id_, _ in lines))
-    assert found.split()[-40:] == [str(label == "1") for _, label in lines]
+    result = python("-c", f"import sys; from dengine import DataEngine; {text}", store, *(id_ for id_, _ in lines))
+    assert result.split()[-40:] == [str(label == "1") for _, label in lines]
 
 
 def test_a_child_process_does_not_keep_the_cell(tmp_path: Path) -> None:

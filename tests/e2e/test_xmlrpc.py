@@ -50,13 +50,13 @@ def cell(tmp_path_factory: pytest.TempPathFactory, stream: Dataset) -> Iterator[
     with a_service(tmp_path_factory.mktemp("cell") / "cell.db") as service:
         app = create_app(service, Access(rate=0.0, largest=200_000), page=False, recorder=recorder)
         with served(app) as port:
-            made = Cell(service, recorder, port)
-            robot = made.robot()
+            created = Cell(service, recorder, port)
+            robot = created.robot()
             for i in range(50):  # it retrains after 40
                 answer = robot.decide(stream.X[i].tolist())
                 if answer["action"] == VERIFY:
                     assert robot.report(answer["id"], bool(stream.y[i]))
-            yield made
+            yield created
 
 
 def fault_of(answer: tuple[int, bytes]) -> xmlrpc.client.Fault:
@@ -82,8 +82,8 @@ def test_a_cell_over_xml_rpc_learns_and_accepts(cell: Cell, stream: Dataset) -> 
     assert ACCEPT in {answer["action"] for answer in answers}
     for i, answer in enumerate(answers):
         assert (answer["id"], type(answer["action"]), type(answer["lower"])) == (f"order-{i}", int, float)
-        known = cell.find(f"order-{i}")
-        assert (known.decision.part, np.array_equal(known.trace[0], stream.X[50 + i])) == (f"P{i}", True)
+        match = cell.find(f"order-{i}")
+        assert (match.decision.part, np.array_equal(match.trace[0], stream.X[50 + i])) == (f"P{i}", True)
 
 
 def test_a_trace_in_pieces_is_the_same_trace(cell: Cell, stream: Dataset) -> None:
@@ -95,8 +95,8 @@ def test_a_trace_in_pieces_is_the_same_trace(cell: Cell, stream: Dataset) -> Non
     assert np.array_equal(cell.find("whole").trace[0], stream.X[1])
     answer = robot.decide_added(id_, 7)
     assert (answer["id"], robot.decide_added(id_, 7), robot.action_added(id_)) == (id_, answer, answer["action"])
-    known = cell.find(id_)
-    assert (known.decision.part, np.array_equal(known.trace[0], stream.X[1])) == ("7", True)
+    match = cell.find(id_)
+    assert (match.decision.part, np.array_equal(match.trace[0], stream.X[1])) == ("7", True)
     ids = [robot.begin() for _ in range(9)]  # more than are kept
     for wrong, call in (
         ("Expected begin and add", lambda: robot.decide_added("unheard of")),
@@ -155,9 +155,9 @@ def test_reports_are_a_bool_and_one_a_decision(cell: Cell, stream: Dataset) -> N
     assert robot.decide(far, "far")["action"] == VERIFY
     assert robot.report("far", 1) is True
     assert robot.report("far", True) is True
-    for said in (False, "OK", -1):
+    for text in (False, "OK", -1):
         with pytest.raises(xmlrpc.client.Fault, match=r"Expected|already"):
-            robot.report("far", said)
+            robot.report("far", text)
     assert robot.report("unheard of", True) is False
 
 

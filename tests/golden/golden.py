@@ -86,14 +86,14 @@ def restart(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
 
 def correct(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
     """Five labels were wrong."""
-    for cycle in [each for each in cycles if each.success][-5:]:
+    for cycle in [item for item in cycles if item.success][-5:]:
         engine.correct(cycle.decision.id, success=False)
     return engine
 
 
 def forget(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
     """Ten labels are worth nothing."""
-    engine.forget(*[each.decision.id for each in cycles if each.success is not None][-10:])
+    engine.forget(*[cycle.decision.id for cycle in cycles if cycle.success is not None][-10:])
     return engine
 
 
@@ -142,7 +142,7 @@ class Story:
     def play(self, folder: Path) -> Arrays:
         engine, cycles = self.live(folder / "engine.db")
         engine.close()
-        return of_decisions([each.decision for each in cycles]) | of_retrains(each.retrain for each in cycles)
+        return of_decisions([cycle.decision for cycle in cycles]) | of_retrains(cycle.retrain for cycle in cycles)
 
 
 class Late(Story):
@@ -193,7 +193,7 @@ class Exported(Story):
         data = self.parts(self.seed)
         rest = Dataset(data.X[CYCLES:], data.y[CYCLES:], part=data.part[CYCLES:])
         heard = np.random.default_rng(self.seed).random(len(rest)) < np.where(rest.y == 1, 0.4, 1.0)
-        return rest, [str(y) if each else "" for y, each in zip(rest.y, heard, strict=True)]
+        return rest, [str(y) if item else "" for y, item in zip(rest.y, heard, strict=True)]
 
     def play(self, folder: Path) -> Arrays:
         return self.ask(self.export(folder))
@@ -234,39 +234,45 @@ STORIES: dict[str, Story | Replayed] = {
 
 def of_answers(decisions: list[Any]) -> Arrays:
     """What an engine and an exported file both say; enumerations by name, no embedding as NaN."""
-    shape = next(np.shape(each.embedding) for each in decisions if each.embedding is not None)
-    points = [np.full(shape, np.nan) if each.embedding is None else each.embedding for each in decisions]
+    shape = next(np.shape(decision.embedding) for decision in decisions if decision.embedding is not None)
+    points = [np.full(shape, np.nan) if decision.embedding is None else decision.embedding for decision in decisions]
     return {
-        "action": np.array([str(each.action) for each in decisions]),
-        "reason": np.array([str(each.reason) for each in decisions]),
-        "lower": np.array([each.lower for each in decisions]),
-        "upper": np.array([each.upper for each in decisions]),
-        "n_success": np.array([each.n_success for each in decisions]),
-        "n_failure": np.array([each.n_failure for each in decisions]),
+        "action": np.array([str(decision.action) for decision in decisions]),
+        "reason": np.array([str(decision.reason) for decision in decisions]),
+        "lower": np.array([decision.lower for decision in decisions]),
+        "upper": np.array([decision.upper for decision in decisions]),
+        "n_success": np.array([decision.n_success for decision in decisions]),
+        "n_failure": np.array([decision.n_failure for decision in decisions]),
         "embedding": np.array(points, dtype=np.float64),
     }
 
 
 def of_decisions(decisions: list[Decision]) -> Arrays:
     return of_answers(decisions) | {
-        "version": np.array([each.model_version for each in decisions]),
-        "audit": np.array([each.audit for each in decisions]),
-        "predicted": np.array([str(each.predicted) for each in decisions]),
+        "version": np.array([decision.model_version for decision in decisions]),
+        "audit": np.array([decision.audit for decision in decisions]),
+        "predicted": np.array([str(decision.predicted) for decision in decisions]),
     }
 
 
 def of_retrains(retrains: Iterable[RetrainReport | None]) -> Arrays:
     """One row a retrain."""
-    rows = [(each.version, each.n_traces, each.n_steps, each.accepted) for each in retrains if each is not None]
+    rows = [
+        (retrain.version, retrain.n_traces, retrain.n_steps, retrain.accepted)
+        for retrain in retrains
+        if retrain is not None
+    ]
     return {"retrains": np.array(rows, dtype=np.int64)}
 
 
 def machine() -> dict[str, str]:
     """What may change the last digit of a float: libraries choose their code by the model."""
     about = Path("/proc/cpuinfo")
-    known = dict(re.findall(r"^(.+?)\s*: (.*)$", about.read_text(encoding="utf-8"), re.M)) if about.exists() else {}
+    existing = dict(re.findall(r"^(.+?)\s*: (.*)$", about.read_text(encoding="utf-8"), re.M)) if about.exists() else {}
     return {
-        "processor": " ".join([platform.machine(), *(known.get(key, "") for key in ("vendor_id", "cpu family", "model"))]),
+        "processor": " ".join(
+            [platform.machine(), *(existing.get(key, "") for key in ("vendor_id", "cpu family", "model"))]
+        ),
         "capability": torch.backends.cpu.get_cpu_capability(),
         "torch": torch.__version__.split("+")[0],
         "numpy": np.__version__,

@@ -69,9 +69,9 @@ def test_the_cell_program_takes_the_same_decisions(name: str, exported, programs
     (data, labels), answers = STORIES[name].told(), []
     with Program(programs, exported(name), "--journal", tmp_path / "cell.csv") as cell:
         for x, part, label in zip(data.X, data.part, labels, strict=True):
-            id_, *said, _ = cell.decide(x, part)  # without the time that it took
-            answers.append(said)
-            if label and said[0] != Action.REJECT:
+            id_, *text, _ = cell.decide(x, part)  # without the time that it took
+            answers.append(text)
+            if label and text[0] != Action.REJECT:
                 assert cell.ask(f"label {id_} {label}") == f"ok {id_}"
     words = np.array(answers)
     expected = kept(name)
@@ -94,9 +94,9 @@ def test_a_restart_changes_no_decision() -> None:
 
 def test_what_is_kept_has_met_everything_that_it_stands_for() -> None:
     stories = {name: kept(name) for name, story in STORIES.items() if not isinstance(story, Replayed)}
-    reasons = set(np.concatenate([each["reason"] for each in stories.values()]))
+    reasons = set(np.concatenate([item["reason"] for item in stories.values()]))
     never = {Reason.SATURATED, Reason.MODEL_ERROR, Reason.NO_STORE, Reason.LATE, Reason.OUTSIDE, Reason.TOO_LARGE}
-    assert reasons == {str(each) for each in set(Reason) - never}
-    assert all(set(each["action"]) == {str(each) for each in Action} for each in stories.values())
-    assert all(each["action"].shape == each["lower"].shape for each in stories.values())
-    assert all(len(each["retrains"]) >= 2 for name, each in stories.items() if name not in EXPORTED)
+    assert reasons == {str(item) for item in set(Reason) - never}
+    assert all(set(item["action"]) == {str(item) for item in Action} for item in stories.values())
+    assert all(item["action"].shape == item["lower"].shape for item in stories.values())
+    assert all(len(item["retrains"]) >= 2 for name, item in stories.items() if name not in EXPORTED)

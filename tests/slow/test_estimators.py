@@ -61,7 +61,7 @@ label_using = pytest.mark.parametrize("name", [name for name, reducer in SMALL.i
 
 
 # An exclusion must fail: `xfail_strict`.
-@parametrize_with_checks(list(ESTIMATORS), expected_failed_checks=lambda each: EXCLUDED.get(type(each), {}))
+@parametrize_with_checks(list(ESTIMATORS), expected_failed_checks=lambda item: EXCLUDED.get(type(item), {}))
 def test_scikit_learns_estimator_checks_pass(estimator: Any, check: Any) -> None:
     check(estimator)
 
@@ -82,7 +82,7 @@ def test_one_channel_may_be_left_out_of_the_shape(name: str) -> None:
     assert flat.trace_shape_ == full.trace_shape_ == (1, 30)
 
 
-@pytest.mark.parametrize("name", [n for n, each in SMALL.items() if "random_state" in each.get_params(deep=False)])
+@pytest.mark.parametrize("name", [n for n, item in SMALL.items() if "random_state" in item.get_params(deep=False)])
 def test_random_state_is_none_an_integer_or_a_random_state(name: str) -> None:
     X, y = traces()
     fits = [
@@ -101,8 +101,8 @@ def test_random_state_is_none_an_integer_or_a_random_state(name: str) -> None:
 def test_of_two_classes_the_larger_is_the_success(name: str, names: tuple[Any, Any]) -> None:
     X, y = traces()
     renamed = np.array(names)[y]
-    found, expected = (clone(SMALL[name]).fit(X, labels).transform(X) for labels in (renamed, y))
-    np.testing.assert_array_equal(found, expected)
+    result, expected = (clone(SMALL[name]).fit(X, labels).transform(X) for labels in (renamed, y))
+    np.testing.assert_array_equal(result, expected)
 
 
 @label_using

@@ -74,5 +74,5 @@ def test_nothing_before_contact_and_nothing_of_the_sensor_tells_the_outcome(stor
         "samples": before[:, ::4],
         "sensor": stored["conditions"][:, [names.index(name) for name in sensor]],
     }
-    found = {name: accuracy(seen, stored["y"], forest()) for name, seen in features.items()}
-    assert max(found.values()) < 0.58, found  # the majority is 0.534
+    result = {name: accuracy(seen, stored["y"], forest()) for name, seen in features.items()}
+    assert max(result.values()) < 0.58, result  # the majority is 0.534

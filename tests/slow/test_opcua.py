@@ -53,7 +53,7 @@ class Plant:
 
     async def decide(self, trace: np.ndarray, request: str = "", part: str = "", channels: int = 1) -> list[Any]:
         arguments = (trace.ravel().tolist(), FLOAT), (channels, COUNT), (request, TEXT), (part, TEXT)
-        return await self.call("Decide", *(ua.Variant(*each) for each in arguments))
+        return await self.call("Decide", *(ua.Variant(*argument) for argument in arguments))
 
     async def report(self, id_: str, success: bool) -> bool:
         return await self.call("Report", ua.Variant(id_, TEXT), ua.Variant(success))
@@ -69,8 +69,8 @@ def anyio_backend() -> str:
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CellService]:
-    with a_service(tmp_path_factory.mktemp("cell") / "cell.db") as made:
-        yield made
+    with a_service(tmp_path_factory.mktemp("cell") / "cell.db") as created:
+        yield created
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +100,8 @@ async def test_a_plc_decides_and_reports_and_a_scada_sees_it(plant: Plant, strea
     with pytest.raises(ua.uaerrors.BadInvalidArgument):
         await plant.decide(stream.X[1], "order-0")
     assert "got another" in await plant.value("LastRefused")
-    known = await plant.service.find("order-7")
-    assert (known.decision.part, np.array_equal(known.trace[0], stream.X[7])) == ("P7", True)
+    match = await plant.service.find("order-7")
+    assert (match.decision.part, np.array_equal(match.trace[0], stream.X[7])) == ("P7", True)
 
 
 async def test_the_variables_and_methods_are_as_they_are_described_and_read_only(plant: Plant) -> None:
@@ -122,8 +122,8 @@ async def test_the_variables_and_methods_are_as_they_are_described_and_read_only
     ):
         for name, arguments in (("InputArguments", taken), ("OutputArguments", given)):
             node = await plant.node(f"Cell.{method}").get_child(f"0:{name}")
-            said = [(each.Name, each.DataType.Identifier, each.ValueRank) for each in await node.read_value()]
-            assert said == [(name, type_.value, 1 if array else -1) for name, type_, array, _ in arguments]
+            texts = [(item.Name, item.DataType.Identifier, item.ValueRank) for item in await node.read_value()]
+            assert texts == [(name, type_.value, 1 if array else -1) for name, type_, array, _ in arguments]
 
 
 @pytest.mark.parametrize("empty", [None, ""])
@@ -135,12 +135,12 @@ async def test_the_example_client_plays_a_shift_with_a_controllers_types_and_emp
         async with opcua.opcua_server(service, port=0) as server:
             counts, *variables = await play(f"opc.tcp://127.0.0.1:{server.bserver.port}/dengine", 120, empty)
             await service.call(lambda engine: engine.flush())
-        known = [past.decision for past in service.read_store.decisions(HistoryFilter(), 1000)]
-    n = {action: sum(each.action == action for each in known) for action in ("verify", "accept", "reject")}
+        expected = [past.decision for past in service.read_store.decisions(HistoryFilter(), 1000)]
+    n = {action: sum(item.action == action for item in expected) for action in ("verify", "accept", "reject")}
     assert counts == ", ".join(f"{count} {action}" for action, count in n.items())
     assert (sum(n.values()), n["accept"] > 0) == (120, True)
-    assert sum(each.part is None for each in known) == 60  # an empty text, or none, is no part's number
-    assert all(len(each.id) > 3 for each in known)  # nor an id of the caller's
+    assert sum(item.part is None for item in expected) == 60  # an empty text, or none, is no part's number
+    assert all(len(item.id) > 3 for item in expected)  # nor an id of the caller's
     assert [line.partition(": ")[0] for line in variables][:2] == ["Decisions", "VerifiedShare"]
 
 
@@ -162,7 +162,7 @@ TYPES = {
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "kind", "called"), [(name, *each) for name, some in TYPES.items() for each in some]
+    ("name", "value", "kind", "called"), [(name, *item) for name, some in TYPES.items() for item in some]
 )
 async def test_a_wrong_type_is_named(plant: Plant, name: str, value: Any, kind: str, called: str) -> None:
     given = {
@@ -179,15 +179,15 @@ async def test_a_wrong_type_is_named(plant: Plant, name: str, value: Any, kind: 
 
 
 def wrong_calls() -> list[tuple[str, tuple[Any, ...], type]]:
-    trace, one, none = ua.Variant([1.0] * 60, FLOAT), ua.Variant(1, COUNT), ua.Variant("", TEXT)
+    trace, first, none = ua.Variant([1.0] * 60, FLOAT), ua.Variant(1, COUNT), ua.Variant("", TEXT)
     bad, few = ua.uaerrors.BadInvalidArgument, ua.uaerrors.BadArgumentsMissing
     return [
         ("Decide", (), few),
-        ("Decide", (ua.Variant([1.0] * 60, ua.VariantType.Double), one, none, none), bad),
-        ("Decide", (ua.Variant([], FLOAT, is_array=True), one, none, none), bad),
+        ("Decide", (ua.Variant([1.0] * 60, ua.VariantType.Double), first, none, none), bad),
+        ("Decide", (ua.Variant([], FLOAT, is_array=True), first, none, none), bad),
         ("Decide", (trace, ua.Variant(2, COUNT), none, none), bad),  # two channels of a cell of one
-        ("Decide", (ua.Variant([1.0] * 10, FLOAT), one, none, none), bad),
-        ("Decide", (trace, one, ua.Variant("a\nb", TEXT), none), bad),
+        ("Decide", (ua.Variant([1.0] * 10, FLOAT), first, none, none), bad),
+        ("Decide", (trace, first, ua.Variant("a\nb", TEXT), none), bad),
         ("Report", (ua.Variant("order-1", TEXT), ua.Variant(1, ua.VariantType.Int32)), bad),
     ]
 
@@ -214,8 +214,8 @@ async def test_an_alarm_is_a_variable_and_an_event(plant: Plant, stream: Dataset
     assert await plant.until("Shadow", bool)
     await plant.service.call(lambda engine: engine.set_shadow(False, "the operator"))
     assert not await plant.until("Shadow", lambda on: not on)
-    found = await plant.service.status()
-    monkeypatch.setattr(plant.service, "status", lambda: asyncio.sleep(0, replace(found, store_fault="disk full")))
+    result = await plant.service.status()
+    monkeypatch.setattr(plant.service, "status", lambda: asyncio.sleep(0, replace(result, store_fault="disk full")))
     await plant.decide(stream.X[0])
     assert await plant.until("Alarm", bool)
     event = await asyncio.wait_for(heard.get(), 60)

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from dengine.cells.simulation.cell import SimulatedInsertion, SimulatedCell, insert_once
+from dengine.cells.simulation.cell import SimulatedCell, SimulatedInsertion, insert_once
 from dengine.cells.simulation.conditions import SCENARIOS, CellParameters, Conditions, draw_conditions, find_scenario
 from dengine.cells.simulation.generate import save_insertions, simulate
 from dengine.cells.simulation.world import push
@@ -37,7 +37,7 @@ def test_a_well_aligned_part_meets_the_bottom_late_and_one_beside_the_hole_rests
 
 
 def traces(insertions: list[SimulatedInsertion]) -> np.ndarray:
-    return np.stack([each.trace for each in insertions])
+    return np.stack([insertion.trace for insertion in insertions])
 
 
 def test_a_trace_depends_on_seed_and_cycle_only() -> None:
@@ -49,8 +49,8 @@ def test_a_trace_depends_on_seed_and_cycle_only() -> None:
 def test_the_cell_still_makes_the_bundled_traces() -> None:
     with (files("dengine") / "data" / "insertion.npz").open("rb") as file, np.load(file) as stored:
         bundled, cycles, seed = stored["X"][:5] * stored["scale"], stored["cycle"][:5], int(stored["seed"])
-    made = np.stack([insert_once(CellParameters(), seed, int(cycle)).trace for cycle in cycles])
-    assert np.median(np.abs(made - bundled)) < 0.02  # N; another processor may differ in the last digits
+    created = np.stack([insert_once(CellParameters(), seed, int(cycle)).trace for cycle in cycles])
+    assert np.median(np.abs(created - bundled)) < 0.02  # N; another processor may differ in the last digits
 
 
 def test_the_clock_charges_cycles_verifications_and_stops() -> None:
@@ -74,7 +74,7 @@ def test_the_clock_charges_cycles_verifications_and_stops() -> None:
 def test_scenarios_change_what_they_say_and_nothing_else() -> None:
     base = CellParameters()
     late = {name: asdict(scenario(base, 99, 100)) for name, scenario in SCENARIOS.items()}
-    changed = {name: {key for key, value in asdict(base).items() if each[key] != value} for name, each in late.items()}
+    changed = {name: {key for key, value in asdict(base).items() if item[key] != value} for name, item in late.items()}
     variant = {"part_mass_kg", "clearance_mm", "chamfer_mm"}
     assert changed == {"nominal": set(), "wear": {"friction"}, "variant": variant, "bias_jump": {"bias_offset_n"}}
     assert SCENARIOS["wear"](base, 99, 100).friction[0] == pytest.approx(base.friction[0] + 0.35)
@@ -99,10 +99,10 @@ def test_a_bad_setting_says_what_was_expected(bad: object, message: str) -> None
 
 
 def test_saved_traces_come_back_within_one_step(tmp_path) -> None:
-    made = simulate(4, seed=6, n_jobs=1)
-    with np.load(save_insertions(tmp_path / "traces.npz", made, seed=6), allow_pickle=False) as saved:
+    created = simulate(4, seed=6, n_jobs=1)
+    with np.load(save_insertions(tmp_path / "traces.npz", created, seed=6), allow_pickle=False) as saved:
         assert (saved["X"].dtype, saved["X"].shape) == (np.int16, (4, 1000))
-        np.testing.assert_allclose(saved["X"] * saved["scale"], traces(made), atol=0.51 * float(saved["scale"].max()))
-        np.testing.assert_array_equal(saved["y"], [each.success for each in made])
-        np.testing.assert_array_equal(saved["cause"], [each.cause for each in made])
+        np.testing.assert_allclose(saved["X"] * saved["scale"], traces(created), atol=0.51 * float(saved["scale"].max()))
+        np.testing.assert_array_equal(saved["y"], [item.success for item in created])
+        np.testing.assert_array_equal(saved["cause"], [item.cause for item in created])
         assert float(saved["rate_hz"]) == 500

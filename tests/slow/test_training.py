@@ -45,9 +45,9 @@ def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run: Run, tmp_pa
     assert "Without screw driving" in first
     assert "\n12 replays are left" in first
     assert "\n0 replays are left" in second
-    rows, told = (pd.read_csv(tmp_path / "evidence" / f"{name}.csv") for name in ("replays", "differences"))
+    rows, answer = (pd.read_csv(tmp_path / "evidence" / f"{name}.csv") for name in ("replays", "differences"))
     certain = rows[rows["alpha"] == 0.1].pivot_table("certain", "seed", "recipe")
-    more = told.query("alpha == 0.1 and recipe == 'knn'").iloc[0]
+    more = answer.query("alpha == 0.1 and recipe == 'knn'").iloc[0]
     assert more["certain_more"] == pytest.approx((certain["knn"] - certain["conv"]).mean(), abs=1e-3)
     assert more["certain_low"] < more["certain_more"] < more["certain_high"]
     assert "| opposite | " in (tmp_path / "evidence" / "tables.md").read_text(encoding="utf-8")
@@ -55,11 +55,13 @@ def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run: Run, tmp_pa
 
 def test_a_row_of_the_evidence_gives_way_where_another_commit_plays_its_condition() -> None:
     evidence = load("evidence")
-    known = {"set": "drift", "interval": "wilson", "alpha": 0.1, "lower_bound": 0.9}
-    old = pd.DataFrame([known | {"recipe": who, "seed": seed, "commit": "a"} for who in ("pca", "conv") for seed in (1, 2)])
-    new = pd.DataFrame([known | {"recipe": "conv", "seed": 2, "commit": "b"}])
-    found = evidence.merged(old, new)[["recipe", "seed", "commit"]]
-    assert found.to_numpy().tolist() == [["conv", 2, "b"], ["pca", 1, "a"], ["pca", 2, "a"]]
+    settings = {"set": "drift", "interval": "wilson", "alpha": 0.1, "lower_bound": 0.9}
+    old = pd.DataFrame(
+        [settings | {"recipe": who, "seed": seed, "commit": "a"} for who in ("pca", "conv") for seed in (1, 2)]
+    )
+    new = pd.DataFrame([settings | {"recipe": "conv", "seed": 2, "commit": "b"}])
+    result = evidence.merged(old, new)[["recipe", "seed", "commit"]]
+    assert result.to_numpy().tolist() == [["conv", 2, "b"], ["pca", 1, "a"], ["pca", 2, "a"]]
 
 
 def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeated(run: Run, tmp_path: Path) -> None:
@@ -70,8 +72,8 @@ def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeat
     for cycle, part, result in ((7, "a", "NOK"), (5, "a", "OK"), (6, "b", "OK")):
         written = {"cycle": cycle, "id code": part, "result": result, "tightening steps": graphs}
         (tmp_path / f"Ch_{cycle:012d}.json").write_text(json.dumps(written), encoding="utf-8")
-    said = run("make_screw_driving", tmp_path, "--samples", 7, "--out", tmp_path / "out.npz")
-    assert "3 runs of 2 workpieces, 2 OK and 1 NOK" in said
+    completed = run("make_screw_driving", tmp_path, "--samples", 7, "--out", tmp_path / "out.npz")
+    assert "3 runs of 2 workpieces, 2 OK and 1 NOK" in completed
     data = load_dataset(tmp_path / "out.npz")
     np.testing.assert_allclose(data.X, [[0.0, 0.1, 0.2, 0.3, 0.5, 0.5, 0.5]] * 3, atol=1e-6)
     assert (data.y.tolist(), data.unit, round(data.rate_hz)) == ([1, 1, 0], "N·m", 833)

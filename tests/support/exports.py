@@ -12,7 +12,7 @@ from tests.support.driving import learn
 
 SAMPLES, LIMIT = 100, 500.0
 WINDOWS = (ForceLimits(0.02, 0.06, high=5.0), ForceLimits(0.1, 0.15, low=-20.0, high=22.5, reject=True))
-OF_POLICY = {each.name for each in fields(Policy)}
+OF_POLICY = {field.name for field in fields(Policy)}
 
 
 def recipe(**settings: Any) -> Recipe:
@@ -39,7 +39,7 @@ def fitted(data: Dataset, reducer: Any = "pca", **settings: Any) -> ModelPredict
 def cell_journal(*lines: str | bytes, head: str = "# dengine 4 0123") -> bytes:
     """A cell program's journal of these lines, each with the checksum over all so far."""
     crc, text = zlib.crc32(head.encode()), head.encode() + b"\n"
-    for line in (each.encode() if isinstance(each, str) else each for each in lines):
+    for line in (item.encode() if isinstance(item, str) else item for item in lines):
         crc = zlib.crc32(line, crc)
         text += b"%s,%08x\n" % (line, crc)
     return text

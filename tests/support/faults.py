@@ -76,7 +76,7 @@ class Trial:
 def read_faults(only: Sequence[str]) -> list[Fault]:
     """The faults of the list whose names contain one of `only`; ListError for one that fits no longer."""
     faults = [Fault(**row) for row in tomllib.loads(LIST.read_text(encoding="utf-8"))["fault"]]
-    wrong = [each for fault in faults for each in fault.wrong()]
+    wrong = [item for fault in faults for item in fault.wrong()]
     wrong += [f"no fault named {name!r}" for name in only if not any(name in fault.name for fault in faults)]
     if wrong or len({fault.name for fault in faults}) < len(faults):
         raise ListError("\n".join(wrong) or "two faults of one name")
@@ -103,11 +103,11 @@ def run_tests(tests: Sequence[str], tree: Path, tier: str, seconds: float = SECO
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "errors": "replace"}
     with subprocess.Popen(command, cwd=tree, env=surroundings, start_new_session=True, **pipes) as process:
         try:
-            said, _ = process.communicate(timeout=seconds)
+            text, _ = process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)  # the tests' own processes too
             return None, process.communicate()[0]
-    return process.returncode, said
+    return process.returncode, text
 
 
 def try_one(fault: Fault, tree: Path, tier: str) -> Trial:
@@ -126,8 +126,8 @@ def try_one(fault: Fault, tree: Path, tier: str) -> Trial:
 
 def check_without(tests: Sequence[str], tree: Path, tier: str) -> str:
     """What to say of tests that do not pass in the tree as it is; "" where they do."""
-    code, said = run_tests(tests, tree, tier, SECONDS * len(tests))
-    return "" if code in (0, NONE) else f"tests fail without the fault: {' '.join(tests)}\n{said[-1500:]}"
+    code, text = run_tests(tests, tree, tier, SECONDS * len(tests))
+    return "" if code in (0, NONE) else f"tests fail without the fault: {' '.join(tests)}\n{text[-1500:]}"
 
 
 def tests_by_file(faults: Sequence[Fault]) -> list[list[str]]:

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 def plans(database: Path) -> Iterator[list[tuple[str, list[str]]]]:
     """Fill a list, once its block has ended, with the SELECTs that were sent in it and the steps of their plans."""
     sent: list[tuple[str, Any]] = []
-    found: list[tuple[str, list[str]]] = []
+    results: list[tuple[str, list[str]]] = []
 
     def catch(connection: Any, cursor: Any, statement: str, parameters: Any, context: Any, many: bool) -> None:
         if statement.startswith("SELECT"):
@@ -21,11 +21,11 @@ def plans(database: Path) -> Iterator[list[tuple[str, list[str]]]]:
 
     sa.event.listen(sa.Engine, "before_cursor_execute", catch)
     try:
-        yield found
+        yield results
     finally:
         sa.event.remove(sa.Engine, "before_cursor_execute", catch)
     plain = sqlite3.connect(database)
     for statement, parameters in sent:
         rows = plain.execute(f"EXPLAIN QUERY PLAN {statement}", parameters).fetchall()
-        found.append((statement, [row[-1] for row in rows]))
+        results.append((statement, [row[-1] for row in rows]))
     plain.close()

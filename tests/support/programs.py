@@ -30,8 +30,8 @@ class Program:
             self.process.stdin.write(line + "\n")
         except BrokenPipeError:
             return ""
-        said = self.process.stdout.readline()
-        return said.rstrip("\n") if said.endswith("\n") else ""
+        text = self.process.stdout.readline()
+        return text.rstrip("\n") if text.endswith("\n") else ""
 
     def decide(self, x: np.ndarray, part: str | None = None) -> list[str]:
         """The words of a decision: its id, action, reason, ...; no more than "" where the program is gone."""
@@ -39,14 +39,14 @@ class Program:
 
     def end(self) -> tuple[int, str]:
         """Its exit code and what it said on stderr."""
-        _, said = self.process.communicate(timeout=60)
-        return self.process.returncode, said
+        _, text = self.process.communicate(timeout=60)
+        return self.process.returncode, text
 
     def must_refuse(self, why: str) -> None:
         """It ended by itself and said why; nothing was decided."""
-        out, said = self.process.communicate(timeout=60)
+        out, text = self.process.communicate(timeout=60)
         assert (self.process.returncode, out) == (1, "")
-        assert why in said
+        assert why in text
 
 
 def asked(x: np.ndarray, part: str | None = None) -> str:

@@ -27,4 +27,6 @@ def same(one: Replay, other: Replay, *but: str) -> None:
     for f in fields(Replay):
         if f.name not in (*TIMES, *but):
             np.testing.assert_array_equal(getattr(one, f.name), getattr(other, f.name), err_msg=f.name)
-    assert [replace(each, seconds=0.0) for each in one.retrains] == [replace(each, seconds=0.0) for each in other.retrains]
+    assert [replace(retrain, seconds=0.0) for retrain in one.retrains] == [
+        replace(retrain, seconds=0.0) for retrain in other.retrains
+    ]

@@ -67,10 +67,10 @@ class Process:
             data, kind = (None, {}) if body is None else (json.dumps(body), {"content-type": "application/json"})
             connection.request("GET" if body is None else "POST", path, data, kind)
             answer = connection.getresponse()
-            said: dict[str, Any] = json.loads(answer.read())
+            document: dict[str, Any] = json.loads(answer.read())
         if answer.status != 200:
-            raise OSError(f"{path}: {answer.status} {said}")
-        return said
+            raise OSError(f"{path}: {answer.status} {document}")
+        return document
 
     def end(self, number: int = signal.SIGTERM, group: bool = False) -> int:
         """Send a signal, to its whole group as a terminal does where asked, and return its exit code."""
@@ -87,11 +87,11 @@ def started(folder: Path, *words: str, wait: bool = True, python_path: str = str
     environment = os.environ | {"PYTHONPATH": python_path}
     process = subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True, **pipes)
     try:
-        lines, said = [], None
-        while wait and said is None and (line := process.stdout.readline()):
-            lines, said = [*lines, line], re.search(r"is served at \S+:(\d+)", line)
-        assert said is not None or not wait, "".join(lines)
-        yield Process(process, int(said[1]) if said else 0)
+        lines, match = [], None
+        while wait and match is None and (line := process.stdout.readline()):
+            lines, match = [*lines, line], re.search(r"is served at \S+:(\d+)", line)
+        assert match is not None or not wait, "".join(lines)
+        yield Process(process, int(match[1]) if match else 0)
     finally:
         if process.poll() is None:
             process.kill()
@@ -135,9 +135,9 @@ def certificate(folder: Path, *uris: str) -> None:
 
     key, now = rsa.generate_private_key(65537, 2048), datetime.now(UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
-    made = x509.CertificateBuilder(name, name, key.public_key(), 7, now - timedelta(1), now + timedelta(2))
+    created = x509.CertificateBuilder(name, name, key.public_key(), 7, now - timedelta(1), now + timedelta(2))
     others = [x509.DNSName("localhost"), *map(x509.UniformResourceIdentifier, uris)]
-    signed = made.add_extension(x509.SubjectAlternativeName(others), critical=False).sign(key, hashes.SHA256())
+    signed = created.add_extension(x509.SubjectAlternativeName(others), critical=False).sign(key, hashes.SHA256())
     pem, form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
     (folder / "cert.pem").write_bytes(signed.public_bytes(pem))
     (folder / "key.pem").write_bytes(key.private_bytes(pem, form, serialization.NoEncryption()))

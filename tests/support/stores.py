@@ -43,16 +43,16 @@ def put_decision(
 
 def labelled(item: StoredDecision, success: bool) -> list[StoredDecision | NewLabel]:
     """A decision that was labelled when it was made."""
-    said = label(item.decision.id, bool(success))
-    return [item, replace(said, time=item.time, content_hash=item.content_hash, decided=item.time)]
+    text = label(item.decision.id, bool(success))
+    return [item, replace(text, time=item.time, content_hash=item.content_hash, decided=item.time)]
 
 
 def put_labels(store: SqlStore, *labels: NewLabel) -> list[int]:
     """Labels of decisions that are there; returns their numbers, in the order given."""
     now, taken = store.clock() if labels else 0.0, []
     for label in labels:
-        held = store.get_decision(label.decision_id, trace=False)
-        taken.append(replace(label, time=now, content_hash=held.content_hash, decided=held.time))
+        stored = store.get_decision(label.decision_id, trace=False)
+        taken.append(replace(label, time=now, content_hash=stored.content_hash, decided=stored.time))
     numbers = dict(store.apply_records(taken))
     return [numbers[label.decision_id] for label in labels]
 

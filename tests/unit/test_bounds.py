@@ -74,9 +74,9 @@ def test_both_bounds_grow_with_the_number_of_successes(interval, n: int, alpha: 
 
 
 @intervals
-@given(n_s=counts, n_f=counts, one=alphas, other=alphas)
-def test_a_smaller_alpha_never_narrows_the_interval(interval, n_s: int, n_f: int, one: float, other: float) -> None:
-    wide, narrow = interval(n_s, n_f, min(one, other)), interval(n_s, n_f, max(one, other))
+@given(n_s=counts, n_f=counts, first=alphas, other=alphas)
+def test_a_smaller_alpha_never_narrows_the_interval(interval, n_s: int, n_f: int, first: float, other: float) -> None:
+    wide, narrow = interval(n_s, n_f, min(first, other)), interval(n_s, n_f, max(first, other))
     assert wide[0] <= narrow[0] + 1e-12
     assert narrow[1] <= wide[1] + 1e-12
 

@@ -63,10 +63,10 @@ def test_where_nothing_can_be_said_the_sentence_says_what_to_set() -> None:
 
 @given(counts.filter(lambda c: c[0] > 5), alphas)
 def test_a_sentence_never_promises_more_than_the_bound(c: tuple[int, int], alpha: float) -> None:
-    found = certificate("all", 0.0, alpha, accepted=c[0], false_accepts=c[1])
-    if "at most" in found.sentence:
-        said = float(found.sentence.split("at most ")[1].split(" %")[0]) / 100
-        assert found.accepted.upper - 1e-12 <= said <= found.accepted.upper * 1.11
+    result = certificate("all", 0.0, alpha, accepted=c[0], false_accepts=c[1])
+    if "at most" in result.sentence:
+        text = float(result.sentence.split("at most ")[1].split(" %")[0]) / 100
+        assert result.accepted.upper - 1e-12 <= text <= result.accepted.upper * 1.11
 
 
 BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)
@@ -94,7 +94,7 @@ def test_the_mean_capital_is_one_at_the_tolerance_and_less_above_it(n: int, q: f
 
 
 @pytest.mark.parametrize(
-    ("stops", "audit_rate", "seen", "known"),
+    ("stops", "audit_rate", "seen", "expected"),
     [
         ("all", 0.0, {"accepted": 1203, "false_accepts": 24}, (1203, 1203, 24, 1.0)),
         ("some", 0.0, {"accepted": 1203, "false_accepts": 24, "confirmed": 1179}, (1203, 1203, 24, 1.0)),
@@ -102,26 +102,31 @@ def test_the_mean_capital_is_one_at_the_tolerance_and_less_above_it(n: int, q: f
         ("some", 0.02, {"accepted": 9800, "audited_accepts": 200, "audited_accepts_bad": 3}, (10_000, 200, 3, 0.02)),
     ],
 )
-def test_what_is_known_of_accepted_parts(stops: str, audit_rate: float, seen: dict[str, int], known) -> None:
-    found = certificate(stops, audit_rate, **seen).accepted
-    assert (found.n, found.n_with_outcome, found.n_bad, found.propensity) == known
-    assert found.upper == failure_bound(found.n, found.n_bad, found.alpha, found.propensity)
+def test_what_is_known_of_accepted_parts(stops: str, audit_rate: float, seen: dict[str, int], expected) -> None:
+    accepted = certificate(stops, audit_rate, **seen).accepted
+    assert (accepted.n, accepted.n_with_outcome, accepted.n_bad, accepted.propensity) == expected
+    assert accepted.upper == failure_bound(accepted.n, accepted.n_bad, accepted.alpha, accepted.propensity)
 
 
 def test_by_prices_it_says_what_was_saved_at_least_and_nothing_where_that_is_not_certain() -> None:
     policy = Policy(0.05, guarantee="cost", stops="all", prices=(5, 120, 47.5))
-    found = policy.certificate(Outcomes(accepted=1203, confirmed=1179, false_accepts=24))
+    result = policy.certificate(Outcomes(accepted=1203, confirmed=1179, false_accepts=24))
     upper = certificate("all", accepted=1203, false_accepts=24).accepted.upper
-    assert (found.tolerance, found.saved) == (5 / 120, pytest.approx(1203 * 5 - 120 * 1203 * upper))
-    assert found.sentence.endswith(f"not checking them saved at least {int(found.saved):,}.")
+    assert (result.tolerance, result.saved) == (5 / 120, pytest.approx(1203 * 5 - 120 * 1203 * upper))
+    assert result.sentence.endswith(f"not checking them saved at least {int(result.saved):,}.")
     outcomes = Outcomes(accepted=60, confirmed=58, false_accepts=2)
     assert policy.certificate(outcomes).sentence.endswith("saved nothing for certain.")
     assert certificate("all", accepted=1203, false_accepts=24).saved is None
 
 
 def test_one_sentence_says_what_was_kept_or_what_audits_tell_which_alone_know_of_rejected_parts() -> None:
-    found = certificate("all", 0.1, rejected=3600, audited_rejects=400, audited_rejects_good=2).rejected
-    assert (found.n, found.n_with_outcome, found.n_bad, certificate("all", rejected=9).rejected.upper) == (4000, 400, 2, 1.0)
+    rejected = certificate("all", 0.1, rejected=3600, audited_rejects=400, audited_rejects_good=2).rejected
+    assert (rejected.n, rejected.n_with_outcome, rejected.n_bad, certificate("all", rejected=9).rejected.upper) == (
+        4000,
+        400,
+        2,
+        1.0,
+    )
     end = " were bad on average, with 95 % confidence, however often one looks; the tolerance is 5 %."
     kept = certificate("all", accepted=1203, false_accepts=24)
     assert kept.kept

@@ -36,7 +36,7 @@ def test_decisions_follow_from_the_interval_and_the_interval_from_the_counts(int
     lower, upper = model.predict_interval(queries)
     np.testing.assert_allclose((lower, upper), policy.bound(*model.count(queries)), atol=1e-12)
     decisions = model.decide(queries)
-    assert list(decisions) == [policy.action(*each) for each in zip(lower, upper, strict=True)]
+    assert list(decisions) == [policy.action(*item) for item in zip(lower, upper, strict=True)]
     assert set(decisions) == set(Action)
 
 

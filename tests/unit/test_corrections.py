@@ -40,12 +40,12 @@ def asked(engine: DataEngine, data: Dataset) -> list:
 
 def state(engine: DataEngine) -> tuple:
     """All that decides what an engine does next."""
-    held = engine.store.labelled(engine.recipe.window)
+    stored = engine.store.labelled(engine.recipe.window)
     rule = engine.model and {name: t.tolist() for name, t in engine.model.rule.state_dict().items()}
     numbers = engine.model and sorted(engine.model.index.column("numbers").tolist())
     return (
         (engine.version, core_of(engine).new_labels, engine.safe_mode, engine.policy, engine.certificate(), rule),
-        (held.seq.tolist(), held.labels.tolist(), numbers),
+        (stored.seq.tolist(), stored.labels.tolist(), numbers),
     )
 
 
@@ -83,21 +83,21 @@ def test_a_label_is_corrected_and_forgotten_for_the_very_next_decision_and_comes
     cycle = next(c for c in reversed(play(engine, data, 0, 150, confirm=True)) if c.success)
     name, probe, n = cycle.decision.id, data.X[cycle.index] + np.float32(1e-4), len(engine.model.index)
     before, spaces = engine.decide(probe), engine.model.index.column("spaces").copy()
-    said = engine.correct(name, False, author="kim")
+    text = engine.correct(name, False, author="kim")
     after = engine.decide(probe)
     assert (after.n_success, after.n_failure) == (before.n_success - 1, before.n_failure + 1)
     assert (after.embedding, after.model_version) == (before.embedding, before.model_version)
     assert engine.model.index.column("spaces").tolist() == spaces.tolist()
     assert set(spaces) == set(fold_of(engine.model.index.column("parts"), engine.model.n_spaces))
-    assert "counts as a failure, was a success" in said.text
+    assert "counts as a failure, was a success" in text.text
     event = engine.store.events(1)[0]
-    assert (event.number, event.kind, event.author) == (said.event, "correct", "kim")
+    assert (event.number, event.kind, event.author) == (text.event, "correct", "kim")
     assert event.data == {"decisions": {name: {"was": True, "now": False}}}
-    said = engine.forget(name, author="kim", reason="another part lay in the fixture")
+    text = engine.forget(name, author="kim", reason="another part lay in the fixture")
     after = engine.decide(probe)
     assert (after.n_success, after.n_failure) == (before.n_success - 1, before.n_failure)
     assert len(engine.model.index) == n - 1
-    assert said.text == f"The label of {name} is forgotten: another part lay in the fixture."
+    assert text.text == f"The label of {name} is forgotten: another part lay in the fixture."
     assert engine.store.get_decision(name).trace.shape == (1, data.X.shape[1])
     engine.correct(name, True)
     assert evidence(engine.decide(probe)) == evidence(before)
@@ -181,15 +181,15 @@ def test_what_is_so_already_is_said_and_changes_nothing(data: Dataset) -> None:
     name = labelled(engine, 1)
     engine.forget(name)
     before = (state(engine), len(engine.store.events()))
-    held = labelled(engine, 2)
+    stored = labelled(engine, 2)
     answers = [
         engine.forget(name),
-        engine.correct(held, engine.store.get_decision(held).success),
+        engine.correct(stored, engine.store.get_decision(stored).success),
         engine.rollback(engine.version),
         engine.set_policy(engine.policy),
     ]
-    assert [each.event for each in answers] == [None] * 4
-    assert all("nothing changed" in each.text for each in answers)
+    assert [answer.event for answer in answers] == [None] * 4
+    assert all("nothing changed" in answer.text for answer in answers)
     assert (state(engine), len(engine.store.events())) == before
 
 
@@ -251,14 +251,14 @@ def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(recipe, 
     data, place = make_data(480, seed=3), tmp_path_factory.mktemp("again")
     with make(recipe, store=place / "engine.db") as engine:
         play(engine, data, 0, 90)
-        for each in steps:
-            step(engine, data, *each)
+        for item in steps:
+            step(engine, data, *item)
         start = engine.store.status()["decisions"]
         with again(engine, place) as reopened:
             assert asked(reopened, data) == asked(engine, data)
             assert state(reopened) == state(engine)
             rest = (start, start + 45)
-            first, second = (play(each, data, *rest) for each in (engine, reopened))
+            first, second = (play(item, data, *rest) for item in (engine, reopened))
             assert [evidence(c.decision) for c in first] == [evidence(c.decision) for c in second]
             assert state(reopened) == state(engine)
 
@@ -275,16 +275,16 @@ def test_a_late_stop_leaves_the_same_references_as_a_reopened_engine_has(data: D
 
 def test_a_transformer_that_is_fitted_again_is_fitted_on_what_it_saw(data: Dataset) -> None:
     """Its labels are corrected and forgotten afterwards; its places, and its references, stay where they were."""
-    own = LinearDiscriminantAnalysis()
-    engine = DataEngine(own, RECIPE.policy, retrain_every=40, replaying=True)
+    custom = LinearDiscriminantAnalysis()
+    engine = DataEngine(custom, RECIPE.policy, retrain_every=40, replaying=True)
     cycles = play(engine, data, 0, 90, confirm=True)
     engine.correct(cycles[3].decision.id, not cycles[3].success)
     engine.forget(cycles[4].decision.id, cycles[5].decision.id)
-    reopened = DataEngine.open(engine.store, reducer=own, replaying=True)
+    reopened = DataEngine.open(engine.store, reducer=custom, replaying=True)
     assert asked(reopened, data) == asked(engine, data)
     first = engine.store.retrains()[0].version
     engine.rollback(first)
-    reopened = DataEngine.open(engine.store, reducer=own, replaying=True)
+    reopened = DataEngine.open(engine.store, reducer=custom, replaying=True)
     assert asked(reopened, data) == asked(engine, data)
 
 
@@ -293,8 +293,8 @@ def test_an_earlier_version_answers_again_as_a_new_one_with_what_came_since(data
     cycles = play(engine, data, 0, 100, confirm=True)
     engine.correct(cycles[0].decision.id, not cycles[0].success)
     old, number, version = engine.model.spaces, engine.version - 1, engine.version
-    said = engine.rollback(number, author="kim")
-    assert (engine.version, said.version, said.kind) == (version + 1, version + 1, "rollback")
+    text = engine.rollback(number, author="kim")
+    assert (engine.version, text.version, text.kind) == (version + 1, version + 1, "rollback")
     assert engine.store.retrains()[-1].reason == f"rolled back to version {number}"
     assert engine.store.events(1)[0].data == {"to": number, "was": version, "now": version + 1}
     assert engine.model.spaces is not old
@@ -334,13 +334,13 @@ def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bou
     play(engine, data, 0, 150, confirm=True)
     probe = data.X[160]
     before = engine.decide(probe)
-    said = engine.set_policy(replace(engine.policy, alpha=0.001, lower_bound=0.99), author="kim")
+    text = engine.set_policy(replace(engine.policy, alpha=0.001, lower_bound=0.99), author="kim")
     after = engine.decide(probe)
     assert (before.action, after.action) == (Action.ACCEPT, Action.VERIFY)
     assert (after.n_success, after.n_failure) == (before.n_success, before.n_failure)
     assert after.lower < before.lower
     assert engine.store.get_decision(before.id).decision.lower == before.lower
-    assert said.text == "The policy's alpha 0.1 -> 0.001, lower_bound 0.9 -> 0.99."
+    assert text.text == "The policy's alpha 0.1 -> 0.001, lower_bound 0.9 -> 0.99."
     event = engine.store.events(1)[0]
     assert (event.data["old"]["alpha"], event.data["new"]["alpha"], event.author) == (0.1, 0.001, "kim")
     assert core_of(engine).exported().recipe == engine.recipe.to_toml()
@@ -387,8 +387,8 @@ def test_silence_under_an_earlier_policy_never_becomes_a_success(data: Dataset) 
     assert silent > 5
     engine.set_policy(replace(engine.policy, stops="all"))
     reopened = DataEngine.open(engine.store, replaying=True)
-    for each in (engine, reopened):
-        each.decide(data.X[160])
-        each.decide(data.X[161])
-        each.flush()
-        assert len(each.store.unreported_accepts()) >= silent
+    for item in (engine, reopened):
+        item.decide(data.X[160])
+        item.decide(data.X[161])
+        item.flush()
+        assert len(item.store.unreported_accepts()) >= silent

@@ -35,27 +35,27 @@ def curve(lax: Sequence[tuple[int, int]], strict: Sequence[tuple[int, int]] = ((
     """Of two policies; for each shuffle of 100 parts, how many were verified, and how many of the others were bad."""
     replays = [
         played(policy, seed, verified, 100 - verified, bad)
-        for policy, each in ((LAX, lax), (STRICT, strict))
-        for seed, (verified, bad) in enumerate(each)
+        for policy, item in ((LAX, lax), (STRICT, strict))
+        for seed, (verified, bad) in enumerate(item)
     ]
     return curve_of(replays, COSTS)
 
 
 def test_a_parts_cost_is_checks_and_errors_over_all_parts() -> None:
-    one = played(LAX, 0, verified=60, accepted=25, bad=2, rejected=15, good=3)
-    assert cost_per_part(one, COSTS) == pytest.approx((60 * 5 + 2 * 100 + 3 * 20) / 100)
-    assert cost_per_part(one, COSTS, slice(60, 85)) == pytest.approx(2 * 100 / 25)
+    first = played(LAX, 0, verified=60, accepted=25, bad=2, rejected=15, good=3)
+    assert cost_per_part(first, COSTS) == pytest.approx((60 * 5 + 2 * 100 + 3 * 20) / 100)
+    assert cost_per_part(first, COSTS, slice(60, 85)) == pytest.approx(2 * 100 / 25)
 
 
 def test_one_half_of_the_shuffles_chooses_and_the_other_reports() -> None:
-    found = curve(lax=[(50, 0), (50, 0), (50, 1), (60, 1)], strict=[(90, 0), (80, 0), (70, 0), (70, 0)])
-    lax, strict = found.rows
-    assert (found.choosing, found.reporting) == (2, 2)
+    result = curve(lax=[(50, 0), (50, 0), (50, 1), (60, 1)], strict=[(90, 0), (80, 0), (70, 0), (70, 0)])
+    lax, strict = result.rows
+    assert (result.choosing, result.reporting) == (2, 2)
     assert (lax.expected_cost, lax.cost) == (pytest.approx(2.5 + 50 * 0.5 / 51), (3.5 + 4.0) / 2)
     assert curve(lax=[(50, 0)] * 4, strict=[(50, 0)] * 4).policy == STRICT  # of equal ones
     assert (strict.expected_cost, strict.cost) == (pytest.approx(4.25 + 15 * 0.5 / 16), 3.5)
-    assert found.policy == LAX  # cheaper where it was chosen, though not where it is reported
-    assert f"{lax.cost:.3g} a part" in found.sentence
+    assert result.policy == LAX  # cheaper where it was chosen, though not where it is reported
+    assert f"{lax.cost:.3g} a part" in result.sentence
 
 
 def test_the_interval_moves_the_errors_to_their_ends_and_is_wider_than_the_luck_of_the_order() -> None:
@@ -78,10 +78,10 @@ def test_a_policy_pays_only_where_its_whole_interval_is_below_verifying_everythi
     "lax", [[(50, 5)] * 4, [(50, 0), (50, 0), (50, 5), (50, 5)]], ids=["never cheaper", "cheaper only where chosen"]
 )
 def test_where_nothing_pays_it_says_so_and_names_no_policy(lax: list[tuple[int, int]]) -> None:
-    found = curve(lax)
-    assert (found.verdict, found.policy) == ("does not pay", None)
-    assert found.sentence.startswith("Nothing pays: verifying everything costs 5 a part")
-    assert not found.to_frame()["chosen"].any()
+    result = curve(lax)
+    assert (result.verdict, result.policy) == ("does not pay", None)
+    assert result.sentence.startswith("Nothing pays: verifying everything costs 5 a part")
+    assert not result.to_frame()["chosen"].any()
     assert "everything was verified. Record more." in curve(lax=[(100, 0)] * 4).sentence
 
 
@@ -94,8 +94,8 @@ def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear(
 
 
 def test_a_shuffle_that_not_every_policy_has_played_is_left_out() -> None:
-    found = curve(lax=[(50, 0), (50, 0), (0, 50)], strict=[(100, 0)] * 2)
-    assert (found.choosing, found.reporting, found.rows[0].cost) == (1, 1, 2.5)
+    result = curve(lax=[(50, 0), (50, 0), (0, 50)], strict=[(100, 0)] * 2)
+    assert (result.choosing, result.reporting, result.rows[0].cost) == (1, 1, 2.5)
     with pytest.raises(SettingError, match="2 or more shuffles"):
         curve(lax=[(50, 0)], strict=[(100, 0)])
 
@@ -109,7 +109,7 @@ def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(found: Co
     asked = RECIPE.with_policy(alpha=0.5, lower_bound=0.8)
     again = [replay(make_data(160), asked, seed, 120) for seed in (2, 3)]
     assert (found.rows[0].policy, asked.policy.stops) == (asked.policy, "all")
-    assert found.rows[0].cost == pytest.approx(np.mean([cost_per_part(one, found.costs) for one in again]))
+    assert found.rows[0].cost == pytest.approx(np.mean([cost_per_part(first, found.costs) for first in again]))
     by_cost = found.rows[-1]
     assert (by_cost.policy.guarantee, by_cost.policy.prices) == ("cost", (5.0, 20.0, 11.0))
     assert (found.cycles, found.choosing, found.reporting, found.dataset) == (120, 2, 2, "insertion-like")
@@ -137,10 +137,10 @@ def test_the_verb_shows_a_table_and_writes_the_curve(data: Dataset, tmp_path: Pa
     assert max(map(len, shown.splitlines())) <= 80
     assert (tmp_path / "out" / "costs.png").stat().st_size > 10_000
     assert (tmp_path / "out" / "costs.csv").read_text(encoding="utf-8").count("\n") == 3
-    told = document(*words.split())
-    assert told["verdict"] in ("pays", "may pay", "does not pay")
-    assert [row["alpha"] for row in told["rows"]] == [0.5, 0.1]
-    assert told["sentence"] in " ".join(shown.split())
+    result = document(*words.split())
+    assert result["verdict"] in ("pays", "may pay", "does not pay")
+    assert [row["alpha"] for row in result["rows"]] == [0.5, 0.1]
+    assert result["sentence"] in " ".join(shown.split())
     assert len(list((tmp_path / "kept").iterdir())) == 4  # played once
     assert "by cost" in succeed(*words.replace("reject 10", "reject 11").split(), "--stops", "all")
     assert "but a list is tried here: use --alphas" in " ".join(dengine(*words.split(), "--alpha", "0.1").output.split())

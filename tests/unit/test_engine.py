@@ -36,12 +36,12 @@ def trained(data: Dataset) -> DataEngine:
 
 
 def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data: Dataset) -> None:
-    said = {"verify": "verify", "proceed": "accept", "reject": "reject"}
+    text = {"verify": "verify", "proceed": "accept", "reject": "reject"}
     asked: list[str] = []
 
     class Listening(ReplayCell):
         def __getattribute__(self, name: str):
-            asked.extend([said[name]] if name in said else [])
+            asked.extend([text[name]] if name in text else [])
             return super().__getattribute__(name)
 
     engine = make(replace(RECIPE, radius=0.4))
@@ -94,8 +94,8 @@ def test_the_collector_works_between_decisions_and_leaves_old_objects_alone_unti
 
     before = gc.get_freeze_count()
     cycles = make(model=Watching()).run(ReplayCell(data), 130)
-    held = [gc.get_freeze_count() > before and gc.isenabled() for _ in cycles]
-    assert held == [False] * 100 + [True] * 30
+    stored = [gc.get_freeze_count() > before and gc.isenabled() for _ in cycles]
+    assert stored == [False] * 100 + [True] * 30
     assert set(at_work) == {False}
     assert (gc.get_freeze_count(), gc.isenabled()) == (before, True)
 
@@ -134,11 +134,11 @@ def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data: Dat
         decision = engine.decide(x)
         if decision.action is Action.VERIFY:
             reports.append(engine.report(decision.id, bool(y)))
-    made = [i + 1 for i, report in enumerate(reports) if report is not None]
-    assert made == list(range(40, len(reports) + 1, 40))
-    assert [r.version for r in reports if r is not None] == list(range(1, len(made) + 1))
+    items = [i + 1 for i, report in enumerate(reports) if report is not None]
+    assert items == list(range(40, len(reports) + 1, 40))
+    assert [r.version for r in reports if r is not None] == list(range(1, len(items) + 1))
     assert all(
-        r.accepted and r.reason == "accepted" and r.n_traces == n for r, n in zip(filter(None, reports), made, strict=True)
+        r.accepted and r.reason == "accepted" and r.n_traces == n for r, n in zip(filter(None, reports), items, strict=True)
     )
 
 
@@ -274,19 +274,19 @@ def test_retrains_that_are_dropped_three_times_in_a_row_are_an_alarm_until_one_i
     engine = make(store=tmp_path / "e.db")
     play(engine, data, 0, 120)
     sound, engine.model.spaces.n_components = engine.model.spaces.n_components, 500
-    said = []
+    texts = []
     for _ in range(3):
         assert not engine.retrain().accepted
-        said.append((core_of(engine).retrain_fault, engine.status().alarm))
+        texts.append((core_of(engine).retrain_fault, engine.status().alarm))
     alarm = (
         "The last 3 retrains were dropped, so nothing new is learned; the last was dropped: PCA needs more than 500 traces"
     )
-    assert said[:2] == [("", ""), ("", "")]
-    assert said[2][0] == said[2][1]
-    assert said[2][0].startswith(alarm)
+    assert texts[:2] == [("", ""), ("", "")]
+    assert texts[2][0] == texts[2][1]
+    assert texts[2][0].startswith(alarm)
     engine.close()
     with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
-        assert (core_of(engine).retrain_fault, engine.status().alarm) == said[2]
+        assert (core_of(engine).retrain_fault, engine.status().alarm) == texts[2]
         assert engine.model.spaces.n_components == sound
         assert engine.retrain().accepted
         assert (core_of(engine).retrain_fault, engine.status().alarm) == ("", "")
@@ -297,12 +297,12 @@ def test_a_second_report_is_an_error_and_the_first_stands(trained: DataEngine, d
     decision = trained.decide(np.roll(good(data), 15))
     assert decision.action is Action.VERIFY
     trained.report(decision.id, True)
-    counts, labels, held = core_of(trained).new_labels, len(trained.store.labelled().labels), len(trained.model.index)
+    counts, labels, count = core_of(trained).new_labels, len(trained.store.labelled().labels), len(trained.model.index)
     with pytest.raises(ReportError, match="success from verification was reported first and stands"):
         trained.report(decision.id, second)
     assert trained.store.get_decision(decision.id).success is True
     n_labels = len(trained.store.labelled().labels)
-    assert (core_of(trained).new_labels, n_labels, len(trained.model.index)) == (counts, labels, held)
+    assert (core_of(trained).new_labels, n_labels, len(trained.model.index)) == (counts, labels, count)
 
 
 def test_a_stop_whose_decision_was_lost_is_accepted_with_its_trace(trained: DataEngine, data: Dataset) -> None:
@@ -318,9 +318,9 @@ def test_a_stop_whose_decision_was_lost_is_accepted_with_its_trace(trained: Data
 
 def test_a_lost_success_is_not_taken_since_only_stops_speak_for_themselves(trained: DataEngine, data: Dataset) -> None:
     before = trained.store.status()
-    for said in ({"success": True, "trace": good(data)}, {"success": False}):
+    for text in ({"success": True, "trace": good(data)}, {"success": False}):
         with pytest.raises(ReportError, match=r"'lost', which is unknown; a system stop .* can be reported with its trace"):
-            trained.report("lost", **said)
+            trained.report("lost", **text)
     assert trained.store.status() == before
 
 
@@ -338,9 +338,9 @@ def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(w
     cycles = []
     with pytest.raises(ConnectionError, match="gripper lost"):
         cycles.extend(engine.run(Broken(data), 200))  # keeps what came before the exception
-    known = sum(c.success is not None for c in cycles)
+    total = sum(c.success is not None for c in cycles)
     with SqlStore(str(tmp_path / "engine.db")) as other:  # beside the engine, which is still open
-        assert other.status()["labels"] == known > 50
+        assert other.status()["labels"] == total > 50
         assert other.status()["decisions"] >= len(cycles) + (where != "insert")
     engine.close()
 

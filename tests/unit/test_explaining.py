@@ -49,12 +49,18 @@ def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(nam
     with played(tmp_path, data, RECIPES[name]) as engine:
         balls = 0
         for past in list(engine.history())[::6]:
-            found = engine.explain(past.decision.id)
-            assert not any("Counted again" in note or "another bound" in note for note in found.notes), (past, found.notes)
-            assert found.decision == past
-            if found.bound is not None:
+            explanation = engine.explain(past.decision.id)
+            assert not any("Counted again" in note or "another bound" in note for note in explanation.notes), (
+                past,
+                explanation.notes,
+            )
+            assert explanation.decision == past
+            if explanation.bound is not None:
                 balls += 1
-                needed = {Action.ACCEPT: found.bound.successes_needed, Action.REJECT: found.bound.failures_needed}
+                needed = {
+                    Action.ACCEPT: explanation.bound.successes_needed,
+                    Action.REJECT: explanation.bound.failures_needed,
+                }
                 assert (needed.get(past.decision.predicted, 1) == 0) or past.decision.predicted is Action.VERIFY
         assert balls > 15
 
@@ -64,25 +70,25 @@ def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(store
     data = Dataset(np.concatenate([data.X, data.X[:60]]), np.concatenate([data.y, data.y[:60]]), name="twice")
     with played(store, data, RECIPES["local"]) as engine:
         (past,) = engine.history(last=1, action="accept")
-        found = engine.explain(past.decision.id, neighbours=15)
-        distances = [each.distance for each in found.neighbours]
+        explanation = engine.explain(past.decision.id, neighbours=15)
+        distances = [item.distance for item in explanation.neighbours]
         assert distances == sorted(distances)
-        assert found.radius == pytest.approx(engine.recipe.radius)
-        assert [each.inside for each in found.neighbours] == [each <= found.radius for each in distances]
-        own = engine.store.get_decision(past.decision.id)
-        for each in found.neighbours:
-            stored = engine.store.get_decision(each.decision_id)
-            assert (stored.success, stored.source) == (each.success, each.source)
-            assert stored.content_hash != own.content_hash  # the same part, which came before, has no vote
-            np.testing.assert_array_equal(each.trace, stored.trace)
-            z = engine.model.predictor.embed(torch.from_numpy(np.array(stored.trace)))[each.space].numpy()
-            assert np.linalg.norm(z - own.decision.embedding[each.space]) == pytest.approx(each.distance, abs=1e-3)
+        assert explanation.radius == pytest.approx(engine.recipe.radius)
+        assert [item.inside for item in explanation.neighbours] == [item <= explanation.radius for item in distances]
+        custom = engine.store.get_decision(past.decision.id)
+        for item in explanation.neighbours:
+            stored = engine.store.get_decision(item.decision_id)
+            assert (stored.success, stored.source) == (item.success, item.source)
+            assert stored.content_hash != custom.content_hash  # the same part, which came before, has no vote
+            np.testing.assert_array_equal(item.trace, stored.trace)
+            z = engine.model.predictor.embed(torch.from_numpy(np.array(stored.trace)))[item.space].numpy()
+            assert np.linalg.norm(z - custom.decision.embedding[item.space]) == pytest.approx(item.distance, abs=1e-3)
 
 
 def test_of_a_version_that_is_not_kept_the_record_is_shown_and_no_neighbours(make_data, tmp_path: Path) -> None:
     with played(tmp_path, make_data(200, samples=60), RECIPES["pooled"]) as engine:
-        made = (past.decision for past in engine.history())
-        old = next(each for each in made if each.model_version == 1 and each.reason is Reason.UNCERTAIN)
+        created = (past.decision for past in engine.history())
+        old = next(item for item in created if item.model_version == 1 and item.reason is Reason.UNCERTAIN)
         first = engine.explain(old.id)
         assert "the references of version 1" in said_of(first)
     execute(tmp_path / "engine.db", "UPDATE model_version SET state = NULL WHERE version = 1")
@@ -99,13 +105,13 @@ def test_of_a_version_that_is_not_kept_the_record_is_shown_and_no_neighbours(mak
 def test_the_bound_says_how_many_more_labels_would_have_done(make_data: Callable[..., Dataset]) -> None:
     with played(None, make_data(200, samples=60), RECIPES["local"]) as engine:
         (past,) = engine.history(last=1, reason="certain")
-    found = Circumstances(RECIPES["local"], TraceSpec(60))
-    policy = found.recipe.policy
+    result = Circumstances(RECIPES["local"], TraceSpec(60))
+    policy = result.recipe.policy
     for n_success, n_failure in ((38, 0), (3, 1), (0, 0), (100, 12), (0, 30), (1, 60)):
         lower, upper = policy.bound(n_success, n_failure)
-        made = replace(past.decision, n_success=n_success, n_failure=n_failure, lower=lower, upper=upper)
-        counted = replace(made, reason=Reason.UNCERTAIN)
-        bound = bound_of(counted, found)
+        created = replace(past.decision, n_success=n_success, n_failure=n_failure, lower=lower, upper=upper)
+        counted = replace(created, reason=Reason.UNCERTAIN)
+        bound = bound_of(counted, result)
         for needed, of_success, at in ((bound.successes_needed, 1, 0.9), (bound.failures_needed, 0, 0.1)):
             reached = [
                 policy.bound(n_success + of_success * m, n_failure + (1 - of_success) * m) for m in (needed, needed - 1)
@@ -156,9 +162,9 @@ def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
         assert engine.safe_mode == "too many traces were novel"
         usual = engine.decide(data.X[0] + np.float32(0.001))
         assert usual.reason is Reason.SAFE_MODE
-        found = engine.explain(usual.id)
-        assert "in safe mode, in which every part is verified: too many traces were novel" in said_of(found)
-        assert "Nothing could pass, whatever the bound: too many traces were novel" in said_of(found)
+        explanation = engine.explain(usual.id)
+        assert "in safe mode, in which every part is verified: too many traces were novel" in said_of(explanation)
+        assert "Nothing could pass, whatever the bound: too many traces were novel" in said_of(explanation)
         before = next(past for past in engine.history() if past.decision.reason is Reason.CERTAIN)
         assert "safe mode" not in said_of(engine.explain(before.decision.id))
 
@@ -174,10 +180,10 @@ def test_a_baseline_has_its_own_numbers_and_no_neighbours(make_data: Callable[..
     with DataEngine(model=Accepting(), store=str(tmp_path / "engine.db"), retrain_every=30, replaying=True) as engine:
         drive(engine, make_data(60, samples=60))
         (past,) = engine.history(last=1, action="accept")
-        found = engine.explain(past.decision.id)
-        assert re.search(r"Accepting gives 30 successes, \d failures, bound 0.800 to 1.000", said_of(found))
-        assert found.neighbours == ()
-        assert found.envelope is not None
+        explanation = engine.explain(past.decision.id)
+        assert re.search(r"Accepting gives 30 successes, \d failures, bound 0.800 to 1.000", said_of(explanation))
+        assert explanation.neighbours == ()
+        assert explanation.envelope is not None
 
 
 def test_an_unknown_id_says_where_the_ids_are(make_data: Callable[..., Dataset]) -> None:
@@ -195,19 +201,22 @@ def test_a_planted_excess_is_found_where_and_how_far_it_is() -> None:
     trace = np.median(X, axis=0)
     trace[1, 20:25] = 6.0
     trace[0, 40] = -5.0
-    found = envelope_of(X, trace, rate_hz=100.0)
-    high, low = found.excesses
+    result = envelope_of(X, trace, rate_hz=100.0)
+    high, low = result.excesses
     assert (low.channel, low.from_s, low.to_s, low.above) == (0, 0.4, 0.4, False)
     assert (high.channel, high.from_s, high.to_s, high.above) == (1, 0.2, 0.24, True)
-    widths = (6.0 - found.high[1, 20:25]) / (found.high - found.low)[1, 20:25]
+    widths = (6.0 - result.high[1, 20:25]) / (result.high - result.low)[1, 20:25]
     assert high.widths == pytest.approx(widths.max(), rel=1e-5)
-    assert found.outside == pytest.approx(6 / 100)
+    assert result.outside == pytest.approx(6 / 100)
     trace = np.zeros((2, 50), np.float32)
     trace[0, 3], trace[1, 4:6] = np.nan, np.inf  # these lie nowhere
     trace[0, 10:12], trace[0, 12:15] = 9.0, -9.0  # one that changes sides is two
-    found = envelope_of(X, trace, rate_hz=1.0)
-    assert found.not_finite == 3
-    assert sorted((each.from_s, each.to_s, each.above) for each in found.excesses) == [(10, 11, True), (12, 14, False)]
+    result = envelope_of(X, trace, rate_hz=1.0)
+    assert result.not_finite == 3
+    assert sorted((excess.from_s, excess.to_s, excess.above) for excess in result.excesses) == [
+        (10, 11, True),
+        (12, 14, False),
+    ]
     assert envelope_of(X[:19], trace, 1.0) is envelope_of(X, trace[:, :49], 1.0) is None
 
 

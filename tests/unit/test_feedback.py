@@ -54,9 +54,9 @@ def spoiled(stream: Dataset) -> Dataset:
 
 def beyond(engine: DataEngine) -> list[int]:
     """Members of LB's own level that the rule counts beyond those of which the store has labels, and the bad ones."""
-    known = engine.store.outcomes_since(0)
+    records = engine.store.outcomes_since(0)
     n, bad = engine.model.rule.evidence.level_counts_since_alarm[0, 0].sum(0).tolist()
-    reached = [each.success for each in known if each.lower >= 0.9]
+    reached = [item.success for item in records if item.lower >= 0.9]
     return [n - len(reached), bad - reached.count(False)]
 
 
@@ -113,15 +113,15 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     engine.decide(stream.X[1])
     engine.flush()
     assert beyond(engine) == [0, 0]
-    held, labels = engine.store.get_decision(stopped.id), engine.model.index.column("labels")
-    assert (held.success, engine.store.labelled().labels[held.label_seq - 1]) == (False, 0)
+    stored, labels = engine.store.get_decision(stopped.id), engine.model.index.column("labels")
+    assert (stored.success, engine.store.labelled().labels[stored.label_seq - 1]) == (False, 0)
     (past,) = [past for past in engine.history() if past.decision.id == stopped.id]
-    assert {held.source, past.source, engine.find(stopped.id).source} == {Source.STOP}
+    assert {stored.source, past.source, engine.find(stopped.id).source} == {Source.STOP}
     status = engine.status()
     assert status.sources["stop"] == status.ever.false_accepts == engine.store.tally().outcomes.false_accepts
     with pytest.raises(ReportError, match="failure from stop was reported first and stands, now came failure from stop"):
         engine.report(stopped.id, False)
-    assert labels[engine.model.index.column("numbers") == held.label_seq].tolist() == [0]
+    assert labels[engine.model.index.column("numbers") == stored.label_seq].tolist() == [0]
     assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.false_accepts > 0
     engine.close()
     with DataEngine.open(tmp_path / "late.db", replaying=True) as engine:
@@ -298,8 +298,8 @@ def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_n
     with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
         assert engine.safe_mode == ""
         assert engine.store.overdue_to(50) > 0
-        told = [each.seq for each in engine.store.outcomes_since(0, 0, 450)]
-        assert told[-5:] == sorted(told[-5:])  # not last, in one burst
+        answers = [item.seq for item in engine.store.outcomes_since(0, 0, 450)]
+        assert answers[-5:] == sorted(answers[-5:])  # not last, in one burst
         engine.report(engine.decide(stream.X[0]).id, True)
     assert verify_history(str(tmp_path / "e.db")).ok
 
@@ -362,8 +362,8 @@ def test_traces_of_one_part_share_a_fold_whatever_they_look_like(stream: Dataset
     for x in stream.X[:10]:
         engine.report(engine.decide(x, part="A-17").id, True)
     hashes = store.labelled().hashes
-    for text, known in (("", 0xCBF29CE484222325), ("a", 0xAF63DC4C8601EC8C), ("foobar", 0x85944171F73967E8)):
-        assert part_hash(text) % 2**64 == known  # FNV-1a: the vectors of its authors' reference
+    for text, records in (("", 0xCBF29CE484222325), ("a", 0xAF63DC4C8601EC8C), ("foobar", 0x85944171F73967E8)):
+        assert part_hash(text) % 2**64 == records  # FNV-1a: the vectors of its authors' reference
     assert set(hashes.tolist()) == {part_hash("A-17")} != set(content_hash(stream.X[:10]).tolist())
     assert len(set(fold_of(hashes, 5).tolist())) == 1
 
@@ -414,11 +414,11 @@ def test_repeats_that_nobody_names_are_noticed_and_named_ones_or_parts_of_their_
     X = (X + rng.normal(0, 0.01, X.shape)).astype(np.float32)
     y, part = np.repeat(base.y, 5), np.repeat(np.arange(60).astype(str), 5)
     order = rng.permutation(300)
-    for parts, said in ((None, True), (part[order], False)):
+    for parts, text in ((None, True), (part[order], False)):
         engine = make(Policy(alpha=0.01, lower_bound=0.99))  # that verifies them all
         cycles = play(engine, Dataset(X[order], y[order], part=parts))
         last = [c.retrain for c in cycles if c.retrain is not None][-1]
-        assert ("give their numbers" in last.reason) is said
+        assert ("give their numbers" in last.reason) is text
 
 
 def rejected(engine: DataEngine, data: Dataset) -> list[Decision]:
@@ -439,34 +439,34 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
     with make(policy, store=tmp_path / "engine.db") as engine:
         play(engine, stream)
         bad = replace(stream, X=stream.X + np.float32(0.001))
-        found = rejected(engine, bad)
-        assert len(found) > 3
+        result = rejected(engine, bad)
+        assert len(result) > 3
         core_of(engine).process_retrains()
         engine.flush()
         before = told(engine)
         n, labels = engine.store.status()["labels"], core_of(engine).new_labels
-        engine.report(found[0].id, True)
-        engine.report(found[1].id, False)
+        engine.report(result[0].id, True)
+        engine.report(result[1].id, False)
         assert told(engine) == before
         assert core_of(engine).new_labels == labels + 2
         status = engine.status()
         assert (status.sources["inspection"], status.labels, status.ever.false_rejects) == (2, n + 2, 1)
-        known = engine.find(found[0].id)
-        assert (known.success, known.source) == (True, Source.INSPECTION)
-        assert {found[0].id} == {
+        match = engine.find(result[0].id)
+        assert (match.success, match.source) == (True, Source.INSPECTION)
+        assert {result[0].id} == {
             past.decision.id for past in engine.history(label="good") if past.source is Source.INSPECTION
         }
-        assert "turned out good (inspection)" in " ".join(engine.explain(found[0].id).sentences)
+        assert "turned out good (inspection)" in " ".join(engine.explain(result[0].id).sentences)
         with pytest.raises(ReportError, match="success from inspection was reported first"):
-            engine.report(found[0].id, False)
-        assert "failure" in engine.correct(found[0].id, False, "kim").text
+            engine.report(result[0].id, False)
+        assert "failure" in engine.correct(result[0].id, False, "kim").text
         assert engine.status().ever.false_rejects == 0
-        engine.correct(found[0].id, True, "kim")
+        engine.correct(result[0].id, True, "kim")
         probe = [engine.decide(x).action for x in stream.X[:40]]
         engine.flush()
         rule = told(engine)
     with DataEngine.open(tmp_path / "engine.db", replaying=True) as engine:
-        assert engine.find(found[0].id).source is Source.INSPECTION
+        assert engine.find(result[0].id).source is Source.INSPECTION
         assert engine.status().ever.false_rejects == 1
         assert told(engine) == rule
         assert [engine.decide(x).action for x in stream.X[:40]] == probe
@@ -475,11 +475,13 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
 def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_they_are_many(stream: Dataset) -> None:
     engine = make(replace(LOCAL, audit_rate=0.3))
     play(engine, stream)
-    found = rejected(engine, stream)
+    result = rejected(engine, stream)
     n = engine.status().certificate.rejected.n
     assert "rejected parts were good" not in engine.status().alarm
-    for decision in found:
+    for decision in result:
         engine.report(decision.id, True)
     status = engine.status()
-    assert status.certificate.rejected.upper >= len(found) / n
-    assert f"{len(found)} of the {status.newest.rejected} newest rejected parts were good: more than 10.0%." in status.alarm
+    assert status.certificate.rejected.upper >= len(result) / n
+    assert (
+        f"{len(result)} of the {status.newest.rejected} newest rejected parts were good: more than 10.0%." in status.alarm
+    )

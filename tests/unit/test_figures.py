@@ -44,8 +44,8 @@ ONE_WRONG = replay_of(["accept"] + ["verify"] * 298 + ["reject"], [0] + [1] * 29
 def test_pooled_precision_weighs_parts_not_replays_and_is_none_where_nothing_was_accepted() -> None:
     (row,) = pool(frame_of([MANY_RIGHT, ONE_WRONG]))
     assert row["precision"] == pytest.approx(1 - 11 / 301)  # the mean of the two ratios would be 0.483
-    told = [row[name] for name in ("npv", "accepted", "total_accepted", "replays", "retrain_max_s")]
-    assert told == [0.0, 150.5, 301, 2, 0.3]
+    answers = [row[name] for name in ("npv", "accepted", "total_accepted", "replays", "retrain_max_s")]
+    assert answers == [0.0, 150.5, 301, 2, 0.3]
     (row,) = pool(frame_of([replay_of(["verify"] * 5, [1] * 5)]))
     assert (math.isnan(row["precision"]), row["promise_kept"]) == (True, None)
     assert promise_lines([row]) == ["pca (local): no part was accepted."]
@@ -119,7 +119,7 @@ def test_a_run_is_summed_up_by_stretches_that_add_up_and_by_an_hour_where_there_
     assert (total["false_positive"], total["false_negative"], total["stops"]) == (1, 1, 1)
     assert total["parts_per_hour"] == pytest.approx(88.0)  # 59 verified good and 29 accepted good in an hour
     assert log_of(None).stretch()["parts_per_hour"] is None
-    assert [len(run_picture(each).axes) for each in (log, log_of(None))] == [3, 2]
+    assert [len(run_picture(item).axes) for item in (log, log_of(None))] == [3, 2]
 
 
 def blank() -> Replay:
@@ -145,7 +145,7 @@ def test_every_figure_is_written_as_a_png_without_pyplot_and_no_legend_lies_on_i
     figure = PICTURES[name]()
     assert save(figure, tmp_path / "deep" / "figure.png", dpi=40).read_bytes().startswith(b"\x89PNG")
     figure.draw_without_rendering()
-    legends = [each.get_legend() for each in figure.axes if each.get_legend()] + figure.legends
+    legends = [ax.get_legend() for ax in figure.axes if ax.get_legend()] + figure.legends
     assert legends
     for legend in legends:
         box = legend.get_window_extent()

@@ -55,9 +55,9 @@ class Fleet:
 
 @pytest.fixture(params=DATABASES)
 def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
-    made = Fleet(url_of(request.param, tmp_path))
-    yield made
-    for engine in made.opened:
+    created = Fleet(url_of(request.param, tmp_path))
+    yield created
+    for engine in created.opened:
         engine.close()
 
 
@@ -213,9 +213,9 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet: Fl
     assert counts(first, probe) == counts(second, probe)
     assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
     assert core_of(second).new_labels == core_of(first).new_labels
-    found = [verify_history(fleet.url, engine.store.cell_id) for engine in (first, second)]
-    assert [report.faults for report in found] == [(), ()]
-    assert found[0].cells[0].digest != found[1].cells[0].digest  # each has a ledger of its own
+    results = [verify_history(fleet.url, engine.store.cell_id) for engine in (first, second)]
+    assert [report.faults for report in results] == [(), ()]
+    assert results[0].cells[0].digest != results[1].cells[0].digest  # each has a ledger of its own
     newest = first.version
     second.rollback(1)
     core_of(first).process_retrains()
@@ -243,11 +243,11 @@ def test_a_peers_version_leaves_the_rule_as_it_was(fleet: Fleet, parts: Dataset)
     learn(first, parts, range(60))
     core_of(second).process_retrains()
     learn(second, parts, range(60, 75))
-    own = rule(second)
+    custom = rule(second)
     first.retrain()
     core_of(second).process_retrains()
     assert second.version == first.version
-    assert rule(second) == own
+    assert rule(second) == custom
 
 
 def reopened(fleet: Fleet, engine: DataEngine) -> SqlStore:
@@ -280,11 +280,11 @@ def test_nothing_is_mixed_between_products_and_cells_without(fleet: Fleet, parts
     assert said(cells["d"], probe) == said(alone, probe)
     rows = {name: np.arange(i, 120, 4) for i, name in enumerate("abcd")}
     for name, kin in {"a": "ab", "b": "ab", "c": "c", "d": "d"}.items():
-        known = cells[name].store.labelled()
+        labelled = cells[name].store.labelled()
         theirs = {parts.X[i].tobytes() for other in kin for i in rows[other]}
-        assert {trace.tobytes() for trace in known.traces} <= theirs
-        assert known.seq.tolist() == list(range(1, len(known.seq) + 1))
-        assert len(known.seq) == sum(cells[other].store.status()["labels"] for other in kin)
+        assert {trace.tobytes() for trace in labelled.traces} <= theirs
+        assert labelled.seq.tolist() == list(range(1, len(labelled.seq) + 1))
+        assert len(labelled.seq) == sum(cells[other].store.status()["labels"] for other in kin)
 
 
 def test_label_numbers_are_unique_and_increase_over_the_product(fleet: Fleet, parts: Dataset) -> None:
@@ -371,20 +371,20 @@ def test_a_cell_keeps_its_product_and_one_that_worked_alone_joins_none(fleet: Fl
     ):
         with pytest.raises(StoreError, match=message):
             SqlStore(fleet.url, f"{cell}-{fleet.tag}", product=product if cell == "c" else f"{product}-{fleet.tag}")
-    found = {cell.cell_id: cell.product for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id}
-    assert found == {f"a-{fleet.tag}": f"gear-{fleet.tag}", f"b-{fleet.tag}": None}
+    result = {cell.cell_id: cell.product for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id}
+    assert result == {f"a-{fleet.tag}": f"gear-{fleet.tag}", f"b-{fleet.tag}": None}
 
 
 def test_questions_about_a_product_go_down_an_index(tmp_path: Path) -> None:
     with SqlStore(str(tmp_path / "a.db"), "a", product="gear") as store:
         store.put_version(RetrainReport(1, 0.1, 10, 1, True, ""), 0, {"w": np.ones(3)})
-        with plans(tmp_path / "a.db") as found:
+        with plans(tmp_path / "a.db") as result:
             store.news_since(5, 10)
             store.load_version(1)
             store.corrections(1)
-    assert len(found) >= 7
+    assert len(result) >= 7
     tables = ("label", "trace", "model_version", "decision", "correction")
-    for statement, plan in found:
+    for statement, plan in result:
         assert not [step for step in plan if step.startswith("SCAN") and step.split()[1] in tables], (statement, plan)
 
 
@@ -394,13 +394,13 @@ def test_the_cells_of_a_database_are_listed(fleet: Fleet, parts: Dataset) -> Non
     fleet.engine("d", None)
     for engine in fleet.opened:
         engine.store.flush()
-    found = {cell.cell_id.split("-")[0]: cell for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id}
-    assert {name: cell.product for name, cell in found.items()} == dict.fromkeys("ab", f"gear-{fleet.tag}") | {"d": None}
-    assert (found["a"].decisions, found["b"].decisions) == (30, 0)
-    assert found["a"].labels == fleet.opened[0].store.status()["labels"]
-    assert (found["a"].version, found["b"].version, found["d"].version) == (1, 1, None)
-    assert found["a"].last_seen is not None
-    assert found["b"].last_seen is None
+    result = {cell.cell_id.split("-")[0]: cell for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id}
+    assert {name: cell.product for name, cell in result.items()} == dict.fromkeys("ab", f"gear-{fleet.tag}") | {"d": None}
+    assert (result["a"].decisions, result["b"].decisions) == (30, 0)
+    assert result["a"].labels == fleet.opened[0].store.status()["labels"]
+    assert (result["a"].version, result["b"].version, result["d"].version) == (1, 1, None)
+    assert result["a"].last_seen is not None
+    assert result["b"].last_seen is None
 
 
 def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset, tmp_path: Path) -> None:

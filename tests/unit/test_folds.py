@@ -100,9 +100,9 @@ def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate: float) -> None
 
 def test_engines_of_different_seeds_audit_different_traces() -> None:
     h = content_hash(noise(20_000, 20))
-    one, other = audited(h, 0.5, seed=1), audited(h, 0.5, seed=2)
-    assert stats.binomtest(int((one == other).sum()), len(h), 0.5).pvalue > 1e-4
-    np.testing.assert_array_equal(one, audited(h, 0.5, seed=1))
+    first, other = audited(h, 0.5, seed=1), audited(h, 0.5, seed=2)
+    assert stats.binomtest(int((first == other).sum()), len(h), 0.5).pvalue > 1e-4
+    np.testing.assert_array_equal(first, audited(h, 0.5, seed=1))
 
 
 def test_the_decider_tosses_as_numpy_does_compiled_or_not() -> None:

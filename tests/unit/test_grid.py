@@ -30,9 +30,9 @@ def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_
     asked += [FunctionTransformer(np.add, kw_args={"x2": value}) for value in (np.zeros(3), np.ones(3))]
     asked += [FunctionTransformer(np.abs), "knn", replace(Contender.load("knn"), params={"k": 3})]
     others = [replace(task, **change) for change in ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})]
-    others += [replace(task, contender=Contender.load(one)) for one in asked]
+    others += [replace(task, contender=Contender.load(first)) for first in asked]
     flipped = KeptReplays(tmp_path, replace(data, y=1 - data.y)).path(task)
-    assert len({flipped, *(kept.path(each) for each in [task, *others])}) == 2 + len(others)
+    assert len({flipped, *(kept.path(item) for item in [task, *others])}) == 2 + len(others)
     assert kept.path(replace(task, contender=replace(who, name="mine"))) == kept.path(task)
     alike = [Task(Contender.load(make_pipeline(FunctionTransformer(np.abs), PCA(2))), 0) for _ in range(2)]
     assert kept.path(alike[0]) == kept.path(alike[1])
@@ -49,7 +49,7 @@ def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(data: Dat
 
     def paths() -> list[Path]:
         asked = (make_pipeline(StandardScaler(), loaded.Own()), f"{module.stem}:Own")
-        return [kept.path(Task(Contender.load(own), seed=1)) for own in asked]
+        return [kept.path(Task(Contender.load(custom), seed=1)) for custom in asked]
 
     before = paths()
     module.write_text(source + "    # changed\n", encoding="utf-8")
@@ -63,14 +63,14 @@ def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_
     played = replay(data, RECIPE, seed=1, cycles=50)
     kept.put(task, played)
     file = kept.path(task).read_bytes()
-    found = []
+    results = []
     for size in [1, 1, 3, 50] * 75:
         damaged = np.frombuffer(file, dtype=np.uint8).copy()
         damaged[rng.integers(len(damaged), size=size)] = rng.integers(256, size=size)
         kept.path(task).write_bytes(damaged.tobytes())
-        found.append(kept.get(task))
-    assert found.count(None) > 200
-    for back in filter(None, found):  # what was hit is nothing that is read
+        results.append(kept.get(task))
+    assert results.count(None) > 200
+    for back in filter(None, results):  # what was hit is nothing that is read
         np.testing.assert_array_equal(back.action, played.action)
     kept.path(task).write_bytes(b"")
     (again,) = iterate_replays(data, [task], keep=tmp_path)
@@ -97,8 +97,8 @@ def test_a_baseline_without_its_library_is_refused_before_anything_is_played(dat
 
 
 def test_a_grid_is_the_same_in_other_processes(data: Dataset) -> None:
-    one, two = (run_grid(data, [RECIPE, "always"], **GRID, n_jobs=workers) for workers in (1, 2))
-    assert one.drop(columns=TIMED).equals(two.drop(columns=TIMED))
+    first, two = (run_grid(data, [RECIPE, "always"], **GRID, n_jobs=workers) for workers in (1, 2))
+    assert first.drop(columns=TIMED).equals(two.drop(columns=TIMED))
 
 
 def test_replays_end_seed_by_seed_so_that_a_part_can_be_compared(data: Dataset) -> None:
@@ -115,7 +115,7 @@ def test_two_of_one_name_and_policy_are_refused_and_a_policy_has_columns_of_its_
         Contender("narrow", replace(plain, radius=0.3)),
         "conv",
     ]
-    assert [one.name for one in load_contenders(asked)] == ["pca", "pca", "narrow", "conv"]
+    assert [contender.name for contender in load_contenders(asked)] == ["pca", "pca", "narrow", "conv"]
     for twice in ([plain, replace(plain, radius=0.3)], [PCA(1), PCA(2)]):
         with pytest.raises(SettingError, match=r"a name of its own for each.*by Contender\(name, recipe\)"):
             load_contenders(twice)

@@ -230,16 +230,16 @@ def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever
 
 
 def test_silence_is_no_success_for_a_level_and_no_failure_for_the_watch() -> None:
-    silent, told = pooled(), pooled()
-    for rule in (silent, told):
+    silent, answer = pooled(), pooled()
+    for rule in (silent, answer):
         tell(rule, 0.95, *[True] * 100)
     before = {name: value.clone() for name, value in silent.state_dict().items() if "counts" in name}
     silent.observe(50, False)
     assert all(torch.equal(silent.state_dict()[name], value) for name, value in before.items())
     for _ in range(50):
-        told.observe(1, False)
+        answer.observe(1, False)
     torch.testing.assert_close(
-        silent.evidence.detector_sums[0], told.evidence.detector_sums[0]
+        silent.evidence.detector_sums[0], answer.evidence.detector_sums[0]
     )  # fifty at once, or one by one
     # Every twentieth accepted part stops the system: within the tolerance, though no success is ever heard of.
     watched = WatchedRule(0.1, 0.9)
@@ -280,7 +280,7 @@ def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(guarantee: str, st
     for name, value in eager.state_dict().items():
         assert torch.equal(value, scripted.state_dict()[name]), name
     counts = [(n, k) for n in range(0, 60, 7) for k in range(0, 10, 3)]
-    assert [eager(*each) for each in counts] == [scripted(*each) for each in counts]
+    assert [eager(*count) for count in counts] == [scripted(*count) for count in counts]
 
 
 @pytest.mark.parametrize("first", [0, 1])

@@ -75,8 +75,8 @@ def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch: pytest.Mo
     for now[0], id_ in zip(times, ids, strict=True):
         put_decision(store, Decision(id_, Action.ACCEPT, Action.ACCEPT, *kind), np.ones(5))
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 2)
-    for found in (history(store), history(store, last=6)):
-        assert [(past.decision.id, past.time) for past in found] == list(zip(ids, times, strict=True))
+    for result in (history(store), history(store, last=6)):
+        assert [(past.decision.id, past.time) for past in result] == list(zip(ids, times, strict=True))
     assert [past.decision.id for past in history(store, last=2, since=2.0)] == ["d0", "d2"]
     assert (store.unreported_accepts(), store.tally(2).count(), store.tally(2).last) == (ids, 2, 7.0)
     store.close()
@@ -120,21 +120,21 @@ def test_counts_of_a_store_are_those_of_its_history(store: SqlStore) -> None:
     whole = everything(store)
     for last in (None, 1, 10, 59, 500):
         some = whole if last is None else whole[-last:]
-        found = store.tally(last)
+        result = store.tally(last)
         kinds = Counter(
             (*(getattr(p.decision, name) for name in KIND), p.quarantined, False, p.success, p.source) for p in some
         )
-        assert {astuple(group) for group in found.groups} == {(*kind, n) for kind, n in kinds.items()}
-        assert (found.first, found.last) == (some[0].time, some[-1].time)
+        assert {astuple(group) for group in result.groups} == {(*kind, n) for kind, n in kinds.items()}
+        assert (result.first, result.last) == (some[0].time, some[-1].time)
 
 
 def counted(some: list[StoredDecision]) -> Stretch:
     actions = [past.decision.action for past in some]
     bad = sum(past.success is False and past.decision.action is Action.ACCEPT for past in some)
-    novel, outside = (sum(past.decision.reason is each for past in some) for each in (Reason.NOVEL, Reason.OUTSIDE))
-    own = sum((past.decision.action, past.decision.reason) == (Action.REJECT, Reason.CERTAIN) for past in some)
-    verified, accepted = (actions.count(each) for each in (Action.VERIFY, Action.ACCEPT))
-    return Stretch(len(some), some[-1].time, verified, novel, accepted, bad, own, outside)
+    novel, outside = (sum(past.decision.reason is item for past in some) for item in (Reason.NOVEL, Reason.OUTSIDE))
+    total = sum((past.decision.action, past.decision.reason) == (Action.REJECT, Reason.CERTAIN) for past in some)
+    verified, accepted = (actions.count(item) for item in (Action.VERIFY, Action.ACCEPT))
+    return Stretch(len(some), some[-1].time, verified, novel, accepted, bad, total, outside)
 
 
 @pytest.mark.parametrize("n", [1, 7, 60, 500])
@@ -143,11 +143,11 @@ def test_stretches_are_consecutive_and_hold_everything(store: SqlStore, n: int) 
     length = max(1, -(-N // n))
     expected = [counted(whole[start : start + length]) for start in range(0, N, length)]
     assert store.stretches(n) == expected
-    shifts = [[each for each in whole if each.time // (10.0 * n) == k] for k in range(N)]
-    assert store.stretches(seconds=10.0 * n) == [counted(each) for each in shifts if each]
+    shifts = [[item for item in whole if item.time // (10.0 * n) == k] for k in range(N)]
+    assert store.stretches(seconds=10.0 * n) == [counted(item) for item in shifts if item]
     for batch, name in (("5", lambda part: part[:5]), ("-/", lambda part: part[: part.rindex("-") + 1])):
-        sizes = Counter(name(each.decision.part) for each in whole)
-        assert {each.batch: each.n for each in store.stretches(batch=batch)} == sizes
+        sizes = Counter(name(item.decision.part) for item in whole)
+        assert {item.batch: item.n for item in store.stretches(batch=batch)} == sizes
 
 
 def test_an_empty_store_has_no_past() -> None:
@@ -161,9 +161,9 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: SqlS
     assert [label.seq for label in every] == list(range(1, len(every) + 1))
     assert [label.seq for label in store.past_labels(3, 7)] == [4, 5, 6, 7]
     assert all(label.point == pytest.approx(np.ones(2)) for label in every)
-    known = store.outcomes_since(0)
-    told = [label for label in every if not label.quarantined]
-    assert [(label.seq, label.novel) for label in told] == [(each.seq, each.novel) for each in known]
+    expected = store.outcomes_since(0)
+    answers = [label for label in every if not label.quarantined]
+    assert [(label.seq, label.novel) for label in answers] == [(item.seq, item.novel) for item in expected]
     by_id = {past.decision.id: past for past in everything(store)}
     assert all(label.decided == by_id[label.decision_id].time for label in every)
 
@@ -171,18 +171,18 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: SqlS
 def test_retrains_and_events_are_those_of_the_time_that_is_asked_for(store: SqlStore) -> None:
     whole = everything(store)
     every = read_retrains_and_events(store)
-    assert (len(every["retrains"]), [each.text[:5] for each in every["events"]]) == (6, ["too m", "fresh"])
+    assert (len(every["retrains"]), [item.text[:5] for item in every["events"]]) == (6, ["too m", "fresh"])
     late = read_retrains_and_events(store, since=whole[-1].time)
-    assert [len(each) for each in late.values()] == [1, 2]
+    assert [len(item) for item in late.values()] == [1, 2]
     assert read_retrains_and_events(store, until=whole[0].time)["retrains"] == []
 
 
 def test_a_page_is_read_along_the_index_and_no_trace_is(tmp_path: Path) -> None:
-    with SqlStore(str(tmp_path / "engine.db")) as opened, plans(tmp_path / "engine.db") as found:
+    with SqlStore(str(tmp_path / "engine.db")) as opened, plans(tmp_path / "engine.db") as result:
         for newest in (True, False):
             opened.decisions(HistoryFilter(action=Action.ACCEPT), 50, "d1", newest)
-    assert len(found) == 2
-    for statement, plan in found:
+    assert len(result) == 2
+    for statement, plan in result:
         assert "trace" not in statement
         assert any("decision USING INDEX decision_number" in step for step in plan), plan
         assert not any("TEMP B-TREE" in step for step in plan), plan

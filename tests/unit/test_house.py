@@ -32,13 +32,13 @@ def test_the_package_keeps_its_size_in_syntax_nodes() -> None:
 
 def names(module: str) -> dict[str, str]:
     """The classes of a module and what it imports from ours, each with the module that it comes from."""
-    known = {node.name: f"{module}.{node.name}" for node in MODULES[module].body if isinstance(node, ast.ClassDef)}
+    sources = {node.name: f"{module}.{node.name}" for node in MODULES[module].body if isinstance(node, ast.ClassDef)}
     for node in ast.walk(MODULES[module]):
         if isinstance(node, ast.ImportFrom) and node.level:
             source = ".".join([*module.split(".")[: -node.level], *filter(None, [node.module])])
             source = source if source in MODULES else f"{source}.__init__"
-            known |= {alias.asname or alias.name: f"{source}.{alias.name}" for alias in node.names}
-    return known
+            sources |= {alias.asname or alias.name: f"{source}.{alias.name}" for alias in node.names}
+    return sources
 
 
 def origin(name: str) -> str:
@@ -50,11 +50,11 @@ def origin(name: str) -> str:
 
 def bases(module: str) -> Iterable[tuple[str, str]]:
     """The classes of a module, each with each of its bases."""
-    known = names(module)
+    sources = names(module)
     for node in ast.walk(MODULES[module]):
         for base in node.bases if isinstance(node, ast.ClassDef) else ():
             name = ast.unparse(base.value if isinstance(base, ast.Subscript) else base)
-            yield f"{module}.{node.name}", origin(known.get(name, name))
+            yield f"{module}.{node.name}", origin(sources.get(name, name))
 
 
 def test_no_base_of_ours_has_a_single_subclass() -> None:
@@ -64,8 +64,8 @@ def test_no_base_of_ours_has_a_single_subclass() -> None:
     aside |= {"dengine.reducers.torch_reducer.TorchReducer", "dengine.decision.rule.DecisionRule"}
     subclasses = {base: [name for name, of in pairs if of == base] for _, base in pairs if base.startswith("dengine.")}
     alone = {base: names[0] for base, names in subclasses.items() if len(names) == 1 and base not in aside}
-    told = ", ".join(f"{base} (of {name})" for base, name in alone.items())
-    assert not alone, f"{len(alone)} bases have one subclass; make the two one class, or compose them: {told}"
+    text = ", ".join(f"{base} (of {name})" for base, name in alone.items())
+    assert not alone, f"{len(alone)} bases have one subclass; make the two one class, or compose them: {text}"
 
 
 def test_the_engine_keeps_a_public_face_of_at_most_25_members() -> None:
@@ -91,8 +91,8 @@ def test_each_fault_of_the_net_fits_the_code_and_names_tests_that_are_there() ->
 def test_tests_go_through_public_faces() -> None:
     private = re.compile(r"\b(?:engine|store)\._[a-z]\w*")
     files = [file for folder in ("tests", "training") for file in (REPO / folder).rglob("*.py")]
-    found = {f"{found} ({file.name})" for file in files for found in private.findall(file.read_text("utf-8"))}
-    assert not found, f"say it by a public face, or leave it out: {', '.join(sorted(found))}"
+    result = {f"{result} ({file.name})" for file in files for result in private.findall(file.read_text("utf-8"))}
+    assert not result, f"say it by a public face, or leave it out: {', '.join(sorted(result))}"
 
 
 LOOK = """

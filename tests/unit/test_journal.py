@@ -90,7 +90,7 @@ def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp
         n = 6 if stops == "all" else 5
         assert (report.imported, report.quarantined, report.repeated) == ((0, 0, n) if again else (n, 0, 0))
         with DataEngine.open(path) as engine:
-            known, last = engine.store.outcomes_since(200), engine.store.labelled(n)
+            records, last = engine.store.outcomes_since(200), engine.store.labelled(n)
             outcomes, sources = engine.store.tally().outcomes, engine.store.status()["sources"]
             members = engine.model.rule.state_dict()["evidence.level_totals"].clone()
         lower, success = [0.25, 0.925, 0.9375, 0.9375, 0.9375, 0.0], [True, True, False, True, False, False]
@@ -99,8 +99,8 @@ def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp
         if stops == "some":  # of the second nothing is known
             lower, success, hashes = (values[:1] + values[2:] for values in (lower, success, hashes))
             silent = [0, 1, 0, 0, 0]
-        told = [(each.lower, each.success, each.silent, each.novel) for each in known]
-        assert told == list(zip(lower, success, silent, [False] * (n - 1) + [True], strict=True))
+        answers = [(item.lower, item.success, item.silent, item.novel) for item in records]
+        assert answers == list(zip(lower, success, silent, [False] * (n - 1) + [True], strict=True))
         assert last.hashes.tolist() == hashes
         assert (outcomes.false_accepts, outcomes.audited_accepts, outcomes.audited_accepts_bad) == (1, 1, 1)
         assert (outcomes.accepted, outcomes.confirmed) == ((3, 2) if stops == "all" else (4, 1))
@@ -110,18 +110,18 @@ def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp
 
 @pytest.mark.parametrize("stops", ["some", "all"])
 def test_a_journal_that_grew_adds_what_is_new(data: Dataset, make_data, tmp_path: Path, stops: Any) -> None:
-    X, found = make_data(7, seed=4).X, {}
+    X, result = make_data(7, seed=4).X, {}
     new = new_store(data, tmp_path / "new.db", stops=stops, audit_rate=0.1)
     for cuts in ([7], [2, 3, 7], range(1, 8)):
         path = shutil.copy(new, str(tmp_path / f"{len(cuts)}.db"))
         for n in cuts:
             import_journal(path, write_lines(tmp_path / "cell.csv", X, CELL[:n]))
         with DataEngine.open(path) as engine:
-            known = engine.store.outcomes_since(200)
-            found[len(cuts)] = ([(each.lower, each.silent) for each in known], engine.store.tally().outcomes)
+            records = engine.store.outcomes_since(200)
+            result[len(cuts)] = ([(item.lower, item.silent) for item in records], engine.store.tally().outcomes)
             engine.decide(X[0])
             engine.report(engine.decide(make_data(1, seed=8, noise=9.0).X[0]).id, True)  # silence adds up: no StoreError
-    assert found[1] == found[3] == found[7]
+    assert result[1] == result[3] == result[7]
 
 
 LATE = [
@@ -140,8 +140,8 @@ LATE = [
 
 def test_labels_that_came_late_stand_where_they_came(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     journal = read_journal(write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE), TraceSpec(100))
-    found = [(line.decision.id, line.label, line.late) for line in journal.lines]
-    assert found == [
+    results = [(line.decision.id, line.label, line.late) for line in journal.lines]
+    assert results == [
         ("a-1", True, True),
         ("a-2", None, False),  # went on, when the next part came
         ("a-2", False, True),  # its stop
@@ -159,8 +159,8 @@ def test_late_labels_are_imported_once_by_their_own_ids(data: Dataset, make_data
         report = import_journal(path, write_lines(tmp_path / "cell.csv", X, LATE))
         assert (report.imported, report.repeated, report.contradicted) == ((0, 4, 0) if again else (4, 0, 0))
     with DataEngine.open(path) as engine:
-        held = [engine.store.get_decision(f"a-{i}") for i in range(1, 7)]
-        assert [known and known.success for known in held] == [True, False, None, True, True, None]
+        stored = [engine.store.get_decision(f"a-{i}") for i in range(1, 7)]
+        assert [records and records.success for records in stored] == [True, False, None, True, True, None]
         outcomes = engine.store.tally().outcomes
         assert (outcomes.accepted, outcomes.false_accepts, outcomes.confirmed) == (3, 1, 2)
     contrary = write_lines(tmp_path / "contrary.csv", X, [line.replace("label,a-5,1", "label,a-5,0") for line in LATE])
@@ -184,14 +184,14 @@ def test_a_changed_missing_moved_or_doubled_line_is_named_and_those_before_are_t
     lines, rng = path.read_bytes().splitlines(), np.random.default_rng(0)
 
     def must_take(changed: list[bytes], number: int) -> None:
-        found = []
+        results = []
         for some in (changed[: number - 1], changed):
             path.write_bytes(b"\n".join([*some, b""]))
-            found.append(read_journal(path, TraceSpec(100)))
-        assert f"line {number} of" in found[1].set_aside
-        assert "does not hold line 11, which its head knows" in found[0].set_aside
-        told = [[(line.decision.id, line.label, line.late) for line in journal.lines] for journal in found]
-        assert told[0] == told[1]
+            results.append(read_journal(path, TraceSpec(100)))
+        assert f"line {number} of" in results[1].set_aside
+        assert "does not hold line 11, which its head knows" in results[0].set_aside
+        answers = [[(line.decision.id, line.label, line.late) for line in journal.lines] for journal in results]
+        assert answers[0] == answers[1]
 
     for i in range(4, len(lines) - 1):  # before the fourth line nothing is labelled
         must_take([*lines[:i], *lines[i:][::-1]], i + 1)

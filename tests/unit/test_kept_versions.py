@@ -29,21 +29,21 @@ def test_the_newest_the_first_and_ever_fewer_of_the_older_ones_keep_their_states
 
 
 def test_what_is_kept_grows_with_the_logarithm_of_what_was_trained() -> None:
-    held: set[int] = set()
+    names: set[int] = set()
     most = {}
     for newest in range(1, 20_001):
-        held = {version for version in held | {newest} if keeps_state(version, newest, KEEP)}
-        most[newest] = len(held)
-    assert held >= {1, 10_000, 19_000, 19_900, 19_990, 19_996, 20_000}
+        names = {version for version in names | {newest} if keeps_state(version, newest, KEEP)}
+        most[newest] = len(names)
+    assert names >= {1, 10_000, 19_000, 19_900, 19_990, 19_996, 20_000}
     assert max(most.values()) <= KEEP + 1 + 4 * 10
 
 
 def test_a_version_is_loaded_by_its_number(store: SqlStore) -> None:
     put(store, 12)
     for version in (1, 10, 12):
-        found = store.load_version(version)
-        assert (found.version, found.last_seq, found.state["w"].tolist()) == (version, version, [float(version)] * 20)
-    found.state["w"][:] = 0  # an array of its own
+        result = store.load_version(version)
+        assert (result.version, result.last_seq, result.state["w"].tolist()) == (version, version, [float(version)] * 20)
+    result.state["w"][:] = 0  # an array of its own
     assert store.load_version(12).state["w"][0] == 12
     for version in (2, 13, 0):
         with pytest.raises(StoreError, match=rf"got {version}, which is not kept; load one of these: 1, 8, 9, 10, 11, 12"):
@@ -83,7 +83,8 @@ def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall
 
 def damage(file: Path, *versions: int) -> None:
     execute(
-        file, *(f"UPDATE model_version SET state = zeroblob(length(state)) WHERE version = {each}" for each in versions)
+        file,
+        *(f"UPDATE model_version SET state = zeroblob(length(state)) WHERE version = {version}" for version in versions),
     )
 
 
@@ -95,8 +96,8 @@ def test_a_damaged_version_is_passed_over_and_told_of_once(tmp_path: Path) -> No
     for _ in range(2):
         with SqlStore(str(file)) as store:
             assert store.last_version().version == 10
-            told = [event.text for event in store.events() if event.kind == "damaged"]
-            assert ["version 12" in told[0], "version 11" in told[1], len(told)] == [True, True, 2]
+            answers = [event.text for event in store.events() if event.kind == "damaged"]
+            assert ["version 12" in answers[0], "version 11" in answers[1], len(answers)] == [True, True, 2]
             with pytest.raises(StoreError, match=r"state of version 12.*bytes have changed"):
                 store.load_version(12)
 

@@ -72,9 +72,9 @@ def faults(file: Path) -> list[tuple[str, str]]:
 def test_what_a_store_wrote_is_whole_in_every_database(place: tuple[str, str]) -> None:
     with SqlStore(*place) as store:
         write(store)
-    found = verify_history(*place)
-    assert (found.ok, found.faults) == (True, ())
-    assert found.cells[0].rows == 2 * 16 + 14 + 3 + 3 + 2
+    result = verify_history(*place)
+    assert (result.ok, result.faults) == (True, ())
+    assert result.cells[0].rows == 2 * 16 + 14 + 3 + 3 + 2
 
 
 def test_the_digest_depends_on_what_was_written_and_not_on_the_database(place: tuple[str, str], tmp_path: Path) -> None:
@@ -98,8 +98,8 @@ def test_every_transaction_is_an_entry_and_an_empty_one_or_one_that_fails_is_non
             lambda: put_label(store, "a", True, Source.VERIFICATION, 0, None),
         ]
         for n, put in enumerate(puts):
-            found = verify_history(*place)
-            assert (found.ok, found.cells[0].entries) == (True, n)
+            result = verify_history(*place)
+            assert (result.ok, result.cells[0].entries) == (True, n)
             put()
         assert verify_history(*place).cells[0].entries == 3
 
@@ -266,12 +266,12 @@ def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path: Path, monkeypa
             connection.execute("UPDATE ledger SET digest = ? WHERE number = ?", (previous, entry["number"]))
     assert {table for table, _ in faults(file)} == {"ledger"}
     other = str(make_key(tmp_path / "other.key"))
-    for said, named in (("with a key", ""), ("with another key", other), ("without a key", key)):
-        if said == "without a key":  # that it ever had one is gone too
+    for text, named in (("with a key", ""), ("with another key", other), ("without a key", key)):
+        if text == "without a key":  # that it ever had one is gone too
             execute(file, "DELETE FROM setting WHERE key = 'ledger_key'")
         monkeypatch.setenv(KEY_VARIABLE, named)
         for use in (SqlStore, verify_history):
-            with pytest.raises(StoreError, match=f"was begun, or made anew, {said}"):
+            with pytest.raises(StoreError, match=f"was begun, or made anew, {text}"):
                 use(str(file))
     monkeypatch.delenv(KEY_VARIABLE)
     assert verify_history(str(file)).ok  # which is why it has to be keyed
@@ -284,9 +284,9 @@ def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file: Pa
     data = bytearray(file.read_bytes())
     data[(root - 1) * size : (root - 1) * size + 100] = bytes(100)
     file.write_bytes(data)
-    found = faults(file)
-    assert ("file", "") in found
-    assert ("event", "") in found
+    result = faults(file)
+    assert ("file", "") in result
+    assert ("event", "") in result
 
 
 def test_another_cells_faults_are_its_own(file: Path) -> None:
@@ -299,9 +299,9 @@ def test_another_cells_faults_are_its_own(file: Path) -> None:
         verify_history(str(file), "a third")
 
 
-@pytest.mark.parametrize("made", [lambda path: None, lambda path: sqlite3.connect(path).execute("CREATE TABLE t (id)")])
-def test_what_is_no_store_is_refused_and_nothing_is_made(made: Callable[[Path], object], tmp_path: Path) -> None:
-    made(tmp_path / "a.db")
+@pytest.mark.parametrize("created", [lambda path: None, lambda path: sqlite3.connect(path).execute("CREATE TABLE t (id)")])
+def test_what_is_no_store_is_refused_and_nothing_is_made(created: Callable[[Path], object], tmp_path: Path) -> None:
+    created(tmp_path / "a.db")
     before = (tmp_path / "a.db").exists()
     with pytest.raises(StoreError, match="Expected a"):
         verify_history(str(tmp_path / "a.db"))
@@ -315,11 +315,11 @@ def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file: Pat
     execute(file, changed, "DELETE FROM trace WHERE decision_id = 'd4'")
     with SqlStore(str(file)) as store:
         for _ in range(2):
-            found, kept = store.labelled(), ~np.isin(whole.seq, [4, 5])
+            result, kept = store.labelled(), ~np.isin(whole.seq, [4, 5])
             for name in ("seq", "traces", "labels", "hashes"):
-                np.testing.assert_array_equal(getattr(found, name), getattr(whole, name)[kept])
-        (told,) = (event.text for event in store.events() if event.kind == "damaged")
-        assert "decision d3, d4" in told
+                np.testing.assert_array_equal(getattr(result, name), getattr(whole, name)[kept])
+        (answer,) = (event.text for event in store.events() if event.kind == "damaged")
+        assert "decision d3, d4" in answer
         with pytest.raises(StoreError, match=r"'d3'.*bytes have changed"):
             store.get_decision("d3")
     execute(file, "UPDATE trace SET data = zeroblob(800)")
@@ -333,22 +333,22 @@ def verb(*words: object) -> tuple[int, str]:
 
 
 def test_the_verb_shows_the_digest_and_names_what_is_wrong_with_exit_code_1(file: Path) -> None:
-    code, said = verb(file, "--json")
-    document = json.loads(said)
+    code, text = verb(file, "--json")
+    document = json.loads(text)
     assert (code, document["ok"], document["faults"]) == (0, True, [])
     digest = document["cells"][0]["digest"]
-    code, said = verb(file, "--expect", digest)
-    assert (code, digest in said) == (0, True)
+    code, text = verb(file, "--expect", digest)
+    assert (code, digest in text) == (0, True)
     execute(file, "UPDATE label SET success = NOT success WHERE seq = 3")
-    code, said = verb(file)
-    assert (code, "cell cell: label d2 was changed." in said) == (1, True)
-    code, said = verb(file, "--json", "--cell", "cell")
-    assert (code, json.loads(said)["faults"][0]["key"]) == (1, "d2")
+    code, text = verb(file)
+    assert (code, "cell cell: label d2 was changed." in text) == (1, True)
+    code, text = verb(file, "--json", "--cell", "cell")
+    assert (code, json.loads(text)["faults"][0]["key"]) == (1, "d2")
     assert verb(file.parent / "none.db")[0] == 1
 
 
 @pytest.mark.parametrize(
-    ("one", "other"),
+    ("first", "other"),
     [
         ({"a": "1"}, {"a": 1}),
         ({"a": 1.0}, {"a": 1}),
@@ -359,9 +359,9 @@ def test_the_verb_shows_the_digest_and_names_what_is_wrong_with_exit_code_1(file
         ({"a": ""}, {}),
     ],
 )
-def test_rows_that_differ_have_sums_that_differ(one: dict[str, object], other: dict[str, object]) -> None:
-    assert row_sum("label", one) != row_sum("label", other)
-    assert row_sum("label", one) != row_sum("event", one)
+def test_rows_that_differ_have_sums_that_differ(first: dict[str, object], other: dict[str, object]) -> None:
+    assert row_sum("label", first) != row_sum("label", other)
+    assert row_sum("label", first) != row_sum("event", first)
 
 
 def test_a_sum_is_what_it_was() -> None:

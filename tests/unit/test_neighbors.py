@@ -49,8 +49,8 @@ def test_a_full_ring_holds_exactly_the_newest_points(batches: list[int], capacit
         start += size
     kept = slice(max(0, start - capacity), start)
     assert len(index) == min(start, capacity)
-    held = sorted(map(tuple, index.column("points").tolist()))
-    assert held == sorted(map(tuple, Z[kept].tolist()))
+    items = sorted(map(tuple, index.column("points").tolist()))
+    assert items == sorted(map(tuple, Z[kept].tolist()))
     expected = (int(y[kept].sum()), int((1 - y[kept]).sum()))
     assert tuple(int(c[0]) for c in index.count(np.zeros((1, 2)), radius=100.0)) == expected
 
@@ -63,9 +63,9 @@ def test_counts_over_k_spaces_are_the_sum_of_the_counts_in_each(K: int, d: int, 
     queries = np.random.default_rng(seed + 1).normal(0, 1, (6, K, d)).astype(np.float32)
     index = filled(Z, y, spaces)
     for i, query in enumerate(queries):
-        each = [brute(Z[spaces == k], y[spaces == k], query[k], radius) for k in range(K)]
+        item = [brute(Z[spaces == k], y[spaces == k], query[k], radius) for k in range(K)]
         n_success, n_failure = index.count(queries[i : i + 1], radius)
-        assert (n_success[0], n_failure[0]) == tuple(np.sum(each, axis=0))
+        assert (n_success[0], n_failure[0]) == tuple(np.sum(item, axis=0))
 
 
 @pytest.mark.parametrize("radius", [0.5, LARGEST_RADIUS])
@@ -80,8 +80,8 @@ def repeats(n_parts: int, times: int, agree: float, seed: int = 0) -> tuple[np.n
     """Points in no order, labels 80 % good; each is its part's common draw with probability `agree`, else its own."""
     rng = np.random.default_rng(seed)
     part = np.repeat(np.arange(1, n_parts + 1), times)
-    common, own = rng.random(n_parts) < 0.8, rng.random(n_parts * times) < 0.8
-    labels = np.where(rng.random(n_parts * times) < agree, common[part - 1], own).astype(np.int8)
+    common, custom = rng.random(n_parts) < 0.8, rng.random(n_parts * times) < 0.8
+    labels = np.where(rng.random(n_parts * times) < agree, common[part - 1], custom).astype(np.int8)
     return rng.normal(size=(len(part), 2)).astype(np.float32), labels, part % 3, part
 
 

@@ -98,9 +98,9 @@ def test_huge_values_are_novel_to_a_gate_that_learned_and_to_no_other(gate: Nove
 
 @pytest.mark.parametrize("size", [1e6, 1e30, 3e38])
 def test_a_glitch_among_the_references_blinds_to_nothing_else(size: float) -> None:
-    known = KNOWN.copy()
-    known[100], known[200, 0, 500] = size, -size
-    gate = fit_novelty(known, 1.5)
+    traces = KNOWN.copy()
+    traces[100], traces[200, 0, 500] = size, -size
+    gate = fit_novelty(traces, 1.5)
     assert share(gate, HELD_OUT[:300]) <= 0.01
     for kind in ("noise", "hum", "offset"):
         assert share(gate, GARBAGE[kind](HELD_OUT[:50], np.random.default_rng(1))) == 1.0
@@ -114,10 +114,10 @@ def three_channels(x: Traces) -> Traces:
 
 @pytest.mark.parametrize("channel", range(3))
 def test_a_channel_that_dies_is_novel(channel: int) -> None:
-    known, held_out = three_channels(KNOWN[:300]), three_channels(HELD_OUT[:50])
-    gate = fit_novelty(known, 1.5)
+    traces, held_out = three_channels(KNOWN[:300]), three_channels(HELD_OUT[:50])
+    gate = fit_novelty(traces, 1.5)
     assert share(gate, held_out) <= 0.04
-    for value in (0.0, known[:, channel].mean()):
+    for value in (0.0, traces[:, channel].mean()):
         dead = held_out.copy()
         dead[:, channel] = value
         assert share(gate, dead) == 1.0

@@ -36,8 +36,8 @@ def test_the_published_figures_are_the_papers(repo: Path) -> None:
     for interval, label in (("wilson", "tab:wsFalsePositiveCount"), ("binomial", "tab:biFalsePositiveCount")):
         table = text[: text.index(label)].rsplit("tabular", 2)[-2]
         for alpha in ALPHAS:
-            said = " & ".join("{}/{}".format(*PUBLISHED[interval, alpha, bound]) for bound in LOWER_BOUNDS)
-            assert f"{alpha} & {said}" in table
+            output = " & ".join("{}/{}".format(*PUBLISHED[interval, alpha, bound]) for bound in LOWER_BOUNDS)
+            assert f"{alpha} & {output}" in table
 
 
 def test_a_table_has_the_papers_form_with_ours_and_theirs() -> None:
@@ -52,23 +52,23 @@ def test_a_table_has_the_papers_form_with_ours_and_theirs() -> None:
 
 
 def test_the_papers_own_figures_bear_its_findings_out() -> None:
-    found = findings(pd.concat([frame(), frame("binomial")]))
+    lines = findings(pd.concat([frame(), frame("binomial")]))
     claims = ("Wilson answers", "Binomial does not answer", "share of false positives", "delays the first", "a retrain of")
-    assert [by_claim(found, claim) for claim in claims] == [[True], [True], [True] * 2, [True] * 3, [True]]
-    told = findings(frame(recipe="knn k=5"))  # no interval of ours
-    assert [by_claim(told, claim) for claim in claims] == [[], [], [True], [], [True]]
+    assert [by_claim(lines, claim) for claim in claims] == [[True], [True], [True] * 2, [True] * 3, [True]]
+    answer = findings(frame(recipe="knn k=5"))  # no interval of ours
+    assert [by_claim(answer, claim) for claim in claims] == [[], [], [True], [], [True]]
 
 
 def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_nothing_breaks_no_tolerance() -> None:
-    found = findings(pd.concat([frame(certain=900), frame("binomial", certain=500, false_positive=60)]))
-    assert by_claim(found, "Wilson answers") == [False]
-    assert by_claim(found, "share of false positives") == [True, False]
-    assert any("in 3 of 9 cells, at most 12.0 %" in line for line in found)  # not at LB 90 and 95 %
+    lines = findings(pd.concat([frame(certain=900), frame("binomial", certain=500, false_positive=60)]))
+    assert by_claim(lines, "Wilson answers") == [False]
+    assert by_claim(lines, "share of false positives") == [True, False]
+    assert any("in 3 of 9 cells, at most 12.0 %" in line for line in lines)  # not at LB 90 and 95 %
     assert by_claim(findings(frame(first_certain=50.0)), "delays the first") == [False] * 3
     assert by_claim(findings(frame(retrain=2.4)), "a retrain of conv") == [False]
-    found = findings(frame(certain=0, false_positive=0, first_certain=float("nan")))
+    lines = findings(frame(certain=0, false_positive=0, first_certain=float("nan")))
     claims = ("share of false positives", "delays the first", "answer")
-    assert [by_claim(found, claim) for claim in claims] == [[True], [], []]
+    assert [by_claim(lines, claim) for claim in claims] == [[True], [], []]
 
 
 def test_the_page_has_a_part_for_each_feedback() -> None:

@@ -28,16 +28,16 @@ def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(make_
     conditions = DecisionConditions(TraceSpec(40))
     queries = [*data.X[100:, None], *make_data(20, samples=40, seed=9).X[:, None], np.ones((1, 40), np.float32)]
     for x in queries:
-        found = trace_gate(*x.shape)(torch.from_numpy(x))
+        result = trace_gate(*x.shape)(torch.from_numpy(x))
         for part in (0, 7):
             fault, content, action, predicted, reason, lower, upper, n_success, n_failure, z, propensity = model.decide_one(
                 x, part, conditions
             )
-            assert (fault, content) == found
+            assert (fault, content) == result
             if not fault:  # without a vote on itself
                 embedding = tuple(map(tuple, z.tolist()))
-                said = (ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
-                assert model.predict_one(x, part or content) == said
+                text = (ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
+                assert model.predict_one(x, part or content) == text
             assert (action, propensity) == (predicted, 0.0 if action else 1.0)
 
 
@@ -73,8 +73,8 @@ def test_a_label_added_later_is_counted_in_its_own_folds_space(data: Dataset) ->
     ring, fold = model.index, content_fold(data.X, 2)
     assert (ring.spaces[:200].numpy() == fold).all()
     assert (ring.labels[1, :200].numpy() == data.y).all()
-    own = model.spaces.embed_references(data.X[150:, None, :], fold[150:]) / model.scale[fold[150:], None]
-    np.testing.assert_allclose(ring.points[:, 150:200].numpy().T, own, atol=1e-5)
+    custom = model.spaces.embed_references(data.X[150:, None, :], fold[150:]) / model.scale[fold[150:], None]
+    np.testing.assert_allclose(ring.points[:, 150:200].numpy().T, custom, atol=1e-5)
 
 
 class _Nosy(TransformerMixin, BaseEstimator):

@@ -19,14 +19,14 @@ from tests.support.replays import replay_of
 def test_the_rates_are_those_of_scikit_learn_over_what_was_decided(cycles) -> None:
     action, truth = np.array([a for a, _ in cycles]), np.array([t for _, t in cycles])
     accepted, certain = action == "accept", action != "verify"
-    found, expected = replay_of(action, truth).summary(), dict.fromkeys(("accuracy", "precision", "npv"), math.nan)
+    result, expected = replay_of(action, truth).summary(), dict.fromkeys(("accuracy", "precision", "npv"), math.nan)
     if certain.any():
         expected["accuracy"] = accuracy_score(truth[certain], accepted[certain])
     if accepted.any():
         expected["precision"] = precision_score(truth[certain], accepted[certain])
     if (action == "reject").any():
         expected["npv"] = precision_score(~truth[certain], ~accepted[certain])
-    assert {name: found[name] for name in expected} == pytest.approx(expected, nan_ok=True)
+    assert {name: result[name] for name in expected} == pytest.approx(expected, nan_ok=True)
 
 
 TWENTY = replay_of(["accept"] * 400, np.arange(400) % 20 != 0)
@@ -47,11 +47,11 @@ def test_no_error_leaves_what_as_many_different_traces_leave() -> None:
 
 
 def test_rejects_are_a_side_of_their_own() -> None:
-    one = replay_of(["reject", "reject", "reject", "accept"], [True, False, False, False])
-    assert pooled_error([one], "rejected").rate == pytest.approx(1 / 3)
-    assert pooled_error([one]).rate == 1.0
+    first = replay_of(["reject", "reject", "reject", "accept"], [True, False, False, False])
+    assert pooled_error([first], "rejected").rate == pytest.approx(1 / 3)
+    assert pooled_error([first]).rate == 1.0
     with pytest.raises(SettingError, match="accepted or rejected, got 'reject'"):
-        pooled_error([one], "reject")
+        pooled_error([first], "reject")
 
 
 def test_the_interval_covers_the_true_share_of_other_parts() -> None:

@@ -22,9 +22,9 @@ def played(data: Dataset) -> Replay:
 
 @pytest.mark.parametrize("recipe", [RECIPE, RECIPE.with_policy(audit_rate=0.3), KNOWN], ids=["plain", "audited", "known"])
 def test_a_seed_repeats_exactly(data: Dataset, recipe: Recipe) -> None:
-    one, other = (replay(data, recipe, seed=1) for _ in range(2))
-    assert one.accepted.sum() > 20
-    same(one, other)
+    first, other = (replay(data, recipe, seed=1) for _ in range(2))
+    assert first.accepted.sum() > 20
+    same(first, other)
 
 
 def test_a_budget_of_wall_time_changes_nothing_in_a_replay(data: Dataset, played: Replay) -> None:
@@ -53,9 +53,9 @@ def test_fewer_cycles_are_the_beginning_of_the_same_pass_told_one_by_one(data: D
 def test_a_replays_repr_shows_its_policy_whose_two_numbers_may_be_given_directly(data: Dataset) -> None:
     plain = replay(data, "pca", cycles=30)
     assert "alpha 0.05, LB 95 %, local" in repr(plain)
-    found = replay(data, "pca", cycles=30, alpha=0.3, lower_bound=0.7)
-    same(found, replay(data, Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7), cycles=30))
-    assert "alpha 0.3, LB 70 %" in repr(found)
+    run = replay(data, "pca", cycles=30, alpha=0.3, lower_bound=0.7)
+    same(run, replay(data, Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7), cycles=30))
+    assert "alpha 0.3, LB 70 %" in repr(run)
     assert "alpha 0.3, LB 95 %" in repr(replay(data, "knn", cycles=30, alpha=0.3))
     with pytest.raises(SettingError, match="alpha beside an engine"):
         replay(data, DataEngine("pca"), cycles=30, alpha=0.3)
@@ -78,10 +78,10 @@ def test_a_live_run_and_a_replay_by_recipe_or_engine_keep_the_same_record(data: 
     assert played.stretches(4) == log.stretches(4)
     same(replay(data, engine(), seed=1), played)
     log = watch(engine(), Silent(ReplayCell(data, order)), 200)  # what the cell does not tell stays unknown
-    told = log.verified | log.stopped
-    assert 0 < told.sum() < 200
-    np.testing.assert_array_equal(log.truth[told], played.truth[told])
-    assert np.isnan(log.truth[~told]).all()
+    answer = log.verified | log.stopped
+    assert 0 < answer.sum() < 200
+    np.testing.assert_array_equal(log.truth[answer], played.truth[answer])
+    assert np.isnan(log.truth[~answer]).all()
     assert log.clock_s is None
 
 
@@ -107,7 +107,7 @@ def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(
     with pytest.raises(DataError, match="because windows are in seconds; give rate_hz"):
         replay(data, RECIPE.with_policy(windows=[window]))
     data = replace(data, rate_hz=500.0)
-    log, wide = (replay(data, RECIPE.with_policy(windows=[each]), seed=1) for each in (window, "0:1:-1e9:"))
+    log, wide = (replay(data, RECIPE.with_policy(windows=[item]), seed=1) for item in (window, "0:1:-1e9:"))
     same(wide, played, "recipe")
     out = highest[log.index] > np.quantile(highest, 0.8)
     np.testing.assert_array_equal(log.outside, out)
@@ -123,9 +123,9 @@ def test_a_notebook_sees_short_records_the_status_and_times_as_datetimes(data: D
     decision = [cycle.decision for cycle in engine.run(ReplayCell(data), 80)][-1]
     frame = engine.history_frame(last=5)
     assert (frame["time"].dt.tz is not None, frame.index[-1], engine.status().ever.decisions) == (True, decision.id, 80)
-    for each in (engine, decision, data, played, engine.explain(decision.id), engine.status()):
-        assert len(repr(each)) < 240
-        assert each._repr_html_().startswith("<table>")
+    for item in (engine, decision, data, played, engine.explain(decision.id), engine.status()):
+        assert len(repr(item)) < 240
+        assert item._repr_html_().startswith("<table>")
 
 
 def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Dataset, tmp_path) -> None:

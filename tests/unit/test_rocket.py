@@ -58,14 +58,14 @@ def test_space_k_is_the_same_bit_for_bit_whatever_the_labels_of_fold_k_also_over
     folds, rng = content_fold(X, 3), np.random.default_rng(1)
     other = y.copy()
     other[folds == k] = 1 - y[folds == k]
-    one, two = RocketReducer(folds=3), RocketReducer(folds=3)
+    first, two = RocketReducer(folds=3), RocketReducer(folds=3)
     for n in (60, 110, 160):
-        one.train(X[:n], y[:n], folds[:n])
+        first.train(X[:n], y[:n], folds[:n])
         two.train(X[:n], other[:n], folds[:n])
         other[folds == k] = rng.permutation(other[folds == k])  # other labels again at the next warm start
-        a, b = one.embed(X), two.embed(X)
+        a, b = first.embed(X), two.embed(X)
         assert np.array_equal(a[:, k], b[:, k])
-        assert one.holdout_losses_[k] == two.holdout_losses_[k]
+        assert first.holdout_losses_[k] == two.holdout_losses_[k]
         assert not np.array_equal(a, b)  # the other spaces did see them
 
 
@@ -87,8 +87,8 @@ def test_a_warm_start_ends_where_a_cold_start_does():
     X, y = traces(300)
     cold = RocketReducer().fit(X, y)
     warm = train(train(clone(cold).set_state(cold.get_state()), X[:100], y[:100]), X, y)
-    for one, other in zip(warm.towers_, cold.towers_, strict=True):
-        assert (one.w - other.w).abs().max() < 5e-3
+    for first, other in zip(warm.towers_, cold.towers_, strict=True):
+        assert (first.w - other.w).abs().max() < 5e-3
     # A share is a tenth, and two of them may say labels equally well.
     assert np.abs(warm.embed(X)[:, :, 0] - cold.embed(X)[:, :, 0]).max() < 0.1
 
@@ -205,13 +205,13 @@ def test_heads_end_where_scikit_learns_logistic_regression_does():
 def test_the_components_are_found_anew_where_the_traces_grew_by_half_and_the_second_axis_keeps_its_direction():
     X, y = traces(160)
     reducer = train(RocketReducer(), X[:60], y[:60])
-    found = []
+    results = []
     for n in (80, 100, 160):
         before = reducer.towers_[0].axes, reducer.embed(X)
         train(reducer, X[:n], y[:n])
-        found.append(reducer.towers_[0].axes is not before[0])
+        results.append(reducer.towers_[0].axes is not before[0])
         assert np.corrcoef(before[1][:, 0, 1], reducer.embed(X)[:, 0, 1])[0, 1] > 0.5
-    assert found == [False, True, True]
+    assert results == [False, True, True]
 
 
 @pytest.mark.parametrize("kind", [partial(RocketReducer, groups=0), RocketReducer])
@@ -223,15 +223,17 @@ def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_to
         seen = [f[:, columns] for columns in reducer.net_.encoder.towers]
         seen.append(pairwise_products(reducer.towers_[0].components(seen[0])[:, :N_LEADING]))
         variances = (*TOWER_VARIANCES[: len(reducer.net_.encoder.towers)], PRODUCT_VARIANCE)
-        for tower, own, variance in zip(reducer.towers_, seen, variances, strict=False):
-            g = own.double() @ tower.axes.double() + tower.centre
+        for tower, custom, variance in zip(reducer.towers_, seen, variances, strict=False):
+            g = custom.double() @ tower.axes.double() + tower.centre
             logits.append((g @ tower.w[:, :-1].T + tower.w[:, -1]).numpy())
             assert g.var(0).sum() == pytest.approx(variance, rel=0.05)  # what a ridge of 1 is weighed against
-    for k, said in enumerate(reducer.embed(X)[..., 0].T):
+    for k, text in enumerate(reducer.embed(X)[..., 0].T):
         mixed = [logits[0][:, k]]
-        for each in logits[1:]:
-            mixed = [each[:, k] + share * (one - each[:, k]) for one in mixed for share in np.linspace(0.0, 1.0, N_SHARES)]
-        assert min(np.abs(expit(one) - said).max() for one in mixed) < 1e-5
+        for logit in logits[1:]:
+            mixed = [
+                logit[:, k] + share * (first - logit[:, k]) for first in mixed for share in np.linspace(0.0, 1.0, N_SHARES)
+            ]
+        assert min(np.abs(expit(first) - text).max() for first in mixed) < 1e-5
 
 
 def test_where_good_of_one_product_is_bad_of_the_other_the_products_of_components_tell_it() -> None:
@@ -248,10 +250,10 @@ def test_where_a_resonance_tells_it_kernels_that_compete_sort_better_than_ramps_
     y = rng.integers(2, size=500)
     noise = rng.standard_normal((500, 1, 410))
     echo = np.cos((0.9 + 0.06 * y) * np.arange(10)[:, None]) * 0.8 ** np.arange(10)[:, None]
-    X = sum(noise[..., i : 400 + i] * own[:, None, None] for i, own in enumerate(echo)).astype(np.float32)
+    X = sum(noise[..., i : 400 + i] * custom[:, None, None] for i, custom in enumerate(echo)).astype(np.float32)
     auc = [
         roc_auc_score(y[300:], reducer.embed(X[300:])[..., 0].mean(1))
-        for reducer in (each.fit(X[:300], y[:300]) for each in (RocketReducer(groups=0), RocketReducer()))
+        for reducer in (item.fit(X[:300], y[:300]) for item in (RocketReducer(groups=0), RocketReducer()))
     ]
     assert auc[1] > auc[0] + 0.02
 
@@ -267,14 +269,14 @@ def test_where_a_trace_is_flat_every_kernel_of_a_group_counts_alike() -> None:
 
 def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkeypatch) -> None:
     X, y = traces(90)
-    reducer, folds, computed, found = RocketReducer(), content_fold(X, 5), [], []
+    reducer, folds, computed, results = RocketReducer(), content_fold(X, 5), [], []
     raw = RocketEncoder.raw_features
     monkeypatch.setattr(RocketEncoder, "raw_features", lambda self, x: (computed.append(len(x)), raw(self, x))[1])
     for first, last in ((0, 60), (30, 90), (30, 90), (0, 60)):
         reducer.train(X[first:last], y[first:last], folds[first:last], numbers=np.arange(1 + first, 1 + last))
-        found.append(sum(computed))
+        results.append(sum(computed))
         computed.clear()
-    assert found == [64, 32, 0, 32]  # whole chunks
+    assert results == [64, 32, 0, 32]  # whole chunks
 
 
 def test_features_of_very_many_traces_are_those_of_each_to_the_bit() -> None:
@@ -288,12 +290,12 @@ def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(cha
     encoder = RocketEncoder(channels, samples, 1, kernels, dilations, 3, 0)
     a = torch.randn(5, channels, samples, generator=torch.Generator().manual_seed(0))
     encoder.learn_filters(a, np.random.default_rng(0))
-    found = torch.bmm(encoder.kernel, encoder.as_windows(encoder.read_taps(a), dilations)).view(dilations, kernels, -1, 5)
+    result = torch.bmm(encoder.kernel, encoder.as_windows(encoder.read_taps(a), dilations)).view(dilations, kernels, -1, 5)
     middle = encoder.taps.view(dilations, 9, -1)[:, 4]
     for d, spread in enumerate((1, 2, 7)):  # 2 ** 0, and up to the length over 8
         weight = encoder.kernel[d].reshape(kernels, channels, 9)
         whole = torch.nn.functional.conv1d(a, weight, padding=4 * spread, dilation=spread)  # (5, kernels, samples)
-        torch.testing.assert_close(found[d], whole[:, :, middle[d]].permute(1, 2, 0))
+        torch.testing.assert_close(result[d], whole[:, :, middle[d]].permute(1, 2, 0))
 
 
 @pytest.mark.parametrize("samples", [400, 1000, 5000])

@@ -53,8 +53,8 @@ class FuseRule(DecisionRule):
 
     def action(self, lower: float, upper: float) -> int:
         """The paper's action, but for a pause."""
-        found = action_of(lower, upper, self.accept_threshold, self.reject_threshold)
-        return 0 if found == 1 and int(self.pause.item()) > 0 else found
+        result = action_of(lower, upper, self.accept_threshold, self.reject_threshold)
+        return 0 if result == 1 and int(self.pause.item()) > 0 else result
 
     @torch.jit.export
     def update(
@@ -225,8 +225,8 @@ def test_a_rule_whose_code_was_changed_in_this_process_is_asked_as_it_is_now_and
     rules = rule_module(tmp_path, monkeypatch, f"rules_{list(CHANGES).index(what)}")
     assert says(rules.MyRule, data)[0] is Action.ACCEPT
     monkeypatch.setattr(owner(rules), name, value)
-    found, model = says(rules.MyRule, data)
-    assert found is action
+    result, model = says(rules.MyRule, data)
+    assert result is action
     with pytest.raises(ExportError, match="MyRule was changed after it was compiled; start Python anew"):
         export_torchscript(model, tmp_path / "model.ts")
 
@@ -236,13 +236,13 @@ def test_two_rules_of_one_name_and_a_notebook_cell_that_is_run_again_are_each_as
 ) -> None:
     accepts, rejects = (rule_module(tmp_path, monkeypatch, name, action) for name, action in (("rule_a", 1), ("rule_b", 2)))
     assert [says(module.MyRule, data)[0] for module in (accepts, rejects)] == [Action.ACCEPT, Action.REJECT]
-    said = []
+    texts = []
     for number, action in enumerate((1, 2, 0)):
         cell, named = RULE.format(limits="math", accept=action).replace("math.LIMIT", "0.5"), f"<cell {number}>"
         monkeypatch.setitem(linecache.cache, named, (len(cell), None, cell.splitlines(keepends=True), named))
         notebook: dict[str, type[DecisionRule]] = {"__name__": "__main__"}
         exec(compile(cell, named, "exec"), notebook)  # as a notebook does
-        found, model = says(notebook["MyRule"], data)
+        result, model = says(notebook["MyRule"], data)
         assert model.is_compiled
-        said.append(found)
-    assert said == [Action.ACCEPT, Action.REJECT, Action.VERIFY]
+        texts.append(result)
+    assert texts == [Action.ACCEPT, Action.REJECT, Action.VERIFY]

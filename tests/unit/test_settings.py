@@ -180,8 +180,8 @@ def test_an_own_reducer_enters_by_name_replay_grid_recipe_and_engine(outside, da
 @pytest.mark.parametrize("mine", [{"reducer": "theirs:Own"}, {"policy": replace(POLICY, guarantee="theirs:Rule")}])
 def test_what_a_store_names_is_imported_only_where_its_caller_says_so(outside, mine, data, tmp_path, monkeypatch) -> None:
     module, ran, url = tmp_path / "theirs.py", tmp_path / "ran", str(tmp_path / "engine.db")
-    made = {"reducer": "pca", "policy": POLICY, "retrain_every": 40} | mine
-    with DataEngine(store=address(url, "a", "nut"), **made) as engine:
+    created = {"reducer": "pca", "policy": POLICY, "retrain_every": 40} | mine
+    with DataEngine(store=address(url, "a", "nut"), **created) as engine:
         drive(engine, data, 0, 60)
     monkeypatch.delitem(sys.modules, "theirs")
     module.write_text(module.read_text() + f"open({str(ran)!r}, 'w').close()\n")

@@ -79,17 +79,17 @@ def test_what_is_not_signed_with_the_key_is_refused_before_torch_sees_it(model, 
 def test_a_file_that_is_replaced_loses_its_earlier_signature(key: Path, tmp_path: Path) -> None:
     file, signatures = tmp_path / "model.ts", tmp_path / "model.ts.sig"
     write_export(file, b"one", key=key)
-    one = signatures.read_text()
+    text = signatures.read_text()
     write_export(file, b"two", force=True, key=key)
-    assert signatures.read_text() != one
+    assert signatures.read_text() != text
     write_export(file, b"four", force=True)
     assert not signatures.exists()  # it was of the file that was replaced
 
 
 def test_a_signature_of_another_tool_is_not_replaced(key: Path, tmp_path: Path) -> None:
-    own = tmp_path / "model.ts.sig"
-    own.write_text("-----BEGIN PGP SIGNATURE-----\n")
+    custom = tmp_path / "model.ts.sig"
+    custom.write_text("-----BEGIN PGP SIGNATURE-----\n")
     with pytest.raises(OutputError, match="was left as it was"):
         write_export(tmp_path / "model.ts", b"one", key=key)
-    assert own.read_text().startswith("-----BEGIN")
+    assert custom.read_text().startswith("-----BEGIN")
     assert not (tmp_path / "model.ts").exists()

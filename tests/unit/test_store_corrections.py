@@ -34,13 +34,17 @@ def correct(store: SqlStore, success: bool | None, *names: str, author: str = "k
 def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: SqlStore) -> None:
     fill(store)
     correct(store, None, "1", "3")
-    found = store.labelled()
-    assert (found.seq.tolist(), found.labels.tolist(), found.hashes.tolist()) == ([1, 3, 5], [1, 1, 1], [100, 102, 104])
-    np.testing.assert_array_equal(found.traces, np.stack([trace(i) for i in (0, 2, 4)]))
+    labelled = store.labelled()
+    assert (labelled.seq.tolist(), labelled.labels.tolist(), labelled.hashes.tolist()) == (
+        [1, 3, 5],
+        [1, 1, 1],
+        [100, 102, 104],
+    )
+    np.testing.assert_array_equal(labelled.traces, np.stack([trace(i) for i in (0, 2, 4)]))
     assert store.labelled(2).seq.tolist() == [3, 5]
-    assert [each.seq for each in store.outcomes_since(0)] == [1, 3, 5]
-    held = store.get_decision("1")
-    assert (held.success, held.source, held.trace.tolist()) == (None, Source.VERIFICATION, trace(1).tolist())
+    assert [item.seq for item in store.outcomes_since(0)] == [1, 3, 5]
+    stored = store.get_decision("1")
+    assert (stored.success, stored.source, stored.trace.tolist()) == (None, Source.VERIFICATION, trace(1).tolist())
     assert (store.status()["labels"], store.status()["forgotten"], store.status()["corrected"]) == (3, 2, 0)
 
 
@@ -62,8 +66,8 @@ def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: 
     put(store, "late")
     put_labels(store, label("late"))
     assert correct(store, None, "late", author="") == 3
-    found = store.corrections()
-    assert [(c.number, c.decision_id, c.success, c.author, c.event, c.newest_seq, c.seq) for c in found] == [
+    result = store.corrections()
+    assert [(c.number, c.decision_id, c.success, c.author, c.event, c.newest_seq, c.seq) for c in result] == [
         (1, "2", False, "kim", 2, 3, 3),
         (2, "0", False, "kim", 2, 3, 1),
         (3, "late", None, "", 3, 4, 4),
@@ -76,12 +80,12 @@ def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: 
     assert (store.events()[0].data, store.events()[0].author) == (None, "")
 
 
-@pytest.mark.parametrize(("name", "said"), [("nobody", "does not hold"), ("open", "report its label")])
-def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is_kept(store, name: str, said: str) -> None:
+@pytest.mark.parametrize(("name", "text"), [("nobody", "does not hold"), ("open", "report its label")])
+def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is_kept(store, name: str, text: str) -> None:
     fill(store, 2)
     put(store, "open")
     store.save_settings({"a": "1"})
-    with pytest.raises(ReportError, match=said):
+    with pytest.raises(ReportError, match=text):
         store.apply_change(Change("correct", "", decisions=("0", name), success=False, settings={"a": "2"}))
     assert (store.events(), store.corrections(), store.settings()) == ([], [], {"a": "1"})
     assert store.labelled().labels.tolist() == [1, 0]
@@ -106,8 +110,8 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
         (Action.VERIFY, Action.REJECT, True),
     ]
     for i, (action, predicted, audit) in enumerate(kinds * 2):
-        made = Decision(str(i), action, predicted, 0.9, 1.0, 9, 0, None, i // 3, Reason.CERTAIN, audit, 0.1)
-        put_decision(store, made, trace(i), i, False)
+        created = Decision(str(i), action, predicted, 0.9, 1.0, 9, 0, None, i // 3, Reason.CERTAIN, audit, 0.1)
+        put_decision(store, created, trace(i), i, False)
         put_labels(store, NewLabel(str(i), True, Source.AUDIT, 0, None))
     correct(store, False, "0", "1", "2")
     correct(store, None, "3", "4", "5")
@@ -128,12 +132,12 @@ def test_what_an_earlier_version_decided_can_be_left_out(store: SqlStore) -> Non
         put_labels(store, NewLabel(f"{version}-0", True, Source.CONFIRMED, version, None, silent=version))
     assert store.unreported_accepts(2) == ["2-1", "2-2"]
     assert (store.silent_total(2), store.silent_total()) == (2, 3)
-    assert ([each.seq for each in store.outcomes_since(0, 2)], len(store.outcomes_since(0))) == ([2], 2)
+    assert ([item.seq for item in store.outcomes_since(0, 2)], len(store.outcomes_since(0))) == ([2], 2)
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(said=st.lists(st.tuples(st.integers(0, 5), st.sampled_from([True, False, None])), max_size=12))
-def test_any_corrections_leave_what_plain_python_would(store: SqlStore, said: list[tuple[int, bool | None]]) -> None:
+@given(changes=st.lists(st.tuples(st.integers(0, 5), st.sampled_from([True, False, None])), max_size=12))
+def test_any_corrections_leave_what_plain_python_would(store: SqlStore, changes: list[tuple[int, bool | None]]) -> None:
     run = uuid.uuid4().hex[:8]
     begin = store.status()["labels"] + store.status()["forgotten"]
     before = len(store.corrections())
@@ -141,13 +145,13 @@ def test_any_corrections_leave_what_plain_python_would(store: SqlStore, said: li
         put(store, f"{run}-{i}")
         put_labels(store, label(f"{run}-{i}", i % 2 == 0))
     now: dict[int, bool | None] = {i: i % 2 == 0 for i in range(6)}
-    for i, success in said:
+    for i, success in changes:
         correct(store, success, f"{run}-{i}")
         now[i] = success
     kept = {begin + 1 + i: success for i, success in now.items() if success is not None}
-    found = store.labelled(first=begin + 1)
-    assert dict(zip(found.seq.tolist(), found.labels.tolist(), strict=True)) == kept
-    assert {each.seq: each.success for each in store.outcomes_since(begin)} == kept
+    labelled = store.labelled(first=begin + 1)
+    assert dict(zip(labelled.seq.tolist(), labelled.labels.tolist(), strict=True)) == kept
+    assert {item.seq: item.success for item in store.outcomes_since(begin)} == kept
     assert [store.get_decision(f"{run}-{i}").success for i in range(6)] == list(now.values())
     as_reported = store.labelled(first=begin + 1, corrected_to=before)
     assert as_reported.labels.tolist() == [1, 0, 1, 0, 1, 0]
@@ -166,9 +170,9 @@ def test_the_newest_labels_are_found_along_indexes_where_there_are_corrections(t
     with SqlStore(str(tmp_path / "a.db"), "cell") as store:
         fill(store)
         correct(store, None, "0")
-        with plans(tmp_path / "a.db") as found:
+        with plans(tmp_path / "a.db") as result:
             store.labelled(3)
-    plan = " | ".join(found[0][1])
+    plan = " | ".join(result[0][1])
     assert "USING INDEX label_training" in plan
     assert "USING INDEX correction_of" in plan or "USING COVERING INDEX correction_of" in plan
     assert "SCAN" not in plan

@@ -10,12 +10,12 @@ from dengine.store import SqlStore, open_store
 
 
 @pytest.mark.parametrize(
-    ("said", "argument", "wait"), [(None, None, 0.4), ("7.5", None, 7.5), ("7.5", 2.0, 2.0), ("", None, 0.4)]
+    ("text", "argument", "wait"), [(None, None, 0.4), ("7.5", None, 7.5), ("7.5", 2.0, 2.0), ("", None, 0.4)]
 )
-def test_the_argument_comes_before_the_environment_before_the_default(said, argument, wait, tmp_path, monkeypatch) -> None:
+def test_the_argument_comes_before_the_environment_before_the_default(text, argument, wait, tmp_path, monkeypatch) -> None:
     monkeypatch.delenv("DENGINE_STORE_WAIT")
-    if said is not None:
-        monkeypatch.setenv("DENGINE_STORE_WAIT", said)
+    if text is not None:
+        monkeypatch.setenv("DENGINE_STORE_WAIT", text)
     with SqlStore(str(tmp_path / "a.db"), wait=argument) as store:
         assert store.wait == wait
     opened = open_store(tmp_path / "a.db", wait=argument)
@@ -23,9 +23,9 @@ def test_the_argument_comes_before_the_environment_before_the_default(said, argu
     opened.close()
 
 
-@pytest.mark.parametrize("said", ["soon", "0", "-1", "nan", "inf"])
-def test_an_environment_that_says_no_seconds_is_named(said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("DENGINE_STORE_WAIT", said)
+@pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf"])
+def test_an_environment_that_says_no_seconds_is_named(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DENGINE_STORE_WAIT", text)
     with pytest.raises(StoreError, match="Expected DENGINE_STORE_WAIT above 0 seconds"):
         DataEngine(store=tmp_path / "a.db")
 

@@ -31,7 +31,7 @@ def test_in_the_shadow_mode_every_part_is_in_it_in_order_and_replays_as_its_reco
     assert np.array_equal(data.X, stream.X)
     assert np.array_equal(data.y, stream.y)
     assert (data.name, data.rate_hz, data.unit, data.part) == ("cell", stream.spec.rate_hz, stream.unit, None)
-    lower = [replay(each, RECIPE, seed=0).lower for each in (data, stream)]
+    lower = [replay(item, RECIPE, seed=0).lower for item in (data, stream)]
     assert np.array_equal(*lower)
 
 

@@ -67,9 +67,9 @@ def test_labels_of_fold_k_move_nothing_in_space_k_over_warm_starts_weights_avera
         labels[folds == k] = rng.integers(2, size=(folds == k).sum())
         reducer.train(X[:n], y[:n], folds[:n])
         other.train(X[:n], labels[:n], folds[:n])
-        one, two = reducer.embed(X), other.embed(X)
-        np.testing.assert_array_equal(one[:, k], two[:, k])
-        assert not np.array_equal(one, two)  # the other members did see these labels
+        first, two = reducer.embed(X), other.embed(X)
+        np.testing.assert_array_equal(first[:, k], two[:, k])
+        assert not np.array_equal(first, two)  # the other members did see these labels
 
 
 def test_a_member_that_is_trained_on_its_own_fold_is_caught_by_the_contract(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,8 +215,8 @@ def test_an_augmentation_of_nothing_changes_nothing_and_a_shift_moves_a_trace_in
     assert torch.equal(same_x, x)
     assert torch.equal(same_y, y)
     moved, _ = Augmentation(3, 0.0, 0.0, 0.0)(x, y, np.random.default_rng(0))
-    for one, other in zip(moved.flatten(0, 1), x.flatten(0, 1), strict=True):
-        inner = [torch.equal(one[:, 3:-3], other[:, 3 + by : 37 + by]) for by in range(-3, 4)]
+    for first, other in zip(moved.flatten(0, 1), x.flatten(0, 1), strict=True):
+        inner = [torch.equal(first[:, 3:-3], other[:, 3 + by : 37 + by]) for by in range(-3, 4)]
         assert any(inner)
 
 

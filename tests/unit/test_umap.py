@@ -113,8 +113,8 @@ def test_the_membership_strengths_are_those_of_umap_learn(
     expected, _, _ = umap_.fuzzy_simplicial_set(exact, 15, None, "precomputed")
     neighbors = fitted.neighbors_
     strengths = membership_strengths(neighbors.distances, 15)
-    found = fuzzy_simplicial_set(neighbors.indices, strengths)
-    assert abs(found - expected).max() < 1e-4
+    result = fuzzy_simplicial_set(neighbors.indices, strengths)
+    assert abs(result - expected).max() < 1e-4
     assert find_ab_params(0.1) == pytest.approx(umap_.find_ab_params(1.0, 0.1), rel=1e-6)
 
 
@@ -126,11 +126,11 @@ def test_the_places_are_as_trustworthy_as_those_of_umap_learn(
 ) -> None:
     X, y = insertion
     other = UmapLearnReducer().fit(X).umap_.embedding_
-    own = fitted.embedding_.numpy()
+    custom = fitted.embedding_.numpy()
     rows = X[:, 0]
-    trust = [trustworthiness(rows, places, n_neighbors=15) for places in (own, other)]
+    trust = [trustworthiness(rows, places, n_neighbors=15) for places in (custom, other)]
     assert trust[0] == pytest.approx(trust[1], abs=0.01)
-    assert label_agreement(own, y) > label_agreement(other, y) - 0.01
+    assert label_agreement(custom, y) > label_agreement(other, y) - 0.01
 
 
 def test_places_that_were_trained_warm_are_as_good_as_those_of_one_fit(
@@ -141,7 +141,7 @@ def test_places_that_were_trained_warm_are_as_good_as_those_of_one_fit(
     warm = UmapReducer()
     for n in range(50, N + 1, 50):
         places = train(warm, X, NUMBERS[:n])
-    trust = [trustworthiness(X[:, 0], each, n_neighbors=15) for each in (places, fitted.embedding_)]
+    trust = [trustworthiness(X[:, 0], item, n_neighbors=15) for item in (places, fitted.embedding_)]
     assert trust[0] > trust[1] - 0.01
     assert label_agreement(places, y) > label_agreement(fitted.embedding_.numpy(), y) - 0.02
 
@@ -150,7 +150,7 @@ def test_frames_keep_the_neighbours_of_whole_traces(insertion: Traces, fitted: U
     rows = insertion[0][:, 0]
     whole = NearestNeighbors(n_neighbors=14).fit(rows).kneighbors(return_distance=False)
     pairs = zip(whole.tolist(), fitted.neighbors_.indices.tolist(), strict=True)
-    assert np.mean([len(set(one) & set(other)) / 14 for one, other in pairs]) > 0.95
+    assert np.mean([len(set(pair) & set(other)) / 14 for pair, other in pairs]) > 0.95
 
 
 @pytest.mark.parametrize(
@@ -162,8 +162,8 @@ def test_frames_cover_the_whole_trace(samples: int, n_frames: int) -> None:
     frames = frames_for(X)
     assert frames.n_frames == n_frames
     # Constant traces: nothing averages out, so that each sample left out would shorten a distance.
-    found = pairwise_distances(frames(torch.from_numpy(X)).numpy())
-    np.testing.assert_allclose(found, pairwise_distances(X.reshape(30, -1)), rtol=1e-3, atol=1e-3)
+    result = pairwise_distances(frames(torch.from_numpy(X)).numpy())
+    np.testing.assert_allclose(result, pairwise_distances(X.reshape(30, -1)), rtol=1e-3, atol=1e-3)
 
 
 def test_an_oscillation_is_not_averaged_away() -> None:
@@ -218,8 +218,8 @@ def test_looking_ahead_changes_no_place(insertion: Traces) -> None:
     plain, ahead = UmapReducer(), UmapReducer()
     for n in (200, 260):
         ahead.precompute(X[:n], NUMBERS[:n])
-        found = train(ahead, X, NUMBERS[:n])
-        np.testing.assert_array_equal(found, train(plain, X, NUMBERS[:n]))
+        result = train(ahead, X, NUMBERS[:n])
+        np.testing.assert_array_equal(result, train(plain, X, NUMBERS[:n]))
 
 
 def test_state_is_restored_bit_for_bit_over_further_trainings(insertion: Traces) -> None:
@@ -240,9 +240,9 @@ def test_places_repeat_exactly_with_a_random_state_and_differ_between_two(
     insertion: Traces,
 ) -> None:
     X, _ = insertion
-    one, same, other = (UmapReducer(random_state=seed).fit(X[:100]).embedding_ for seed in (1, 1, 2))
-    assert torch.equal(one, same)
-    assert not torch.equal(one, other)
+    first, same, other = (UmapReducer(random_state=seed).fit(X[:100]).embedding_ for seed in (1, 1, 2))
+    assert torch.equal(first, same)
+    assert not torch.equal(first, other)
 
 
 def test_the_scripted_module_is_the_eager_one_bit_for_bit(
@@ -253,8 +253,8 @@ def test_the_scripted_module_is_the_eager_one_bit_for_bit(
     module = fitted.module()
     scripted = script(module)
     with torch.inference_mode():
-        for one in x.split(1):
-            assert torch.equal(scripted(one), module(one))
+        for word in x.split(1):
+            assert torch.equal(scripted(word), module(word))
         torch.testing.assert_close(scripted(x), module(x), rtol=1e-5, atol=1e-5)
 
 
@@ -295,17 +295,17 @@ def test_both_exports_decide_as_the_model_does(
     data, new = make_data(300), make_data(100, seed=9)
     classifier = WilsonRadiusClassifier(0.5, 0.2, 0.8)
     model = ModelPrediction("umap", classifier).fit(data.X, data.y)
-    one = load_onnx(export_onnx(model, tmp_path / "model.onnx"))
+    exported_onnx = load_onnx(export_onnx(model, tmp_path / "model.onnx"))
     two = load_exported(export_torchscript(model, tmp_path / "model.ts"))
     expected = model.predict_many(new.X)
     actions = [prediction.action for prediction in expected]
     places = np.array([prediction.embedding for prediction in expected])
     assert {Action.ACCEPT, Action.REJECT} <= set(actions)
-    for exported in (one, two):
+    for exported in (exported_onnx, two):
         decided = exported.decide_many(new.X)
         assert [decision.action for decision in decided] == actions
-        found = [decision.embedding for decision in decided]
-        np.testing.assert_allclose(found, places, rtol=1e-4, atol=1e-5)
+        results = [decision.embedding for decision in decided]
+        np.testing.assert_allclose(results, places, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("n_components", [1, 2, 3])

@@ -42,8 +42,10 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
     X[3, 4], X[5] = np.nan, 1.5
     X.tofile(tmp_path / "traces.f32")
     journal = tmp_path / "cell.csv"
-    said = run(build / "consumer", file, tmp_path / "traces.f32", key, journal, env=os.environ | {"LC_ALL": "de_DE.UTF-8"})
-    *lines, last = said.splitlines()
+    completed = run(
+        build / "consumer", file, tmp_path / "traces.f32", key, journal, env=os.environ | {"LC_ALL": "de_DE.UTF-8"}
+    )
+    *lines, last = completed.splitlines()
     expected = load_exported(file, key=key).decide_many(X)
     for line, decision in zip(lines, expected, strict=True):
         id_, *words = line.split()

@@ -93,8 +93,8 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
                     continue
                 engine.report(decisions[k].id, bool(y[k]))
                 stop = decisions[k].action is Action.ACCEPT and not y[k]
-                said = cell.ask(f"stop {ids[k]}" if stop else f"label {ids[k]} {y[k]}")
-                assert said == f"ok {ids[k]}"
+                text = cell.ask(f"stop {ids[k]}" if stop else f"label {ids[k]} {y[k]}")
+                assert text == f"ok {ids[k]}"
                 told_of += k != i
         assert cell.end() == (0, "")
     assert told_of > 20
@@ -102,16 +102,16 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
     assert {d.action for d in decisions} >= {Action.VERIFY, Action.ACCEPT, *rejects}
     report = import_journal(tmp_path / "imported.db", journal)
     assert report.contradicted == report.cut == report.repeated == 0
-    found = []
+    results = []
     for name in ("imported", "own"):
         with DataEngine.open(tmp_path / f"{name}.db") as engine:
-            known, outcomes = engine.store.outcomes_since(400), engine.store.tally().outcomes
+            records, outcomes = engine.store.outcomes_since(400), engine.store.tally().outcomes
             rule = {key: value.tolist() for key, value in engine.model.rule.state_dict().items()}
-            evidence = [(each.lower, each.upper, each.success, each.novel, each.silent) for each in known]
+            evidence = [(item.lower, item.upper, item.success, item.novel, item.silent) for item in records]
             certain = outcomes.false_accepts, outcomes.confirmed, outcomes.audited_accepts, outcomes.audited_accepts_bad
             hashes = engine.store.labelled().hashes.tolist()
-            found.append([evidence, rule, engine.store.status()["sources"], hashes, certain])
-    assert found[0] == found[1]
+            results.append([evidence, rule, engine.store.status()["sources"], hashes, certain])
+    assert results[0] == results[1]
     with DataEngine.open(tmp_path / "imported.db") as engine:
         labelled = next(k for k, d in enumerate(decisions) if k in due[k] and d.action is Action.VERIFY)
         assert engine.store.get_decision(ids[labelled]).success is bool(y[labelled])  # by the id that the cell answered
@@ -152,8 +152,8 @@ def test_a_program_killed_at_any_moment_loses_no_label_that_it_acknowledged_and_
         kills, done = kills + 1, until
     assert kills > 3
     assert decided == whole
-    held = read_journal(tmp_path / "cell.csv", TraceSpec(SAMPLES)).lines
-    assert acknowledged.items() <= {line.decision.id: line.label for line in held if line.label is not None}.items()
+    stored = read_journal(tmp_path / "cell.csv", TraceSpec(SAMPLES)).lines
+    assert acknowledged.items() <= {line.decision.id: line.label for line in stored if line.label is not None}.items()
 
 
 @ONE
@@ -208,14 +208,14 @@ def test_traces_come_from_files_too_and_one_that_cannot_be_read_is_verified(prog
         good.rsplit(",", 1)[0] + ",12N": 'expected a number in column 100, got "12N"',
     }
     with Program(programs, learned.file) as cell:
-        said = [f"decide P1 {tmp_path / name}" for name in ("trace.f32", "column.txt")]
-        answers = [cell.ask(line) for line in (good, good + "\r", *said)]
+        texts = [f"decide P1 {tmp_path / name}" for name in ("trace.f32", "column.txt")]
+        answers = [cell.ask(line) for line in (good, good + "\r", *texts)]
         assert len({answer.split(",", 1)[1].rsplit(",", 1)[0] for answer in answers}) == 1
         for line in wrong:
             assert cell.ask(line).startswith("-,verify,malformed,0,1,0,0,")
-        code, said = cell.end()
+        code, texts = cell.end()
     assert code == 1
-    for line, why in zip(said.splitlines(), wrong.values(), strict=True):
+    for line, why in zip(texts.splitlines(), wrong.values(), strict=True):
         assert "is malformed: " in line
         assert why in line
 
@@ -230,15 +230,15 @@ def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(start,
             if id_ == "-":
                 assert (action, reason) == ("verify", "journal_error")
                 refused += 1
-            elif action == "verify" and (said := cell.ask(f"label {id_} 1")).startswith("ok"):
+            elif action == "verify" and (answer := cell.ask(f"label {id_} 1")).startswith("ok"):
                 acknowledged.append(id_)
             elif action == "verify":
-                assert "cannot be written: File too large" in said
+                assert "cannot be written: File too large" in answer
         assert cell.end()[0] == 1
     assert refused > 10
-    held = read_journal(tmp_path / "cell.csv", TraceSpec(SAMPLES))  # no half line is left
-    assert held.cut == 0
-    assert set(acknowledged) <= {line.decision.id for line in held.lines if line.label}
+    journal = read_journal(tmp_path / "cell.csv", TraceSpec(SAMPLES))  # no half line is left
+    assert journal.cut == 0
+    assert set(acknowledged) <= {line.decision.id for line in journal.lines if line.label}
     with start() as cell:  # there is room again
         assert cell.decide(X[0])[0] != "-"
 

@@ -147,9 +147,9 @@ def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
         journal.write_text(written[:end])
         with Program(programs, file, "--journal", journal) as cell:
             cell.decide(many[0])
-            code, said = cell.end()
+            code, text = cell.end()
         kept = written[:first] if end >= first else written[: written.index("\n") + 1]
-        assert (code, "the last line was cut while it was written" in said) == (0, end > 0)
+        assert (code, "the last line was cut while it was written" in text) == (0, end > 0)
         assert journal.read_text().startswith(kept)
         assert journal.read_text().count("\n") == kept.count("\n") + 1
 

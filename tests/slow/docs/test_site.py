@@ -80,5 +80,5 @@ def test_the_commands_that_install_name_what_is_there() -> None:
     targets = re.findall(r"^([\w-]+):", text_of([REPO / "Makefile"]), flags=re.M)
     assert set(re.findall(r"^make ([\w-]+)", typed, flags=re.M)) <= set(targets)
     named = ",".join(re.findall(r"^python -m pip install .*\[([\w,]+)\]", typed, flags=re.M))
-    known = tomllib.loads(text_of([REPO / "pyproject.toml"]))["project"]["optional-dependencies"]
-    assert set() < set(named.split(",")) <= set(known)
+    extras = tomllib.loads(text_of([REPO / "pyproject.toml"]))["project"]["optional-dependencies"]
+    assert set() < set(named.split(",")) <= set(extras)

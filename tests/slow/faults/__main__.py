@@ -86,11 +86,11 @@ def faults(
     }
     if program is not None:
         killed["SIGKILL of the C++ program"] = partial(kills.kill_programs, times=others, program=program)
-    found = [("SQLite", title(each), each, trials) for each in (*ON_SQLITE, *ON_DISKS)]
-    found += [("SQLite", f"{title(asked_again)}: {ids:,} others in the store", partial(asked_again, stored=ids), 1)]
-    found += [("SQLite", words, fault, 1) for words, fault in killed.items()]
-    found += [("PostgreSQL", title(each), each, trials) for each in ON_POSTGRES]
-    return [*found, *(("PostgreSQL", words, fault, 1) for words, fault in list(killed.items())[:2])]
+    results = [("SQLite", title(fault), fault, trials) for fault in (*ON_SQLITE, *ON_DISKS)]
+    results += [("SQLite", f"{title(asked_again)}: {ids:,} others in the store", partial(asked_again, stored=ids), 1)]
+    results += [("SQLite", words, fault, 1) for words, fault in killed.items()]
+    results += [("PostgreSQL", title(fault), fault, trials) for fault in ON_POSTGRES]
+    return [*results, *(("PostgreSQL", words, fault, 1) for words, fault in list(killed.items())[:2])]
 
 
 def between(program: list[str]) -> None:

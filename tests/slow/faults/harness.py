@@ -135,5 +135,5 @@ def bounds(engine: DataEngine) -> list[tuple[Any, ...]]:
 
 def missing(store: SqlStore, acknowledged: dict[str, bool]) -> int:
     """How many labels a store does not hold as they were acknowledged."""
-    found = {name: store.get_decision(name) for name in acknowledged}
-    return sum(known is None or known.success is not acknowledged[name] for name, known in found.items())
+    result = {name: store.get_decision(name) for name in acknowledged}
+    return sum(item is None or item.success is not acknowledged[name] for name, item in result.items())

@@ -114,21 +114,21 @@ def drive(told: str, seed: int) -> None:
         def ask(path: str, **body: object) -> dict[str, Any]:
             connection.request("POST", path, json.dumps(body), {"content-type": "application/json"})
             answer = connection.getresponse()
-            said: dict[str, Any] = json.loads(answer.read())
+            document: dict[str, Any] = json.loads(answer.read())
             if answer.status != 200:
-                raise ConnectionError(said)
-            return said
+                raise ConnectionError(document)
+            return document
 
         with suppress(OSError, http.client.HTTPException, ValueError):  # it was killed, as it was to be
             for n, _ in enumerate(_for_a_while()):
                 i = int(rng.integers(len(data) - PROBE))
-                said = ask("/decide", trace=data.X[i].tolist(), request=f"{seed}-{n}")
-                if said["late"] or said["reason"] == Reason.NO_STORE:
+                document = ask("/decide", trace=data.X[i].tolist(), request=f"{seed}-{n}")
+                if document["late"] or document["reason"] == Reason.NO_STORE:
                     continue
-                _acknowledge(told, "answer", said["id"], i, said["action"], said["lower"])
-                if said["action"] == Action.VERIFY:
-                    ask("/report", id=said["id"], success=bool(data.y[i]))
-                    _acknowledge(told, "label", said["id"], int(data.y[i]))
+                _acknowledge(told, "answer", document["id"], i, document["action"], document["lower"])
+                if document["action"] == Action.VERIFY:
+                    ask("/report", id=document["id"], success=bool(data.y[i]))
+                    _acknowledge(told, "label", document["id"], int(data.y[i]))
 
 
 def importing(place: Place, told: str, seed: int) -> None:
@@ -154,23 +154,23 @@ def _at_home(surroundings: dict[str, str], child: Callable[..., None], *words: o
 
 def killed(child: Callable[..., None], place: Place, seed: int, most: float = 0.5) -> list[list[str]]:
     """Run a child until a random moment after its first word, kill it, and return what it, and who asked it, told."""
-    told = f"{place.url if '://' not in place.url else f'/tmp/dengine-{os.getpid()}-{place.cell}'}.told"
-    Path(told).write_text("")
-    process = CONTEXT.Process(target=_at_home, args=(dict(os.environ), child, place, told, seed))
+    answer = f"{place.url if '://' not in place.url else f'/tmp/dengine-{os.getpid()}-{place.cell}'}.told"
+    Path(answer).write_text("")
+    process = CONTEXT.Process(target=_at_home, args=(dict(os.environ), child, place, answer, seed))
     process.start()
     end = time.monotonic() + 60
-    while "\n" not in Path(told).read_text() and process.is_alive() and time.monotonic() < end:
+    while "\n" not in Path(answer).read_text() and process.is_alive() and time.monotonic() < end:
         time.sleep(0.005)
     timer = threading.Timer(float(np.random.default_rng(seed).uniform(0.0, most)), process.kill)
     timer.start()
     if child is serving and process.is_alive():
-        drive(told, seed)
+        drive(answer, seed)
     timer.join()
     process.join()
     if process.exitcode != -signal.SIGKILL:
         raise RuntimeError("the process that was to be killed had ended by itself")
-    text = Path(told).read_text()
-    Path(told).unlink()
+    text = Path(answer).read_text()
+    Path(answer).unlink()
     return [line.split() for line in text[: text.rfind("\n") + 1].splitlines()]
 
 
@@ -202,14 +202,14 @@ def check_cell(outcome: Outcome, place: Place, told: list[list[str]], excuse: st
     with DataEngine.open(place.store()) as engine:
         outcome.labels += len(labels)
         outcome.versions += sum(engine.version - int(version) for _, version in began)
-        said = bool(excuse) and any(excuse in event.text for event in engine.store.events())
+        text = bool(excuse) and any(excuse in event.text for event in engine.store.events())
         lost, n_stored = missing(engine.store, labels), engine.store.status()["labels"]
         probe = engine.decide(stream().X[-1])
-        outcome.lost += 0 if said and lost == 1 else lost
+        outcome.lost += 0 if text and lost == 1 else lost
         now = [str(v) for v in (engine.version, probe.lower, probe.upper, probe.n_success, probe.n_failure)]
-        if told and told[-1][0] == "probe" and not said and [n_stored - len(labels)] == [int(n) for n, _ in began]:
+        if told and told[-1][0] == "probe" and not text and [n_stored - len(labels)] == [int(n) for n, _ in began]:
             outcome.must(now == told[-1][1:], f"decides otherwise: {now}, {told[-1]}")
-        for id_, i, *answer in (words[1:] for words in told if words[0] == "answer" and not said):
+        for id_, i, *answer in (words[1:] for words in told if words[0] == "answer" and not text):
             again = engine.decide(stream().X[int(i)], decision_id=id_)
             outcome.must([again.action, str(again.lower)] == answer, f"{id_} is answered otherwise: {answer}, {again}")
 
@@ -226,13 +226,13 @@ def kill_cells(
     damage : done to what was left, of a store of its own each time; returns what is to be said of it.
     """
     for seed in range(times):
-        own = next_place(place, seed if damage else seed - seed % IN_ONE)
+        custom = next_place(place, seed if damage else seed - seed % IN_ONE)
         if damage:
-            DataEngine(recipe=SOON, store=own.store()).close()
-        told = killed(child, own, seed)
+            DataEngine(recipe=SOON, store=custom.store()).close()
+        answer = killed(child, custom, seed)
         outcome.injected += 1
         try:
-            check_cell(outcome, own, told, damage(own, seed) if damage else "")
+            check_cell(outcome, custom, answer, damage(custom, seed) if damage else "")
         except DengineError as error:
             outcome.tell(error)
 
@@ -246,18 +246,18 @@ def kill_imports(outcome: Outcome, place: Place, times: int) -> None:
     """Kill imports, each of a new store; each is then repeated, and has every trace once."""
     n = len(stream())
     for seed in range(times):
-        own = next_place(place, seed)
-        told = killed(importing, own, seed, most=1.5)
+        custom = next_place(place, seed)
+        answer = killed(importing, custom, seed, most=1.5)
         outcome.injected += 1
-        done = sum(int(words[1]) for words in told)
+        done = sum(int(words[1]) for words in answer)
         outcome.labels += done
         try:
-            with own.store() as store:
+            with custom.store() as store:
                 outcome.lost += max(0, done - store.status()["labels"])
-            import_labelled(own.store(), stream(), recipe=RECIPE)
-            with own.store() as store:
-                found = store.status()["labels"]
-            outcome.must(found == n, f"{found} of {n} labels after the repetition")
+            import_labelled(custom.store(), stream(), recipe=RECIPE)
+            with custom.store() as store:
+                labels = store.status()["labels"]
+            outcome.must(labels == n, f"{labels} of {n} labels after the repetition")
         except DengineError as error:
             outcome.tell(error)
 
@@ -275,13 +275,13 @@ def exported(place: Place) -> Path:
 
 def kill_exports(outcome: Outcome, place: Place, times: int) -> None:
     """Kill exports; after each the file decides as the engine does, or is refused as damaged."""
-    known = load_exported(exported(place)).decide(stream().X[0])
+    decision = load_exported(exported(place)).decide(stream().X[0])
     for seed in range(times):
         killed(exporting, place, seed, most=0.3)
         outcome.injected += 1
         with suppress(ExportError):  # killed between the file and its sum: exported again it is whole
-            found = load_exported(Path(place.url).with_suffix(".ts")).decide(stream().X[0])
-            outcome.must(found.action is known.action, "a killed export decides otherwise")
+            result = load_exported(Path(place.url).with_suffix(".ts")).decide(stream().X[0])
+            outcome.must(result.action is decision.action, "a killed export decides otherwise")
 
 
 def kill_programs(outcome: Outcome, place: Place, times: int, program: Path) -> None:
@@ -311,8 +311,8 @@ def killed_program(command: list[str], seed: int) -> dict[str, bool]:
 
     def ask(line: str) -> str:
         process.stdin.write(line + "\n")
-        said = process.stdout.readline()
-        return said if said.endswith("\n") else ""
+        text = process.stdout.readline()
+        return text if text.endswith("\n") else ""
 
     try:
         while True:

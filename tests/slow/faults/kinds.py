@@ -260,31 +260,31 @@ def _unsynced(cell: Cell, i: int) -> Decision:
     """Decide and report while nothing is synced: what is not on the disk is verified, and not acknowledged."""
     engine, outcome, x, good = cell.engine, cell.outcome, stream().X[i], bool(stream().y[i])
     cell.timed(lambda: engine.decide(x))
-    known: Decision = cell.timed(lambda: engine.decide(x, decision_id=f"part-{i}"))
-    outcome.must(known.action is Action.VERIFY, f"{known.id} goes on unchecked, and is on no disk")
+    earlier: Decision = cell.timed(lambda: engine.decide(x, decision_id=f"part-{i}"))
+    outcome.must(earlier.action is Action.VERIFY, f"{earlier.id} goes on unchecked, and is on no disk")
     for success, error in ((good, StoreError), (not good, ReportError), (good, StoreError)):
         with contextlib.suppress(error):
-            cell.timed(lambda success=success: engine.report(known.id, success))
-            outcome.must(False, f"the label {success} of {known.id} was acknowledged on no disk")
-    return known
+            cell.timed(lambda success=success: engine.report(earlier.id, success))
+            outcome.must(False, f"the label {success} of {earlier.id} was acknowledged on no disk")
+    return earlier
 
 
 def hung_disk(outcome: Outcome, place: Place, do: str = "hang") -> None:
     """A disk whose syncs hang: no call takes long, and what was not taken can be said again."""
     cell, data = _before_a_disk(outcome, place, full=do == "hang"), stream()
     with _syncs(do):
-        told = {i: _unsynced(cell, i) for i in range(60, 63)}
+        answer = {i: _unsynced(cell, i) for i in range(60, 63)}
         fault = cell.timed(lambda: core_of(cell.engine).store_fault)
     outcome.must(bool(fault), "the engine says that its disk is well")
     cell.until_back()
-    for i, known in told.items():
-        cell.acknowledged[known.id] = bool(data.y[i])
-        cell.engine.report(known.id, cell.acknowledged[known.id])
+    for i, item in answer.items():
+        cell.acknowledged[item.id] = bool(data.y[i])
+        cell.engine.report(item.id, cell.acknowledged[item.id])
     cell.play(60)
     cell.finish()
     with DataEngine.open(place.store()) as again:
-        for i, known in told.items():
-            outcome.must(again.decide(data.X[i], decision_id=known.id) == known, f"{known.id} is answered otherwise")
+        for i, item in answer.items():
+            outcome.must(again.decide(data.X[i], decision_id=item.id) == item, f"{item.id} is answered otherwise")
 
 
 def failing_disk(outcome: Outcome, place: Place) -> None:
@@ -345,10 +345,10 @@ def served_over_a_hung_disk(outcome: Outcome, place: Place) -> None:
         server.ask("/report", {"id": first["id"], "success": good[0]})
         with _syncs("hang"):
             outcome.injected += 1
-            told = cell.timed(lambda: server.ask("/decide", {"trace": x[1], "request": "second"}))
-            outcome.must(told["action"] == Action.VERIFY, "a part goes on unchecked over a hung disk")
+            answer = cell.timed(lambda: server.ask("/decide", {"trace": x[1], "request": "second"}))
+            outcome.must(answer["action"] == Action.VERIFY, "a part goes on unchecked over a hung disk")
             with contextlib.suppress(OSError):
-                cell.timed(lambda: server.ask("/report", {"id": told["id"], "success": good[1]}))
+                cell.timed(lambda: server.ask("/report", {"id": answer["id"], "success": good[1]}))
                 outcome.must(False, "a label was acknowledged on no disk")
             outcome.must(server.ask("/healthz")["status"] == "degraded", "the server says that its disk is well")
             with contextlib.suppress(OSError):  # it may say that it does not know, but not wait
@@ -431,16 +431,16 @@ def changed(outcome: Outcome, place: Place) -> None:
         with contextlib.closing(sqlite3.connect(other.url)) as connection:
             connection.row_factory = sqlite3.Row
             row = connection.execute("SELECT * FROM label WHERE seq = 3").fetchone()
-            said = {"success": 1 - row["success"]}
-            connection.create_function("sum_of", 0, lambda row=dict(row) | said: row_sum("label", row))
+            texts = {"success": 1 - row["success"]}
+            connection.create_function("sum_of", 0, lambda row=dict(row) | texts: row_sum("label", row))
             connection.executescript(sql)
             outcome.injected += 1
         with DataEngine.open(other.store()) as again:
-            said = [again.decide(x) for x in stream().X[:20]]
-            outcome.must({(d.action, d.reason) for d in said} == {(Action.VERIFY, Reason.NO_STORE)}, f"decided on: {sql}")
-            again.report(said[0].id, True)
+            texts = [again.decide(x) for x in stream().X[:20]]
+            outcome.must({(d.action, d.reason) for d in texts} == {(Action.VERIFY, Reason.NO_STORE)}, f"decided on: {sql}")
+            again.report(texts[0].id, True)
             outcome.must("see `dengine verify`" in core_of(again).store_fault, f"nobody was told of: {sql}")
-            outcome.lost += missing(again.store, {said[0].id: True})
+            outcome.lost += missing(again.store, {texts[0].id: True})
         outcome.must(not verify_history(other.url).ok, f"verified: {sql}")
         with contextlib.suppress(DataError):
             load_dataset(other.url)
@@ -481,8 +481,8 @@ def flipped_store(outcome: Outcome, place: Place) -> None:
         outcome.injected += 1
         with contextlib.suppress(StoreError), DataEngine.open(other.store()) as again:  # else it is refused, and said
             same = bounds(again) == before and not missing(again.store, cell.acknowledged)
-            told = core_of(again).store_fault or any(event.kind == "damaged" for event in again.store.events())
-            outcome.must(same or bool(told), f"flip {i}: nobody is told of it")
+            answer = core_of(again).store_fault or any(event.kind == "damaged" for event in again.store.events())
+            outcome.must(same or bool(answer), f"flip {i}: nobody is told of it")
 
 
 def put_back(outcome: Outcome, place: Place) -> None:
@@ -540,7 +540,7 @@ def asked_again(outcome: Outcome, place: Place, stored: int = 0) -> None:
     for start in range(0, stored, 5000):
         ids = (f"stored-{i}" for i in range(start, min(start + 5000, stored)))
         cell.engine.store.apply_records([StoredDecision(replace(nothing, id=id_), X[:1], 1, True, 0.0) for id_ in ids])
-    known = [cell.timed(lambda i=i: cell.engine.decide(X[i], decision_id=f"part-{i}")) for i in range(IDS)]
+    earlier = [cell.timed(lambda i=i: cell.engine.decide(X[i], decision_id=f"part-{i}")) for i in range(IDS)]
     cell.engine.close()
     cell.engine = engine = DataEngine.open(place.store())  # which has none of them by heart
     core_of(engine).load_decision_ids()
@@ -549,25 +549,27 @@ def asked_again(outcome: Outcome, place: Place, stored: int = 0) -> None:
         cell.play(1)
         time.sleep(AWAY)
         decisions = [cell.timed(lambda i=i: engine.decide(X[IDS + i], decision_id=f"new-{i}")) for i in range(IDS)]
-        unknown = sum(each.reason is Reason.NO_STORE for each in decisions)
+        unknown = sum(decision.reason is Reason.NO_STORE for decision in decisions)
         outcome.must(unknown <= 2, f"{unknown} of {IDS} new ids were taken for old ones")  # one in 500 at a million is
-        for i, each in enumerate(known):
+        for i, decision in enumerate(earlier):
             for j in (i, i + 1):
-                told = cell.timed(lambda i=i, j=j: engine.decide(X[j], decision_id=f"part-{i}"))
-                outcome.must((told.action, told.reason) == (Action.VERIFY, Reason.NO_STORE), f"{each.id} got an answer")
+                answer = cell.timed(lambda i=i, j=j: engine.decide(X[j], decision_id=f"part-{i}"))
+                outcome.must(
+                    (answer.action, answer.reason) == (Action.VERIFY, Reason.NO_STORE), f"{decision.id} got an answer"
+                )
             with contextlib.suppress(StoreError):
-                engine.report(each.id, True)
-                outcome.must(False, f"a label was taken on {each.id}, which nobody could look up")
-        for each in decisions:
-            if each.action is Action.VERIFY and each.reason is not Reason.NO_STORE:
-                cell.timed(lambda each=each: engine.report(each.id, True))
-                cell.acknowledged[each.id] = True
+                engine.report(decision.id, True)
+                outcome.must(False, f"a label was taken on {decision.id}, which nobody could look up")
+        for decision in decisions:
+            if decision.action is Action.VERIFY and decision.reason is not Reason.NO_STORE:
+                cell.timed(lambda decision=decision: engine.report(decision.id, True))
+                cell.acknowledged[decision.id] = True
     cell.until_back()
-    for i, each in enumerate(known):
-        outcome.must(engine.decide(X[i], decision_id=each.id) == each, f"{each.id} is answered otherwise")
+    for i, decision in enumerate(earlier):
+        outcome.must(engine.decide(X[i], decision_id=decision.id) == decision, f"{decision.id} is answered otherwise")
         with contextlib.suppress(TraceError):
-            engine.decide(X[i + 1], decision_id=each.id)
-            outcome.must(False, f"{each.id} was taken for another part")
+            engine.decide(X[i + 1], decision_id=decision.id)
+            outcome.must(False, f"{decision.id} was taken for another part")
     cell.finish()
 
 

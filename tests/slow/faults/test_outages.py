@@ -72,9 +72,9 @@ def place(tmp_path: Path) -> Place:
 
 @pytest.fixture
 def cell(place: Place) -> Iterator[Cell]:
-    made = Cell(place, Outcome())
-    yield made
-    made.engine.close()
+    created = Cell(place, Outcome())
+    yield created
+    created.engine.close()
 
 
 def test_a_version_that_took_too_long_to_store_is_not_stored_later(place: Place, cell: Cell) -> None:
@@ -143,9 +143,9 @@ def test_what_is_damaged_in_a_journal_is_noticed_and_costs_none_behind_it(
     journal.close()
     path.write_bytes(damage(path.read_bytes(), offsets))
     for again in (False, True):  # and goes on behind what is there
-        records, found, dropped = left(path)
+        records, result, dropped = left(path)
         unfinished = kept == "ABCD" and not again
-        assert ("".join(chr(record[0]) for record in records), found, dropped) == (kept, damaged, unfinished)
+        assert ("".join(chr(record[0]) for record in records), result, dropped) == (kept, damaged, unfinished)
     with contextlib.closing(Journal(path)) as again:
         again.append([b"F" * 50])
     assert [record[:1] for record in left(path)[0]][-1] == b"F"
@@ -181,8 +181,8 @@ def test_a_label_and_an_event_in_a_journal_return_bit_for_bit(tmp_path: Path) ->
 
 def test_what_a_journal_holds_of_another_decision_of_an_id_is_set_aside_with_its_label(place: Place) -> None:
     def record(x: np.ndarray, time: float) -> StoredDecision:
-        made = Decision("part 7", Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0)
-        return StoredDecision(made, x, 1, False, time)
+        created = Decision("part 7", Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0)
+        return StoredDecision(created, x, 1, False, time)
 
     first, other = (record(np.full((1, 5), i, dtype=np.float32), float(i)) for i in range(2))
     label = NewLabel("part 7", False, Source.VERIFICATION, 0, None, content_hash=1)

@@ -18,14 +18,14 @@ OBJECTS = [object(), int, len, range(3), slice(1), np.ma.masked, np.datetime64("
 
 plain = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=300)
 nested = st.recursive(
-    plain, lambda each: st.lists(each, max_size=4) | st.dictionaries(st.text(max_size=5), each, max_size=3)
+    plain, lambda item: st.lists(item, max_size=4) | st.dictionaries(st.text(max_size=5), item, max_size=3)
 )
 shapes = st.sampled_from(
     [(), (0,), (1,), (SAMPLES - 1,), (SAMPLES,), (1, SAMPLES), (SAMPLES, 1), (2, SAMPLES), (1, 1, SAMPLES)]
 )
 arrays = hnp.arrays(hnp.scalar_dtypes() | st.sampled_from([np.dtype("S3"), np.dtype("U2")]), shapes)
 anything = nested | st.binary(max_size=9) | st.complex_numbers() | st.sampled_from(OBJECTS) | arrays
-traces = arrays | arrays.map(np.ndarray.tolist) | arrays.map(lambda found: found.astype(object)) | anything
+traces = arrays | arrays.map(np.ndarray.tolist) | arrays.map(lambda result: result.astype(object)) | anything
 
 
 def tries(share: float = 1.0) -> Callable[[Any], Any]:

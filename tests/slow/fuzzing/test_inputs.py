@@ -74,9 +74,9 @@ def learned(store: Path | None = None) -> DataEngine:
 @pytest.fixture(scope="module")
 def engines() -> Iterator[list[DataEngine]]:
     """With a model, without one, and of an open contract; each works after all that was tried."""
-    made = [learned(), DataEngine("pca", trace=SPEC), DataEngine("pca", trace=TraceSpec(SAMPLES, fit="resample"))]
-    yield made
-    for engine in made:
+    items = [learned(), DataEngine("pca", trace=SPEC), DataEngine("pca", trace=TraceSpec(SAMPLES, fit="resample"))]
+    yield items
+    for engine in items:
         id_ = engine.decide(X[0] * -9.0).id
         engine.report(id_, True)
         assert engine.find(id_).success is True
@@ -85,11 +85,11 @@ def engines() -> Iterator[list[DataEngine]]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("fuzz")
-    (made / "small.npz").write_bytes(FILES["data.npz"][0])
-    (made / "cell.csv").write_bytes(journal("\n".join(PARTS).encode()))
-    learned(made / "store.db").close()
-    return made
+    created = tmp_path_factory.mktemp("fuzz")
+    (created / "small.npz").write_bytes(FILES["data.npz"][0])
+    (created / "cell.csv").write_bytes(journal("\n".join(PARTS).encode()))
+    learned(created / "store.db").close()
+    return created
 
 
 def journal(lines: bytes) -> bytes:

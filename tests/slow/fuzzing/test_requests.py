@@ -66,11 +66,11 @@ def call(name: str, arguments: Any) -> bytes:
 
 
 def only(body: st.SearchStrategy[bytes], content: str, path: str = "/decide") -> st.SearchStrategy[bytes]:
-    return body.map(lambda found: request(found, path, content))
+    return body.map(lambda result: request(result, path, content))
 
 
 fields = st.dictionaries(st.sampled_from(["trace", "request", "part", "id", "success", "a"]), nested, max_size=3)
-asked = fields.map(lambda found: {"trace": GOOD} | found) | fields
+asked = fields.map(lambda result: {"trace": GOOD} | result) | fields
 ids = st.uuids().map(str)  # of what is spoilt, and may yet be good
 sound = ids.map(lambda id_: {"trace": GOOD, "request": id_})
 paths = st.tuples(st.sampled_from(PATHS.split()), st.sampled_from(ODD)).map("".join)
@@ -87,7 +87,7 @@ KINDS = {
         st.binary(max_size=200) | st.sampled_from([2, 3, 100]).map(lambda n: struct.pack(f"<{SAMPLES}f", *GOOD) * n),
         st.sampled_from(["", "channels=0", "channels=3", "channels=1&channels=1", "a=b", "request=%00", "part=%0a"]),
     ),
-    "MessagePack": only(asked.map(lambda found: encode(json.loads(json.dumps(found), parse_int=float))), PACK)
+    "MessagePack": only(asked.map(lambda result: encode(json.loads(json.dumps(result), parse_int=float))), PACK)
     | only(sound.map(encode).flatmap(spoilt) | st.binary(max_size=50), PACK)
     | only(st.sampled_from([b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 5000, b"\xc1"]), PACK),
     "XML-RPC": only(st.builds(call, names, st.lists(simple, max_size=4)), XML, "/RPC2")
@@ -97,7 +97,7 @@ KINDS = {
         lambda path, body: request(body, path, JSON, "POST", "Origin: http://localhost"),
         st.sampled_from(["/correct", "/forget", "/rollback", "/policy", "/retrain", "/export"]),
         st.dictionaries(st.sampled_from(["id", "ids", "success", "version", "alpha", "guarantee"]), nested, max_size=3)
-        .map(lambda found: found | {"author": " "})
+        .map(lambda result: result | {"author": " "})
         .map(json.dumps)
         .map(str.encode),
     ),
@@ -122,27 +122,27 @@ class Cell:
     def send(self, sent: bytes) -> bytes:
         """What it answers until it closes; who sends no more is waited for by nobody."""
         with socket.create_connection(("127.0.0.1", self.port), timeout=60) as connection:
-            said = b""
+            text = b""
             try:
                 connection.sendall(sent)
                 connection.shutdown(socket.SHUT_WR)
                 while piece := connection.recv(65536):
-                    said += piece
+                    text += piece
             except ConnectionError:  # it was refused before all was sent
                 pass
-        return said
+        return text
 
     def decisions(self) -> dict[str, str]:
         store = self.service.submit(lambda engine: (engine.flush(), engine.store)[1]).result(60)
-        found = [store.get_decision(each.decision.id) for each in store.decisions(HistoryFilter(), 10**6)]
-        return {each.decision.id: repr(each) + each.trace.tobytes().hex() for each in found}
+        results = [store.get_decision(decision.decision.id) for decision in store.decisions(HistoryFilter(), 10**6)]
+        return {decision.decision.id: repr(decision) + decision.trace.tobytes().hex() for decision in results}
 
     def probed(self, run: str) -> list[Any]:
         """What it decides on the same few traces."""
         X, _ = toy_traces(20, SAMPLES)
         bodies = [{"trace": (x + np.float32(0.02)).tolist(), "request": f"{run}-{i}"} for i, x in enumerate(X[:, 0])]
-        said = [json.loads(self.send(request(json.dumps(each).encode())).partition(b"\r\n\r\n")[2]) for each in bodies]
-        return [each | {"id": "", "time": 0, "seconds": 0} for each in said]
+        texts = [json.loads(self.send(request(json.dumps(body).encode())).partition(b"\r\n\r\n")[2]) for body in bodies]
+        return [body | {"id": "", "time": 0, "seconds": 0} for body in texts]
 
 
 @pytest.fixture(scope="module")
@@ -153,15 +153,15 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
     with closing(CellService(lambda: DataEngine.open(file), file, deadline=60.0)) as service:
         app = create_app(service, Access(rate=0.0, body_seconds=0.2))
         with served(app, head_seconds=0.3) as port:
-            made = Cell(service, port)
-            yield made
-            assert b'"ok"' in made.send(request(b"", "/healthz", JSON, "GET"))
-            assert made.probed("after") == made.probes
-            after = made.decisions()
-            assert {id_: after[id_] for id_ in made.before} == made.before
-            probes = 2 * len(made.probes)
-            assert len(after) - len(made.before) - probes <= made.found["taken"]
-            assert made.found["refused"] > made.found["taken"]
+            created = Cell(service, port)
+            yield created
+            assert b'"ok"' in created.send(request(b"", "/healthz", JSON, "GET"))
+            assert created.probed("after") == created.probes
+            after = created.decisions()
+            assert {id_: after[id_] for id_ in created.before} == created.before
+            probes = 2 * len(created.probes)
+            assert len(after) - len(created.before) - probes <= created.found["taken"]
+            assert created.found["refused"] > created.found["taken"]
 
 
 def learned(file: Path) -> None:
@@ -180,9 +180,9 @@ def learned(file: Path) -> None:
 @tries(0.3)
 def test_a_malformed_request_is_answered_and_changes_nothing(cell: Cell, kind: str, data: st.DataObject) -> None:
     sent = data.draw(KINDS[kind])
-    said = cell.send(sent)
-    status = re.match(rb"HTTP/1\.1 (\d{3}) ", said)
+    text = cell.send(sent)
+    status = re.match(rb"HTTP/1\.1 (\d{3}) ", text)
     assert status is not None, "the connection was closed without an answer"
-    assert status[1][:1] in b"24", said
-    assert b"Traceback" not in said
-    cell.found["refused" if status[1][:1] == b"4" or b"<fault>" in said else "taken"] += 1
+    assert status[1][:1] in b"24", text
+    assert b"Traceback" not in text
+    cell.found["refused" if status[1][:1] == b"4" or b"<fault>" in text else "taken"] += 1

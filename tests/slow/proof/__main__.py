@@ -33,7 +33,7 @@ def pieces_of(part: str, repeats: int) -> list[Piece]:
         "certificate": (max(2, repeats // 10), _product(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))),
         "garbage": (max(1, repeats // 40), _product(reducer=QUICK)),
     }[part]
-    pieces = [Piece(part, each, seed) for each in settings for seed in range(n)]
+    pieces = [Piece(part, setting, seed) for setting in settings for seed in range(n)]
     return [*pieces, Piece(part, {"reducer": "umap"})] if part == "garbage" else pieces
 
 

@@ -71,13 +71,15 @@ def count_noise(recipe: Recipe, noise: Noise, seed: int) -> NDArray[np.float64]:
     """z^2 of the last `QUERIES` traces' balls after each of `RETRAINS`, each from the one before."""
     model = ModelPrediction.from_recipe(replace(recipe, novelty=0.0), seed)
     queries = noise.X[-QUERIES:][~noise.easy[-QUERIES:]]
-    found = []
+    results = []
     for n in RETRAINS:
         X = as_traces(noise.X[:n])
         model = model.successor().train(X, noise.y[:n], content_hash(X))
         n_success, n_failure = model.count(queries)
-        found.append(squared_deviations(n_success, n_success + n_failure - _easy(model, noise.easy[:n], queries), noise.p))
-    return np.concatenate(found)
+        results.append(
+            squared_deviations(n_success, n_success + n_failure - _easy(model, noise.easy[:n], queries), noise.p)
+        )
+    return np.concatenate(results)
 
 
 def _easy(model: ModelPrediction, easy: NDArray[np.bool_], queries: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -109,14 +111,14 @@ def places(recipe: Recipe, data: Dataset, seed: int) -> NDArray[np.float64]:
     """(n, K, d) where each trace lay in every space when it was decided; NaN before the first retrain."""
     sure_of_nothing = replace(recipe.with_policy(alpha=1e-6, lower_bound=0.999), novelty=0.0)  # every label becomes known
     engine = DataEngine(recipe=sure_of_nothing, seed=seed, replaying=True)
-    found = [cycle.decision.embedding for cycle in engine.run(ReplayCell(data), len(data))]
-    shape = np.shape(found[-1])
-    return np.array([np.full(shape, np.nan) if each is None else each for each in found])
+    results = [cycle.decision.embedding for cycle in engine.run(ReplayCell(data), len(data))]
+    shape = np.shape(results[-1])
+    return np.array([np.full(shape, np.nan) if item is None else item for item in results])
 
 
 def moved(recipe: Recipe, data: Dataset, fold: int, seed: int) -> float:
     """Share of the traces whose place in the fold's own space depends on the fold's labels; honest: 0."""
-    own = content_fold(data.X[:, None, :], recipe.folds) == fold
-    turned = replace(data, y=np.where(own, 1 - data.y, data.y).astype(np.int8))
-    one, other = (places(recipe, each, seed)[:, fold] for each in (data, turned))
-    return float((~np.isclose(one, other, rtol=0.0, atol=0.0, equal_nan=True)).any(axis=1).mean())
+    custom = content_fold(data.X[:, None, :], recipe.folds) == fold
+    turned = replace(data, y=np.where(custom, 1 - data.y, data.y).astype(np.int8))
+    first, other = (places(recipe, item, seed)[:, fold] for item in (data, turned))
+    return float((~np.isclose(first, other, rtol=0.0, atol=0.0, equal_nan=True)).any(axis=1).mean())

@@ -74,9 +74,9 @@ def garbage(seed: int, reducer: str) -> list[dict[str, Any]]:
     X, y, clean = data.X[order[:LEARNED]], data.y[order[:LEARNED]], data.X[order[LEARNED:]]
     good, bad = X[y == 1][:PER_KIND], X[y == 0][:PER_KIND]
     kinds = {name: np.asarray(make(good, bad, rng), dtype=np.float32) for name, make in KINDS.items()}
-    found = screws(X.shape[1], rng)
-    if found is not None:
-        kinds["screw driving"] = found
+    result = screws(X.shape[1], rng)
+    if result is not None:
+        kinds["screw driving"] = result
     rows = _rows(reducer, seed, X, y, kinds, clean)
     few = slice(0, 300)  # of three channels, one of which dies
     dead = np.repeat(good[:, None], 3, axis=1)
@@ -98,4 +98,4 @@ def _rows(
 
 
 def _share(model: ModelPrediction, X: Traces, actions: list[Action]) -> float:
-    return float(np.mean([each.action in actions for each in model.predict_many(X)]))
+    return float(np.mean([item.action in actions for item in model.predict_many(X)]))

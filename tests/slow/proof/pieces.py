@@ -61,21 +61,21 @@ class Piece:
     @property
     def name(self) -> str:
         """Its configuration's."""
-        return ", ".join(str(getattr(each, "name", each)) for each in self.settings.values())
+        return ", ".join(str(getattr(value, "name", value)) for value in self.settings.values())
 
 
 def sources_digest() -> str:
     """SHA-256 of every source that decides a result."""
-    own, theirs = Path(__file__).parent, Path(dengine.__file__).parent
-    files = [*sorted(own.glob("*.py")), *sorted(theirs.rglob("*.py"))]
+    parent, theirs = Path(__file__).parent, Path(dengine.__file__).parent
+    files = [*sorted(parent.glob("*.py")), *sorted(theirs.rglob("*.py"))]
     files = [f for f in files if not {f.stem, f.parent.name} & {*BESIDE, "report"}]
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
 
 
 def run_piece(piece: Piece, sources: str) -> list[Row]:
     """Every row of a piece, with its seed; sources : part of what it is kept under."""
-    found = FUNCTIONS[piece.kind](seed=piece.seed, **piece.settings)
-    return [{"seed": piece.seed} | row for row in (found if isinstance(found, list) else [found])]
+    result = FUNCTIONS[piece.kind](seed=piece.seed, **piece.settings)
+    return [{"seed": piece.seed} | row for row in (result if isinstance(result, list) else [result])]
 
 
 def finish(pieces: list[Piece], out: Path, jobs: int, tell: Callable[[str], None] = print) -> list[tuple[Piece, list[Row]]]:

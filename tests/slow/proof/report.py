@@ -98,27 +98,27 @@ def tables(done: Iterable[tuple[Piece, list[Row]]]) -> dict[str, pd.DataFrame]:
     gathered: dict[tuple[str, str], tuple[Row, list[Row]]] = {}
     for piece, rows in done:
         gathered.setdefault((piece.kind, piece.name), (piece.settings, []))[1].extend(rows)
-    found: dict[str, list[Row]] = {}
+    result: dict[str, list[Row]] = {}
     for (kind, name), (settings, rows) in gathered.items():
-        made = ROWS[kind](settings, rows)
-        named = [{"configuration": name} | row for row in (made if isinstance(made, list) else [made])]
-        found.setdefault(kind, []).extend(named)
-    return {kind: pd.DataFrame(rows) for kind, rows in found.items()}
+        created = ROWS[kind](settings, rows)
+        named = [{"configuration": name} | row for row in (created if isinstance(created, list) else [created])]
+        result.setdefault(kind, []).extend(named)
+    return {kind: pd.DataFrame(rows) for kind, rows in result.items()}
 
 
 def write_report(done: Iterable[tuple[Piece, list[Row]]], docs: Path) -> str:
     """Write both files; returns what became of everything that is called a guarantee, in a few lines."""
     docs.mkdir(parents=True, exist_ok=True)
-    found = tables(done)
-    whole = pd.concat([frame.assign(part=kind) for kind, frame in found.items()], ignore_index=True)
+    result = tables(done)
+    whole = pd.concat([frame.assign(part=kind) for kind, frame in result.items()], ignore_index=True)
     whole.to_csv(docs / "proof.csv", index=False, float_format="%.6g")
     blocks = ["# The proof", "`make proof` writes this page."]
-    for kind in (kind for kind in HEADS if kind in found):
+    for kind in (kind for kind in HEADS if kind in result):
         title, text = HEADS[kind]
-        blocks += [f"## {title}", text, _table(found[kind])]
+        blocks += [f"## {title}", text, _table(result[kind])]
     (docs / "proof.md").write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
-    said = whole.get("verdict", pd.Series(dtype=str)).dropna()
-    claimed = said[~said.str.startswith("(")]
+    output = whole.get("verdict", pd.Series(dtype=str)).dropna()
+    claimed = output[~output.str.startswith("(")]
     lines = [f"{title}: {', '.join(whole['configuration'][at.index]) or 'none'}." for title, at in (
         (f"Of {len(claimed)} promises, broken beyond sampling error", claimed[claimed == "BROKEN"]),
         ("Not yet known well enough", claimed[claimed == "within error"]),
@@ -138,5 +138,5 @@ def _table(frame: pd.DataFrame) -> str:
 
 
 def _mean(values: Iterable[float]) -> float:
-    known = [v for v in values if not np.isnan(v)]
-    return float(np.mean(known)) if known else float("nan")
+    finite = [v for v in values if not np.isnan(v)]
+    return float(np.mean(finite)) if finite else float("nan")

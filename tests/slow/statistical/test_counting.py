@@ -58,8 +58,8 @@ def test_labels_of_noise_are_counted_by_a_trained_network_as_chance_says() -> No
 def test_labels_of_noise_on_real_traces_are_counted_as_chance_says(proof_repeats: int) -> None:
     X = load_dataset("insertion").X[:, ::10]
     seeds = range(max(6, proof_repeats))
-    found = mean_square(count_noise(RECIPES["conv"], relabelled(X, 500, 0.5, seed), seed) for seed in seeds)
-    assert HONEST[0] - 0.1 <= found <= HONEST[1]
+    result = mean_square(count_noise(RECIPES["conv"], relabelled(X, 500, 0.5, seed), seed) for seed in seeds)
+    assert HONEST[0] - 0.1 <= result <= HONEST[1]
 
 
 def test_no_label_of_a_fold_moves_anything_in_its_own_space() -> None:
@@ -69,10 +69,10 @@ def test_no_label_of_a_fold_moves_anything_in_its_own_space() -> None:
 def test_it_would_be_seen_in_the_other_spaces() -> None:
     # Or a check that compares nothing would pass.
     data = weak_signal(200, 8.0, seed=1)
-    own = content_fold(data.X[:, None, :], 5)
-    turned = replace(data, y=np.where(own == 0, 1 - data.y, data.y).astype(np.int8))
-    one, other = places(RECIPES["conv"], data, 0), places(RECIPES["conv"], turned, 0)
-    assert np.nanmax(np.abs(one[:, 1] - other[:, 1])) > 0.05
+    custom = content_fold(data.X[:, None, :], 5)
+    turned = replace(data, y=np.where(custom == 0, 1 - data.y, data.y).astype(np.int8))
+    first, other = places(RECIPES["conv"], data, 0), places(RECIPES["conv"], turned, 0)
+    assert np.nanmax(np.abs(first[:, 1] - other[:, 1])) > 0.05
 
 
 def test_where_every_part_is_just_beyond_the_tolerance_hardly_any_replay_accepts(proof_repeats: int) -> None:
@@ -89,7 +89,9 @@ def members_of_all_folds(patch: pytest.MonkeyPatch) -> None:
 
 
 def heads_of_all_folds(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(rocket.RocketReducer, "training_masks", lambda self, folds: np.ones((self.folds, len(folds)), dtype=np.bool_))
+    patch.setattr(
+        rocket.RocketReducer, "training_masks", lambda self, folds: np.ones((self.folds, len(folds)), dtype=np.bool_)
+    )
 
 
 def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
@@ -137,12 +139,12 @@ def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
 def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
     whole = LiveModel.learn
 
-    def learn(self: Any, known: Any, success: bool, silent: int) -> Any:
+    def learn(self: Any, item: Any, success: bool, silent: int) -> Any:
         if (model := self.answering) is not None:
-            model.add_reference(known.trace, int(success), known.content_hash)
-            now = model.predict_one(known.trace)
-            known = replace(known, decision=replace(known.decision, lower=now.lower, upper=now.upper))
-        return whole(self, known, success, silent)
+            model.add_reference(item.trace, int(success), item.content_hash)
+            now = model.predict_one(item.trace)
+            item = replace(item, decision=replace(item.decision, lower=now.lower, upper=now.upper))
+        return whole(self, item, success, silent)
 
     patch.setattr(LiveModel, "learn", learn)
 

@@ -43,11 +43,11 @@ def test_the_gate_keeps_garbage_out_and_lets_parts_in() -> None:
 def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
     case = {"case": Case("short", "sharp", reducer="pca", cycles=80)}
     pieces = [Piece("planted", case, seed) for seed in (0, 1)]
-    said: list[str] = []
-    first = finish(pieces[:1], tmp_path, 1, said.append)
-    both = finish(pieces, tmp_path, 1, said.append)
+    texts: list[str] = []
+    first = finish(pieces[:1], tmp_path, 1, texts.append)
+    both = finish(pieces, tmp_path, 1, texts.append)
     assert repr(both[0][1]) == repr(first[0][1])  # NaN is not equal to itself
-    assert "1 of 2 pieces are there already." in said
+    assert "1 of 2 pieces are there already." in texts
     text = write_report(both, tmp_path / "docs")
     assert "Of 1 promises" in text
     assert {file.name for file in (tmp_path / "docs").iterdir()} == {"proof.csv", "proof.md"}

@@ -40,9 +40,9 @@ def locking(descriptor: int, mode: int, n_bytes: int) -> None:
 
 def without(module: types.ModuleType, names: str) -> types.ModuleType:
     """A module that lacks names."""
-    made, hidden = types.ModuleType(module.__name__), set(names.split())
-    made.__dict__.update({name: value for name, value in vars(module).items() if name not in hidden})
-    return made
+    created, hidden = types.ModuleType(module.__name__), set(names.split())
+    created.__dict__.update({name: value for name, value in vars(module).items() if name not in hidden})
+    return created
 
 
 SEEN = {"os": without(os, HIDDEN["os"]), "signal": without(signal, HIDDEN["signal"])}
