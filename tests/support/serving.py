@@ -34,7 +34,10 @@ def a_service(file: Path | None = None, recipe: Recipe = RECIPE, deadline: float
 
 @contextmanager
 def served(app: Any, port: int = 0, connections: int = 100, **limits: Any) -> Iterator[int]:
-    """An application in a thread of this process, as `dengine serve` has it; gives its port.  limits : of `ConnectionPool`."""
+    """An application in a thread of this process, as `dengine serve` has it; gives its port.
+
+    limits : of `ConnectionPool`.
+    """
     import uvicorn
 
     from dengine.serve.connections import ConnectionPool
