@@ -123,7 +123,8 @@ def wald_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.0
     return _as_floats(*wald_limits(np, successes, failures, z))
 
 
-binomial_interval = wald_interval  # the paper's name
+binomial_interval = wald_interval
+"""The paper's name of `wald_interval`."""
 
 
 def clopper_pearson_interval(
