@@ -119,6 +119,5 @@ class Candidate:
         """Take the number that the store gave the version; 0 keeps the number that it has.
 
         The two differ where a peer's version was stored first.
-
         """
         self.report = replace(self.report, version=version or self.report.version)

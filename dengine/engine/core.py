@@ -420,7 +420,6 @@ class EngineCore:
         """Load the ids of all decisions, so that `decide` need not look up a new id in the store.
 
         It takes a second for a million decisions.
-
         """
         self.flush()
         self.outbox.load_ids()

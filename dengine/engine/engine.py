@@ -103,7 +103,6 @@ def core_of(engine: DataEngine) -> EngineCore:
     """Return the internal interface of an engine, which may change with any release.
 
     `dengine serve` and the tests use it.
-
     """
     return engine._core
 
@@ -534,7 +533,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Return bounds, at confidence 1 - alpha, on the errors of unchecked decisions.
 
         Decisions since the last change of policy count.
-
         """
         self.flush()
         policy = self.policy

@@ -135,7 +135,6 @@ class Feedback:
         """Count accepted parts without an outcome as confirmed, or as unobserved.
 
         It is called when the next trace has come.
-
         """
         if not self._unreported:
             return

@@ -72,7 +72,6 @@ class GuardedModel:
         """Make a labelled trace a reference and return its point (d,).
 
         Returns None, and adds no reference, where it fails.
-
         """
         with logged_failure(
             "the model cannot take a labelled trace; the next version learns it from the store"

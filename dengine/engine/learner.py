@@ -181,16 +181,17 @@ class Learner:
         begin = self._clock()
         self._begin_retrain()
         trained = self._retrainer.train(self.live.newest, begin)
-        candidate = self._candidate = self._as_candidate_of(trained)
+        candidate = self._as_candidate_of(trained)
+        self._candidate = candidate
         self._report = None
         self._advance(to_the_end=True)
-        return self._report or candidate.report  # a stored one may wait for the labels since
+        # A version that is stored may still wait for labels that came since.
+        return self._report or candidate.report
 
     def start_retrain(self) -> RetrainReport | None:
         """Begin to train in the executor, unless it trains already, and return None.
 
         Without an executor, retrain in line and return the report.
-
         """
         self.collect()
         if self.is_busy:
@@ -228,7 +229,7 @@ class Learner:
     def _lacks_steps(self) -> bool:
         """Whether the answering version lacks training steps, as after a large import.
 
-        Not where the last retrain was dropped: its labels wait for the next one. Nor where cells
+        It is False after a dropped retrain, whose labels wait for the next one, and where cells
         share a product: each of them would train the same version.
         """
         is_alone = self._peers is None and self.live.answering is not None

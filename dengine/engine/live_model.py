@@ -213,7 +213,6 @@ class LiveModel:
         """Count a decision as overdue no more, because its check was reported.
 
         Returns whether it was counted so; then the rule must be rebuilt.
-
         """
         if decision_id not in self.overdue:
             return False

@@ -255,7 +255,6 @@ class EngineModel(ABC):
         """Make the rule forget every outcome and start in a safe mode, a position in `SAFE_MODES`.
 
         Position 0 is no safe mode.
-
         """
 
     @abstractmethod
