@@ -709,10 +709,10 @@ def _needed_sentence(
         return f"To {action}: no level held, so nothing could be {action}ed."
     if needed == 0:
         return f"To {action}, {condition.format(threshold)}, enough."
-    one, several, other = kinds
+    single, several, other = kinds
     more = "no number of labels"
     if needed is not None:
-        more = f"{needed} more {one if needed == 1 else several} and no {other}"
+        more = f"{needed} more {single if needed == 1 else several} and no {other}"
     return f"To {action}, {condition.format(threshold)}: {more} would do."
 
 

@@ -74,10 +74,10 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     newest = list(_newest_marks(store, ids))
     newest_ids = {mark.id for mark in newest}
     parts = {decision.id: decision.part for decision in recent}
-    known = _known_marks(store, recipe, version, parts) if version else []
-    known = [mark for mark in known if mark.id not in newest_ids]
+    labelled = _known_marks(store, recipe, version, parts) if version else []
+    labelled = [mark for mark in labelled if mark.id not in newest_ids]
     radius = recipe.radius if newest else None
-    return PartMap(version, (*known, *newest), radius, has_own_unit(recipe.reducer))
+    return PartMap(version, (*labelled, *newest), radius, has_own_unit(recipe.reducer))
 
 
 def _newest_marks(store: "SqlStore", ids: list[str]) -> Iterator[Mark]:
