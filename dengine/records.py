@@ -311,7 +311,7 @@ class Cycle:
 LONGEST = 200  # characters of an id, or of a part's number
 
 
-def as_success(value: Any, of: str = "") -> bool:
+def as_success(value: Any, owner: str = "") -> bool:
     """Convert a label to bool.
 
     Parameters
@@ -319,8 +319,8 @@ def as_success(value: Any, of: str = "") -> bool:
     value : object
         A bool, or a number or 0-d array that is exactly 1 or 0. Nothing else is guessed at:
         `bool("NG")` is True, and -1 is what some controllers call true.
-    of : str
-        Whose label it is, for the error.
+    owner : str
+        Whose label it is, for the error: "decision 1a2b".
 
     Raises
     ------
@@ -330,19 +330,19 @@ def as_success(value: Any, of: str = "") -> bool:
     plain = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(plain, bool | np.bool_ | Real) and (plain == 0 or plain == 1):
         return bool(plain)
-    whose = f" of {of}," if of else ""
+    whose = f" of {owner}," if owner else ""
     wanted = f"a label, True (success) or False (failure), or exactly 1 or 0,{whose}"
     do = "nothing was stored: turn it into one of these first, as in success=(answer == 'OK')"
     raise ReportError(f"Expected {wanted} got {shortened(value)}; {do}.")
 
 
-def as_outcome(value: Any, of: str = "") -> Outcome:
+def as_outcome(value: Any, owner: str = "") -> Outcome:
     """Convert what `Cell.proceed` returned to an `Outcome`.
 
-    Raises ReportError for any other value, which would otherwise be taken for UNKNOWN. `of` names
-    the decision in the error.
+    Raises ReportError for any other value, which would otherwise be taken for UNKNOWN. `owner`
+    names the decision in the error.
     """
-    whose = f" of {of}," if of else ""
+    whose = f" of {owner}," if owner else ""
     message = f"Expected an Outcome, {', '.join(Outcome)},{whose} got {shortened(value)}"
     do = "return Outcome.UNKNOWN where nothing is known"
     with instead(ReportError, message, ValueError, TypeError, do=do):
@@ -350,7 +350,7 @@ def as_outcome(value: Any, of: str = "") -> Outcome:
 
 
 def source_of(action: Action, audit: bool, success: bool) -> Source:
-    """Return where a label on a decision comes from, given its action, whether it was an audit."""
+    """Return the source of a label by the decision: its action, and whether it was an audit."""
     if action is Action.REJECT:
         return Source.INSPECTION
     if action is Action.VERIFY:

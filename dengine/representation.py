@@ -17,14 +17,15 @@ from .errors import without_password
 def to_html(record: Any) -> str:
     """Return the `repr` of a record as an HTML table, for its `_repr_html_`.
 
-    Each part of the `repr` between commas is a row. The sentences of its attribute `sentences`, if it
-    has one, are paragraphs below the table.
+    Each part of the `repr` between commas is a row. Its attribute `sentences`, if it has one, gives
+    the paragraphs below the table.
     """
     title, _, parts = repr(record).strip("<>").partition(": ")
     left = "style='text-align: left'"
     rows = "".join(f"<tr><td {left}>{escape(part)}</td></tr>" for part in parts.split(", "))
-    sentences = "".join(f"<p>{escape(sentence)}</p>" for sentence in getattr(record, "sentences", ()))
-    return f"<table><tr><th {left}>{escape(title)}</th></tr>{rows}</table>{sentences}"
+    sentences = getattr(record, "sentences", ())
+    paragraphs = "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
+    return f"<table><tr><th {left}>{escape(title)}</th></tr>{rows}</table>{paragraphs}"
 
 
 def to_jsonable(value: Any) -> Any:
