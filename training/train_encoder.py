@@ -39,10 +39,11 @@ from dengine import ConvReducer, Dataset, load_dataset
 from dengine.errors import DataError
 from dengine.experiments.figures import BLUE, GREY, LIMIT, blank, finish, save
 from dengine.experiments.tables import write_csv
+from dengine.reducers.checkpoints import save_checkpoint
 from dengine.reducers.conv import ConvNetwork
 from dengine.reducers.encoder import Members
 from dengine.reducers.preprocessing import Preprocessor, averaging
-from dengine.reducers.torch_reducer import Augmentation, save_checkpoint
+from dengine.reducers.torch_reducer import Augmentation
 from dengine.traces import as_traces
 
 Batches = DataLoader[tuple[Tensor, ...]]  # x (B, 1, channels, samples) preprocessed, y (B, 1)

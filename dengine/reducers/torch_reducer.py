@@ -1,29 +1,26 @@
-"""`TorchReducer`: train any PyTorch encoder of traces on the CPU, a few steps at every retrain.
+"""`TorchReducer`: train any PyTorch network on the CPU, a few steps at every retrain.
 
-Member k of the encoder is trained on the labels outside fold k alone, so that labels of fold k may be counted in space k.
-A retrain goes on from the last one: it takes some AdamW steps on augmented batches, at a constant learning rate. An
-exponential average of the weights answers, with the statistics of batch normalisation taken anew.
-
-    >>> reducer = TorchReducer(network=MyNetwork)      # MyNetwork(channels, samples) is an nn.Module
+    >>> reducer = TorchReducer(network=MyNetwork)  # MyNetwork(channels, samples) is an nn.Module
     >>> DataEngine(reducer=reducer)
+
+Member k of the network is trained on the labels outside fold k alone, so that labels of fold k may
+be counted in space k. A retrain goes on from the last one: `fit_loop` takes some AdamW steps on
+augmented batches, at a constant learning rate. An exponential average of the weights answers, with
+the statistics of batch normalisation estimated anew. `conv` is this class with its own network.
 
 References
 ----------
-Loshchilov and Hutter (2019), Decoupled weight decay regularization, ICLR. Zhang, Cisse, Dauphin and Lopez-Paz (2018),
-mixup: Beyond empirical risk minimization, ICLR. Polyak and Juditsky (1992), Acceleration of stochastic approximation by
-averaging, SIAM J. Control Optim. 30(4). Chernozhukov et al. (2018), Double/debiased machine learning, Econometrics Journal
-21: cross-fitting.
+Loshchilov and Hutter (2019), Decoupled weight decay regularization, ICLR. Zhang, Cisse, Dauphin and
+Lopez-Paz (2018), mixup: Beyond empirical risk minimization, ICLR. Polyak and Juditsky (1992),
+Acceleration of stochastic approximation by averaging, SIAM J. Control Optim. 30(4). Chernozhukov et
+al. (2018), Double/debiased machine learning, Econometrics Journal 21: cross-fitting.
 """
 
 import copy
 import logging
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from io import BytesIO
-from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any, Self
 
 import numpy as np
@@ -35,21 +32,20 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 
 from ..decision.scripting import arrays_with_prefix, restore, script
-from ..errors import SettingError, expect, instead
-from ..files import write_output
+from ..errors import SettingError, expect
 from ..records import is_whole
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, folds_of, seed_of
+from .checkpoints import load_checkpoint
 from .encoder import Encoder, Members, NetworkFactory, fold_batch_norms
 from .preprocessing import Preprocessor, averaging
 
 log = logging.getLogger("dengine")
-SEPARATE = re.compile(r"^(networks\.networks\.)\d+\.")  # names in `encoder.Separate`
 
-MIN_TRACES = 20
+MIN_TRACES = 20  # of the first training
 CHUNK = 64  # traces that are embedded at once: what they need stays in the cache
-STATISTICS = 256  # traces from which the statistics of batch normalisation are taken
-STEPS_A_LABEL = 1.2  # that training must have had before it is called complete
-INITIAL_STEPS = 36  # steps on top of these
+STATISTICS_TRACES = 256  # from which the statistics of batch normalisation are estimated
+STEPS_PER_LABEL = 1.2  # that training must have had before it is called complete,
+INITIAL_STEPS = 36  # on top of these
 MANY_LABELS = 4000  # labels beyond which embedding them leaves no time for more steps
 CATCH_UP_FACTOR = 2  # times the steps of a retrain, as long as training is behind
 
@@ -58,8 +54,16 @@ CATCH_UP_FACTOR = 2  # times the steps of a retrain, as long as training is behi
 class Augmentation:
     """Change preprocessed traces in ways that keep their labels.
 
-    shift : frames that a trace is moved in time at most.  gain : standard deviation of a factor on the whole trace.
-    noise : standard deviation of white noise.  mixup : parameter of the Beta distribution that mixes two traces.
+    Parameters
+    ----------
+    shift : int
+        Largest number of frames by which a trace is moved in time.
+    gain : float
+        Standard deviation of a factor on the whole trace, whose mean is 1.
+    noise : float
+        Standard deviation of white noise.
+    mixup : float
+        Parameter of the Beta distribution by which two traces and their labels are mixed.
     """
 
     shift: int
@@ -68,63 +72,82 @@ class Augmentation:
     mixup: float
 
     def __call__(self, x: Tensor, y: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """Augment x (B, K, C, L) and y (B, K); traces are mixed with others of the same member."""
+        """Augment a batch; a trace is mixed with one of the same member.
+
+        Parameters
+        ----------
+        x : Tensor of float32, shape (B, K, C', L)
+            Preprocessed traces of each member.
+        y : Tensor of float32, shape (B, K)
+            Labels.
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        x, y : Tensor
+            Of the same shapes; a label lies between 0 and 1.
+        """
         batch, members, _, length = x.shape
-        offset = torch.from_numpy(rng.integers(-self.shift, self.shift + 1, size=(batch, members, 1, 1)))
+        size = (batch, members, 1, 1)
+        offset = torch.from_numpy(rng.integers(-self.shift, self.shift + 1, size=size))
         frame = (torch.arange(length) + offset).clamp(0, length - 1)
         x = x.gather(3, frame.expand_as(x))
-        x = x * (1.0 + self.gain * _normal(rng, batch, members, 1, 1))
-        x = x + self.noise * _normal(rng, *x.shape)
+        x = x * (1.0 + self.gain * standard_normal(rng, *size))
+        x = x + self.noise * standard_normal(rng, *x.shape)
         if self.mixup <= 0.0:
             return x, y
         share = rng.beta(self.mixup, self.mixup, size=(batch, members)).astype(np.float32)
-        own = torch.from_numpy(np.maximum(share, 1.0 - share))
-        other_x, other_y = x.roll(1, 0), y.roll(1, 0)
-        return other_x.lerp(x, own[:, :, None, None]), other_y.lerp(y, own)
+        weight = torch.from_numpy(np.maximum(share, 1.0 - share))
+        other_x = x.roll(1, 0)
+        other_y = y.roll(1, 0)
+        return other_x.lerp(x, weight[:, :, None, None]), other_y.lerp(y, weight)
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class TorchReducer(Reducer):
-    """Embed traces by a PyTorch network that is trained with cross-fitting, within the time of a retrain.
+    """Embed traces by a PyTorch network that is trained with cross-fitting, a bit at each retrain.
 
-    The first axis of the embedding is the predicted probability of success, the second the difference of the two units
-    behind it, times 0.1 (see `dengine.reducers.encoder`). Distances are not rescaled: a radius of 0.07 holds parts whose
-    probabilities differ by 0.07 at most.
+    The first axis of the embedding is the predicted probability of success, the second the
+    difference of the two units behind it, times 0.1 (see `dengine.reducers.encoder`). Distances are
+    not rescaled: within a radius of 0.07, probabilities differ by 0.07 at most.
 
     Parameters
     ----------
     network : callable
-        ``network(channels, samples)`` gives an `nn.Module` from preprocessed traces (B, channels, samples) to features
-        (B, features). Of each channel of a trace it sees two: the averaged, standardised trace and its differences.
+        ``network(channels, samples)`` returns an `nn.Module` from preprocessed traces
+        (B, channels, samples) to features (B, features). Of each channel of a trace it sees two:
+        the averaged, standardised trace and its differences.
     n_components : {1, 2}, default 2
         1 leaves the second axis out.
     folds : int, default 5
         K, members and spaces. Member k is trained without the labels of fold k.
     steps : int, default 12
-        AdamW steps of a retrain; twice as many as long as training is behind (see `n_steps_left_`).
+        AdamW steps of a retrain; twice as many while training is behind (see `n_steps_left_`).
     fit_steps : int, default 400
-        Steps of `fit`, and of the training after many labels came at once; twice as many hardly lower the loss.
+        Steps of `fit`, and of the training after many labels came at once; twice as many hardly
+        lower the loss.
     batch_size : int, default 32
         Traces of each member in a step.
     learning_rate, weight_decay : float, default 4e-3, 0.02
-        Of AdamW. The rate is constant: training never ends.
+        Of AdamW. The rate is constant, since training never ends.
     weight_averaging : float, default 0.97
         Share of the averaged weights that a step keeps.
     shift, gain, noise, mixup : default 5, 0.05, 0.03, 0.1
-        Augmentation: frames of shift in time, standard deviations of a factor and of white noise, and the parameter of
-        mixup; 0 turns each off.
+        Augmentation: frames of shift in time, standard deviations of a factor and of white noise,
+        and the parameter of mixup; 0 turns each off.
     checkpoint : str, default ""
-        File of tensors that `training/train_encoder.py` wrote, from which all members start. It must not have been
-        trained on parts that are counted later.
+        File of tensors that `training/train_encoder.py` wrote, from which all members start. It
+        must not have been trained on parts that are counted later.
     random_state : int, RandomState or None, default 0
-        Of the initial weights, the batches and the augmentation.
+        Seed of the initial weights, the batches and the augmentation.
 
     Attributes
     ----------
     n_steps_ : int
         Steps of all trainings so far.
     n_steps_left_ : int
-        Steps that are missing to complete training, after many labels came at once; 0 in normal production.
+        Steps that are missing to complete training, after many labels came at once; 0 in normal
+        production.
     loss_ : float
         Mean training loss of the last retrain, in nats; NaN where it took no step.
     """
@@ -157,15 +180,15 @@ class TorchReducer(Reducer):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Train from the initial weights to the end.
+        """Train `fit_steps` steps from initial weights.
 
         Parameters
         ----------
         X : array of float, shape (n, T) or (n, C, T)
-        y : array of shape (n,)
-            Two classes; the larger value is the success.
-        folds : array of int, shape (n,), optional
-            Permanent folds; by default those of the traces' content.
+        y : array, shape (n,)
+            Labels of two classes, the larger one for success.
+        folds : array of int64, shape (n,), optional
+            Permanent folds. None: by the traces' content.
 
         Raises
         ------
@@ -179,26 +202,42 @@ class TorchReducer(Reducer):
         self._train(traces, labels, folds, StopRule(), steps=self.fit_steps)
         return self
 
-    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
+    def train(
+        self,
+        X: Floats,
+        y: Ints,
+        folds: Ints,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
+    ) -> Floats:
+        """Take `n_steps_due` steps from the present weights; see `Reducer.train`.
+
+        SettingError for fewer than 20 traces in the first training.
+        """
         if "members_" not in vars(self):
-            expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first")
+            do = "verify more parts first"
+            expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
             self._start(self.check_traces(X, reset=True))
         traces = self.check_traces(X)
         labels = binary_labels(y, len(X), type(self).__name__)
         x = self._train(traces, labels, folds, stop or StopRule(), self.n_steps_due(len(traces)))
-        return self._embed_own(x, folds)
+        return self._embed_in_fold_space(x, folds)
 
     def n_steps_due(self, n_labels: int) -> int:
-        """Steps that the next retrain takes on so many labels."""
-        behind = self._n_steps_wanted(n_labels) - self.n_steps_
-        most = self.steps if n_labels > MANY_LABELS else CATCH_UP_FACTOR * self.steps
-        return min(max(behind, self.steps), most)
+        """Return the number of steps that the next retrain takes on `n_labels` labels."""
+        n_missing = self._n_steps_wanted(n_labels) - self.n_steps_
+        largest = self.steps if n_labels > MANY_LABELS else CATCH_UP_FACTOR * self.steps
+        return min(max(n_missing, self.steps), largest)
 
     def _n_steps_wanted(self, n_labels: int) -> int:
-        return int(min(self.fit_steps, INITIAL_STEPS + STEPS_A_LABEL * n_labels))
+        """Return the number of steps, over all trainings, that make training complete."""
+        return int(min(self.fit_steps, INITIAL_STEPS + STEPS_PER_LABEL * n_labels))
 
     def _start(self, traces: Floats) -> None:
-        """Build preprocessor and members for traces (n, C, T), from which the scales are read; no label is read."""
+        """Build preprocessor and members anew for traces (n, C, T); no label is read.
+
+        The channels' scales are read from the traces, the weights from the checkpoint, if any.
+        """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
         self.preprocessor_.learn(x)
@@ -207,35 +246,57 @@ class TorchReducer(Reducer):
             self.averaged_members_.load_state_dict(self.members_.state_dict())
 
     def _build(self, channels: int, samples: int, average: int) -> None:
+        """Check the parameters, and set initial weights and an empty state for such traces."""
         self.check()
         if samples < 2:
-            raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
+            got = f"{samples} (n_features = {channels * samples})"
+            raise SettingError(f"Expected at least 2 samples, got {got}.")
         self.preprocessor_ = Preprocessor(channels, samples, average)
-        self.seed_ = _drawn_seed(self.random_state)
+        self.seed_ = draw_seed(self.random_state)
         shape = self.preprocessor_.channels, self.preprocessor_.samples
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed_)
             self.members_ = Members(self.network, *shape, self.folds)
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
-        self.n_steps_ = self.n_steps_left_ = self.n_new_steps_ = 0
+        self.n_steps_ = 0
+        self.n_steps_left_ = 0
+        self.n_new_steps_ = 0
         self.loss_ = float("nan")
         self.encoder_ = self._new_encoder()
 
-    def _train(self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule, steps: int) -> Tensor:
-        """Train on traces (n, C, T) and let the averaged members answer; returns the preprocessed traces."""
+    def _train(
+        self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule, steps: int
+    ) -> Tensor:
+        """Train on traces (n, C, T) and let the averaged members answer.
+
+        Returns the preprocessed traces (n, C', L).
+        """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
         self.fit_loop(x, torch.from_numpy(labels).float(), folds, stop, steps)
-        missing = self._n_steps_wanted(len(labels)) - self.n_steps_
-        # Who limits the steps of a retrain wants no further retrains in their place.
-        self.n_steps_left_ = max(0, missing) if stop.max_steps is None else 0
+        n_missing = self._n_steps_wanted(len(labels)) - self.n_steps_
+        # A caller who limits the steps of a retrain wants no further retrains in their place.
+        self.n_steps_left_ = max(0, n_missing) if stop.max_steps is None else 0
         self.estimate_statistics(x)
         self.encoder_ = self._new_encoder()
         return x
 
     def fit_loop(self, x: Tensor, y: Tensor, folds: Ints, stop: StopRule, steps: int) -> None:
-        """Take AdamW steps on x (n, C', L) and y (n,), member k on the rows outside fold k."""
+        """Take AdamW steps, member k on the rows outside fold k.
+
+        Parameters
+        ----------
+        x : Tensor of float32, shape (n, C', L)
+            Preprocessed traces.
+        y : Tensor of float32, shape (n,)
+            Labels.
+        folds : array of int64, shape (n,)
+        stop : StopRule
+            Asked before each step.
+        steps : int
+            Largest number of steps.
+        """
         optimizer = self.make_optimizer()
         augmentation = Augmentation(self.shift, self.gain, self.noise, self.mixup)
         rng = np.random.default_rng([self.seed_, self.n_steps_])
@@ -246,31 +307,39 @@ class TorchReducer(Reducer):
             for rows in draw_batches(folds, self.folds, self.batch_size, steps, rng):  # (B, K)
                 if stop.exhausted(len(losses)):
                     break
-                batch = augmentation(x[rows], y[rows], rng)
-                losses.append(self.train_step(optimizer, *batch))
+                batch_x, batch_y = augmentation(x[rows], y[rows], rng)
+                losses.append(self.train_step(optimizer, batch_x, batch_y))
         self.optimizer_state_ = optimizer.state_dict()["state"]
         self.n_new_steps_ = len(losses)
         self.loss_ = float(np.mean(losses)) if losses else float("nan")
 
     def train_step(self, optimizer: torch.optim.Optimizer, x: Tensor, y: Tensor) -> float:
-        """Take one step on x (B, K, C', L) and y (B, K); returns the mean loss of the members."""
-        logits = self.members_(x)
+        """Take one step on x (B, K, C', L) and y (B, K); return the mean loss of the members."""
+        logits = self.members_(x)  # (B, K)
         loss = F.binary_cross_entropy_with_logits(logits, y)
         optimizer.zero_grad()
-        (self.folds * loss).backward()  # type: ignore[no-untyped-call]  # the members share nothing: each gets the gradient of its own mean loss
+        # Members share no weights, so each gets the gradient of its own mean loss.
+        (self.folds * loss).backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         self.n_steps_ += 1
         self.average_weights()
         return float(loss.detach())
 
     def make_optimizer(self) -> torch.optim.Optimizer:
-        """AdamW as the last training left it; weights decay, biases and batch normalisation do not."""
-        named = list(self.members_.named_parameters())
+        """Return AdamW with the moments that the last training left.
+
+        Weights decay; biases and the parameters of batch normalisation do not.
+        """
+        decayed: list[nn.Parameter] = []
+        others: list[nn.Parameter] = []
+        for name, parameter in self.members_.named_parameters():
+            is_weight = parameter.dim() > 1 and name.endswith("weight")
+            (decayed if is_weight else others).append(parameter)
         groups: list[dict[str, Any]] = [
-            {"params": [p for name, p in named if _decays(name, p)]},
-            {"params": [p for name, p in named if not _decays(name, p)], "weight_decay": 0.0},
+            {"params": decayed, "weight_decay": self.weight_decay},
+            {"params": others, "weight_decay": 0.0},
         ]
-        optimizer = torch.optim.AdamW(groups, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        optimizer = torch.optim.AdamW(groups, lr=self.learning_rate, fused=True)
         if self.optimizer_state_:
             optimizer.load_state_dict(optimizer.state_dict() | {"state": self.optimizer_state_})
         return optimizer
@@ -279,48 +348,61 @@ class TorchReducer(Reducer):
     def average_weights(self) -> None:
         """Move the averaged members towards the trained ones, further in the first steps."""
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
-        for average, current in zip(self.averaged_members_.parameters(), self.members_.parameters(), strict=True):
+        averages = self.averaged_members_.parameters()
+        for average, current in zip(averages, self.members_.parameters(), strict=True):
             average.lerp_(current, 1.0 - kept)
 
     @torch.no_grad()
     def estimate_statistics(self, x: Tensor) -> None:
-        """Take the statistics of batch normalisation anew for the averaged weights, on traces x (n, C', L)."""
+        """Estimate the statistics of batch normalisation that fit the averaged weights.
+
+        x : preprocessed traces (n, C', L), of which 256 at most are used.
+        """
         members = self.averaged_members_.eval()
         norms = [module for module in members.modules() if isinstance(module, nn.BatchNorm1d)]
         for norm in norms:
             norm.reset_running_stats()
             norm.momentum = None  # the mean over all batches
             norm.train()
-        rows = np.random.default_rng(len(x)).permutation(len(x))[:STATISTICS]
+        rows = np.random.default_rng(len(x)).permutation(len(x))[:STATISTICS_TRACES]
         for chunk in torch.from_numpy(rows).chunk(-(-len(rows) // CHUNK)):
             members(x[chunk, None].expand(-1, self.folds, -1, -1))
         members.eval()
 
     def _new_encoder(self) -> Encoder:
+        """Return the module that answers: the preprocessor and a copy of the averaged members."""
         members = fold_batch_norms(copy.deepcopy(self.averaged_members_).eval())
-        encoder = Encoder(self.preprocessor_, members, self.n_components)  # type: ignore[arg-type]  # still `Members`
+        encoder = Encoder(self.preprocessor_, members, self.n_components)  # type: ignore[arg-type]
         return encoder.eval().requires_grad_(False)
 
     @torch.inference_mode()
-    def _embed_own(self, x: Tensor, folds: Ints) -> Floats:
-        """Preprocessed traces (n, C', L) -> (n, dim), row i in space folds[i]: each member computes its own rows alone."""
-        rows = [np.flatnonzero(folds == k) for k in range(self.folds)]
-        longest = max(map(len, rows))
-        table = np.stack([np.resize(own, longest) if len(own) else np.zeros(longest, np.int64) for own in rows], axis=1)
+    def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
+        """Embed preprocessed traces (n, C', L): (n, d), row i in space ``folds[i]``.
+
+        Each member computes the rows of its fold alone, a fifth of what `embed` would take.
+        """
+        rows_of_fold = [np.flatnonzero(folds == k) for k in range(self.folds)]
+        longest = max(map(len, rows_of_fold))
+        columns = [
+            np.resize(rows, longest) if len(rows) else np.zeros(longest, np.int64)
+            for rows in rows_of_fold
+        ]
+        table = np.stack(columns, axis=1)  # (longest, K): rows of shorter folds are repeated
         points = np.empty((len(x), self.n_components), dtype=np.float32)
         for first in range(0, longest, CHUNK):
-            some = torch.from_numpy(table[first : first + CHUNK])  # (B, K)
-            embedded = self.encoder_.embed(x[some]).numpy()
-            for k, own in enumerate(rows):
-                points[own[first : first + CHUNK]] = embedded[: max(0, len(own) - first), k]
+            batch = torch.from_numpy(table[first : first + CHUNK])  # (B, K)
+            embedded = self.encoder_.embed(x[batch]).numpy()  # (B, K, d)
+            for k, rows in enumerate(rows_of_fold):
+                n_left = max(0, len(rows) - first)
+                points[rows[first : first + CHUNK]] = embedded[:n_left, k]
         return points
 
     @torch.inference_mode()
     def embed(self, X: Floats) -> Floats:
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
-        chunks = [self.encoder_(traces[i : i + CHUNK]) for i in range(0, max(1, len(traces)), CHUNK)]
-        return torch.cat(chunks).numpy()
+        chunks = torch.split(traces, CHUNK)
+        return torch.cat([self.encoder_(chunk) for chunk in chunks]).numpy()
 
     def warm_up(self) -> None:
         warm_optimizer()
@@ -328,37 +410,49 @@ class TorchReducer(Reducer):
     def untrained_module(self, X: Floats) -> Encoder | None:
         if "encoder_" in vars(self):
             return self.module()
-        new: Self = clone(self)
-        new._build(X.shape[1], X.shape[2], averaging(torch.from_numpy(X)))
-        return new.module()
+        untrained: Self = clone(self)
+        untrained._build(X.shape[1], X.shape[2], averaging(torch.from_numpy(X)))
+        return untrained.module()
 
     def module(self) -> Encoder | None:
         check_is_fitted(self, "encoder_")
-        compiles = can_compile(self.network, self.preprocessor_.channels, self.preprocessor_.samples)
-        return self.encoder_ if compiles else None
+        shape = self.preprocessor_.channels, self.preprocessor_.samples
+        return self.encoder_ if can_compile(self.network, *shape) else None
 
     @property
     def report(self) -> FitReport:
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
         left = f"{self.n_steps_left_} steps to go" if self.n_steps_left_ else ""
-        return FitReport(self.n_new_steps_, ", ".join(filter(None, (note, left))), self.n_steps_left_)
+        note = ", ".join(filter(None, (note, left)))
+        return FitReport(self.n_new_steps_, note, self.n_steps_left_)
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         check_is_fitted(self, "encoder_")
-        numbers = [self.preprocessor_.average, self.seed_, self.n_steps_, self.n_steps_left_, self.n_new_steps_]
-        state = {"shape": np.array(self.trace_shape_), "numbers": np.array(numbers), "loss": np.array(self.loss_)}
-        modules = {"preprocessor": self.preprocessor_, "members": self.members_, "averaged": self.averaged_members_}
-        for prefix, module in modules.items():
-            state |= {f"{prefix}.{name}": value.numpy().copy() for name, value in module.state_dict().items()}
-        for i, tensors in self.optimizer_state_.items():
-            state |= {f"optimizer.{i}.{name}": value.numpy().copy() for name, value in tensors.items()}
+        counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
+        counts += [self.n_steps_left_, self.n_new_steps_]
+        state = {
+            "shape": np.array(self.trace_shape_),
+            "counts": np.array(counts),
+            "loss": np.array(self.loss_),
+        }
+        tensors: dict[str, Mapping[str, Tensor]] = {
+            "preprocessor": self.preprocessor_.state_dict(),
+            "members": self.members_.state_dict(),
+            "averaged": self.averaged_members_.state_dict(),
+        }
+        for i, moments in self.optimizer_state_.items():
+            tensors[f"optimizer.{i}"] = moments
+        for prefix, named in tensors.items():
+            for name, value in named.items():
+                state[f"{prefix}.{name}"] = value.numpy().copy()
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         channels, samples = (int(value) for value in state["shape"])
-        average, seed, n_steps, n_steps_left, n_new_steps = (int(value) for value in state["numbers"])
-        self.trace_shape_, self.n_features_in_ = (channels, samples), channels * samples
+        average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
+        self.trace_shape_ = (channels, samples)
+        self.n_features_in_ = channels * samples
         self._build(channels, samples, average)
         self.seed_ = seed
         self.n_steps_ = n_steps
@@ -370,7 +464,8 @@ class TorchReducer(Reducer):
         restore(self.averaged_members_, arrays_with_prefix(state, "averaged."))
         for name, value in arrays_with_prefix(state, "optimizer.").items():
             i, key = name.split(".")
-            self.optimizer_state_.setdefault(int(i), {})[key] = torch.from_numpy(np.array(value))
+            moments = self.optimizer_state_.setdefault(int(i), {})
+            moments[key] = torch.from_numpy(np.array(value))
         self.encoder_ = self._new_encoder()
         return self
 
@@ -383,13 +478,17 @@ class TorchReducer(Reducer):
         expect(is_whole(self.batch_size, 2, 10**6), "batch_size >= 2, an integer", self.batch_size)
         expect(is_whole(self.shift, 0, 10**6), "shift >= 0 frames, an integer", self.shift)
         expect(self.learning_rate > 0.0, "learning_rate > 0", self.learning_rate)
-        expect(0.0 <= self.weight_averaging < 1.0, "weight_averaging from 0 to below 1", self.weight_averaging)
+        is_share = 0.0 <= self.weight_averaging < 1.0
+        expect(is_share, "weight_averaging from 0 to below 1", self.weight_averaging)
         for name in ("weight_decay", "gain", "noise", "mixup"):
-            expect(0.0 <= getattr(self, name) < float("inf"), f"{name} >= 0", getattr(self, name))
+            value = getattr(self, name)
+            expect(0.0 <= value < float("inf"), f"{name} >= 0", value)
 
 
-def draw_batches(folds: Ints, n_folds: int, batch_size: int, steps: int, rng: np.random.Generator) -> Iterator[Tensor]:
-    """Draw rows for each step and member, without replacement until all rows of a member were drawn.
+def draw_batches(
+    folds: Ints, n_folds: int, batch_size: int, steps: int, rng: np.random.Generator
+) -> Iterator[Tensor]:
+    """Draw the rows of each step and member, in shuffled passes over the rows of the member.
 
     Parameters
     ----------
@@ -397,89 +496,62 @@ def draw_batches(folds: Ints, n_folds: int, batch_size: int, steps: int, rng: np
         Member k gets no row of fold k.
     n_folds, batch_size, steps : int
         K, B and the number of batches. B is smaller where a member has fewer rows.
+    rng : numpy.random.Generator
 
     Yields
     ------
     Tensor of int64, shape (B, K)
+
+    Raises
+    ------
+    SettingError
+        If fewer than two rows lie outside a fold.
     """
     pools = [np.flatnonzero(folds != k) for k in range(n_folds)]
     smallest = min(map(len, pools))
     if smallest < 2:
         got = f"{smallest} (n_samples = {len(folds)}); all traces may be the same"
-        raise SettingError(f"Expected at least 2 traces outside each fold, got {got}. Look at the sensor, or the unit.")
+        raise SettingError(
+            f"Expected at least 2 traces outside each fold, got {got}. "
+            "Check the sensor and the unit."
+        )
     size = min(batch_size, smallest)
     drawn = np.empty((steps, size, n_folds), dtype=np.int64)
     for k, pool in enumerate(pools):
-        rounds = -(-steps * size // len(pool))
-        order = np.concatenate([rng.permutation(pool) for _ in range(rounds)])
+        n_passes = -(-steps * size // len(pool))
+        order = np.concatenate([rng.permutation(pool) for _ in range(n_passes)])
         drawn[:, :, k] = order[: steps * size].reshape(steps, size)
     yield from torch.from_numpy(drawn)
 
 
 @cache
 def warm_optimizer() -> None:
-    """Take a step on one weight: the first step in a process imports a compiler, which takes two seconds."""
+    """Take a step on one weight, once in a process.
+
+    The first step of an optimiser imports a compiler, which takes two seconds.
+    """
     weight = nn.Parameter(torch.zeros(1))
     weight.grad = torch.zeros(1)
     torch.optim.AdamW([weight], fused=True).step()
 
 
-def save_checkpoint(members: Members, path: str | Path) -> None:
-    """Write the weights of a single member as a file of tensors, from which any number can start."""
-    expect(members.count == 1, "a single member", members.count)
-    content = BytesIO()  # torch's own writer aborts the process on a full disk
-    torch.save(members.state_dict(), content)
-    write_output(path, content.getvalue(), force=True)
-
-
-def load_checkpoint(members: Members, path: str | Path) -> None:
-    """Start every member from the weights of a checkpoint; only tensors are read, no code.
-
-    Raises
-    ------
-    SettingError
-        If the file cannot be read, or is of another network.
-    """
-    unreadable = OSError, RuntimeError, ValueError, EOFError, UnpicklingError
-    with instead(SettingError, f"The checkpoint {path} cannot be read", *unreadable):
-        single = torch.load(path, map_location="cpu", weights_only=True)
-    own = members.state_dict()
-    sources = {name: SEPARATE.sub(r"\g<1>0.", name) for name in own}
-    wanted = {sources[name]: _shape_of_one(name, value, members.count) for name, value in own.items()}
-    if not isinstance(single, dict) or {name: value.shape for name, value in single.items()} != wanted:
-        raise SettingError(
-            f"Expected a checkpoint of this network for traces of this many channels, {path} is of another; "
-            "train one with training/train_encoder.py."
-        )
-    with torch.no_grad():
-        for name, value in own.items():
-            times = value.shape[0] // single[sources[name]].shape[0] if value.dim() else 1
-            value.copy_(torch.cat([single[sources[name]]] * times) if times > 1 else single[sources[name]])
-
-
-def _shape_of_one(name: str, value: Tensor, count: int) -> torch.Size:
-    """The shape that a tensor of all members has where there is a single member."""
-    if value.dim() == 0 or SEPARATE.match(name):
-        return value.shape
-    return torch.Size([value.shape[0] // count, *value.shape[1:]])
-
-
-def _decays(name: str, parameter: nn.Parameter) -> bool:
-    return parameter.dim() > 1 and name.endswith("weight")
-
-
-def _drawn_seed(random_state: Any) -> int:
+def draw_seed(random_state: Any) -> int:
+    """Return the seed of a `random_state`, a random one for None."""
     seed = seed_of(random_state)
     return int(np.random.default_rng().integers(2**31)) if seed is None else seed
 
 
-def _normal(rng: np.random.Generator, *shape: int) -> Tensor:
+def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:
+    """Draw a float32 tensor of a standard normal distribution."""
     return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
 
 
 @lru_cache(maxsize=32)
 def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
-    """Whether TorchScript takes a network; one of a user's own may hold Python that it does not."""
+    """Return whether TorchScript compiles a network; log a warning if it does not.
+
+    A user's network may hold Python that TorchScript does not support.
+    """
     with torch.random.fork_rng(devices=[]):
         members = Members(network, channels, samples, 2).eval()
     try:
@@ -487,6 +559,9 @@ def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
     except Exception as error:
         name = getattr(network, "__qualname__", repr(network))
         reason = str(error).strip().splitlines()[0]
-        log.warning("%s cannot be compiled by TorchScript, so it answers in Python and is not exported: %s", name, reason)
+        message = (
+            "%s cannot be compiled by TorchScript, so it answers in Python and is not exported: %s"
+        )
+        log.warning(message, name, reason)
         return False
     return True

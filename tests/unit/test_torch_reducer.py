@@ -17,9 +17,10 @@ from dengine.errors import SettingError
 from dengine.folds import content_fold
 from dengine.reducers import torch_reducer
 from dengine.reducers.base import StopRule
+from dengine.reducers.checkpoints import load_checkpoint, save_checkpoint
 from dengine.reducers.conv import ConvNetwork
 from dengine.reducers.encoder import Members
-from dengine.reducers.torch_reducer import Augmentation, draw_batches, load_checkpoint, save_checkpoint
+from dengine.reducers.torch_reducer import Augmentation, draw_batches
 from dengine.testing import check_reducer, labels_of_a_fold_move_nothing_in_its_space, toy_traces
 
 

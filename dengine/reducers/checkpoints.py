@@ -1,0 +1,66 @@
+"""Checkpoints of a network: weights of a single member, from which all members of a reducer start.
+
+`training/train_encoder.py` writes one with `save_checkpoint`; `TorchReducer(checkpoint=...)` reads
+it with `load_checkpoint`. A checkpoint holds tensors alone, so that loading it runs no code.
+"""
+
+import re
+from io import BytesIO
+from pathlib import Path
+from pickle import UnpicklingError
+
+import torch
+from torch import Tensor
+
+from ..errors import SettingError, expect, instead
+from ..files import write_output
+from .encoder import Members
+
+SEPARATE = re.compile(r"^(networks\.networks\.)\d+\.")  # names of parameters in `encoder.Separate`
+
+
+def save_checkpoint(members: Members, path: str | Path) -> None:
+    """Write the weights of a single member to a file, which is replaced if it exists.
+
+    Raises SettingError for more than one member.
+    """
+    expect(members.count == 1, "a single member", members.count)
+    content = BytesIO()  # torch's own writer aborts the process on a full disk
+    torch.save(members.state_dict(), content)
+    write_output(path, content.getvalue(), force=True)
+
+
+def load_checkpoint(members: Members, path: str | Path) -> None:
+    """Set the weights of every member to those of a checkpoint; only tensors are read, no code.
+
+    Raises
+    ------
+    SettingError
+        If the file cannot be read, or is of another network.
+    """
+    unreadable = OSError, RuntimeError, ValueError, EOFError, UnpicklingError
+    with instead(SettingError, f"The checkpoint {path} cannot be read", *unreadable):
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    state = members.state_dict()
+    names = {name: SEPARATE.sub(r"\g<1>0.", name) for name in state}  # in the checkpoint
+    shapes = {
+        names[name]: shape_of_member(name, value, members.count) for name, value in state.items()
+    }
+    is_state = isinstance(weights, dict)
+    if not is_state or {name: value.shape for name, value in weights.items()} != shapes:
+        raise SettingError(
+            "Expected a checkpoint of this network for traces of this many channels, "
+            f"{path} is of another; train one with training/train_encoder.py."
+        )
+    with torch.no_grad():
+        for name, value in state.items():
+            weight = weights[names[name]]
+            n_copies = value.shape[0] // weight.shape[0] if value.dim() else 1
+            value.copy_(torch.cat([weight] * n_copies) if n_copies > 1 else weight)
+
+
+def shape_of_member(name: str, value: Tensor, count: int) -> torch.Size:
+    """Return the shape that a tensor of `count` members has in a checkpoint of a single one."""
+    if value.dim() == 0 or SEPARATE.match(name):
+        return value.shape
+    return torch.Size([value.shape[0] // count, *value.shape[1:]])
