@@ -23,7 +23,7 @@ import numpy as np
 from .decision.policy import Policy, check_radius
 from .errors import SettingError, StoreError, expect, instead, listed
 from .records import is_number, is_whole
-from .reducers import REDUCERS, make_reducer, own_default, reducer_class
+from .reducers import REDUCERS, class_default, make_reducer, reducer_class
 
 Params = Mapping[str, bool | int | float | str]
 CLASS_PATH = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
@@ -67,7 +67,7 @@ class ReducerDefault:
             return None  # the default, as `dataclass` reads it
         value = vars(recipe)[self.field_name]
         if value is None:
-            value = own_default(recipe.reducer, self.name)
+            value = class_default(recipe.reducer, self.name)
             self.check(value)
         return value
 

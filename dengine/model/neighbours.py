@@ -38,7 +38,7 @@ from ..errors import ExportError, listed
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, describe_estimator
 from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
-from ..reducers import make_reducer, own_default
+from ..reducers import class_default, make_reducer
 from ..reducers.base import (
     FitReport,
     Floats,
@@ -259,7 +259,7 @@ class ModelPrediction(EngineModel):
         self.folds = folds
         self.reducer = make_reducer(reducer) if isinstance(reducer, str) else reducer
         self.classifier = classifier or WilsonRadiusClassifier(
-            own_default(self.reducer, "default_radius")
+            class_default(self.reducer, "default_radius")
         )
         self.name = type(self.reducer).__name__
         self.rule = rule or self.classifier.policy().rule()

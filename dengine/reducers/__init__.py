@@ -1,4 +1,9 @@
-"""Reducers by name: trace -> embedding, each a scikit-learn transformer, interchangeable everywhere."""
+"""Reducers by name. A reducer embeds traces, and each is a scikit-learn transformer.
+
+`REDUCERS` maps a name to a function that makes the reducer, and `make_reducer` also takes the
+`module:Class` of a user's own. A new reducer is a module of this folder and a line in `_NAMED`,
+which also gives it a recipe; its defaults are attributes of its class, see `base.Reducer`.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -22,7 +27,8 @@ if TYPE_CHECKING:
     from .umap import UmapReducer as UmapReducer
     from .umap_learn import UmapLearnReducer as UmapLearnReducer
 
-_NAMED = {  # by a reducer's name: its module, which is imported when it is asked for, and its class
+# Module and class of each reducer by its name; the module is imported when the class is needed.
+_NAMED = {
     "conv": ("conv", "ConvReducer"),
     "umap": ("umap", "UmapReducer"),
     "umap-learn": ("umap_learn", "UmapLearnReducer"),
@@ -32,55 +38,103 @@ _NAMED = {  # by a reducer's name: its module, which is imported when it is aske
 _LAZY = {"base": ["Reducer", "CrossFitted"], "torch_reducer": ["TorchReducer"]}
 _LAZY |= {module: [class_name] for module, class_name in _NAMED.values()}
 
-MOST = 2**31 - 1  # of a parameter that is an integer
+MAX_INTEGER = 2**31 - 1  # of a parameter
+TRANSFORMER_METHODS = ("fit", "transform", "get_params")
 
 
 def reducer_class(name: str) -> type:
-    """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for."""
-    expect(name in _NAMED or ":" in name, f"a reducer among {', '.join(_NAMED)}, or module:Class of your own", name)
-    found: type = __getattr__(_NAMED[name][1]) if name in _NAMED else import_class(name)
-    if missing := [each for each in ("fit", "transform", "get_params") if not callable(getattr(found, each, None))]:
-        raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has no {' and no '.join(missing)}.")
-    return found
+    """Import and return the class of a reducer.
+
+    Parameters
+    ----------
+    name : str
+        A name in `REDUCERS`, or `module:Class`.
+
+    Raises
+    ------
+    SettingError
+        If there is no such class, or it is no scikit-learn transformer.
+    """
+    expected = f"a reducer among {', '.join(_NAMED)}, or module:Class of your own"
+    expect(name in _NAMED or ":" in name, expected, name)
+    cls: type = __getattr__(_NAMED[name][1]) if name in _NAMED else import_class(name)
+    missing = [method for method in TRANSFORMER_METHODS if not callable(getattr(cls, method, None))]
+    if missing:
+        got = f"{name} has no {' and no '.join(missing)}"
+        raise SettingError(f"Expected a scikit-learn transformer as reducer, {got}.")
+    return cls
 
 
 def make_reducer(name: str, **params: Any) -> Any:
-    """A reducer by its name in `REDUCERS` or `module:Class`; SettingError for an unknown name or parameter."""
-    found = reducer_class(name)
-    allowed = signature(found).parameters
+    """Make a reducer.
+
+    Parameters
+    ----------
+    name : str
+        A name in `REDUCERS`, or `module:Class`.
+    **params
+        Parameters of its class.
+
+    Returns
+    -------
+    Reducer, or another scikit-learn transformer
+
+    Raises
+    ------
+    SettingError
+        If the name or a parameter is unknown, or a value is of another type than its default.
+    """
+    cls = reducer_class(name)
+    allowed = signature(cls).parameters
     unknown = sorted(set(params) - set(allowed))
     if unknown:
-        raise SettingError(f"{found.__name__} has no parameter {', '.join(unknown)}; it has {', '.join(allowed)}.")
+        problem = f"{cls.__name__} has no parameter {', '.join(unknown)}"
+        raise SettingError(f"{problem}; it has {', '.join(allowed)}.")
     if name in _NAMED:
         for key, value in params.items():
-            _must_be_like(allowed[key].default, key, value)
-    return found(**params)
+            _check_type(allowed[key].default, key, value)
+    return cls(**params)
 
 
-def _must_be_like(default: Any, key: str, value: Any) -> None:
-    """SettingError for a parameter of another type than its default: or every retrain would fail by it, one by one."""
-    what = {bool: "true or false", str: "a text", int: "an integer", float: "a number"}.get(type(default))
-    fits = {
+def _check_type(default: Any, key: str, value: Any) -> None:
+    """Raise SettingError for a parameter of another type than its default.
+
+    Otherwise every retrain would fail.
+    """
+    types = {bool: "true or false", str: "a text", int: "an integer", float: "a number"}
+    expected = types.get(type(default))
+    integers = (2, 1000) if key == "folds" else (-MAX_INTEGER, MAX_INTEGER)
+    valid = {
         bool: isinstance(value, bool | np.bool_),
         str: isinstance(value, str),
-        int: is_whole(value, 2 if key == "folds" else -MOST, 1000 if key == "folds" else MOST),
+        int: is_whole(value, *integers),
         float: is_number(value) and value == value,  # no NaN
     }
-    expect(what is None or fits[type(default)], f"{what} as the reducer's {key}, as {default!r}", value)
+    fits = expected is None or valid[type(default)]
+    expect(fits, f"{expected} as the reducer's {key}, as {default!r}", value)
 
 
-def own_default(reducer: Any, name: str) -> Any:
-    """Return what a reducer's class says of itself, `default_radius` say; `reducer` is a name, a class or an object.
+def class_default(reducer: Any, name: str) -> Any:
+    """Return an attribute of a reducer's class, such as `default_radius`; see `Reducer`.
 
-    scikit-learn's transformers say nothing of it, so they have the default of `Reducer`.
+    Parameters
+    ----------
+    reducer : str, type or estimator
+        A name, a class or an object. A class without the attribute, such as another scikit-learn
+        transformer, has the value of `Reducer`.
+    name : str
+        The attribute.
     """
-    kind = reducer_class(reducer) if isinstance(reducer, str) else reducer
-    return getattr(kind, name, getattr(__getattr__("Reducer"), name))
+    cls = reducer_class(reducer) if isinstance(reducer, str) else reducer
+    return getattr(cls, name, getattr(__getattr__("Reducer"), name))
 
 
 def has_own_unit(reducer: Any) -> bool:
-    """Whether a reducer's embedding is never scaled, its first axis a predicted probability; see `Reducer.own_unit`."""
-    return bool(own_default(reducer, "own_unit"))
+    """Return whether the embedding of a reducer is never scaled, see `Reducer.own_unit`.
+
+    Its first axis is then a predicted probability. `reducer` is a name, a class or an object.
+    """
+    return bool(class_default(reducer, "own_unit"))
 
 
 REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _NAMED}

@@ -1,13 +1,15 @@
-"""The module that answers: preprocessor, K members of a network, and the embedding of each.
+"""The module that `TorchReducer` trains and exports: K members of a network, and their embeddings.
 
     x (B, C, T) raw        -> Preprocessor -> (B, C', L)
     K copies of the network                -> (B, K, F) features
     two units each, sigmoid                -> (B, K, 2) units u1, u2
     logit = slope . units + offset         -> (B, K)
-    embedding                              -> (B, K, 2) probability sigmoid(logit), difference SPREAD * (u1 - u2)
+    embedding                              -> (B, K, 2): probability sigmoid(logit),
+                                              difference 0.1 * (u1 - u2)
 
-Both coordinates are learned. The probability says how good a part looks; the difference says which of the two units
-speaks for it, so that parts of which the units disagree are not counted together with parts of which both are half sure.
+Both coordinates are learned. The probability tells how good a part looks. The difference tells
+which of the two units is active, so that parts on which the units disagree are not counted together
+with parts on which both are undecided.
 """
 
 from collections.abc import Callable
@@ -20,10 +22,11 @@ from torch.nn.utils import fuse_conv_bn_eval
 from ..errors import SettingError
 from .preprocessing import Preprocessor
 
-NetworkFactory = Callable[..., nn.Module]  # (channels, samples) -> module, (B, channels, samples) -> (B, features)
+# network(channels, samples) returns a module from (B, channels, samples) to (B, features).
+NetworkFactory = Callable[..., nn.Module]
 
-SPREAD = 0.1  # range of the second coordinate, against the first one's range of 1
-SLOPE = 4.0  # of each unit in the logit, to begin with
+DIFFERENCE_RANGE = 0.1  # of the second coordinate; that of the first one is 1
+INITIAL_SLOPE = 4.0  # of each unit in the logit
 
 
 class Members(nn.Module):
@@ -32,8 +35,9 @@ class Members(nn.Module):
     Parameters
     ----------
     network : callable
-        ``network(channels, samples)`` gives a module from (B, channels, samples) to (B, features). A factory that takes
-        ``members`` as well gives one module for all of them, from (B, K * channels, samples) to (B, K * features).
+        ``network(channels, samples)`` returns a module from (B, channels, samples) to
+        (B, features). A factory that also takes ``members`` returns one module for all members,
+        from (B, K * channels, samples) to (B, K * features).
     channels, samples : int
         Shape of a preprocessed trace.
     count : int
@@ -42,7 +46,7 @@ class Members(nn.Module):
     Raises
     ------
     SettingError
-        If the module gives another shape.
+        If the output of the module has another number of dimensions.
     """
 
     def __init__(self, network: NetworkFactory, channels: int, samples: int, count: int) -> None:
@@ -54,30 +58,30 @@ class Members(nn.Module):
             if grouped
             else Separate([network(channels, samples) for _ in range(count)])
         )
-        features = _features_of(self.networks, count, channels, samples)
+        features = count_features(self.networks, count, channels, samples)
         bound = features**-0.5
         self.weight = nn.Parameter(torch.empty(count, features, 2).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(count, 2))
-        self.slope = nn.Parameter(torch.full((count, 2), SLOPE))
-        self.offset = nn.Parameter(torch.full((count,), -SLOPE))
+        self.slope = nn.Parameter(torch.full((count, 2), INITIAL_SLOPE))
+        self.offset = nn.Parameter(torch.full((count,), -INITIAL_SLOPE))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, K, channels, samples), the traces of each member -> (B, K) logits."""
+        """Traces of each member (B, K, channels, samples) -> logits (B, K)."""
         return self.logits(self.units(x))
 
     def units(self, x: Tensor) -> Tensor:
-        """(B, K, channels, samples) -> (B, K, 2), from 0 to 1."""
+        """Traces of each member (B, K, channels, samples) -> units (B, K, 2), from 0 to 1."""
         features = self.networks(x)  # (B, K, F)
         units: Tensor = (features.unsqueeze(2) @ self.weight).squeeze(2) + self.bias
         return units.sigmoid()
 
     def logits(self, units: Tensor) -> Tensor:
-        """(B, K, 2) -> (B, K)."""
+        """Units (B, K, 2) -> logits (B, K)."""
         return (units * self.slope).sum(2) + self.offset
 
 
 class Grouped(nn.Module):
-    """One module that computes all members: (B, K, C', L) -> (B, K, F)."""
+    """Compute all members by one module, `network`: (B, K, C', L) -> (B, K, F)."""
 
     def __init__(self, network: NetworkFactory, channels: int, samples: int, count: int) -> None:
         super().__init__()
@@ -90,7 +94,7 @@ class Grouped(nn.Module):
 
 
 class Separate(nn.Module):
-    """A module for each member: (B, K, C', L) -> (B, K, F)."""
+    """Compute each member by a module of its own: (B, K, C', L) -> (B, K, F)."""
 
     def __init__(self, networks: list[nn.Module]) -> None:
         super().__init__()
@@ -107,7 +111,7 @@ class Encoder(nn.Module):
     ----------
     preprocessor : Preprocessor
     members : Members
-        Those that answer, in evaluation mode; batch normalisation is folded into the convolutions before it.
+        In evaluation mode, with batch normalisation folded into the convolutions.
     dim : int
         2, or 1 for the probability alone.
     """
@@ -118,29 +122,30 @@ class Encoder(nn.Module):
         self.members = members
         self.count = members.count
         self.dim = dim
-        self.spread = SPREAD
+        self.difference_range = DIFFERENCE_RANGE
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) raw -> (B, K, dim)."""
+        """Raw traces (B, C, T) -> (B, K, dim)."""
         x = self.preprocessor(x)
         return self.embed(x.unsqueeze(1).expand(-1, self.count, -1, -1))
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:
-        """(B, K, C', L), the preprocessed traces of each member -> (B, K, dim)."""
+        """Preprocessed traces of each member (B, K, C', L) -> (B, K, dim)."""
         units = self.members.units(x)
         probability = self.members.logits(units).sigmoid()
         if self.dim == 1:
             return probability.unsqueeze(2)
         difference = units.select(2, 0) - units.select(2, 1)
-        return torch.stack([probability, self.spread * difference], 2)
+        return torch.stack([probability, self.difference_range * difference], 2)
 
 
 def fold_batch_norms(module: nn.Module) -> nn.Module:
-    """Return the module with each batch normalisation in a `Sequential` folded into the convolution before it.
+    """Fold each batch normalisation in a `Sequential` into the convolution before it.
 
-    The module must be in evaluation mode. Folding is done once, before anything is compiled, so that the engine and an
-    exported file compute with the same numbers.
+    The module, which must be in evaluation mode, is changed; a `Sequential` is returned as a new
+    one. Folding is done once, before anything is compiled, so that the engine and an exported file
+    compute with the same numbers.
     """
     for name, child in module.named_children():
         setattr(module, name, fold_batch_norms(child))
@@ -155,8 +160,11 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
     return nn.Sequential(*layers)
 
 
-def _features_of(networks: nn.Module, count: int, channels: int, samples: int) -> int:
-    """Find out how many features a network gives, by two traces of zeros; SettingError for another shape."""
+def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:
+    """Return the number of features of each member, by embedding two traces of zeros.
+
+    Raises SettingError if the output does not have the shape (B, K, features).
+    """
     networks.eval()
     with torch.no_grad():
         features = networks(torch.zeros(2, count, channels, samples))

@@ -1,4 +1,4 @@
-"""PCA: the plainest label-free reducer, closed-form, exportable."""
+"""PCA: the simplest reducer without labels; it is fitted in closed form, and exported."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,9 +17,18 @@ from .base import Floats, Reducer, as_rows
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class PcaReducer(Reducer):
-    """The first `n_components` principal components of the samples, by scikit-learn's randomised solver.
+    """Embed traces by their first principal components, with scikit-learn's randomised solver.
 
-    Source: Halko, Martinsson and Tropp (2011), SIAM Review 53(2).
+    Parameters
+    ----------
+    n_components : int, default 2
+        Dimension of the embedding.
+    random_state : int, RandomState or None, default 0
+        Seed of the solver.
+
+    References
+    ----------
+    Halko, Martinsson and Tropp (2011), Finding structure with randomness, SIAM Review 53(2).
     """
 
     default_radius = 0.2
@@ -28,36 +37,63 @@ class PcaReducer(Reducer):
     random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit on traces (n, T) or (n, C, T); labels are ignored. SettingError for no more traces than dimensions."""
+        """Fit on traces; labels are ignored.
+
+        Parameters
+        ----------
+        X : array of float, shape (n, T) or (n, C, T)
+            Traces.
+        y : ignored
+            Labels are not used.
+
+        Raises
+        ------
+        SettingError
+            If there are no more than `n_components` traces, or fewer samples in a trace.
+        """
         rows = as_rows(self.check_traces(X, reset=True))
         if len(rows) <= self.n_components:
-            raise SettingError(f"PCA needs more than {self.n_components} traces, got n_samples = {len(rows)}.")
+            needs = f"PCA needs more than {self.n_components} traces"
+            raise SettingError(f"{needs}, got n_samples = {len(rows)}.")
         if rows.shape[1] < self.n_components:
-            raise SettingError(f"PCA needs {self.n_components} samples or more, got n_features = {rows.shape[1]}.")
-        pca = PCA(n_components=self.n_components, svd_solver="randomized", random_state=self.random_state).fit(rows)
+            needs = f"PCA needs {self.n_components} samples or more"
+            raise SettingError(f"{needs}, got n_features = {rows.shape[1]}.")
+        pca = PCA(self.n_components, svd_solver="randomized", random_state=self.random_state)
+        pca.fit(rows)
         self.mean_ = pca.mean_.astype(np.float32)
         self.components_ = pca.components_.astype(np.float32)
         return self
 
     def embed(self, X: Floats) -> Floats:
-        return np.asarray((as_rows(self.check_traces(X)) - self.mean_) @ self.components_.T)[:, None, :]
+        centred = as_rows(self.check_traces(X)) - self.mean_
+        return np.asarray(centred @ self.components_.T)[:, None, :]
 
     def module(self) -> nn.Module:
         check_is_fitted(self, "components_")
-        return _Projection(torch.from_numpy(self.mean_), torch.from_numpy(self.components_))
+        return PcaEncoder(torch.from_numpy(self.mean_), torch.from_numpy(self.components_))
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         check_is_fitted(self, "components_")
-        return {"mean": self.mean_, "components": self.components_, "shape": np.array(self.trace_shape_)}
+        return {
+            "mean": self.mean_,
+            "components": self.components_,
+            "shape": np.array(self.trace_shape_),
+        }
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        self.mean_, self.components_ = np.array(state["mean"]), np.array(state["components"])
+        self.mean_ = np.array(state["mean"])
+        self.components_ = np.array(state["components"])
         self.n_features_in_ = len(self.mean_)
         self.trace_shape_ = tuple(int(n) for n in state["shape"])
         return self
 
 
-class _Projection(nn.Module):
+class PcaEncoder(nn.Module):
+    """Project raw traces on principal axes: (B, C, T) -> (B, 1, n_components).
+
+    mean (C * T,), components (n_components, C * T).
+    """
+
     mean: Tensor
     components: Tensor
 
@@ -67,5 +103,5 @@ class _Projection(nn.Module):
         self.register_buffer("components", components.T.contiguous())
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) -> (B, 1, n_components)."""
+        """Raw traces (B, C, T) -> (B, 1, n_components)."""
         return ((x.flatten(1) - self.mean) @ self.components).unsqueeze(1)

@@ -1,21 +1,25 @@
-"""What every network sees of a trace: averaged, standardised, with its differences beside it."""
+"""What every network reads of a trace: averaged, standardised, with its differences in time.
+
+`TorchReducer` puts `Preprocessor` before its network. `rocket` and `umap` also use `averaging`.
+"""
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 
-FRAMES = 200  # samples that an averaged trace has at least
-EXPLAINED = 0.8  # share of the variance that averaging keeps at least
-TRACES = 256  # traces that the statistics are read from
+MIN_FRAMES = 200  # samples of an averaged trace
+MIN_EXPLAINED_VARIANCE = 0.8  # share of the variance that averaging keeps
+STATISTICS_TRACES = 256  # from which scales and the averaging are read
 CLIP = 8.0  # standard deviations
 FLOOR = 1e-6  # added to a standard deviation, for a channel that never moved
 
 
 class Preprocessor(nn.Module):
-    """Average traces, standardise each channel, and append the differences: (B, C, T) -> (B, 2 * C, L).
+    """Average traces, standardise channels, append differences: (B, C, T) -> (B, 2 * C, L).
 
-    Channel ``2 * c`` of the result is channel c of the trace, channel ``2 * c + 1`` its differences in time. Both are
-    clipped at eight standard deviations, so that one huge sample does not carry an embedding.
+    Channel ``2 * c`` of the result is channel c of the trace, channel ``2 * c + 1`` its differences
+    in time. Both are clipped at eight standard deviations, so that one huge sample does not carry
+    an embedding.
 
     Parameters
     ----------
@@ -32,7 +36,7 @@ class Preprocessor(nn.Module):
     def __init__(self, channels: int, samples: int, average: int) -> None:
         super().__init__()
         self.average = average
-        self.skipped = samples % average  # at the start: the end of an insertion says most
+        self.skipped = samples % average  # at the start: the end of an insertion tells most
         self.channels = 2 * channels
         self.samples = samples // average
         self.clip = CLIP
@@ -42,49 +46,52 @@ class Preprocessor(nn.Module):
 
     @torch.jit.unused
     def learn(self, traces: Tensor) -> None:
-        """Set the statistics of each channel from traces (n, C, T); labels are not needed."""
-        averaged = self.averaged(traces[:TRACES]).double()
+        """Set mean and scales of each channel from the first 256 of the traces (n, C, T)."""
+        averaged = self.average_samples(traces[:STATISTICS_TRACES]).double()
         self.mean.copy_(averaged.mean((0, 2))[:, None])
         self.scale.copy_(1.0 / (averaged.std((0, 2), correction=0)[:, None] + FLOOR))
-        differences = self.standardised(averaged.float()).double().diff(dim=2)
+        differences = self.standardise(averaged.float()).double().diff(dim=2)
         self.difference_scale.copy_(1.0 / (differences.std((0, 2), correction=0)[:, None] + FLOOR))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) raw -> (B, 2 * C, L)."""
-        x = self.standardised(self.averaged(x))
-        differences = ((x[:, :, 1:] - x[:, :, :-1]) * self.difference_scale).clamp(-self.clip, self.clip)
+        """Raw traces (B, C, T) -> (B, 2 * C, L)."""
+        x = self.standardise(self.average_samples(x))
+        differences = (x[:, :, 1:] - x[:, :, :-1]) * self.difference_scale
+        differences = differences.clamp(-self.clip, self.clip)
         return torch.stack([x, F.pad(differences, [1, 0])], 2).flatten(1, 2)
 
-    def averaged(self, x: Tensor) -> Tensor:
-        """(B, C, T) -> (B, C, L)."""
+    def average_samples(self, x: Tensor) -> Tensor:
+        """Raw traces (B, C, T) -> averaged (B, C, L); no sample is standardised yet."""
         return F.avg_pool1d(x[:, :, self.skipped :], self.average) if self.average > 1 else x
 
-    def standardised(self, x: Tensor) -> Tensor:
-        """(B, C, L) -> (B, C, L)."""
+    def standardise(self, x: Tensor) -> Tensor:
+        """Averaged traces (B, C, L) -> standardised and clipped (B, C, L)."""
         return ((x - self.mean) * self.scale).clamp(-self.clip, self.clip)
 
 
-def averaging(traces: Tensor, frames: int = FRAMES) -> int:
+def averaging(traces: Tensor, min_frames: int = MIN_FRAMES) -> int:
     """Choose how many samples to average to one.
 
     Parameters
     ----------
     traces : Tensor of float32, shape (n, C, T)
-    frames : int, default 200
-        Samples that an averaged trace has at least.
+    min_frames : int, default 200
+        Smallest number of samples of an averaged trace.
 
     Returns
     -------
     int
-        The largest number that leaves so many samples and 80 % of the variance; 1 where an oscillation would be lost.
+        The largest number that leaves so many samples and 80 % of the variance of each channel; 1
+        where an oscillation would be lost.
     """
-    traces = traces[:: 1 + (len(traces) - 1) // TRACES]
+    traces = traces[:: 1 + (len(traces) - 1) // STATISTICS_TRACES]
     samples = traces.size(2)
     centred = traces.double() - traces.double().mean((0, 2), keepdim=True)
     variance = centred.square().mean((0, 2))
-    for average in range(samples // frames, 1, -1):
+    for average in range(samples // min_frames, 1, -1):
         n_means = samples // average
-        means = centred[:, :, samples - n_means * average :].reshape(len(traces), -1, n_means, average).mean(3)
-        if bool((means.square().mean((0, 2)) >= EXPLAINED * variance).all()):
+        used = centred[:, :, samples - n_means * average :]
+        means = used.reshape(len(traces), -1, n_means, average).mean(3)
+        if bool((means.square().mean((0, 2)) >= MIN_EXPLAINED_VARIANCE * variance).all()):
             return average
     return 1

@@ -1,4 +1,4 @@
-"""UMAP as the library umap-learn has it, to compare with `dengine.reducers.umap`."""
+"""UMAP by the library umap-learn, to compare with `dengine.reducers.umap`."""
 
 import warnings
 from collections.abc import Iterator
@@ -28,8 +28,16 @@ class UmapLearnReducer(Reducer):
 
     Parameters
     ----------
-    n_components, n_neighbors, min_dist, n_epochs, random_state
-        As in umap-learn.
+    n_components : int, default 2
+        Dimension of the embedding.
+    n_neighbors : int, default 15
+        Size of a neighbourhood.
+    min_dist : float, default 0.1
+        Distance in the embedding up to which neighbours are drawn together.
+    n_epochs : int, optional
+        Epochs of a fit. None: as many as umap-learn chooses.
+    random_state : int, RandomState or None, default 0
+        Seed of the fit.
 
     References
     ----------
@@ -65,7 +73,7 @@ class UmapLearnReducer(Reducer):
             raise SettingError(f"UMAP needs {wanted}, got n_samples = {n}.")
         from umap import UMAP
 
-        with _contained():
+        with shielded():
             self.umap_ = UMAP(**self.get_params(), n_jobs=1).fit(as_rows(traces))
         return self
 
@@ -82,21 +90,22 @@ class UmapLearnReducer(Reducer):
 
     def transform(self, X: ArrayLike) -> Floats:
         check_is_fitted(self, "umap_")
-        return self._placed(self.check_traces(X))
+        return self._transform_batch(self.check_traces(X))
 
     def embed(self, X: Floats) -> Floats:
         check_is_fitted(self, "umap_")
         traces = self.check_traces(X)
-        alone = [self._placed(traces[i : i + 1]) for i in range(len(traces))]
-        return np.concatenate(alone)[:, None, :]
+        points = [self._transform_batch(traces[i : i + 1]) for i in range(len(traces))]
+        return np.concatenate(points)[:, None, :]
 
-    def _placed(self, traces: Floats) -> Floats:
-        with _contained():
+    def _transform_batch(self, traces: Floats) -> Floats:
+        """Place traces (n, C, T) by umap-learn, together: float32 (n, d)."""
+        with shielded():
             return np.asarray(self.umap_.transform(as_rows(traces)), dtype=np.float32)
 
 
 @contextmanager
-def _contained() -> Iterator[None]:
+def shielded() -> Iterator[None]:
     """Keep umap-learn's warnings and its number of threads out of the process.
 
     At its first kernel numba sets OpenMP's number of threads for the whole process, torch's too.
