@@ -153,7 +153,7 @@ def prepare_export(
         )
     conditions = DecisionConditions(source.trace, source.windows, source.audit_rate, source.seed)
     shape = (model.n_spaces, model.index.dim)
-    decider = model.decider(conditions)
+    decider = model.build_decider(conditions)
     return source, DecisionModule(source.trace, decider, shape, source.stops_all)
 
 

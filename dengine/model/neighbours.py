@@ -413,24 +413,45 @@ class ModelPrediction(EngineModel):
     def prepare(self, previous: EngineModel) -> None:
         """Take over the rule of the previous model, stale or not, and build the decider.
 
-        A decider that was built with that rule is kept.
+        It is built for the conditions under which the previous model decided. A decider that was
+        built with that rule for these is kept.
         """
         if not isinstance(previous, ModelPrediction):
             return
-        compiled_with_rule = self._decider is not None and self.rule is previous.rule
+        conditions = previous._conditions or self._conditions
+        is_built = self._decider is not None and self.rule is previous.rule
+        is_built = is_built and conditions == self._conditions
         self.rule = previous.rule
         self.rule_is_stale = self.rule_is_stale or previous.rule_is_stale
-        if not compiled_with_rule:
-            self._conditions = previous._conditions or self._conditions
-            self._decider = self._build_decider()
+        if not is_built:
+            self._decider = self.build_decider(conditions)
+            self._conditions = conditions
 
-    def _build_decider(self) -> Decider:
-        """Return a decider for `_conditions`, compiled if encoder and rule can be compiled."""
+    def build_decider(self, conditions: DecisionConditions | None) -> Decider:
+        """Build a decider that shares the references and the rule of this model.
+
+        Parameters
+        ----------
+        conditions : DecisionConditions or None
+            None stands for no force limits, no sensor limit and no audits.
+
+        Returns
+        -------
+        Decider
+            Compiled if encoder and rule can be compiled.
+
+        Raises
+        ------
+        ValueError
+            If nothing was fitted.
+        """
+        if "index" not in vars(self):
+            raise ValueError("Expected a fitted model; call fit(X, y) first.")
         encoder = self.spaces.module()
         neighbours: Any = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
         scale = torch.from_numpy(self.scale)
         channels, samples = self.trace_shape
-        conditions = self._conditions or DecisionConditions(TraceSpec(samples, channels=channels))
+        conditions = conditions or DecisionConditions(TraceSpec(samples, channels=channels))
         shape = (self.n_spaces, self.index.dim)
         rule_compiles = self.rule.scriptable and _compiles(self.rule)
         if encoder is not None and not _compiles(encoder):
@@ -456,17 +477,14 @@ class ModelPrediction(EngineModel):
         return self.decider(self._conditions).predictor
 
     def decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Return the module that decides under these conditions, built if there is none yet.
+        """Return the decider for these conditions; it is built where they are others than before.
 
-        None stands for no force limits, no sensor limit and no audits. Raises ValueError if nothing
-        was fitted.
+        Raises ValueError if nothing was fitted.
         """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
-            if "index" not in vars(self):
-                raise ValueError("Expected a fitted model; call fit(X, y) first.")
+            self._decider = self.build_decider(conditions)
             self._conditions = conditions
-            self._decider = self._build_decider()
         return self._decider
 
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
