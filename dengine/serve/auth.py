@@ -326,6 +326,7 @@ def _limited(receive: Receive, access: Access) -> Receive:
     deadline = asyncio.get_running_loop().time() + access.body_seconds
 
     async def receive_body() -> Message:
+        """Return the next message; count the body's bytes and keep its deadline."""
         nonlocal bytes_left, is_incomplete
         if not is_incomplete:  # the next message says that the client disconnected, at any time
             return await receive()
@@ -345,6 +346,7 @@ def _limited(receive: Receive, access: Access) -> Receive:
 
 
 def _too_large(largest: int) -> Refusal:
+    """Return the refusal of a body of more than `largest` bytes."""
     text = (
         f"Expected a request of at most {largest} bytes (dengine serve --largest), "
         "got a larger one."

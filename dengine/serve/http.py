@@ -251,6 +251,7 @@ class HttpApi:
         """Begin a retrain on all labels, unless one is under way."""
 
         def begin(engine: DataEngine, by: str) -> Changed:
+            """Start the retrain and record who asked for it; return what changed."""
             core = core_of(engine)
             if core.is_retraining:
                 text = "A retrain is under way already; nothing changed."
@@ -538,6 +539,7 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        """Run what `beside` starts as long as the application; note a failure to start."""
         async with AsyncExitStack() as stack:
             try:
                 for start in beside:

@@ -357,8 +357,9 @@ class AddressSpace:
 
         @wraps(call)
         async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
-            code, got = _argument_error(variants, arguments)
-            line = f"Expected {listed}{got}."
+            """Check the arguments, call, and return the results or a status code."""
+            code, detail = _argument_error(variants, arguments)
+            line = f"Expected {listed}{detail}."
             if code is None:
                 try:
                     values = await call(*map(_argument_value, variants, arguments))

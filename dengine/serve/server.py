@@ -284,6 +284,7 @@ def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
         raise SettingError("Expected --cert and --key together, got one of them.")
 
     def refuse_password() -> str:
+        """Raise SettingError when OpenSSL asks for the key's password."""
         raise SettingError(
             f"Expected a key without a password, {key} has one; protect the file instead: "
             f"chmod 600 {key}"

@@ -268,6 +268,7 @@ class CellService:
         label = as_success(success)
 
         def work(engine: DataEngine) -> tuple[bool, RetrainReport | None]:
+            """Return whether the label was reported before, and the retrain that it set off."""
             stored = engine.find(decision_id)
             if stored is not None and stored.success is label:
                 return True, None

@@ -114,7 +114,9 @@ def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str
     """Return the MuJoCo model (MJCF) of the cell under these conditions."""
     c = conditions
     tool_z = (c.gap_mm + c.protrusion_mm + PROTRUSION_MM) / 1000 + 0.06
-    k_lateral, k_axial, k_angular = 1000 * c.lateral_n_mm, 1000 * c.axial_n_mm, c.angular_nm_rad
+    k_lateral = 1000 * c.lateral_n_mm
+    k_axial = 1000 * c.axial_n_mm
+    k_angular = c.angular_nm_rad
     return f"""
 <mujoco model="simulated insertion">
   <compiler angle="radian" autolimits="true"/>

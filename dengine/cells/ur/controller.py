@@ -122,11 +122,9 @@ class RobotProgram:
         yield from repeat(None, 1)
         if verb == Verb.REJECT:
             return ResultCode.DONE
-        return (
-            (ResultCode.CONFIRMED if self.confirm else ResultCode.UNKNOWN)
-            if good
-            else ResultCode.STOPPED
-        )
+        if not good:
+            return ResultCode.STOPPED
+        return ResultCode.CONFIRMED if self.confirm else ResultCode.UNKNOWN
 
     def _insert(self, number: int) -> Any:
         """Play the next trace, one sample per cycle; return DONE, or FAILED after the last."""
@@ -361,10 +359,10 @@ class FakeController(AbstractContextManager["FakeController"]):
                 response = bytes([1]) + ",".join(recipe.types).encode()
             case PackageType.INPUTS:
                 others = [
-                    held.names
+                    recipe.names
                     for other in self._clients
                     if other is not client
-                    for held in other.inputs.values()
+                    for recipe in other.inputs.values()
                 ]
                 number = len(client.inputs) + 1
                 recipe = self._recipe(number, payload, {*self.refuses}.union(*others), IN_USE)

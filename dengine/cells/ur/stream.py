@@ -128,6 +128,7 @@ class RtdeClient:
         return package.payload
 
     def _send(self, data: bytes) -> None:
+        """Send bytes to the controller; CellError if the connection is lost."""
         with instead(
             CellError,
             f"Expected {self.where} to take what it is sent, the connection is lost",
@@ -142,14 +143,11 @@ class RtdeClient:
             try:
                 piece = self._socket.recv(RECEIVE_BYTES)
             except OSError as error:
-                silent = f"it was silent for {self._socket.gettimeout():g} s"
-                what = (
-                    silent
-                    if isinstance(error, TimeoutError)
-                    else f"the connection is lost: {error}"
-                )
+                reason = f"the connection is lost: {error}"
+                if isinstance(error, TimeoutError):
+                    reason = f"it was silent for {self._socket.gettimeout():g} s"
                 raise CellError(
-                    f"Expected packages from {self.where}, {what}{self._last_text}."
+                    f"Expected packages from {self.where}, {reason}{self._last_text}."
                 ) from error
             if not piece:
                 raise CellError(

@@ -1,24 +1,24 @@
-// Pictures of what the server answers: traces and courses by uPlot, bounds and the map as SVG. Each says what it shows in words.
+// Charts: traces and the course of decisions with uPlot, bounds and the map as SVG. Each has a caption that says the same in words.
 
 import { capital, el, labelOf, labelWord, nameOf, number, partAddress, percent, svg } from "./dom.js";
 
-const CHANNELS = 3; // drawn, those that leave the band farthest
-const HEIGHTS = [220, 118, 84]; // of each chart, where so many are drawn: what stands below keeps its place
-const drawn = new Map(); // a chart's element: its uPlot, and what watches its width
+const CHANNELS = 3; // channels drawn: those farthest outside the band
+const HEIGHTS = [220, 118, 84]; // of each chart, by the number of charts, so that what is below keeps its place
+const drawn = new Map(); // by a chart's element: its uPlot, and the observer of its width
 const probe = document.createElement("span");
 
 function colour(name) {
   if (!probe.isConnected) document.body.append(probe);
   probe.hidden = true;
   probe.style.color = `var(--${name})`;
-  return getComputedStyle(probe).color; // of light-dark() the one that holds
+  return getComputedStyle(probe).color; // the current one of light-dark()
 }
 
-function chart(key, alt, height, made) {
-  // made : uPlot's options and data, asked for once the chart is in the page, and again in another appearance.
+function chart(key, alt, height, makePlot) {
+  // makePlot returns uPlot's options and data. It is called when the chart is in the page, and again for another appearance.
   const node = el("div", { class: "chart", role: "img", "aria-label": alt, "data-chart": key });
   node.make = () => {
-    const { options, data } = made();
+    const { options, data } = makePlot();
     const size = () => ({ width: Math.max(200, node.clientWidth), height });
     const plot = new uPlot({ ...size(), legend: { show: false }, cursor: { y: false, drag: { setScale: false } }, ...options }, data, node);
     const watch = new ResizeObserver(() => plot.setSize(size()));
@@ -29,7 +29,7 @@ function chart(key, alt, height, made) {
 }
 
 export function drawAll(anew = false) {
-  // Draw what is new in the page, and let go of what has left it.
+  // Draw new charts, and destroy those that are not in the page any more.
   for (const [node, { plot, watch }] of drawn) {
     if (node.isConnected && !anew) continue;
     watch.disconnect();
@@ -45,19 +45,21 @@ function axis(side, given = {}) {
   return { side, stroke: ink, font: "14px system-ui, sans-serif", labelFont: "14px system-ui, sans-serif", grid, ticks: grid, ...given };
 }
 
-// Traces, and over them the operator's windows: the limits where they hold, in the stretch where they do
+// Traces, and over them the operator's force limits, in the stretches of time where they hold
 
-function windowsOf(found, channel) {
-  const { rate_hz, columns } = found.spec;
+// Return the force limits of a channel, with the times between which they hold.
+function limitsOf(explanation, channel) {
+  const { rate_hz, columns } = explanation.spec;
   const at = (named) => (typeof named === "string" ? columns.indexOf(named) : named);
-  return found.windows.filter((each) => at(each.channel) === channel).map((each) => {
+  return explanation.windows.filter((each) => at(each.channel) === channel).map((each) => {
     if (each.along === null) return { ...each, from: each.start, to: each.end };
-    const there = found.trace[at(each.along)].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [i / rate_hz] : []));
+    const there = explanation.trace[at(each.along)].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [i / rate_hz] : []));
     return { ...each, from: there[0], to: there.at(-1) };
   }).filter((each) => each.from !== undefined);
 }
 
-function windowMarks({ ctx, bbox, valToPos }, windows) {
+// Draw force limits as brackets; the bent ends point to the side that is not allowed.
+function drawLimits({ ctx, bbox, valToPos }, windows) {
   ctx.save();
   ctx.strokeStyle = colour("link");
   ctx.lineWidth = 2 * devicePixelRatio;
@@ -67,7 +69,7 @@ function windowMarks({ ctx, bbox, valToPos }, windows) {
     for (const [limit, outwards] of [[high, -1], [low, 1]]) {
       if (limit === null) continue;
       const y = valToPos(limit, "y", true);
-      const tip = y + 8 * outwards * devicePixelRatio; // bent ends point to the side that is not allowed
+      const tip = y + 8 * outwards * devicePixelRatio;
       ctx.moveTo(left, tip);
       ctx.lineTo(left, y);
       ctx.lineTo(right, y);
@@ -78,38 +80,38 @@ function windowMarks({ ctx, bbox, valToPos }, windows) {
   ctx.restore();
 }
 
-function windowWords({ from, to, low, high, reject }) {
+function limitsText({ from, to, low, high, reject }) {
   const limits = [low !== null && `at least ${number(low, 1)}`, high !== null && `at most ${number(high, 1)}`].filter(Boolean).join(" and ");
-  return `From ${number(from, 2)} to ${number(to, 2)} s an operator's window wants ${limits}, else ${reject ? "reject" : "verify"}. `;
+  return `From ${number(from, 2)} to ${number(to, 2)} s the operator's limits are ${limits}, else ${reject ? "reject" : "verify"}. `;
 }
 
 const unitOf = ({ unit }, channel) => (typeof unit === "string" ? unit : unit[channel]);
 
 export const isForce = ({ channels, unit }) => channels === 1 && /^[µmckM]?N$/.test(unit);
 
-export function traceCharts(found) {
-  const widest = found.trace.map(() => 0);
-  for (const each of found.envelope?.excesses ?? []) widest[each.channel] = Math.max(widest[each.channel], each.widths);
+export function traceCharts(explanation) {
+  const widest = explanation.trace.map(() => 0);
+  for (const each of explanation.envelope?.excesses ?? []) widest[each.channel] = Math.max(widest[each.channel], each.widths);
   const order = widest.map((_, channel) => channel).sort((a, b) => widest[b] - widest[a] || a - b);
   const shown = order.slice(0, CHANNELS).sort((a, b) => a - b);
-  return shown.map((channel) => traceChart(found, channel, HEIGHTS[shown.length - 1]));
+  return shown.map((channel) => traceChart(explanation, channel, HEIGHTS[shown.length - 1]));
 }
 
-function traceChart(found, channel, height) {
-  const trace = found.trace[channel];
-  const band = found.low && [found.high[channel], found.low[channel], found.median[channel]];
-  const bads = found.bads.map((bad) => bad[channel]);
-  const windows = windowsOf(found, channel);
+function traceChart(explanation, channel, height) {
+  const trace = explanation.trace[channel];
+  const band = explanation.low && [explanation.high[channel], explanation.low[channel], explanation.median[channel]];
+  const bads = explanation.bads.map((bad) => bad[channel]);
+  const windows = limitsOf(explanation, channel);
   const limits = windows.flatMap(({ low, high }) => [low, high]).filter((limit) => limit !== null);
-  const key = [found.decision.id, channel, found.envelope?.n, bads.length, JSON.stringify(windows)].join(" ");
-  const said = traceWords(found, channel);
+  const key = [explanation.decision.id, channel, explanation.envelope?.n, bads.length, JSON.stringify(windows)].join(" ");
+  const caption = traceCaption(explanation, channel);
   const line = (name, width, dash) => ({ stroke: colour(name), width, dash, points: { show: false } });
-  const made = () => ({
-    data: [trace.map((_, i) => i / found.spec.rate_hz), ...(band ?? []), ...bads, trace],
+  const makePlot = () => ({
+    data: [trace.map((_, i) => i / explanation.spec.rate_hz), ...(band ?? []), ...bads, trace],
     options: {
       scales: { x: { time: false }, y: { range: (_, low, high) => uPlot.rangeNum(Math.min(low, ...limits), Math.max(high, ...limits), 0.1, true) } },
-      hooks: { draw: [(plot) => windowMarks(plot, windows)] },
-      axes: [axis(2, { label: "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: unitOf(found.spec, channel), labelSize: 22, size: 56 })],
+      hooks: { draw: [(plot) => drawLimits(plot, windows)] },
+      axes: [axis(2, { label: "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: unitOf(explanation.spec, channel), labelSize: 22, size: 56 })],
       bands: band ? [{ series: [1, 2], fill: colour("good-soft") }] : [],
       series: [
         {},
@@ -119,32 +121,32 @@ function traceChart(found, channel, height) {
       ],
     },
   });
-  return el("figure", {}, chart(key, said, height, made), el("figcaption", {}, said));
+  return el("figure", {}, chart(key, caption, height, makePlot), el("figcaption", {}, caption));
 }
 
-function traceWords(found, channel) {
-  const { envelope, spec } = found;
-  const values = found.trace[channel].filter((value) => value !== null);
+function traceCaption(explanation, channel) {
+  const { envelope, spec } = explanation;
+  const values = explanation.trace[channel].filter((value) => value !== null);
   const [low, high] = values.length ? [Math.min(...values), Math.max(...values)] : [0, 0];
-  const several = found.trace.length > 1;
+  const several = explanation.trace.length > 1;
   const what = isForce(spec) ? "Force" : spec.columns[channel] ?? (several ? `Channel ${channel + 1}` : "Trace");
-  const said = `${what} over ${number(found.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${unitOf(spec, channel)}. ${windowsOf(found, channel).map(windowWords).join("")}`;
-  if (!envelope) return `${said}No band of good parts is drawn before 20 of them are known.`;
-  const outside = `${said}${percent(envelope.outside, 1)} of ${several ? "all channels" : "it"} lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
+  const caption = `${what} over ${number(explanation.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${unitOf(spec, channel)}. ${limitsOf(explanation, channel).map(limitsText).join("")}`;
+  if (!envelope) return `${caption}The band of good parts is drawn from 20 good parts on.`;
+  const outside = `${caption}${percent(envelope.outside, 1)} of ${several ? "all channels" : "it"} lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
   const most = envelope.excesses.filter((each) => each.channel === channel).sort((a, b) => b.widths - a.widths)[0];
   if (!most) return outside;
   const [from, to] = [number(most.from_s, 2), number(most.to_s, 2)];
   return `${outside} It leaves the band farthest ${most.above ? "upwards" : "downwards"} ${from === to ? "at" : `between ${from} s and`} ${to} s.`;
 }
 
-export function traceLegend(found) {
-  const { envelope } = found;
+export function traceLegend(explanation) {
+  const { envelope } = explanation;
   const swatch = (kind, text) => el("li", {}, el("span", { class: `swatch ${kind}`, "aria-hidden": "true" }), text);
   return el("ul", { class: "legend" },
     swatch("line-trace", "this part"),
     envelope && [swatch("area-band", `95 % of ${number(envelope.n)} good parts`), swatch("line-median", "their median")],
-    found.bads.length > 0 && swatch("line-bad", `bad parts (${number(found.bads.length)})`),
-    found.windows.length > 0 && swatch("line-window", `operator's windows (${number(found.windows.length)})`));
+    explanation.bads.length > 0 && swatch("line-bad", `bad parts (${number(explanation.bads.length)})`),
+    explanation.windows.length > 0 && swatch("line-window", `operator's limits (${number(explanation.windows.length)})`));
 }
 
 // The course of decisions
@@ -155,7 +157,7 @@ export function courseChart(course) {
   const share = (name) => [...course.stretches, course.stretches.at(-1)].map((each) => each[name] / each.n);
   const [verified, accepted, novel] = ["verified", "accepted", "novel"].map(share);
   const after = (time) => ends[course.stretches.filter((each) => each.last <= time).length];
-  const said = `Share of verified parts from the first to the newest: it began at ${percent(verified[0])} and is now at ${percent(verified.at(-1))}; accepted without a check now: ${percent(accepted.at(-1))}.`;
+  const caption = `Share of verified parts over time: it was ${percent(verified[0])} at first and is ${percent(verified.at(-1))} now; accepted without a check now: ${percent(accepted.at(-1))}.`;
 
   function marks(plot) {
     const { ctx, bbox } = plot;
@@ -188,7 +190,7 @@ export function courseChart(course) {
 
   const paths = (...given) => uPlot.paths.stepped({ align: 1 })(...given);
   const line = (name, width, dash) => ({ stroke: colour(name), width, dash, paths, points: { show: false } });
-  const made = () => ({
+  const makePlot = () => ({
     data: [ends, verified, accepted, novel],
     options: {
       scales: { x: { time: false }, y: { range: [0, 1] } },
@@ -201,7 +203,7 @@ export function courseChart(course) {
     el("li", {}, el("span", { class: `swatch ${kind}`, "aria-hidden": "true" }), text));
   legend.push(el("li", {}, el("span", { "aria-hidden": "true" }, "▲"), "retrain"));
   legend.push(el("li", { class: "label bad" }, el("span", { "aria-hidden": "true" }, "✕"), "bad accepted"));
-  return [el("figure", {}, chart(JSON.stringify(course.stretches.map((each) => each.n)) + ends.at(-1) + course.retrains.length, said, 260, made), el("figcaption", {}, said)),
+  return [el("figure", {}, chart(JSON.stringify(course.stretches.map((each) => each.n)) + ends.at(-1) + course.retrains.length, caption, 260, makePlot), el("figcaption", {}, caption)),
     el("ul", { class: "legend" }, legend)];
 }
 
@@ -218,17 +220,17 @@ export function boundChart(bound) {
     zones.push([bound.accept_threshold, 1, "accept"]);
     marks.push(["✓ ≥", bound.accept_threshold]);
   }
-  const said = `The success rate lies between ${percent(bound.lower, 1)} and ${percent(bound.upper, 1)}. Accepted from ${percent(bound.accept_threshold, 1)} on, rejected up to ${percent(bound.reject_threshold, 1)}.`;
-  return interval(1, bound.lower, bound.upper, zones, marks, said);
+  const caption = `The success rate lies between ${percent(bound.lower, 1)} and ${percent(bound.upper, 1)}. Accepted from ${percent(bound.accept_threshold, 1)} on, rejected up to ${percent(bound.reject_threshold, 1)}.`;
+  return interval(1, bound.lower, bound.upper, zones, marks, caption);
 }
 
 export function judgedChart(judged) {
   const most = Math.min(1, Math.max(0.02, 2 * judged.tolerance, 1.1 * judged.upper));
-  const said = `The share of wrong ones lies between ${percent(judged.lower, 1)} and ${percent(judged.upper, 1)}; the tolerance is ${percent(judged.tolerance, 1)}.`;
-  return interval(most, judged.lower, judged.upper, [[0, judged.tolerance, "accept"]], [["≤", judged.tolerance]], said);
+  const caption = `The share of wrong ones lies between ${percent(judged.lower, 1)} and ${percent(judged.upper, 1)}; the tolerance is ${percent(judged.tolerance, 1)}.`;
+  return interval(most, judged.lower, judged.upper, [[0, judged.tolerance, "accept"]], [["≤", judged.tolerance]], caption);
 }
 
-function interval(most, lower, upper, zones, marks, said) {
+function interval(most, lower, upper, zones, marks, caption) {
   const [begin, end, middle] = [16, 464, 42];
   const x = (value) => begin + (Math.min(value, most) / most) * (end - begin);
   const bar = (low, high, half, least, kind) =>
@@ -236,7 +238,7 @@ function interval(most, lower, upper, zones, marks, said) {
   const places = marks.map(([, value]) => Math.min(Math.max(x(value), begin + 44), end - 44));
   const text = (words, at, kind) => svg("text", { x: at, y: 88, class: kind, "aria-hidden": "true" }, words);
   const ends = [[0, begin, "start"], [most, end, "end"]].filter(([, at]) => places.every((place) => Math.abs(at - place) > 110));
-  return svg("svg", { viewBox: "0 0 480 96", role: "img", "aria-label": said, class: "bound" },
+  return svg("svg", { viewBox: "0 0 480 96", role: "img", "aria-label": caption, class: "bound" },
     bar(0, most, 20, 0, "axis"),
     zones.map(([low, high, kind]) => bar(low, high, 20, 1, `zone ${kind}`)),
     bar(lower, upper, 7, 3, "interval"),
@@ -245,31 +247,31 @@ function interval(most, lower, upper, zones, marks, said) {
     ends.map(([value, at, kind]) => text(percent(value), at, kind)));
 }
 
-// The map: every mark is a link to its part, and one of them is reached by the tab key
+// The map: every mark is a link to its part; the tab key reaches one of them, and arrow keys the others
 
 const WIDE = 720;
 const HIGH = 500;
 const ROOM = 24;
 
-export function mapChart(found, chosen) {
-  const xs = found.marks.map((mark) => mark.x);
-  const ys = found.marks.map((mark) => mark.y).sort((a, b) => a - b);
-  const cut = Math.floor(ys.length * 0.005); // outermost parts lie on the edge
-  const across = scale(found.probability ? [0, 1] : [Math.min(...xs), Math.max(...xs)], [ROOM, WIDE - ROOM]);
+export function mapChart(partMap, chosen) {
+  const xs = partMap.marks.map((mark) => mark.x);
+  const ys = partMap.marks.map((mark) => mark.y).sort((a, b) => a - b);
+  const cut = Math.floor(ys.length * 0.005); // the outermost parts are drawn on the edge
+  const across = scale(partMap.probability ? [0, 1] : [Math.min(...xs), Math.max(...xs)], [ROOM, WIDE - ROOM]);
   const up = scale([ys[cut], ys.at(-1 - cut)], [HIGH - ROOM, ROOM]);
-  const newest = found.marks.at(-1);
-  const reached = found.marks.find((mark) => mark.id === chosen) ?? newest;
-  const known = found.marks.filter((mark) => mark.action === null);
-  const good = known.filter((mark) => mark.success).length;
-  const said = `Map of ${known.length} known parts, ${good} good and ${known.length - good} bad, and the newest ${found.marks.length - known.length}. Arrow keys go from part to part.`;
-  const ball = found.radius !== null && svg("svg", { x: 0, y: 0, width: WIDE, height: HIGH, "aria-hidden": "true" },
-    svg("ellipse", { cx: across(newest.x), cy: up(newest.y), rx: found.radius * across.per, ry: found.radius * up.per, class: "ball" }));
-  const name = found.probability ? "model's probability of a good part" : "first axis";
-  return svg("svg", { viewBox: `0 0 ${WIDE} ${HIGH + 26}`, role: "group", "aria-label": said, class: "map" },
+  const newest = partMap.marks.at(-1);
+  const reached = partMap.marks.find((mark) => mark.id === chosen) ?? newest;
+  const labelled = partMap.marks.filter((mark) => mark.action === null);
+  const good = labelled.filter((mark) => mark.success).length;
+  const caption = `Map of ${labelled.length} labelled parts, ${good} good and ${labelled.length - good} bad, and the newest ${partMap.marks.length - labelled.length}. Arrow keys move from part to part.`;
+  const neighbourhood = partMap.radius !== null && svg("svg", { x: 0, y: 0, width: WIDE, height: HIGH, "aria-hidden": "true" },
+    svg("ellipse", { cx: across(newest.x), cy: up(newest.y), rx: partMap.radius * across.per, ry: partMap.radius * up.per, class: "neighbourhood" }));
+  const name = partMap.probability ? "model's probability of a good part" : "first axis";
+  return svg("svg", { viewBox: `0 0 ${WIDE} ${HIGH + 26}`, role: "group", "aria-label": caption, class: "map" },
     svg("rect", { x: 1, y: 1, width: WIDE - 2, height: HIGH - 2, class: "axis" }),
     svg("text", { x: WIDE - 4, y: HIGH + 20, class: "end", "aria-hidden": "true" }, `${name} →`),
-    ball,
-    found.marks.map((mark) => mapMark(mark, across(mark.x), up(mark.y), mark === reached, mark.id === chosen, mark === newest)));
+    neighbourhood,
+    partMap.marks.map((mark) => mapMark(mark, across(mark.x), up(mark.y), mark === reached, mark.id === chosen, mark === newest)));
 }
 
 function scale([low, high], [begin, end]) {
@@ -300,8 +302,8 @@ function mapMark(mark, x, y, reached, chosen, newest) {
 
 const DIRECTIONS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
-export function goOverMap(event) {
-  // Arrow keys go to the nearest mark in their direction.
+export function moveOnMap(event) {
+  // Move the focus with the arrow keys to the nearest mark in their direction.
   const mark = event.target.closest?.("a.mark");
   const direction = DIRECTIONS[event.key];
   if (!mark || !direction) return;

@@ -1,8 +1,8 @@
-// The OpenAPI document, to read.
+// Shows the OpenAPI document as a page.
 
 import { el } from "./dom.js";
 
-const described = await (await fetch("openapi.json")).json();
+const openapi = await (await fetch("openapi.json")).json();
 
 const named = (id) => el("a", { href: `#${id}` }, id);
 const code = (text) => el("code", {}, text);
@@ -12,21 +12,21 @@ function list(schemas) {
   return el("dl", {}, Object.entries(schemas).map(([name, schema]) => [el("dt", {}, code(name)), el("dd", {}, schema.description ?? "")]));
 }
 
-function operation(path, method, said) {
-  const taken = Object.entries(said.requestBody?.content ?? {}).flatMap(([kind, content]) => [
+function operation(path, method, description) {
+  const body = Object.entries(description.requestBody?.content ?? {}).flatMap(([kind, content]) => [
     el("p", {}, "Takes ", code(kind), ": ", typed(content, "bytes"), "."),
     Object.values(content.examples ?? {}).map((example) => el("pre", {}, JSON.stringify(example.value))),
   ]);
-  const answers = Object.entries(said.responses["200"].content).map(([kind, content]) => el("p", {}, "Answers ", typed(content, kind), "."));
-  const asked = Object.fromEntries(said.parameters.map((each) => [each.name, each.schema]));
-  return [el("h2", {}, code(`${method.toUpperCase()} ${path}`)), el("p", {}, said.summary), list(asked), taken, answers];
+  const responses = Object.entries(description.responses["200"].content).map(([kind, content]) => el("p", {}, "Returns ", typed(content, kind), "."));
+  const parameters = Object.fromEntries(description.parameters.map(({ name, schema }) => [name, schema]));
+  return [el("h2", {}, code(`${method.toUpperCase()} ${path}`)), el("p", {}, description.summary), list(parameters), body, responses];
 }
 
-document.title = `${described.info.title} ${described.info.version}`;
+document.title = `${openapi.info.title} ${openapi.info.version}`;
 document.getElementById("main").append(...[
-  Object.entries(described.paths).map(([path, methods]) => Object.entries(methods).map(([method, said]) => operation(path, method, said))),
+  Object.entries(openapi.paths).map(([path, methods]) => Object.entries(methods).map(([method, description]) => operation(path, method, description))),
   el("h2", {}, "Objects"),
-  Object.entries(described.components.schemas).map(([name, schema]) =>
-    [el("h3", { id: name }, name), el("p", {}, schema.description), list(schema.properties ?? {})]),
+  Object.entries(openapi.components.schemas).map(([name, schema]) =>
+    [el("h3", { id: name }, name), el("pre", {}, schema.description), list(schema.properties ?? {})]),
 ].flat(9));
 document.getElementById(location.hash.slice(1))?.scrollIntoView();

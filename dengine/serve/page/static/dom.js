@@ -1,4 +1,4 @@
-// Elements out of data, and how numbers, times and the engine's words are written. Text stays text: nothing is parsed as HTML.
+// Creates elements, and formats numbers, times and the engine's words. Text is never parsed as HTML.
 
 const SVG = "http://www.w3.org/2000/svg";
 const SHAPES = {
@@ -12,18 +12,18 @@ const SHAPES = {
 SHAPES.good = SHAPES.kept = SHAPES.accept;
 SHAPES.bad = SHAPES.broken = SHAPES.reject;
 
-function filled(node, given, children) {
-  for (const [name, value] of Object.entries(given)) {
+function fill(node, attributes, children) {
+  for (const [name, value] of Object.entries(attributes)) {
     if (value === null || value === undefined || value === false) continue;
     if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
     else node.setAttribute(name, value === true ? "" : value);
   }
-  node.append(...children.flat(9).filter((each) => each !== null && each !== undefined && each !== false));
+  node.append(...children.flat(9).filter((child) => child !== null && child !== undefined && child !== false));
   return node;
 }
 
-export const el = (name, given = {}, ...children) => filled(document.createElement(name), given, children);
-export const svg = (name, given = {}, ...children) => filled(document.createElementNS(SVG, name), given, children);
+export const el = (name, given = {}, ...children) => fill(document.createElement(name), given, children);
+export const svg = (name, given = {}, ...children) => fill(document.createElementNS(SVG, name), given, children);
 export const icon = (name) => svg("svg", { class: "icon", viewBox: "0 0 24 24", "aria-hidden": "true" }, svg("path", { d: SHAPES[name] }));
 
 export function number(value, digits = 0) {
@@ -39,26 +39,26 @@ export function duration(seconds) {
   return Math.abs(seconds) < 7200 ? `${number(seconds / 60)} min` : `${number(seconds / 3600, 1)} h`;
 }
 
-const two = (n) => String(n).padStart(2, "0");
+const twoDigits = (n) => String(n).padStart(2, "0");
 
 export function clock(seconds) {
   const at = new Date(seconds * 1000);
-  return `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
+  return `${twoDigits(at.getHours())}:${twoDigits(at.getMinutes())}:${twoDigits(at.getSeconds())}`;
 }
 
 export function moment(seconds) {
   const at = new Date(seconds * 1000);
-  return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${clock(seconds)}`;
+  return `${at.getFullYear()}-${twoDigits(at.getMonth() + 1)}-${twoDigits(at.getDate())} ${clock(seconds)}`;
 }
 
 export const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
 const REASONS = {
   not_finite: "samples missing", constant: "dead sensor", saturated: "sensor at its limit",
-  too_large: "impossible values", no_model: "no model yet", no_store: "store away", late: "too late", outside: "outside a window",
+  too_large: "impossible values", no_model: "no model yet", no_store: "store unavailable", late: "timeout", outside: "outside the operator's limits",
 };
 const LABELS = { good: "good", bad: "bad", none: "not known" };
-const SOURCES = { verification: "check", audit: "audit", stop: "system stop", confirmed: "confirmed later", inspection: "inspection of a reject" };
+const SOURCES = { verification: "check", audit: "audit", stop: "line stop", confirmed: "confirmation", inspection: "inspection of a reject" };
 
 export const ACTIONS = ["verify", "accept", "reject"];
 export const REASON_NAMES = [
@@ -76,7 +76,7 @@ export const chip = (action) => el("span", { class: `chip ${action}` }, icon(act
 export const label = (success) => el("span", { class: `label ${labelOf(success)}` }, icon(labelOf(success)), labelWord(labelOf(success)));
 
 export function table(titles, rows, given = {}) {
-  // titles : [text, class]; rows : arrays of cells, in the same order.
+  // titles: [text, class] of each column; rows: arrays of cells in the same order.
   const head = titles.map(([title, kind]) => el("th", { scope: "col", class: kind }, title));
   const body = rows.map((row) => el("tr", {}, row.map((cell, i) => el("td", { class: titles[i][1] }, cell))));
   return el("table", given, el("thead", {}, el("tr", {}, head)), el("tbody", {}, body));

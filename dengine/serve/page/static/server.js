@@ -1,10 +1,10 @@
-// What is asked of the server: its public API and its stream of changes, and nothing else.
+// Requests to the server's public API, and its stream of changes; all other modules use only these.
 
-const REST = 10; // an answer that took a second is not asked for anew for so many: looking on is not to be felt
-const LONGEST = 30000; // ms of such a rest at most
-const SILENCE = 12000; // ms without a word, after which the line counts as cut: the server says something every 5 s
-const kept = new Map(); // by address: an answer, and until when it rests
-let done = 0; // requests that changed something: what was asked before is old then
+const REUSE_FACTOR = 10; // a response is reused for this many times the time it took, so that viewers cost the server little
+const MAX_REUSE = 30000; // ms
+const MAX_SILENCE = 12000; // ms without an event, after which the connection counts as lost: the server sends one every 5 s
+const responses = new Map(); // by path: data, and until when they are reused
+let nChanges = 0; // requests that changed something; responses to earlier requests are then old
 
 export class Problem extends Error {
   constructor(status, detail) {
@@ -13,56 +13,57 @@ export class Problem extends Error {
   }
 }
 
-async function checked(answer) {
-  if (answer.ok) return answer;
-  const said = await answer.json().catch(() => ({}));
-  throw new Problem(answer.status, said.detail ?? `The server answered ${answer.status}.`);
+// Return the response, or throw a Problem for one that is not 2xx.
+async function checked(response) {
+  if (response.ok) return response;
+  const problem = await response.json().catch(() => ({}));
+  throw new Problem(response.status, problem.detail ?? `The server responded with ${response.status}.`);
 }
 
-export async function get(path, rests = []) {
-  // The answer to a question; an address whose answer is taken again says in `rests` when it may be asked anew.
-  const was = kept.get(path);
+export async function get(path, reusedUntil = []) {
+  // Return the JSON of a GET. If an earlier response is reused, the time until which it is reused is added to `reusedUntil`.
+  const earlier = responses.get(path);
   const begin = Date.now();
-  const before = done;
-  if (was && begin < was.until) {
-    rests.push(was.until);
-    return was.said;
+  const nBefore = nChanges;
+  if (earlier && begin < earlier.until) {
+    reusedUntil.push(earlier.until);
+    return earlier.data;
   }
-  const said = await (await checked(await fetch(path, { headers: { accept: "application/json" } }))).json();
-  if (kept.size > 64) kept.clear();
-  if (before === done) kept.set(path, { said, until: Date.now() + Math.min(LONGEST, REST * (Date.now() - begin)) });
-  return said;
+  const data = await (await checked(await fetch(path, { headers: { accept: "application/json" } }))).json();
+  if (responses.size > 64) responses.clear();
+  if (nBefore === nChanges) responses.set(path, { data, until: Date.now() + Math.min(MAX_REUSE, REUSE_FACTOR * (Date.now() - begin)) });
+  return data;
 }
 
 export async function post(path, body) {
-  const answer = await checked(await fetch(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) }));
-  kept.clear();
-  done += 1;
-  return answer;
+  const response = await checked(await fetch(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) }));
+  responses.clear();
+  nChanges += 1;
+  return response;
 }
 
-export function listen(changed, lineIs) {
-  // Follow the server. changed : called for each change.  lineIs : with "live" or "cut", and when it was heard of last.
-  let heard = Date.now();
+export function listen(onChange, onConnection) {
+  // Follow the server. onChange is called for each change; onConnection with "live" or "cut" and the time of the last event.
+  let lastEvent = Date.now();
   let version = null;
   const alive = () => {
-    heard = Date.now();
-    lineIs("live", heard);
+    lastEvent = Date.now();
+    onConnection("live", lastEvent);
   };
   const connect = () => {
     const source = new EventSource("changes");
     source.addEventListener("hello", (event) => {
       alive();
-      if (version !== null && version !== event.data) location.reload(); // another release: another script
+      if (version !== null && version !== event.data) location.reload(); // another version of the server has other scripts
       version = event.data;
     });
-    source.addEventListener("changed", () => { alive(); changed(); });
+    source.addEventListener("changed", () => { alive(); onChange(); });
     source.addEventListener("tick", alive);
     source.addEventListener("error", () => {
-      lineIs("cut", heard);
-      if (source.readyState === EventSource.CLOSED) setTimeout(connect, 2000); // refused, not only interrupted
+      onConnection("cut", lastEvent);
+      if (source.readyState === EventSource.CLOSED) setTimeout(connect, 2000); // refused, so that the browser does not connect again
     });
   };
   connect();
-  setInterval(() => { if (Date.now() - heard > SILENCE) lineIs("cut", heard); }, 1000);
+  setInterval(() => { if (Date.now() - lastEvent > MAX_SILENCE) onConnection("cut", lastEvent); }, 1000);
 }
