@@ -14,7 +14,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from common import POLICY, options, quantiles, tell, wall_time
+from common import POLICY, options, print_table, quantiles, wall_time
 
 from dengine import DataEngine, Dataset, Recipe, ReplayCell, load_dataset, make_reducer, replay
 from dengine.engine.engine import core_of, frozen_objects, uncollected
@@ -118,7 +118,7 @@ def main() -> None:
     recipe = Recipe.load(args.recipe).with_policy(**POLICY)
     with busy_cores() if args.burn else nullcontext():
         rows = measure(load_dataset(args.data, args.samples), recipe, args.replays, args.repeats, args.umap_repeats)
-    tell(rows, "A cycle's times", args.out / "benchmark_cycle.csv")
+    print_table(rows, "A cycle's times", args.out / "benchmark_cycle.csv")
 
 
 if __name__ == "__main__":

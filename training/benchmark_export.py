@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import options, tell, wall_time
+from common import options, print_table, wall_time
 from rich.progress import track
 
 from dengine import DataEngine, Dataset, Recipe, export_torchscript, load_dataset, load_exported
@@ -136,7 +136,7 @@ def main() -> None:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         rows = measure(args, Path(folder))
-    tell(rows, f"Exported decision: {args.reducer} on {args.data}", args.out / "benchmark_export.csv", width=100)
+    print_table(rows, f"Exported decision: {args.reducer} on {args.data}", args.out / "benchmark_export.csv", width=100)
     sys.exit(any(row["target"] == "0" and row["value"] > 0 for row in rows))
 
 

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import sqlalchemy as sa
-from common import POLICY, noisy, options, quantiles, tell, wall_time
+from common import POLICY, noisy, options, print_table, quantiles, wall_time
 
 from dengine import Action, DataEngine, Dataset, Recipe, RetrainReport, SqlStore, load_dataset
 from dengine.engine.engine import core_of
@@ -208,8 +208,8 @@ def show(plan: Plan, worked: list[Worked], out: Path) -> bool:
             taken[name] += seconds
     rows = [{"call": name, **quantiles(seconds)} for name, seconds in taken.items()]
     took = max(each["marks"][-1]["time_s"] for each in worked)
-    tell(rows, f"{plan.cells} cells on one {kind}, {took:.0f} s", out / "benchmark_fleet.csv")
-    tell(worked[0]["marks"], "How the first cell grows", out / "benchmark_fleet_growth.csv")
+    print_table(rows, f"{plan.cells} cells on one {kind}, {took:.0f} s", out / "benchmark_fleet.csv")
+    print_table(worked[0]["marks"], "How the first cell grows", out / "benchmark_fleet_growth.csv")
     counted = pd.DataFrame([check(plan, each) for each in worked])
     write_csv(counted, out / "benchmark_fleet_cells.csv", force=True)
     total = counted.sum()

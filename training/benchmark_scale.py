@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import POLICY, noisy, options, tell, wall_time
+from common import POLICY, noisy, options, print_table, wall_time
 from rich.progress import track
 
 from dengine import Action, DataEngine, Dataset, Decision, Reason, Recipe, Source, load_dataset
@@ -69,7 +69,7 @@ def main() -> None:
     data, recipe = load_dataset(args.data, args.samples), Recipe.load(args.recipe).with_policy(**POLICY)
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:
         stores = [measure_store(data, recipe, int(n), args.repeats, Path(folder)) for n in args.sizes.split(",")]
-    tell(stores, "Times against store size", args.out / "benchmark_scale.csv")
+    print_table(stores, "Times against store size", args.out / "benchmark_scale.csv")
 
 
 if __name__ == "__main__":

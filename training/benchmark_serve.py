@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import POLICY, options, quantiles, tell, wall_time
+from common import POLICY, options, print_table, quantiles, wall_time
 
 from dengine import Dataset, Recipe, load_dataset
 from dengine.records import ACTIONS
@@ -163,7 +163,7 @@ def main() -> None:
         found = {"fdatasync of 4 kB": syncs(folder)}
         found |= over_the_network(data, args.n, recipe, folder, args.pace, args.only)
         rows = [{"what": way, **quantiles(seconds)} for way, seconds in found.items()]
-        tell(rows, "dengine serve over loopback")
+        print_table(rows, "dengine serve over loopback")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What several scripts have: options, a stopwatch, a table on the screen and as CSV."""
+"""Helpers of the scripts in this folder: options, a stopwatch, tables on the screen and as CSV."""
 
 import argparse
 import math
@@ -22,14 +22,15 @@ POLICY = {"alpha": 0.1, "lower_bound": 0.9}
 
 
 def span(text: str) -> range:
-    """'100:130' -> the seeds 100 to 129."""
+    """Parse '100:130' as the seeds 100 to 129; argparse prints an error for other text."""
     first, last = map(int, text.split(":"))
     if not 0 <= first < last:
-        raise argparse.ArgumentTypeError(f"expected first:last with 0 <= first < last, as 100:130, got {text}")
+        expected = "first:last with 0 <= first < last, as 100:130"
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text}")
     return range(first, last)
 
 
-KNOWN: dict[str, tuple[Any, str]] = {
+OPTIONS: dict[str, tuple[Any, str]] = {
     "data": (str, "a bundled set, a folder of recordings, or an .npz file with X and y"),
     "part": (str, "name of the array of parts' numbers in the file"),
     "samples": (int, "use the first so many samples of each trace; all by default"),
@@ -46,29 +47,36 @@ KNOWN: dict[str, tuple[Any, str]] = {
 
 
 def options(description: str | None, **defaults: Any) -> argparse.ArgumentParser:
-    """A parser with these of the `KNOWN` options."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Return a parser with some of the `OPTIONS`: those that `defaults` gives a default value."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     for name, default in defaults.items():
-        kind, text = KNOWN[name]
+        kind, text = OPTIONS[name]
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=default, help=text)
     return parser
 
 
-def wall_time(call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
-    """Seconds until a call returns, and what it returns."""
+def wall_time(call: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
+    """Call a function; return the seconds that it took, and its result."""
     begin = time.perf_counter()
-    found = call(*given)
-    return time.perf_counter() - begin, found
+    result = call(*arguments)
+    return time.perf_counter() - begin, result
 
 
 def quantiles(seconds: Sequence[float] | np.ndarray) -> dict[str, Any]:
-    """How many, their median, 99th percentile and worst; NaN where there are none."""
-    found = np.quantile(seconds, [0.5, 0.99, 1.0]).tolist() if len(seconds) else [math.nan] * 3
-    return {"n": len(seconds)} | dict(zip(("p50_s", "p99_s", "worst_s"), found, strict=True))
+    """Return the number of times, their median, 99th percentile and worst; NaN without times."""
+    values = np.quantile(seconds, [0.5, 0.99, 1.0]).tolist() if len(seconds) else [math.nan] * 3
+    return {"n": len(seconds)} | dict(zip(("p50_s", "p99_s", "worst_s"), values, strict=True))
 
 
-def tell(rows: Sequence[Mapping[str, Any]], title: str, path: Path | None = None, width: int = 124) -> None:
-    """Print rows as a table, and write them as CSV; a column's ending is its unit: _s, _bytes, _share."""
+def print_table(
+    rows: Sequence[Mapping[str, Any]], title: str, path: Path | None = None, width: int = 124
+) -> None:
+    """Print rows as a table, and write them as CSV where a path is given.
+
+    The end of a column's name is its unit: _s, _bytes, _share.
+    """
     if path is not None:
         write_csv(pd.DataFrame(rows), path, force=True)
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
@@ -80,7 +88,7 @@ def tell(rows: Sequence[Mapping[str, Any]], title: str, path: Path | None = None
 
 
 def noisy(data: Dataset, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Labelled traces (n, C, T), and (n,): recorded ones with 0.2 units of fresh sensor noise."""
+    """Draw n recorded traces and add noise of 0.2 units: traces (n, C, T) and labels (n,)."""
     rows = rng.integers(len(data), size=n)
     X = as_traces(data.X[rows])
     return X + rng.normal(0.0, 0.2, X.shape).astype(np.float32), data.y[rows]
