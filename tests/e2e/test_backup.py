@@ -15,7 +15,7 @@ import pytest
 from dengine import DataEngine, Dataset, SqlStore
 from dengine.errors import StoreError
 from dengine.store import backup_store, verify_history
-from tests.support.command_line import dengine, document, said
+from tests.support.command_line import dengine, document, line_of
 from tests.support.driving import learn
 
 IN_STORE, IN_JOURNAL = 40, 25  # parts
@@ -102,11 +102,11 @@ def test_verify_says_what_waits_in_a_journal_and_of_a_plain_copy_that_there_is_n
     tmp_path: Path, in_use: DataEngine
 ) -> None:
     store, copy = tmp_path / "engine.db", tmp_path / "plain.db"
-    text = said("verify", store)
+    text = line_of("verify", store)
     assert f"The journal of cell cell holds {2 * IN_JOURNAL} records" in text
     for suffix in ("", "-wal"):
         shutil.copyfile(f"{store}{suffix}", f"{copy}{suffix}")
-    text = said("verify", copy)
+    text = line_of("verify", copy)
     assert "The journal of cell cell is not here" in text
     assert "dengine backup" in text
     assert document("verify", copy)["cells"][0]["waiting"] is None
@@ -124,7 +124,7 @@ def test_a_plain_copy_of_the_file_alone_is_refused_where_its_tables_are_in_the_l
 def test_a_backup_of_a_copy_says_that_it_has_no_journal(tmp_path: Path, in_use: DataEngine) -> None:
     backup_store(tmp_path / "engine.db", tmp_path / "copy.db")
     assert document("backup", tmp_path / "copy.db", "--out", tmp_path / "again.db")["without_journal"] == ["cell"]
-    text = said("backup", tmp_path / "copy.db", "--out", tmp_path / "third.db")
+    text = line_of("backup", tmp_path / "copy.db", "--out", tmp_path / "third.db")
     assert "No journal of cell cell lies beside" in text
 
 

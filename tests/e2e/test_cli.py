@@ -22,7 +22,7 @@ from dengine.datasets import importing
 from dengine.datasets.importing import import_labelled
 from dengine.experiments.baselines import BASELINES
 from dengine.store import SqlStore
-from tests.support.command_line import dengine, document, said, succeed, well
+from tests.support.command_line import dengine, document, line_of, succeed, well
 from tests.support.driving import easy_parts
 from tests.support.exports import cell_journal
 
@@ -75,7 +75,7 @@ def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with reducers of one's own, in which the command is called."""
     (tmp_path / "his.py").write_text(OWN_REDUCERS)
     monkeypatch.chdir(tmp_path)
@@ -150,12 +150,12 @@ def test_every_verb_is_listed_with_its_whole_sentence_speaks_json_and_explains_e
 
 def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(data: Path, tmp_path: Path) -> None:
     asked = ["replay", "--data", data, "--reducer", "pca", *POLICY, "--repeats", 2, "--check-seconds", 9]
-    shown = said(*asked, "--out", tmp_path, "--explain")
+    shown = line_of(*asked, "--out", tmp_path, "--explain")
     for words in ("retrains, the worst in", "FP: bad parts accepted", "pca (local)"):
         assert words in shown
     row = document(*asked)["rows"][0]
     assert row["saved_s"] == 9 * row["certain"] > 0
-    assert "FP: bad" not in said(*asked)
+    assert "FP: bad" not in line_of(*asked)
     assert len((tmp_path / "replays.csv").read_text().splitlines()) == 3
     assert {p.name for p in tmp_path.glob("*.png")} == {"curves.png", "map_pca.png"}
 
@@ -173,7 +173,7 @@ def compare(data: Path, words: str) -> list[object]:
 
 
 def test_the_papers_grid_writes_its_tables_its_figures_and_its_findings(data: Path, tmp_path: Path) -> None:
-    shown = said(*compare(data, "--reducers pca --paper --repeats 1"), "--out", tmp_path)
+    shown = line_of(*compare(data, "--reducers pca --paper --repeats 1"), "--out", tmp_path)
     page = (tmp_path / "tables.md").read_text(encoding="utf-8")
     assert page.count("| alpha / LB | 80 % | 90 % | 95 % |") == 2
     assert "[36.9 / 1019.8]" in page
@@ -211,7 +211,7 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained
     assert shown["labels"] == shown["sources"]["verification"] == shown["reasons"]["no_model"] == 160
     assert (shown["version"] >= 1, shown["safe_mode"]) == (True, "")
     assert "Nothing can be said yet" in shown["certificate"]["sentence"]
-    out = said("status", trained)
+    out = line_of("status", trained)
     for words in ("alpha 0.2, lower bound 0.8", "guarantee local", "retrain every 50", "budget 450 ms", "rate 500 Hz"):
         assert words in out
     with np.load(data) as file, DataEngine.open(trained) as engine:
@@ -227,18 +227,18 @@ def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_th
     np.testing.assert_array_equal(store.labelled().labels, y[2:])  # bad ones are kept, and never trained on
 
 
-def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, own: Path, monkeypatch) -> None:
+def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, own_folder: Path, monkeypatch) -> None:
     for words in (["--reducer", "his:FirstAndLast"], ["--allow-import"]):  # made, and opened again
-        monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(own)])
+        monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(own_folder)])
         sys.modules.pop("his", None)
         out = succeed("train", "--data", data, "--store", "e.db", *words)
         assert "his" in sys.modules
-        assert sys.path[-1] == str(own)  # last: a module of this folder shadows nothing
+        assert sys.path[-1] == str(own_folder)  # last: a module of this folder shadows nothing
         assert "FirstAndLast answers" in " ".join(out.split())
     assert "his:FirstAndLast" in succeed("status", "e.db")
     words = ["compare", "--data", data, "--reducers", "pca,his:FirstAndLast", *POLICY, "--repeats", 1, "--out", "out"]
     assert [(row["recipe"], row["certain"] > 0) for row in document(*words)["rows"]][1] == ("FirstAndLast", True)
-    assert (own / "out" / "map_FirstAndLast.png").is_file()
+    assert (own_folder / "out" / "map_FirstAndLast.png").is_file()
 
 
 def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data: Path, tmp_path: Path) -> None:
@@ -331,7 +331,7 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
     assert 300 < change["cycle"] <= 320
     assert change["reason"] == shown["safe_mode"] == "too many traces were novel"
     assert shown["stretches"][-1]["safe_mode"] == 320 - change["cycle"] + 1
-    out = said("status", store)
+    out = line_of("status", store)
     sentences = (shown["certificate"][name] for name in ("sentence", "sentence_on_rejects"))
     for part in (*sentences, "guarantee pooled, stops all", "audit rate 10.0 %", "safe mode too many traces were novel"):
         assert part in out
@@ -342,20 +342,20 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
     ended = well(*words[:-2], "--cycles", 380)
     assert re.findall(r"^After cycle \d+: safe mode.*$", ended.stdout, flags=re.M)[-1].endswith("safe mode ended.")
     assert "safe mode ended." in ended.stderr
-    assert "safe mode too" not in said("status", store)
+    assert "safe mode too" not in line_of("status", store)
 
 
-def test_an_interrupted_replay_reports_what_was_finished(data: Path, own: Path) -> None:
+def test_an_interrupted_replay_reports_what_was_finished(data: Path, own_folder: Path) -> None:
     words = ["--reducer", "his:Interrupting", *POLICY, "--cycles", 60, "--repeats", 50, "--out", "out"]
     result = dengine("replay", "--data", data, *words)
     assert result.exit_code == INTERRUPTED
     assert "Interrupted: 2 of 50 replays were finished; the table shows those." in result.stderr
     assert "2 replays" in result.stdout
-    assert len((own / "out" / "replays.csv").read_text().splitlines()) == 3
-    assert (own / "out" / "curves.png").is_file()
+    assert len((own_folder / "out" / "replays.csv").read_text().splitlines()) == 3
+    assert (own_folder / "out" / "curves.png").is_file()
 
 
-def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own: Path) -> None:
+def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own_folder: Path) -> None:
     words = ["--data", data, "--cycles", 160, "--store", "e.db", "--reducer", "his:Interrupting", "--lower-bound", "0.99"]
     result = dengine("run", "--cell", "replay", *words)
     assert result.exit_code == INTERRUPTED

@@ -12,7 +12,7 @@ import pytest
 from dengine import DataEngine, Policy
 from dengine.datasets.importing import import_labelled
 from dengine.history.status import history
-from tests.support.command_line import dengine, document, said
+from tests.support.command_line import dengine, document, line_of
 
 
 @pytest.fixture(scope="module")
@@ -46,12 +46,12 @@ def labels(store: Path) -> dict[int, int]:
 def test_a_label_is_corrected_and_the_line_says_what_it_was(store: Path) -> None:
     first, before = ids(store)[0], labels(store)[1]
     now = "bad" if before else "good"
-    line = said("correct", store, first, now, "--author", "kim")
+    line = line_of("correct", store, first, now, "--author", "kim")
     assert line.startswith(f"Decision {first} counts as a {'failure' if before else 'success'}, was a ")
     assert line.endswith("Event 1, by kim.")
     assert labels(store)[1] == 1 - before
-    assert "already; nothing changed." in said("correct", store, first, now)
-    assert said("retrain", store).startswith("Version 3 answers. 1 retrain, the worst in ")
+    assert "already; nothing changed." in line_of("correct", store, first, now)
+    assert line_of("retrain", store).startswith("Version 3 answers. 1 retrain, the worst in ")
     result = document("retrain", store, "--author", "kim")
     assert (result["retrain"]["version"], result["retrain"]["accepted"], result["author"]) == (4, True, "kim")
     with DataEngine.open(store) as engine:  # and a retrain by hand learns it
@@ -65,17 +65,17 @@ def test_a_part_is_found_and_reported_by_its_number(store: Path, make_data) -> N
         engine.set_policy(replace(engine.policy, windows=("0:0:1000::reject",)))
         engine.decide(np.roll(make_data(1).X[0], 9), "P-8")
         assert "or its HTTP where it is served" in dengine("report", store, "P-7", "bad").stderr  # while it runs
-    assert said("report", store, "P-8", "good", "--author", "kim").endswith(" was good. Event 2, by kim.")
+    assert line_of("report", store, "P-8", "good", "--author", "kim").endswith(" was good. Event 2, by kim.")
     (reject,) = document("history", store, "--part", "P-8")["decisions"]
     assert (reject["action"], reject["label"], reject["source"]) == ("reject", "good", "inspection")
-    assert "good inspection" in said("history", store, "--part", "P-8")
-    assert "inspection 1" in " ".join(said("status", store).split())
-    assert "failure" in said("correct", store, "P-8", "bad", "--author", "kim")
+    assert "good inspection" in line_of("history", store, "--part", "P-8")
+    assert "inspection 1" in " ".join(line_of("status", store).split())
+    assert "failure" in line_of("correct", store, "P-8", "bad", "--author", "kim")
     assert document("explain", store, "P-8")["decision"]["id"] == reject["id"]
     assert "'P-9', which is unknown" in dengine("correct", store, "P-9", "good").stderr
     assert "'P-9', which is unknown" in dengine("explain", store, "P-9").stderr
     assert "'P-9', which is unknown" in dengine("report", store, "P-9", "good").stderr
-    assert said("report", store, "P-7", "bad", "--author", "kim").endswith(" was bad. Event 4, by kim.")
+    assert line_of("report", store, "P-7", "bad", "--author", "kim").endswith(" was bad. Event 4, by kim.")
     (result,) = document("history", store, "--part", "P-7")["decisions"]
     assert (result["part"], result["label"]) == ("P-7", "bad")
 
@@ -85,7 +85,7 @@ def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store: Pa
     failed = dengine("forget", store, names[0], "nobody")
     assert (failed.exit_code, len(labels(store))) == (1, 60)
     assert "'nobody'" in failed.stderr
-    line = said("forget", store, names[0], names[1], "--reason", "wrong part")
+    line = line_of("forget", store, names[0], names[1], "--reason", "wrong part")
     assert line.startswith(f"The labels of {names[0]}, {names[1]} are forgotten: wrong part. Event 1,")
     assert sorted(labels(store)) == list(range(3, 61))
     assert document("status", store)["forgotten"] == 2
@@ -95,7 +95,7 @@ def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store: Pa
 
 
 def test_an_earlier_version_answers_again(store: Path) -> None:
-    line = said("rollback", store, 1, "--author", "kim")
+    line = line_of("rollback", store, 1, "--author", "kim")
     assert line == "Version 1 answers again, as version 3 after 2. Event 1, by kim."
     assert document("status", store)["version"] == 3
     failed = dengine("rollback", store, 9)
@@ -109,22 +109,22 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path, tmp_path: P
     with DataEngine.open(store) as engine:
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
         assert engine.certificate().alpha == 0.2
-    assert "alpha 0.2, lower bound 0.8" in said("status", store)
-    assert "windows none -> 0.05:0.1:-5:60:reject. Event" in said("policy", store, "--window", "0.05:0.1:-5:60:reject")
+    assert "alpha 0.2, lower bound 0.8" in line_of("status", store)
+    assert "windows none -> 0.05:0.1:-5:60:reject. Event" in line_of("policy", store, "--window", "0.05:0.1:-5:60:reject")
     assert document("policy", store, "--window", "")["policy"]["windows"] == []
     wrong = dengine("policy", store, "--window", "0.05:0.1:-5::channel=4")
     assert "got '0.05:0.1:-5::channel=4'" in " ".join(wrong.stderr.split())  # and not as an option of the command
-    shown = said("policy", store)
+    shown = line_of("policy", store)
     assert all(words in shown for words in ("alpha 0.2", "audit rate 10.0 %", "stops all"))
-    assert "interval wilson -> jeffreys. Event 4, by" in said("policy", store, "--interval", "jeffreys")
-    assert said("policy", store, "--shadow", "on", "--author", "kim").startswith("Shadow mode: every part is verified")
+    assert "interval wilson -> jeffreys. Event 4, by" in line_of("policy", store, "--interval", "jeffreys")
+    assert line_of("policy", store, "--shadow", "on", "--author", "kim").startswith("Shadow mode: every part is verified")
     assert document("status", store)["shadow"] is True
-    assert "already" in said("policy", store, "--shadow", "on")
+    assert "already" in line_of("policy", store, "--shadow", "on")
     rule = "from dengine.decision.rule import DecisionRule\n\nclass Mine(DecisionRule): ...\n"
     (tmp_path / "own_rule.py").write_text(rule)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
-    assert "guarantee local -> own_rule:Mine" in said("policy", store, "--guarantee", "own_rule:Mine", "--shadow", "off")
+    assert "guarantee local -> own_rule:Mine" in line_of("policy", store, "--guarantee", "own_rule:Mine", "--shadow", "off")
     result = document("status", store)
     assert (result["shadow"], result["recipe"]["policy"]["guarantee"]) == (False, "own_rule:Mine")
 

@@ -12,7 +12,7 @@ from dengine.cli.history import TABLE_WIDTH
 from dengine.decision.intervals import wilson_interval
 from dengine.history.status import bad_accepts
 from dengine.store.records import Outcomes
-from tests.support.command_line import dengine, document, said, succeed
+from tests.support.command_line import dengine, document, line_of, succeed
 from tests.support.driving import RECIPE, drive, easy_parts
 
 
@@ -182,11 +182,11 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     accept, certified = result["ever"]["would_accept"], result["certificate"]
     assert (accept["n"] > 50, accept["verdict"], certified["accepted"]["shadowed"]) == (True, "kept", True)
     assert f"Of {accept['n']} parts that the model would accept, each of which was checked," in certified["sentence"]
-    n, words = len(certain), said("status", store, "--check-seconds", "60")
+    n, words = len(certain), line_of("status", store, "--check-seconds", "60")
     assert f"It would have decided {n} of the {result['ever']['verified']} parts that were verified: {60 * n} s of" in words
-    assert "shadow yes" in said("status", store)
+    assert "shadow yes" in line_of("status", store)
     assert result["ever"]["bad_accepts"]["n_known"] == 0  # nothing was accepted, so none of it is known to be bad
-    words = said("status", store)
+    words = line_of("status", store)
     assert f"certain but checked {n} {n}" in words
     assert words.count("bad accepts none was accepted none was accepted") == 1
     assert "audits" not in words
@@ -198,7 +198,7 @@ def test_each_figure_has_one_interval_prices_have_names_and_dates_are_iso(stream
     policy = replace(RECIPE.policy, audit_rate=0.3)
     with DataEngine(recipe=RECIPE.with_settings(policy=policy), store=(store := tmp_path / "engine.db")) as engine:
         drive(engine, stream, 0, 300)
-    words = said("status", store)
+    words = line_of("status", store)
     ever = document("status", store)["ever"]
     assert ever["accepted"] > 0
     assert ever["would_accept"]["n_known"] == ever["bad_accepts"]["n_known"] > 0

@@ -27,10 +27,10 @@ from tests.support.serving import a_service, served, started
 CHROMIUM = shutil.which("chromium")
 
 
-def missing(what: str) -> None:
+def missing(tool: str) -> None:
     if os.environ.get("DENGINE_REQUIRE_BROWSER") == "1":
-        pytest.fail(f"the page's tests need {what}")
-    pytest.skip(f"the page's tests need {what}", allow_module_level=True)
+        pytest.fail(f"the page's tests need {tool}")
+    pytest.skip(f"the page's tests need {tool}", allow_module_level=True)
 
 
 if CHROMIUM is None:

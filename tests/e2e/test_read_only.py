@@ -39,7 +39,7 @@ def dengine(*commands: Sequence[object]) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory, make_data) -> dict[str, Path]:
+def stores(tmp_path_factory: pytest.TempPathFactory, make_data) -> dict[str, Path]:
     """A store in each state."""
     data: Dataset = make_data(60, samples=80)
     place = tmp_path_factory.mktemp("made")
@@ -56,10 +56,10 @@ def made(tmp_path_factory: pytest.TempPathFactory, make_data) -> dict[str, Path]
 
 
 @pytest.fixture(params=CASES, ids=lambda case: f"{case[1]} of what was {case[0]}")
-def store(request: pytest.FixtureRequest, made: dict[str, Path], tmp_path: Path) -> Iterator[Path]:
+def store(request: pytest.FixtureRequest, stores: dict[str, Path], tmp_path: Path) -> Iterator[Path]:
     left, locked = request.param
     folder = tmp_path / "archive"
-    shutil.copytree(made[left], folder)
+    shutil.copytree(stores[left], folder)
     of_folder, of_files = LOCKED[locked]
     for file in folder.iterdir():
         file.chmod(of_files)
@@ -68,9 +68,9 @@ def store(request: pytest.FixtureRequest, made: dict[str, Path], tmp_path: Path)
     folder.chmod(0o755)
 
 
-def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(made: dict[str, Path], tmp_path: Path) -> None:
+def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(stores: dict[str, Path], tmp_path: Path) -> None:
     store, journal = tmp_path / "engine.db", tmp_path / "engine.db.cell.journal"
-    shutil.copy(made["closed"] / "engine.db", store)
+    shutil.copy(stores["closed"] / "engine.db", store)
     journal.write_bytes(b"another user's")
     journal.chmod(0o000)
     verified, refused = dengine(["verify", store, "--json"], ["backup", store, "--out", tmp_path / "copy.db"])

@@ -33,7 +33,7 @@ from dengine.serve.auth import Access, Token
 from dengine.serve.http import create_app
 from dengine.serve.service import CellService
 from tests.support.command_line import dengine
-from tests.support.serving import RECIPE, a_service, certificate, held, served, started
+from tests.support.serving import RECIPE, a_service, busy_engine, certificate, served, started
 
 TOKEN = "correct-horse-battery-staple"
 JSON, PROBLEM = "application/json", "application/problem+json"
@@ -216,12 +216,12 @@ def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another
             client.post("/decide", json={"trace": stream.X[i].tolist(), "request": f"found-{i}", "part": f"F{i % 6}"})
         client.post("/report", json={"id": "found-1", "success": False})
 
-        def found(**query: Any) -> list[str]:
+        def listed_ids(**query: Any) -> list[str]:
             return [decision["id"] for decision in client.get("/decisions", params=query).json()["decisions"]]
 
-        assert found(part="F0") == ["found-6", "found-0"]
-        assert found(part="F1", label="bad", action="verify") == ["found-1"]
-        assert found(part="F1", action="reject") == found(part="nobody") == found(part="F1", until=1.0) == []
+        assert listed_ids(part="F0") == ["found-6", "found-0"]
+        assert listed_ids(part="F1", label="bad", action="verify") == ["found-1"]
+        assert listed_ids(part="F1", action="reject") == listed_ids(part="nobody") == listed_ids(part="F1", until=1.0) == []
         pages, older = [], None
         while older is not None or not pages:
             page = client.get("/decisions", params={"limit": 3} | ({"before": older} if older else {})).json()
@@ -436,7 +436,7 @@ def test_paths_and_methods_that_there_are_not_are_problems_too_with_every_header
 
 
 def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None:
-    with serving(most=1) as (service, client), held(service):
+    with serving(most=1) as (service, client), busy_engine(service):
         service.submit(lambda engine: None)
         answer = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"])
         must_be_problem(answer, 503)
@@ -510,7 +510,7 @@ def test_connections_without_a_token_keep_nobody_out_who_has_one(tmp_path: Path,
         assert robot.get("/status").json()["ever"]["decisions"] == 20
         assert robot.get("/status", headers={"authorization": "Bearer wrong"}).status_code == 401
         process.end()
-    assert process.said.count("a wrong token came from 127.0.0.1") == 1
+    assert process.output.count("a wrong token came from 127.0.0.1") == 1
 
 
 def half(head: str, body: str = "") -> bytes:
@@ -583,8 +583,8 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
             for store, at, text in (("cell.db", "0", "cell.db"), ("b.db", process.port, "already in use")):
                 refused_in_a_line(text, "--store", tmp_path / store, "--port", at)
             assert process.end() == 0
-    assert all(" level=" in line and " message=" in line for line in process.said.splitlines()), process.said
-    assert TOKEN not in process.said
+    assert all(" level=" in line and " message=" in line for line in process.output.splitlines()), process.output
+    assert TOKEN not in process.output
     with DataEngine.open(tmp_path / "cell.db") as engine:
         assert engine.find("order-0").decision.action == "verify"
 

@@ -98,8 +98,8 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
         for thread in threads:
             thread.join(WAIT)
     assert code == 0
-    assert "Traceback" not in process.said
-    lines = process.said.splitlines()
+    assert "Traceback" not in process.output
+    lines = process.output.splitlines()
     assert all(" level=" in line and " message=" in line for line in lines), lines
     assert any(f"{name}: ending" in line for line in lines)
     until(lambda: not any(map(is_alive, below)))
@@ -188,8 +188,8 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
                 np.testing.assert_array_equal(np.float32(record["trace"]).ravel(), parts.X[2])
                 assert process.ask("/status")["ever"]["decisions"] >= 3
             assert process.end() == 0
-    assert "no recording of" in process.said
-    assert "Traceback" not in process.said
+    assert "no recording of" in process.output
+    assert "Traceback" not in process.output
 
 
 def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(tmp_path: Path, make_data) -> None:

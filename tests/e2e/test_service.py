@@ -13,7 +13,7 @@ from dengine import DataEngine, Dataset, Reason
 from dengine.errors import TraceError
 from dengine.serve.service import CellService
 from tests.support.driving import Counting, evidence
-from tests.support.serving import RECIPE, WAIT, a_service, held
+from tests.support.serving import RECIPE, WAIT, a_service, busy_engine
 
 
 def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: Path) -> None:
@@ -26,7 +26,7 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
         read = asyncio.create_task(asyncio.to_thread(free.wait, WAIT))  # as a store that does not answer
         await service.decide(stream.X[0], "order-0")
         service.deadline = 0.05
-        with held(service):
+        with busy_engine(service):
             late = await service.decide(stream.X[1], "order-1", part="P1")
             broken = await service.decide(bad, "order-2")
             with pytest.raises(TraceError, match="got another"):
@@ -96,7 +96,7 @@ def test_a_decision_without_an_id_is_what_the_thread_would_say_and_verify_where_
         assert evidence(at_once.decision) == evidence(thread.decision)
         assert at_once.decision.model_version == 1
         service.deadline = 0.05
-        with held(service):
+        with busy_engine(service):
             late = asyncio.create_task(service.decide(stream.X[42]))
             await asyncio.sleep(0.2)
         assert (await late).decision.reason is Reason.LATE

@@ -18,7 +18,7 @@ from dengine.cells.ur.protocol import CHANNELS, TYPES, Package, PackageReader, P
 from dengine.cells.ur.stream import RtdeClient, RtdeStream
 from dengine.datasets.triggers import Trigger
 from dengine.errors import CellError, DengineError
-from tests.support.command_line import dengine, document, said, succeed
+from tests.support.command_line import dengine, document, line_of, succeed
 
 SAMPLES = 80
 FORCE = "actual_TCP_force[2]"
@@ -275,7 +275,7 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dat
     store = tmp_path / "cell.db"
     with FakeController(RobotProgram(parts), speed=None, troubles=[Trouble(3, 9, "drop", 2)]) as fake:
         result = document(*run_on(fake, store), "--reducer", "pca", "--cycles", 12)
-        shown = said(*run_on(fake, store), "--cycles", 3)
+        shown = line_of(*run_on(fake, store), "--cycles", 3)
     assert (result["total"]["verified"], result["cell"]["incomplete"]) == (12, 1)
     assert result["cell"]["missing"] >= 2
     assert "incomplete 0" in shown

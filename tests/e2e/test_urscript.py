@@ -22,7 +22,7 @@ from dengine import Action, Dataset
 from dengine.serve.auth import Access
 from dengine.serve.http import create_app
 from dengine.store.views import HistoryFilter
-from tests.support.serving import PushedTraces, a_service, held, served
+from tests.support.serving import PushedTraces, a_service, busy_engine, served
 
 SCRIPT = Path(__file__).parents[2] / "dengine" / "cells" / "ur" / "ur_xmlrpc_cell.script"
 TEXT = SCRIPT.read_text(encoding="utf-8")
@@ -165,7 +165,7 @@ def test_a_shift_of_the_program_decides_checks_and_reports(cell: SimpleNamespace
 
 def test_what_is_not_answered_in_time_is_checked(cell: SimpleNamespace, make_data) -> None:
     robot = Robot(make_data(2, samples=SAMPLES, seed=3), 2, cell, patience=0.3)
-    with held(cell.service):
+    with busy_engine(cell.service):
         robot.play()
     assert robot.checked == [0, 1]
     assert sum("no response" in text for text in robot.said) == 2

@@ -153,7 +153,7 @@ def test_a_served_cell_retrains_in_a_process_and_ends_in_order(tmp_path: Path, m
         labels = process.ask("/status")["labels"]
         backup = python("-m", "dengine", "backup", tmp_path / "cell.db", "--out", tmp_path / "copy.db", "--json")
         assert process.end(signal.SIGINT) == 0
-    assert "Traceback" not in process.said
+    assert "Traceback" not in process.output
     assert '"decisions": 80' in backup
     with DataEngine.open(tmp_path / "cell.db") as engine:
         assert engine.status().labels == labels

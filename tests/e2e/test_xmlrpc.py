@@ -20,7 +20,7 @@ from dengine.serve.auth import Access
 from dengine.serve.http import create_app
 from dengine.serve.robot_calls import MAX_SAMPLES, RobotCalls
 from dengine.serve.service import CellService
-from tests.support.serving import PushedTraces, a_service, held, served
+from tests.support.serving import PushedTraces, a_service, busy_engine, served
 
 VERIFY, ACCEPT = 0, 1
 
@@ -138,7 +138,7 @@ def test_what_was_not_recorded_is_verified_and_no_fault(cell: Cell, stream: Data
 
 def test_a_busy_server_answers_verify_and_keeps_no_report(cell: Cell, stream: Dataset) -> None:
     robot, waiting = cell.robot(), []
-    with held(cell.service):
+    with busy_engine(cell.service):
         with suppress(BusyError):
             while True:
                 waiting.append(cell.service.submit(lambda engine: None))

@@ -27,14 +27,14 @@ def kept(name: str) -> Arrays:
         return dict(file)
 
 
-def assert_same(found: Arrays, expected: Arrays) -> None:
+def assert_same(result: Arrays, expected: Arrays) -> None:
     if not SAME_MACHINE:
-        assert (found["action"] != expected["action"]).mean() <= MOVED
+        assert (result["action"] != expected["action"]).mean() <= MOVED
         return
-    assert set(found) == set(expected)
+    assert set(result) == set(expected)
     for key, values in expected.items():
-        np.testing.assert_array_equal(found[key], values, err_msg=key)
-        assert (found[key].dtype, found[key].tobytes()) == (values.dtype, values.tobytes()), key
+        np.testing.assert_array_equal(result[key], values, err_msg=key)
+        assert (result[key].dtype, result[key].tobytes()) == (values.dtype, values.tobytes()), key
 
 
 @pytest.mark.parametrize("name", [name for name in STORIES if name not in EXPORTED])

@@ -1,4 +1,4 @@
-"""The `dengine` command in this process: what it printed, and with which exit code."""
+"""Runs the `dengine` command in this process, for tests of verbs."""
 
 import json
 from tempfile import gettempdir
@@ -10,12 +10,15 @@ from dengine.cli.output import SCREEN_WIDTH
 
 
 def dengine(*words: object) -> Result:
-    """A verb and its words."""
+    """Run a verb with its words; return its exit code and output."""
     return CliRunner().invoke(main, [str(word) for word in words])
 
 
 def well(*words: object) -> Result:
-    """A verb that must end well; but for JSON, help, paths and a history its output fits 80 columns, uncut."""
+    """Run a verb that must end with exit code 0; return its result.
+
+    Its output must fit 80 columns, uncut, except for JSON, help, paths and a history.
+    """
     result = dengine(*words)
     assert result.exit_code == 0, result.output
     if not {"--json", "--help", "history"} & set(words):
@@ -25,17 +28,17 @@ def well(*words: object) -> Result:
 
 
 def succeed(*words: object) -> str:
-    """What a verb that ends well prints."""
+    """Return what a verb prints that must succeed."""
     return well(*words).stdout
 
 
-def said(*words: object) -> str:
-    """The same in one line, without the lines of tables."""
+def line_of(*words: object) -> str:
+    """Return what a verb prints in one line, without the borders of tables."""
     return " ".join(succeed(*words).replace("│", " ").replace("┃", " ").split())
 
 
 def document(*words: object) -> dict:
-    """Its JSON document, and nothing else."""
+    """Return the JSON document of a verb, which must print nothing else."""
     result = well(*words, "--json")
     assert result.stderr == ""
     return json.loads(result.stdout)

@@ -52,11 +52,11 @@ def bad_traces(x: np.ndarray) -> list[np.ndarray]:
     return [nan, inf, both, beyond, np.full_like(x, 2.5), np.zeros_like(x), np.full_like(x, np.nan)]
 
 
-def wild_traces(known: np.ndarray) -> np.ndarray:
+def wild_traces(traces: np.ndarray) -> np.ndarray:
     """(n + 207, T): known ones, random ones of every size, and bad ones."""
     rng = np.random.default_rng(5)
-    wild = rng.normal(size=(200, known.shape[1])) * 10.0 ** rng.uniform(-3, 6, (200, 1))
-    return np.concatenate([known, wild, np.array(bad_traces(known[0]))]).astype(np.float32)
+    wild = rng.normal(size=(200, traces.shape[1])) * 10.0 ** rng.uniform(-3, 6, (200, 1))
+    return np.concatenate([traces, wild, np.array(bad_traces(traces[0]))]).astype(np.float32)
 
 
 def row(decision: Any) -> tuple[Any, ...]:

@@ -63,7 +63,7 @@ class Process:
 
     process: subprocess.Popen[str]
     port: int
-    said: str = ""
+    output: str = ""
 
     def ask(self, path: str, body: Any = None) -> dict[str, Any]:
         with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT)) as connection:
@@ -78,7 +78,7 @@ class Process:
     def end(self, number: int = signal.SIGTERM, group: bool = False) -> int:
         """Send a signal, to its whole group as a terminal does where asked, and return its exit code."""
         (os.killpg if group else os.kill)(self.process.pid, number)
-        self.said, _ = self.process.communicate(timeout=WAIT)
+        self.output, _ = self.process.communicate(timeout=WAIT)
         return self.process.returncode
 
 
@@ -119,7 +119,7 @@ class PushedTraces:
 
 
 @contextmanager
-def held(service: Any) -> Iterator[None]:
+def busy_engine(service: Any) -> Iterator[None]:
     """The engine's thread, busy with something else."""
     begun, free = threading.Event(), threading.Event()
     service.submit(lambda engine: (begun.set(), free.wait(60)))

@@ -31,10 +31,10 @@ RECIPE = Recipe("pca", policy=Policy(alpha=0.1, lower_bound=0.9))
 RETRAINS = tuple(RetrainReport(i, seconds, 50, 0, seconds > 0.2, "") for i, seconds in enumerate((0.1, 0.3)))
 
 
-def replay_of(action: list[str], truth: list[int], recipe: Recipe = RECIPE, **known: Any) -> Replay:
+def replay_of(action: list[str], truth: list[int], recipe: Recipe = RECIPE, **fields: Any) -> Replay:
     good = np.array(truth, dtype=bool)
     stopped = (np.array(action) == "accept") & ~good
-    return by_hand(action, good, recipe=recipe, name=recipe.name, stopped=stopped, retrains=RETRAINS, **known)
+    return by_hand(action, good, recipe=recipe, name=recipe.name, stopped=stopped, retrains=RETRAINS, **fields)
 
 
 MANY_RIGHT = replay_of(["accept"] * 300, [1] * 290 + [0] * 10)

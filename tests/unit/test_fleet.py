@@ -71,7 +71,7 @@ def probe() -> np.ndarray:
     return insertion_like(40, seed=99, noise=0.3).X[:, None]
 
 
-def said(engine: DataEngine, probe: np.ndarray) -> list[Any]:
+def predictions(engine: DataEngine, probe: np.ndarray) -> list[Any]:
     """What an engine says of traces that nobody learns from, to the last bit."""
     return [(p.action, p.lower, p.upper, p.n_success, p.n_failure, p.embedding) for p in engine.model.predict_many(probe)]
 
@@ -100,7 +100,7 @@ def test_a_new_cell_decides_at_once_and_as_its_peers_do(fleet: Fleet, parts: Dat
     second = fleet.engine("b")
     assert second.store.status()["labels"] == 0
     assert second.version == first.version > 0
-    assert said(second, probe) == said(first, probe)
+    assert predictions(second, probe) == predictions(first, probe)
     assert any(second.decide(x).action is Action.ACCEPT for x in parts.X[100:140])
 
 
@@ -115,7 +115,7 @@ def test_one_retrain_serves_all(recipe: Recipe, fleet: Fleet, parts: Dataset, pr
     retrains = cells[0].store.retrains()
     assert [report.version for report in retrains] == list(range(1, labels // EVERY + 1))
     assert {engine.version for engine in cells} == {len(retrains)}
-    assert said(cells[0], probe) == said(cells[1], probe) == said(cells[2], probe)
+    assert predictions(cells[0], probe) == predictions(cells[1], probe) == predictions(cells[2], probe)
     assert {len(engine.model.index) for engine in cells} == {labels}
     assert {core_of(engine).new_labels for engine in cells} == {labels - EVERY * len(retrains)}
 
@@ -200,7 +200,7 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
     assert first.version == second.version == 2
     learn(first, parts, range(15, 20))
     core_of(second).process_retrains()
-    assert said(first, probe) == said(second, probe)
+    assert predictions(first, probe) == predictions(second, probe)
 
 
 def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet: Fleet, parts: Dataset, probe) -> None:
@@ -261,9 +261,9 @@ def reopened(fleet: Fleet, engine: DataEngine) -> SqlStore:
 def test_a_reopened_cell_decides_the_same_bit_for_bit(recipe: Recipe, fleet: Fleet, parts: Dataset, probe) -> None:
     for engine in taught(fleet, parts, 130, recipe):
         core_of(engine).process_retrains()
-        before = said(engine, probe), rule(engine), engine.version, core_of(engine).new_labels
+        before = predictions(engine, probe), rule(engine), engine.version, core_of(engine).new_labels
         again = fleet.engine("", recipe=None, store=reopened(fleet, engine))
-        assert (said(again, probe), rule(again), again.version, core_of(again).new_labels) == before
+        assert (predictions(again, probe), rule(again), again.version, core_of(again).new_labels) == before
 
 
 def test_nothing_is_mixed_between_products_and_cells_without(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
@@ -277,7 +277,7 @@ def test_nothing_is_mixed_between_products_and_cells_without(fleet: Fleet, parts
             learn(alone, parts, [i])
     for engine in cells.values():
         core_of(engine).process_retrains()
-    assert said(cells["d"], probe) == said(alone, probe)
+    assert predictions(cells["d"], probe) == predictions(alone, probe)
     rows = {name: np.arange(i, 120, 4) for i, name in enumerate("abcd")}
     for name, kin in {"a": "ab", "b": "ab", "c": "c", "d": "d"}.items():
         labelled = cells[name].store.labelled()

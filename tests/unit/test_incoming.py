@@ -23,7 +23,7 @@ class Slow(Counting):
         Slow.now += STEP / 2
 
 
-def said(engine: DataEngine, probe: np.ndarray) -> list[tuple]:
+def answers(engine: DataEngine, probe: np.ndarray) -> list[tuple]:
     return [evidence(engine.decide(x)) for x in probe]
 
 
@@ -75,7 +75,7 @@ def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides
                 core_of(engine).process_retrains(brief=True)
             engine.close()
         with DataEngine.open(tmp_path / f"{n}.db") as first:
-            expected = said(first, probe)
+            expected = answers(first, probe)
             assert len(first.model.index) == n
         with DataEngine.open(tmp_path / f"{n}.db") as second:
-            assert said(second, probe) == expected
+            assert answers(second, probe) == expected

@@ -14,7 +14,7 @@ from dengine.export import import_journal
 from dengine.export.cell_journal import read_journal
 from dengine.folds import part_hash
 from dengine.records import Reason
-from tests.support.command_line import said, succeed
+from tests.support.command_line import line_of, succeed
 from tests.support.exports import cell_journal, trained
 
 DECIDED = "verify,verify,uncertain,0,1,0,0"
@@ -176,7 +176,7 @@ def test_a_last_line_that_was_cut_anywhere_is_left_out_and_said(store: str, make
         path.write_text(text[:end])
         journal = read_journal(path, TraceSpec(100))
         assert (len(journal.lines), journal.cut) == (5, end - begin)
-    assert f"cut {journal.cut:,} " in said("import-labels", path, "--store", store, "--any-model")
+    assert f"cut {journal.cut:,} " in line_of("import-labels", path, "--store", store, "--any-model")
 
 
 def test_a_changed_missing_moved_or_doubled_line_is_named_and_those_before_are_taken(make_data, tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_what_is_no_journal_or_a_line_that_does_not_fit_is_named(tmp_path: Path,
 
 def test_the_verbs_export_and_import(store: str, make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     out = tmp_path / "model.ts"
-    assert "version 1 with 200 labelled references" in said("export", store, "--out", out)
+    assert "version 1 with 200 labelled references" in line_of("export", store, "--out", out)
     assert load_exported(out).metadata["references"] == 200
     new = make_data(30, seed=4)
     journal = write(tmp_path / "cell.csv", new.X, new.y)

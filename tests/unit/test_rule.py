@@ -217,12 +217,12 @@ def says(rule: type[DecisionRule], data: Dataset) -> tuple[Action, ModelPredicti
     return model.decide(good(data)[None])[0], model
 
 
-@pytest.mark.parametrize("what", CHANGES)
+@pytest.mark.parametrize("change", CHANGES)
 def test_a_rule_whose_code_was_changed_in_this_process_is_asked_as_it_is_now_and_not_exported_as_it_was(
-    data: Dataset, tmp_path: Path, monkeypatch, what: str
+    data: Dataset, tmp_path: Path, monkeypatch, change: str
 ) -> None:
-    owner, name, value, action = CHANGES[what]
-    rules = rule_module(tmp_path, monkeypatch, f"rules_{list(CHANGES).index(what)}")
+    owner, name, value, action = CHANGES[change]
+    rules = rule_module(tmp_path, monkeypatch, f"rules_{list(CHANGES).index(change)}")
     assert says(rules.MyRule, data)[0] is Action.ACCEPT
     monkeypatch.setattr(owner(rules), name, value)
     result, model = says(rules.MyRule, data)

@@ -53,11 +53,11 @@ def quick(**params: Any) -> ConvReducer:
     return ConvReducer(**{"folds": 3, "steps": 4, "fit_steps": 30} | params)
 
 
-def own(network: Any = SmallNetwork) -> TorchReducer:
+def own_reducer(network: Any = SmallNetwork) -> TorchReducer:
     return TorchReducer(network=network, folds=2, steps=4, fit_steps=30)
 
 
-@pytest.mark.parametrize("make", [quick, lambda: own()], ids=["conv", "own network"])
+@pytest.mark.parametrize("make", [quick, lambda: own_reducer()], ids=["conv", "own network"])
 def test_labels_of_fold_k_move_nothing_in_space_k_over_warm_starts_weights_averages_and_statistics(make: Any) -> None:
     X, y = toy_traces(120)
     reducer, other = make(), make()
@@ -83,7 +83,7 @@ def test_a_member_that_is_trained_on_its_own_fold_is_caught_by_the_contract(monk
 
 
 def test_a_users_own_network_keeps_the_whole_contract_of_a_reducer() -> None:
-    check_reducer(own())
+    check_reducer(own_reducer())
 
 
 def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit() -> None:
@@ -267,13 +267,13 @@ def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(tmp_path: Any, 
 def test_a_network_of_another_shape_is_refused_in_a_sentence() -> None:
     X, y = toy_traces(30)
     with pytest.raises(SettingError, match=r"maps \(B, 2, 120\) to \(B, features\), got one that gives 3 dimensions"):
-        own(lambda channels, samples: nn.Conv1d(channels, 3, 5)).fit(X, y)
+        own_reducer(lambda channels, samples: nn.Conv1d(channels, 3, 5)).fit(X, y)
 
 
 def test_a_network_that_does_not_compile_answers_in_python_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
     X, y = toy_traces(60)
     with caplog.at_level(logging.WARNING):
-        reducer = own(PythonNetwork).fit(X, y)
+        reducer = own_reducer(PythonNetwork).fit(X, y)
         assert reducer.module() is None
     assert "PythonNetwork cannot be compiled by TorchScript" in caplog.text
     assert reducer.embed(X).shape == (60, 2, 2)
@@ -297,7 +297,7 @@ def test_two_networks_of_one_name_in_one_process_answer_each_for_itself() -> Non
     X, y = toy_traces(60)
     embeddings = []
     for sign in (1.0, -1.0):
-        engine = DataEngine(reducer=own(network(sign)), replaying=True, radius=0.07)
+        engine = DataEngine(reducer=own_reducer(network(sign)), replaying=True, radius=0.07)
         for x, good in zip(X, y, strict=True):
             engine.report(engine.decide(x).id, bool(good))
         assert engine.retrain().accepted
