@@ -117,7 +117,7 @@ def test_a_token_that_systemd_hands_over_is_taken_though_its_acl_shows_as_a_righ
 ) -> None:
     if handed:
         monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
-    with nullcontext() if taken else pytest.raises(SettingError, match="its owner's alone"):
+    with nullcontext() if taken else pytest.raises(SettingError, match="only its owner may use"):
         tokens = read_tokens(token_file(tmp_path, mode))
         assert [(item.operates, item.name) for item in tokens] == [(True, ""), (False, "Line display")]
 
