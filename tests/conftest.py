@@ -3,7 +3,9 @@
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: one thread is steadier at these sizes
-os.environ.setdefault("DENGINE_STORE_WAIT", "30")  # a disk that others use stalls for longer than a cell would wait
+os.environ.setdefault(
+    "DENGINE_STORE_WAIT", "30"
+)  # a disk that others use stalls for longer than a cell would wait
 
 import shutil
 import signal
@@ -13,7 +15,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 REPO = Path(__file__).resolve().parents[1]
-os.environ.setdefault("NUMBA_CACHE_DIR", str(REPO / "build" / "numba"))  # before umap: what it compiled is kept
+os.environ.setdefault(
+    "NUMBA_CACHE_DIR", str(REPO / "build" / "numba")
+)  # before umap: what it compiled is kept
 
 import pytest
 import torch
@@ -27,7 +31,15 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
-LONG = ("test_docs", "test_notebooks", "test_page", "test_requests", "test_golden", "test_training", "test_cli")
+LONG = (
+    "test_docs",
+    "test_notebooks",
+    "test_page",
+    "test_requests",
+    "test_golden",
+    "test_training",
+    "test_cli",
+)
 # The C++ programs are built once, by one worker; each process that uses umap-learn compiles it anew, for 25 s.
 PROGRAMS = ("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program", "test_golden")
 GROUPS = dict.fromkeys(PROGRAMS, "cpp")
@@ -36,7 +48,14 @@ GROUPS |= dict.fromkeys(("test_estimators", "test_reducers", "test_umap"), "umap
 SLOW = REPO / "tests" / "slow"
 SLOW_CASES = ("umap-learn", "postgres", "minirocket")
 # What is slow and yet run before each merge; single tests are marked where they stand.
-MERGE = ("test_cpp", "test_c_interface", "test_onnx_program", "test_estimators", "test_store_postgres", "test_site")
+MERGE = (
+    "test_cpp",
+    "test_c_interface",
+    "test_onnx_program",
+    "test_estimators",
+    "test_store_postgres",
+    "test_site",
+)
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups, and -m the marks
@@ -48,7 +67,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         item.add_marker(pytest.mark.xdist_group(GROUPS.get(stem, stem)))
         if stem in MERGE or "postgres" in case:
             item.add_marker("merge")
-        if item.get_closest_marker("merge") or SLOW in item.path.parents or any(name in case for name in SLOW_CASES):
+        if (
+            item.get_closest_marker("merge")
+            or SLOW in item.path.parents
+            or any(name in case for name in SLOW_CASES)
+        ):
             item.add_marker("slow")
 
 
@@ -56,11 +79,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_xdist_node_collection_finished(node, ids: list[str]) -> None:
     """End where the groups are not in force: files would be split, and two workers build the same programs at once."""
     if node.config.getoption("dist") == "loadgroup" and not all("@" in name for name in ids):
-        pytest.exit("these versions of pytest and pytest-xdist do not keep groups of tests together", returncode=4)
+        pytest.exit(
+            "these versions of pytest and pytest-xdist do not keep groups of tests together",
+            returncode=4,
+        )
 
 
 def insertion_like(
-    n: int = 200, samples: int = 100, channels: int = 1, *, seed: int = 0, failures: float = 0.2, noise: float = 0.5
+    n: int = 200,
+    samples: int = 100,
+    channels: int = 1,
+    *,
+    seed: int = 0,
+    failures: float = 0.2,
+    noise: float = 0.5,
 ) -> Dataset:
     """n traces as `toy_traces` has them: a failure that met the rim early stays on a plateau (newtons)."""
     X, y = toy_traces(n, samples, channels, seed, failures, noise)
@@ -80,7 +112,9 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     written = export_sources(tmp_path_factory.mktemp("cell") / "sources")
     for file in (path for path in written.rglob("*") if path.is_file()):
         kept = sources / file.relative_to(written)
-        if not kept.exists() or kept.read_bytes() != file.read_bytes():  # what has not changed is not compiled again
+        if (
+            not kept.exists() or kept.read_bytes() != file.read_bytes()
+        ):  # what has not changed is not compiled again
             kept.parent.mkdir(parents=True, exist_ok=True)
             kept.write_bytes(file.read_bytes())
     prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
@@ -129,7 +163,10 @@ def stream() -> Dataset:
 
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
 NO_POSTGRES = "DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh"
-DATABASES = ["sqlite", pytest.param("postgres", marks=pytest.mark.skipif(not POSTGRES, reason=NO_POSTGRES))]
+DATABASES = [
+    "sqlite",
+    pytest.param("postgres", marks=pytest.mark.skipif(not POSTGRES, reason=NO_POSTGRES)),
+]
 
 
 def url_of(kind: str, directory: Path) -> str | None:

@@ -57,7 +57,9 @@ print(json.dumps({name: float(value) for name, value in seconds.items()}))
 
 def checked_out(revision: str, folder: Path) -> Path:
     """The revision's files, without touching this checkout."""
-    archive = subprocess.run(["git", "archive", revision, "dengine"], cwd=REPO, capture_output=True, check=True).stdout
+    archive = subprocess.run(
+        ["git", "archive", revision, "dengine"], cwd=REPO, capture_output=True, check=True
+    ).stdout
     subprocess.run(["tar", "-x", "-C", str(folder)], input=archive, check=True)
     return folder
 
@@ -67,7 +69,12 @@ def measured(root: Path, decisions: int, reports: int) -> dict[str, float]:
     code = MEASURED.replace("DECISIONS", str(decisions)).replace("REPORTS", str(reports))
     environment = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, cwd=root, capture_output=True, text=True, check=False
+        [sys.executable, "-c", code],
+        env=environment,
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
         raise SystemExit(f"The revision at {root} failed: {done.stderr[-2000:]}")
@@ -76,7 +83,9 @@ def measured(root: Path, decisions: int, reports: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("revision", help="what to compare with: a commit, a tag or a branch")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--decisions", type=int, default=5000)
@@ -86,7 +95,9 @@ def main() -> None:
         other = checked_out(args.revision, Path(folder))
         how = args.decisions, args.reports
         rounds = [(measured(REPO, *how), measured(other, *how)) for _ in range(args.rounds)]
-    print(f"{'milliseconds':<20} {'here':>9} {'worst':>9} {args.revision[:9]:>9} {'worst':>9} {'ratio':>7}")
+    print(
+        f"{'milliseconds':<20} {'here':>9} {'worst':>9} {args.revision[:9]:>9} {'worst':>9} {'ratio':>7}"
+    )
     for name in rounds[0][0]:
         here, there = ([1000 * sides[k][name] for sides in rounds] for k in (0, 1))
         ratio = statistics.median(a / b for a, b in zip(here, there, strict=True))

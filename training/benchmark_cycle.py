@@ -25,7 +25,9 @@ BUDGET = 0.45
 WARM_UP = 0.07  # share of the cycles beside a retrain that are not timed
 
 
-def measure(data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repeats: int) -> list[dict[str, Any]]:
+def measure(
+    data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repeats: int
+) -> list[dict[str, Any]]:
     """Every quantity, a row each."""
     # An engine that replays loads torch's optimiser before it begins; a cell has loaded it long before its first retrain.
     DataEngine(recipe=recipe, replaying=True)
@@ -38,24 +40,38 @@ def measure(data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repe
     print(f"{certain[0]} decisions were certain; without a clock {certain[1]}.")
     engine = filled_engine(data, recipe)
     found = {
-        f"retrain, all of {replays} replays": [each.seconds for one in played for each in one.retrains],
-        f"retrain on {len(data)} traces": [engine.retrain().seconds for _ in range(repeats)],  # as a long run's last
+        f"retrain, all of {replays} replays": [
+            each.seconds for one in played for each in one.retrains
+        ],
+        f"retrain on {len(data)} traces": [
+            engine.retrain().seconds for _ in range(repeats)
+        ],  # as a long run's last
     }
     engine = filled_engine(data, recipe)
     with frozen_objects(), uncollected():  # as `DataEngine.run` has it
         found["decide"] = [wall_time(engine.decide, trace)[0] for _ in range(3) for trace in data.X]
     spawned = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
     for name, executor in (("thread", ThreadPoolExecutor(1)), ("process", spawned)):
-        found[f"decide, retraining in a {name}"], found[f"decide and swap, {name}"] = beside(data, recipe, executor)
+        found[f"decide, retraining in a {name}"], found[f"decide and swap, {name}"] = beside(
+            data, recipe, executor
+        )
     if umap_repeats:
         X = as_traces(data.X).reshape(len(data), -1)
         make_reducer("umap-learn").fit(X[:200])  # compiles
         reducer = make_reducer("umap-learn")
-        found[f"umap-learn fit on {len(data)} traces"] = [wall_time(reducer.fit, X)[0] for _ in range(umap_repeats)]
+        found[f"umap-learn fit on {len(data)} traces"] = [
+            wall_time(reducer.fit, X)[0] for _ in range(umap_repeats)
+        ]
         reducer.transform(X[:1])
-        found["umap-learn single transform"] = [wall_time(reducer.transform, x[None])[0] for x in X[:200]]
+        found["umap-learn single transform"] = [
+            wall_time(reducer.transform, x[None])[0] for x in X[:200]
+        ]
     return [
-        {"what": name, **quantiles(seconds), "target_s": BUDGET if name.startswith("retrain") else None}
+        {
+            "what": name,
+            **quantiles(seconds),
+            "target_s": BUDGET if name.startswith("retrain") else None,
+        }
         for name, seconds in found.items()
     ]
 
@@ -69,7 +85,9 @@ def burn() -> None:
 @contextmanager
 def busy_cores() -> Iterator[None]:
     """Another process burns on each core until the block ends."""
-    burning = [get_context("spawn").Process(target=burn, daemon=True) for _ in range(os.cpu_count() or 1)]
+    burning = [
+        get_context("spawn").Process(target=burn, daemon=True) for _ in range(os.cpu_count() or 1)
+    ]
     for each in burning:
         each.start()
     try:
@@ -110,14 +128,24 @@ def beside(data: Dataset, recipe: Recipe, executor: Executor) -> tuple[list[floa
 def main() -> None:
     """Parse, measure, print, write."""
     parser = options(__doc__, data="insertion", samples=None, recipe="conv", out=Path("out"))
-    parser.add_argument("--replays", type=int, default=30, help="shuffled replays whose retrains are timed")
+    parser.add_argument(
+        "--replays", type=int, default=30, help="shuffled replays whose retrains are timed"
+    )
     parser.add_argument("--repeats", type=int, default=10, help="warm retrains on the whole set")
     parser.add_argument("--burn", action="store_true", help="beside a process that burns each core")
-    parser.add_argument("--umap-repeats", type=int, default=3, help="fits of umap-learn on the whole set")
+    parser.add_argument(
+        "--umap-repeats", type=int, default=3, help="fits of umap-learn on the whole set"
+    )
     args = parser.parse_args()
     recipe = Recipe.load(args.recipe).with_policy(**POLICY)
     with busy_cores() if args.burn else nullcontext():
-        rows = measure(load_dataset(args.data, args.samples), recipe, args.replays, args.repeats, args.umap_repeats)
+        rows = measure(
+            load_dataset(args.data, args.samples),
+            recipe,
+            args.replays,
+            args.repeats,
+            args.umap_repeats,
+        )
     print_table(rows, "A cycle's times", args.out / "benchmark_cycle.csv")
 
 

@@ -54,7 +54,9 @@ def random_traces(data: Dataset, n: int, rng: np.random.Generator) -> np.ndarray
     share = rng.random((n, 1, 1)).astype(np.float32)
     out = share * one + (1.0 - share) * two + rng.normal(0.0, 0.5, one.shape).astype(np.float32)
     wild = rng.random(n) < 0.3
-    noise = rng.normal(size=(int(wild.sum()), *X.shape[1:])) * 10.0 ** rng.uniform(-3, 6, (int(wild.sum()), 1, 1))
+    noise = rng.normal(size=(int(wild.sum()), *X.shape[1:])) * 10.0 ** rng.uniform(
+        -3, 6, (int(wild.sum()), 1, 1)
+    )
     out[wild] = noise.astype(np.float32)
     for value in (np.nan, np.inf, -np.inf):
         out[rng.random(n) < 0.025, 0, int(rng.integers(X.shape[2]))] = value
@@ -71,7 +73,10 @@ def told(decision: Any) -> list[Any]:
 def differing(found: list[Any], expected: list[Any]) -> int:
     """Decisions (action, reason, counts, bounds) that differ: the bounds by more than the tolerance."""
     pairs = zip(found, map(told, expected), strict=True)
-    return sum(a[:4] != b[:4] or np.abs(np.subtract(a[4:], b[4:])).max() > BOUND_TOLERANCE for a, b in pairs)
+    return sum(
+        a[:4] != b[:4] or np.abs(np.subtract(a[4:], b[4:])).max() > BOUND_TOLERANCE
+        for a, b in pairs
+    )
 
 
 def microseconds(decide: Callable[[Any], Any], X: np.ndarray, calls: int) -> np.ndarray:
@@ -81,7 +86,10 @@ def microseconds(decide: Callable[[Any], Any], X: np.ndarray, calls: int) -> np.
 
 def quantiles(name: str, taken: np.ndarray, targets: tuple[str, str] = ("", "")) -> list[Row]:
     """Median and 99th percentile."""
-    return [finding(f"{name}, p{p}", np.percentile(taken, p), "µs", t) for p, t in zip((50, 99), targets, strict=True)]
+    return [
+        finding(f"{name}, p{p}", np.percentile(taken, p), "µs", t)
+        for p, t in zip((50, 99), targets, strict=True)
+    ]
 
 
 def ask(cell: Path, file: Path, X: np.ndarray) -> tuple[list[list[Any]], np.ndarray]:
@@ -97,7 +105,10 @@ def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
     """Every row of the table."""
     data, rng = load_dataset(args.data), np.random.default_rng(1)
     engine = train(data, Recipe.load(args.reducer))
-    X, known = np.concatenate([as_traces(data.X), random_traces(data, args.random, rng)]), as_traces(data.X)
+    X, known = (
+        np.concatenate([as_traces(data.X), random_traces(data, args.random, rng)]),
+        as_traces(data.X),
+    )
     expected = [engine.decide(x) for x in track(X, description="engine")]
     file = export_torchscript(engine, folder / "model.ts")
     exported = load_exported(file)
@@ -107,17 +118,29 @@ def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
         finding("decisions compared", len(X), ""),
         finding("of them certain", sum(d.predicted is not Action.VERIFY for d in expected), ""),
         finding("of them audits", sum(d.audit for d in expected)),
-        finding("Python differs in", differing(list(map(told, exported.decide_many(X))), expected), "", "0"),
+        finding(
+            "Python differs in",
+            differing(list(map(told, exported.decide_many(X))), expected),
+            "",
+            "0",
+        ),
         finding("first call after loading", first, "µs", "<= 1 ms"),
-        *quantiles("Python", microseconds(exported.decide, known, args.calls), ("<= 150 µs", "<= 500 µs")),
+        *quantiles(
+            "Python", microseconds(exported.decide, known, args.calls), ("<= 150 µs", "<= 500 µs")
+        ),
     ]
     if args.cell is not None:
         wrong = differing(ask(args.cell, file, X)[0], expected)
         _, taken = ask(args.cell, file, known[np.arange(args.calls) % len(known)])
-        rows += [finding("C++ differs in", wrong, "", "0"), *quantiles("C++", taken, ("<= 120 µs", "<= 400 µs"))]
+        rows += [
+            finding("C++ differs in", wrong, "", "0"),
+            *quantiles("C++", taken, ("<= 120 µs", "<= 400 µs")),
+        ]
     if args.onnx:
         runtime = load_onnx(export_onnx(engine.model, folder / "model.onnx", trace=engine.trace))
-        model = load_exported(export_torchscript(engine.model, folder / "plain.ts", trace=engine.trace))
+        model = load_exported(
+            export_torchscript(engine.model, folder / "plain.ts", trace=engine.trace)
+        )
         new = X[len(known) :]  # a reference that is asked about itself has a vote in ONNX
         found = list(map(told, runtime.decide_many(new)))
         rows.append(finding("onnxruntime differs in", differing(found, model.decide_many(new))))
@@ -129,14 +152,28 @@ def main() -> None:
     """Parse, measure, print."""
     parser = options(__doc__, data="insertion", out=Path("out"))
     parser.add_argument("--reducer", default="conv", help="a recipe's name or TOML file")
-    parser.add_argument("--random", type=int, default=10_000, help="random traces compared beside the data set's own")
+    parser.add_argument(
+        "--random",
+        type=int,
+        default=10_000,
+        help="random traces compared beside the data set's own",
+    )
     parser.add_argument("--calls", type=int, default=5000, help="calls timed")
-    parser.add_argument("--cell", type=Path, help="the built C++ program; without it C++ is left out")
-    parser.add_argument("--no-onnx", dest="onnx", action="store_false", help="leave onnxruntime out")
+    parser.add_argument(
+        "--cell", type=Path, help="the built C++ program; without it C++ is left out"
+    )
+    parser.add_argument(
+        "--no-onnx", dest="onnx", action="store_false", help="leave onnxruntime out"
+    )
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         rows = measure(args, Path(folder))
-    print_table(rows, f"Exported decision: {args.reducer} on {args.data}", args.out / "benchmark_export.csv", width=100)
+    print_table(
+        rows,
+        f"Exported decision: {args.reducer} on {args.data}",
+        args.out / "benchmark_export.csv",
+        width=100,
+    )
     sys.exit(any(row["target"] == "0" and row["value"] > 0 for row in rows))
 
 

@@ -95,15 +95,23 @@ def read_mark(x: np.ndarray) -> tuple[int, int]:
 
 def grown(plan: Plan, cell: int, begin: float, cycles: int) -> dict[str, Any]:
     """What a cell's process holds in memory at present (Linux), and its files."""
-    memory = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    memory = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf(
+        "SC_PAGE_SIZE"
+    )
     url = sa.make_url(plan.url if "://" in plan.url else f"sqlite:///{plan.url}")
     journal = journal_path(url, f"cell-{cell}-{plan.tag}")
     named = {"memory": memory} | {
         name: file.stat().st_size if file.is_file() else 0
-        for name, file in (("file", Path(plan.url)), ("log", Path(f"{plan.url}-wal")), ("journal", journal))
+        for name, file in (
+            ("file", Path(plan.url)),
+            ("log", Path(f"{plan.url}-wal")),
+            ("journal", journal),
+        )
     }
     took = time.perf_counter() - begin
-    return {"time_s": took, "cycles": cycles} | {f"{name}_bytes": size for name, size in named.items()}
+    return {"time_s": took, "cycles": cycles} | {
+        f"{name}_bytes": size for name, size in named.items()
+    }
 
 
 def told(engine: DataEngine, decision_id: str, good: bool) -> RetrainReport | None:
@@ -120,12 +128,19 @@ def work(plan: Plan, data: Dataset, cell: int) -> Worked:
     marks : of `grown`.
     """
     marks: list[dict[str, Any]] = []
-    rng, sent, seconds, certain = np.random.default_rng(cell), {}, defaultdict[str, list[float]](list), 0
+    rng, sent, seconds, certain = (
+        np.random.default_rng(cell),
+        {},
+        defaultdict[str, list[float]](list),
+        0,
+    )
     with DataEngine.open_or_create(plan.store(cell), recipe=plan.recipe) as engine:
         READY.wait()
         begin = time.perf_counter()
         for cycle in count():
-            done = cycle / plan.cycles if plan.cycles else (time.perf_counter() - begin) / plan.seconds
+            done = (
+                cycle / plan.cycles if plan.cycles else (time.perf_counter() - begin) / plan.seconds
+            )
             if done >= (len(marks) + 1) / MARKS:
                 marks.append(grown(plan, cell, begin, cycle))
                 if len(marks) == MARKS:
@@ -138,7 +153,9 @@ def work(plan: Plan, data: Dataset, cell: int) -> Worked:
                 took, retrain = wall_time(told, engine, decision.id, bool(y[0]))
                 seconds["report" if retrain is None else "report that retrains"].append(took)
                 sent[decision.id] = cycle, bool(y[0])
-            seconds["settle, with news of peers"].append(wall_time(core_of(engine).process_retrains)[0])
+            seconds["settle, with news of peers"].append(
+                wall_time(core_of(engine).process_retrains)[0]
+            )
             time.sleep(plan.pause)
         until = time.monotonic() + BACK
         engine.flush()
@@ -158,8 +175,15 @@ def break_server(url: str, seconds: float) -> None:
         folder = Path(connection.execute(sa.text("SHOW data_directory")).scalar_one())
     engine.dispose()
     pid = folder / "postmaster.pid"
-    first, command = pid.read_text().split()[0], shlex.split((folder / "postmaster.opts").read_text())
-    steps = ((seconds / 4, signal.SIGSTOP), (FROZEN, signal.SIGCONT), (seconds / 4 - FROZEN, signal.SIGKILL))
+    first, command = (
+        pid.read_text().split()[0],
+        shlex.split((folder / "postmaster.opts").read_text()),
+    )
+    steps = (
+        (seconds / 4, signal.SIGSTOP),
+        (FROZEN, signal.SIGCONT),
+        (seconds / 4 - FROZEN, signal.SIGKILL),
+    )
     for pause, number in steps:
         time.sleep(pause)
         processes = [first, *Path(f"/proc/{first}/task/{first}/children").read_text().split()]
@@ -169,7 +193,9 @@ def break_server(url: str, seconds: float) -> None:
     time.sleep(DOWN)
     pid.unlink(missing_ok=True)
     owner = ["runuser", "-u", folder.owner(), "--"] if os.getuid() != folder.stat().st_uid else []
-    subprocess.Popen([*owner, *command], cwd=folder.parent, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    subprocess.Popen(
+        [*owner, *command], cwd=folder.parent, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     print("started again", flush=True)
 
 
@@ -202,13 +228,18 @@ def check(plan: Plan, worked: Worked) -> dict[str, Any]:
 
 def show(plan: Plan, worked: list[Worked], out: Path) -> bool:
     """Tables on the screen and as CSV; whether nothing was lost, wrong or mixed."""
-    kind, taken = "PostgreSQL" if plan.url.startswith("postgres") else "SQLite", defaultdict[str, list[float]](list)
+    kind, taken = (
+        "PostgreSQL" if plan.url.startswith("postgres") else "SQLite",
+        defaultdict[str, list[float]](list),
+    )
     for each in worked:
         for name, seconds in each["seconds"].items():
             taken[name] += seconds
     rows = [{"call": name, **quantiles(seconds)} for name, seconds in taken.items()]
     took = max(each["marks"][-1]["time_s"] for each in worked)
-    print_table(rows, f"{plan.cells} cells on one {kind}, {took:.0f} s", out / "benchmark_fleet.csv")
+    print_table(
+        rows, f"{plan.cells} cells on one {kind}, {took:.0f} s", out / "benchmark_fleet.csv"
+    )
     print_table(worked[0]["marks"], "How the first cell grows", out / "benchmark_fleet_growth.csv")
     counted = pd.DataFrame([check(plan, each) for each in worked])
     write_csv(counted, out / "benchmark_fleet_cells.csv", force=True)
@@ -223,14 +254,33 @@ def show(plan: Plan, worked: list[Worked], out: Path) -> bool:
 def main() -> None:
     """Parse, run, check, show."""
     parser = options(__doc__, data="insertion", samples=None, recipe="pca", out=Path("out"))
-    parser.add_argument("--cells", type=int, default=16, help="processes, each with an engine of its own")
-    parser.add_argument("--minutes", type=float, default=5.0, help="of running, once all engines are open")
-    parser.add_argument("--cycles", type=int, default=0, help="so many of each cell, in the place of minutes")
-    parser.add_argument("--faults", action="store_true", help="freeze the PostgreSQL server, and kill it")
-    parser.add_argument("--store", help="a PostgreSQL or SQLite URL, or a file; a temporary SQLite file by default")
-    parser.add_argument("--products", type=int, default=2, help="so many among the cells; 0: no cell shares anything")
-    parser.add_argument("--window", type=int, default=10_000, help="labels that a cell holds in memory")
-    parser.add_argument("--pause", type=float, default=0.0, help="seconds between two cycles of a cell")
+    parser.add_argument(
+        "--cells", type=int, default=16, help="processes, each with an engine of its own"
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=5.0, help="of running, once all engines are open"
+    )
+    parser.add_argument(
+        "--cycles", type=int, default=0, help="so many of each cell, in the place of minutes"
+    )
+    parser.add_argument(
+        "--faults", action="store_true", help="freeze the PostgreSQL server, and kill it"
+    )
+    parser.add_argument(
+        "--store", help="a PostgreSQL or SQLite URL, or a file; a temporary SQLite file by default"
+    )
+    parser.add_argument(
+        "--products",
+        type=int,
+        default=2,
+        help="so many among the cells; 0: no cell shares anything",
+    )
+    parser.add_argument(
+        "--window", type=int, default=10_000, help="labels that a cell holds in memory"
+    )
+    parser.add_argument(
+        "--pause", type=float, default=0.0, help="seconds between two cycles of a cell"
+    )
     args = parser.parse_args()
     recipe = replace(Recipe.load(args.recipe).with_policy(**POLICY), window=args.window)
     data = load_dataset(args.data, args.samples)

@@ -33,15 +33,23 @@ def fill(engine: DataEngine, data: Dataset, n: int) -> None:
         for i, (x, good, hash_) in enumerate(zip(X, y, content_hash(X), strict=True), start):
             trace = np.array(x, np.float32, ndmin=2)
             records.append(StoredDecision(_verified(f"import-{i}"), trace, hash_, False, 0.0))
-            records.append(NewLabel(f"import-{i}", bool(good), Source.VERIFICATION, 0, None, content_hash=hash_))
+            records.append(
+                NewLabel(
+                    f"import-{i}", bool(good), Source.VERIFICATION, 0, None, content_hash=hash_
+                )
+            )
         engine.store.apply_records(records)
 
 
 def _verified(name: str) -> Decision:
-    return Decision(name, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0)
+    return Decision(
+        name, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0
+    )
 
 
-def measure_store(data: Dataset, recipe: Recipe, n: int, repeats: int, folder: Path) -> dict[str, Any]:
+def measure_store(
+    data: Dataset, recipe: Recipe, n: int, repeats: int, folder: Path
+) -> dict[str, Any]:
     """Times of one store of n labelled traces, in seconds."""
     path = folder / f"{n}.db"
     with DataEngine(recipe=recipe, store=path) as engine:
@@ -56,19 +64,35 @@ def measure_store(data: Dataset, recipe: Recipe, n: int, repeats: int, folder: P
             report.append(wall_time(engine.report, decision.id, True)[0])
     engine.close()
     took = {"opening": opened, "retrain_p50": np.median(retrains), "retrain_max": np.max(retrains)}
-    took |= {"decide_p50": np.median(decide), "decide_p99": np.quantile(decide, 0.99), "report_p50": np.nanmedian(report)}
-    return {"traces": n, "store_bytes": path.stat().st_size} | {f"{name}_s": seconds for name, seconds in took.items()}
+    took |= {
+        "decide_p50": np.median(decide),
+        "decide_p99": np.quantile(decide, 0.99),
+        "report_p50": np.nanmedian(report),
+    }
+    return {"traces": n, "store_bytes": path.stat().st_size} | {
+        f"{name}_s": seconds for name, seconds in took.items()
+    }
 
 
 def main() -> None:
     """Parse, measure, print, write."""
-    parser = options(__doc__, data="insertion", samples=None, recipe="conv", folder=None, out=Path("out"))
-    parser.add_argument("--sizes", default="1503,10000,100000,1000000", help="labelled traces in a store; 4 kB each")
+    parser = options(
+        __doc__, data="insertion", samples=None, recipe="conv", folder=None, out=Path("out")
+    )
+    parser.add_argument(
+        "--sizes", default="1503,10000,100000,1000000", help="labelled traces in a store; 4 kB each"
+    )
     parser.add_argument("--repeats", type=int, default=5, help="retrains at each size")
     args = parser.parse_args()
-    data, recipe = load_dataset(args.data, args.samples), Recipe.load(args.recipe).with_policy(**POLICY)
+    data, recipe = (
+        load_dataset(args.data, args.samples),
+        Recipe.load(args.recipe).with_policy(**POLICY),
+    )
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:
-        stores = [measure_store(data, recipe, int(n), args.repeats, Path(folder)) for n in args.sizes.split(",")]
+        stores = [
+            measure_store(data, recipe, int(n), args.repeats, Path(folder))
+            for n in args.sizes.split(",")
+        ]
     print_table(stores, "Times against store size", args.out / "benchmark_scale.csv")
 
 

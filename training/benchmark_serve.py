@@ -39,8 +39,22 @@ class Server:
 
     def __init__(self, folder: Path, *words: str) -> None:
         """Start it, and return once it listens."""
-        command = [sys.executable, "-m", "dengine", "serve", "--store", "cell.db", "--port", "0", "--rate", "0", *words]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))}
+        command = [
+            sys.executable,
+            "-m",
+            "dengine",
+            "serve",
+            "--store",
+            "cell.db",
+            "--port",
+            "0",
+            "--rate",
+            "0",
+            *words,
+        ]
+        environment = os.environ | {
+            "PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))
+        }
         log = folder / "server.log"
         with log.open("a", encoding="utf-8") as errors:
             pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": errors, "text": True}
@@ -64,11 +78,19 @@ class Connection:
     def __init__(self, port: int) -> None:
         self._http = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
 
-    def decide(self, trace: np.ndarray, request: str | None = None, form: str = RAW) -> dict[str, Any]:
+    def decide(
+        self, trace: np.ndarray, request: str | None = None, form: str = RAW
+    ) -> dict[str, Any]:
         """Ask for a decision on a trace (T,)."""
         if form == JSON:
-            return self.ask("/decide", json.dumps({"trace": trace.tolist(), "request": request}), JSON)
-        return self.ask(f"/decide?request={request}" if request else "/decide", trace.astype("<f4").tobytes(), RAW)
+            return self.ask(
+                "/decide", json.dumps({"trace": trace.tolist(), "request": request}), JSON
+            )
+        return self.ask(
+            f"/decide?request={request}" if request else "/decide",
+            trace.astype("<f4").tobytes(),
+            RAW,
+        )
 
     def report(self, decision_id: str, success: bool) -> dict[str, Any]:
         """Report a label."""
@@ -84,7 +106,9 @@ class Connection:
         return said
 
 
-def drive(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, name: str, pace: float) -> Timed:
+def drive(
+    data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, name: str, pace: float
+) -> Timed:
     """Seconds of each decision by each way of asking, taken in turn; of each report; and versions that answered."""
     seconds: dict[str, list[float]] = {way: [] for way in asks}
     rng, order = np.random.default_rng(0), np.random.default_rng(0).permutation(len(data))
@@ -101,7 +125,14 @@ def drive(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, name: str, 
     return seconds, told, len(versions) - 1
 
 
-def timed(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, trained: Callable[[], bool], pace: float) -> Timed:
+def timed(
+    data: Dataset,
+    n: int,
+    asks: dict[str, Ask],
+    told_by: Any,
+    trained: Callable[[], bool],
+    pace: float,
+) -> Timed:
     """`drive` once the first version answers."""
     drive(data, 100, {"warm": next(iter(asks.values()))}, told_by, "warm", pace)
     until = time.monotonic() + PATIENCE
@@ -112,7 +143,9 @@ def timed(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, trained: Ca
     return drive(data, n, asks, told_by, "timed", pace)
 
 
-def over_the_network(data: Dataset, n: int, recipe: Path, folder: Path, pace: float, only: str) -> dict[str, list[float]]:
+def over_the_network(
+    data: Dataset, n: int, recipe: Path, folder: Path, pace: float, only: str
+) -> dict[str, list[float]]:
     """HTTP in its forms, and XML-RPC.  only : those whose name begins so."""
     server = Server(folder, "--recipe", str(recipe))
     try:
@@ -121,17 +154,25 @@ def over_the_network(data: Dataset, n: int, recipe: Path, folder: Path, pace: fl
 
         def call(trace: Any, id_: str) -> dict[str, Any]:
             answer: Any = rpc.decide(trace, id_)
-            return {"id": answer["id"], "action": ACTIONS[answer["action"]].value, "model_version": answer["version"]}
+            return {
+                "id": answer["id"],
+                "action": ACTIONS[answer["action"]].value,
+                "model_version": answer["version"],
+            }
 
         asks: dict[str, Ask] = {
             "HTTP, float32, request id": web.decide,
             "HTTP, float32": lambda x, id_: web.decide(x),
             "HTTP, JSON, request id": lambda x, id_: web.decide(x, id_, JSON),
             "XML-RPC, doubles, request id": lambda x, id_: call(x.tolist(), id_),
-            "XML-RPC, base64, request id": lambda x, id_: call(xmlrpc.client.Binary(x.astype("<f4").tobytes()), id_),
+            "XML-RPC, base64, request id": lambda x, id_: call(
+                xmlrpc.client.Binary(x.astype("<f4").tobytes()), id_
+            ),
         }
         asks = {way: ask for way, ask in asks.items() if way.startswith(only)}
-        seconds, told, swaps = timed(data, n, asks, web.report, lambda: web.ask("/status")["version"] > 0, pace)
+        seconds, told, swaps = timed(
+            data, n, asks, web.report, lambda: web.ask("/status")["version"] > 0, pace
+        )
     finally:
         server.end()
     print(f"{swaps} versions swapped in meanwhile", file=sys.stderr)
@@ -159,7 +200,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=args.folder) as name:
         folder, recipe = Path(name), Path(name) / "recipe.toml"
         data = load_dataset(args.data, args.samples)
-        recipe.write_text(Recipe.load(args.recipe).with_policy(**POLICY).to_toml(), encoding="utf-8")
+        recipe.write_text(
+            Recipe.load(args.recipe).with_policy(**POLICY).to_toml(), encoding="utf-8"
+        )
         found = {"fdatasync of 4 kB": syncs(folder)}
         found |= over_the_network(data, args.n, recipe, folder, args.pace, args.only)
         rows = [{"what": way, **quantiles(seconds)} for way, seconds in found.items()]

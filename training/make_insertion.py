@@ -36,7 +36,9 @@ CONTACT_N = 3.0
 COLOURS = {1: "tab:blue", 0: "tab:red"}
 
 
-def first_of_each(insertions: Iterable[SimulatedInsertion], successes: int, failures: int) -> list[SimulatedInsertion]:
+def first_of_each(
+    insertions: Iterable[SimulatedInsertion], successes: int, failures: int
+) -> list[SimulatedInsertion]:
     """So many insertions of each label, the first ones, in their order; ValueError where there are fewer."""
     wanted, kept = {True: successes, False: failures}, []
     for each in insertions:
@@ -44,7 +46,9 @@ def first_of_each(insertions: Iterable[SimulatedInsertion], successes: int, fail
             wanted[each.success] -= 1
             kept.append(each)
     if any(wanted.values()):
-        raise ValueError(f"Expected {wanted[True]} successes and {wanted[False]} failures more; simulate more cycles.")
+        raise ValueError(
+            f"Expected {wanted[True]} successes and {wanted[False]} failures more; simulate more cycles."
+        )
     return kept
 
 
@@ -52,7 +56,9 @@ def draw_causes(data: Dataset, path: Path) -> None:
     """Thirty traces of each cause, in panels of one scale."""
     figure = Figure(figsize=(13, 5.5), layout="constrained")
     time_s = np.arange(data.X.shape[1]) / data.spec.rate_hz
-    for axes, cause in zip(figure.subplots(2, 4, sharex=True, sharey=True).flat, CAUSES, strict=True):
+    for axes, cause in zip(
+        figure.subplots(2, 4, sharex=True, sharey=True).flat, CAUSES, strict=True
+    ):
         rows = np.flatnonzero(data.cause == cause)
         axes.plot(time_s, data.X[rows[:SHOWN]].T, linewidth=0.5, alpha=0.7)
         axes.set_title(f"{said(cause)} ({len(rows)} of {len(data)})", fontsize=10)
@@ -61,17 +67,32 @@ def draw_causes(data: Dataset, path: Path) -> None:
     figure.savefig(path, dpi=70)
 
 
-def draw_heights(data: Dataset, heights_mm: NDArray[np.float32], wrong: NDArray[np.bool_], path: Path) -> None:
+def draw_heights(
+    data: Dataset, heights_mm: NDArray[np.float32], wrong: NDArray[np.bool_], path: Path
+) -> None:
     """Final heights about the tolerance, and those of the parts that a forest gets wrong."""
-    figure, tolerance = Figure(figsize=(10, 3.2), layout="constrained"), CellParameters().height_tolerance_mm
-    titles = {"all simulated parts": wrong | True, f"the {wrong.sum()} that a random forest gets wrong": wrong}
+    figure, tolerance = (
+        Figure(figsize=(10, 3.2), layout="constrained"),
+        CellParameters().height_tolerance_mm,
+    )
+    titles = {
+        "all simulated parts": wrong | True,
+        f"the {wrong.sum()} that a random forest gets wrong": wrong,
+    }
     for axes, (title, chosen) in zip(figure.subplots(1, 2), titles.items(), strict=True):
         for label, colour in COLOURS.items():
-            axes.hist(heights_mm[chosen & (data.y == label)], np.linspace(-1, 3, 41), color=colour, alpha=0.7)
+            axes.hist(
+                heights_mm[chosen & (data.y == label)],
+                np.linspace(-1, 3, 41),
+                color=colour,
+                alpha=0.7,
+            )
         for edge in (tolerance, -tolerance):
             axes.axvline(edge, color="black", linestyle=":")
         axes.set_title(title, fontsize=10)
-        axes.set_xlabel("final height in mm (blue: success, red: failure; dotted: tolerance)", fontsize=8)
+        axes.set_xlabel(
+            "final height in mm (blue: success, red: failure; dotted: tolerance)", fontsize=8
+        )
     figure.savefig(path, dpi=70)
 
 
@@ -89,13 +110,18 @@ def draw_scenarios(path: Path, n: int = 160, seed: int = 1, n_jobs: int = -1) ->
 
 def draw_scenario(axes: Any, insertions: list[SimulatedInsertion], scenario: str) -> None:
     """One scenario: first quarter dotted, last quarter solid, successes blue, failures red."""
-    X, y = np.stack([each.trace for each in insertions]), np.array([each.success for each in insertions])
+    X, y = (
+        np.stack([each.trace for each in insertions]),
+        np.array([each.success for each in insertions]),
+    )
     n, time_s, cycle = len(y), np.arange(X.shape[1]) / RATE_HZ, np.arange(len(y))
     quarters = {"first quarter": (cycle < n // 4, ":"), "last quarter": (cycle >= n - n // 4, "-")}
     for when, (inside, style) in quarters.items():
         for label, name in ((1, "success"), (0, "failure")):
             low, middle, high = np.quantile(X[inside & (y == label)], (0.25, 0.5, 0.75), axis=0)
-            axes.plot(time_s, middle, style, color=COLOURS[label], linewidth=1, label=f"{name}, {when}")
+            axes.plot(
+                time_s, middle, style, color=COLOURS[label], linewidth=1, label=f"{name}, {when}"
+            )
             axes.fill_between(time_s, low, high, color=COLOURS[label], alpha=0.12, linewidth=0)
     first, last = (100 * y[inside].mean() for inside, _ in quarters.values())
     axes.set_title(f"{scenario}: success {first:.0f} % → {last:.0f} %", fontsize=10)
@@ -115,8 +141,12 @@ def table(heads: str, rows: Iterable[tuple[object, ...]]) -> str:
 
 def parameter_table() -> str:
     """Every setting of the nominal cell, as it was used."""
-    values = {f"`{field.name}`": getattr(CellParameters(), field.name) for field in fields(CellParameters)}
-    written = {k: f"{v[0]:g} to {v[1]:g}" if isinstance(v, tuple) else f"{v:g}" for k, v in values.items()}
+    values = {
+        f"`{field.name}`": getattr(CellParameters(), field.name) for field in fields(CellParameters)
+    }
+    written = {
+        k: f"{v[0]:g} to {v[1]:g}" if isinstance(v, tuple) else f"{v:g}" for k, v in values.items()
+    }
     return table("parameter, value", written.items())
 
 
@@ -127,14 +157,18 @@ def forest(seed: int = 0) -> RandomForestClassifier:
 
 def predicted(X: NDArray[Any], y: NDArray[np.int8], model: Any, seed: int = 0) -> NDArray[Any]:
     """Every label (n,), predicted by a model that was fitted on the other four of five folds."""
-    return np.asarray(cross_val_predict(model, X, y, cv=StratifiedKFold(5, shuffle=True, random_state=seed)))
+    return np.asarray(
+        cross_val_predict(model, X, y, cv=StratifiedKFold(5, shuffle=True, random_state=seed))
+    )
 
 
 def hardness(data: Dataset, repeats: int = 3) -> str:
     """Accuracy of 1-NN and of a random forest on the raw traces: mean and standard deviation over shuffled folds."""
     rows = []
     for name, model in {"1-NN": KNeighborsClassifier(1), "random forest": forest()}.items():
-        scores = [np.mean(predicted(data.X, data.y, model, seed) == data.y) for seed in range(repeats)]
+        scores = [
+            np.mean(predicted(data.X, data.y, model, seed) == data.y) for seed in range(repeats)
+        ]
         rows.append((name, f"{np.mean(scores):.3f} ± {np.std(scores):.3f}"))
     return table("model on raw traces, accuracy", rows)
 
@@ -148,7 +182,10 @@ def ambiguity(heights_mm: NDArray[np.float32], wrong: NDArray[np.bool_]) -> str:
         "further off": seated > NEAR_MM,
         "seated": seated <= tolerance,
     }
-    rows = [(name, inside.sum(), f"{100 * wrong[inside].mean():.1f} %") for name, inside in zones.items()]
+    rows = [
+        (name, inside.sum(), f"{100 * wrong[inside].mean():.1f} %")
+        for name, inside in zones.items()
+    ]
     return table("final height, parts, the forest errs on", rows)
 
 
@@ -172,22 +209,36 @@ def shortcuts(data: Dataset) -> str:
     X, y, before = data.X, data.y, data.X[:, :BEFORE_CONTACT]
     features = {
         "offset before contact (mean)": before.mean(axis=1, keepdims=True),
-        "noise before contact (standard deviation of differences)": np.diff(before).std(axis=1, keepdims=True),
+        "noise before contact (standard deviation of differences)": np.diff(before).std(
+            axis=1, keepdims=True
+        ),
         "drift before contact (slope)": np.polyfit(np.arange(BEFORE_CONTACT), before.T, 1)[:1].T,
         "held samples before contact (count, longest run)": held_samples(before),
         f"all {BEFORE_CONTACT} samples before contact": before,
         "time of first contact": first_contact(X)[:, None],
         "final force (mean of the last 0.2 s)": X[:, -100:].mean(axis=1, keepdims=True),
     }
-    rows = [(name, f"{np.mean(predicted(seen, y, forest()) == y):.3f}") for name, seen in features.items()]
+    rows = [
+        (name, f"{np.mean(predicted(seen, y, forest()) == y):.3f}")
+        for name, seen in features.items()
+    ]
     majority = max(np.mean(y), 1 - np.mean(y))
-    return table("what the forest sees, accuracy", [("nothing: the majority", f"{majority:.3f}"), *rows])
+    return table(
+        "what the forest sees, accuracy", [("nothing: the majority", f"{majority:.3f}"), *rows]
+    )
 
 
 def halved_step(n: int, seed: int, n_jobs: int) -> str:
     """What becomes of the same cycles at half the time step."""
-    whole, half = simulate(n, seed, n_jobs=n_jobs), simulate(n, seed, n_jobs=n_jobs, time_step_s=TIME_STEP_S / 2)
-    flipped = [(a.height_mm, b.height_mm) for a, b in zip(whole, half, strict=True) if a.success != b.success]
+    whole, half = (
+        simulate(n, seed, n_jobs=n_jobs),
+        simulate(n, seed, n_jobs=n_jobs, time_step_s=TIME_STEP_S / 2),
+    )
+    flipped = [
+        (a.height_mm, b.height_mm)
+        for a, b in zip(whole, half, strict=True)
+        if a.success != b.success
+    ]
     moved = ", ".join(f"{a:.2f} to {b:.2f} mm" for a, b in flipped)
     apart = [abs(a.height_mm - b.height_mm) for a, b in zip(whole, half, strict=True)]
     median, most, largest = np.quantile(apart, (0.5, 0.95, 1.0))
@@ -216,8 +267,16 @@ def write_card(out: Path, steps: int, jobs: int) -> str:
     draw_heights(data, heights_mm, wrong, out / "insertion_heights.png")
     draw_scenarios(out / "insertion_scenarios.png", n_jobs=jobs)
     text = CARD.read_text(encoding="utf-8")
-    causes = table("cause, traces", [(said(cause), np.sum(data.cause == cause)) for cause in CAUSES])
-    for measured in (causes, hardness(data), ambiguity(heights_mm, wrong), shortcuts(data), parameter_table()):
+    causes = table(
+        "cause, traces", [(said(cause), np.sum(data.cause == cause)) for cause in CAUSES]
+    )
+    for measured in (
+        causes,
+        hardness(data),
+        ambiguity(heights_mm, wrong),
+        shortcuts(data),
+        parameter_table(),
+    ):
         text = with_table(text, measured)
     text = re.sub(r"MuJoCo \d[\d.]*", f"MuJoCo {mujoco.__version__}", text)
     text = re.sub(r"At 0\.25 ms, .*", f"At 0.25 ms, {halved_step(steps, SEED, jobs)}.", text)
@@ -227,17 +286,30 @@ def write_card(out: Path, steps: int, jobs: int) -> str:
 
 def main() -> None:
     """Write insertion.npz, insertion.md and the card's pictures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=Path("dengine/data"), help="folder to write to")
-    parser.add_argument("--steps", type=int, default=200, help="insertions to repeat at half the time step")
+    parser.add_argument(
+        "--steps", type=int, default=200, help="insertions to repeat at half the time step"
+    )
     parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: one a core")
-    parser.add_argument("--card-only", action="store_true", help="keep the traces that are there; measure and draw anew")
+    parser.add_argument(
+        "--card-only",
+        action="store_true",
+        help="keep the traces that are there; measure and draw anew",
+    )
     args = parser.parse_args()
     if not args.card_only:
         start = time.perf_counter()
         insertions = simulate(CYCLES, SEED, n_jobs=args.jobs)
         print(f"{time.perf_counter() - start:.0f} s for {CYCLES} cycles")
-        save_insertions(args.out / "insertion.npz", first_of_each(insertions, SUCCESSES, FAILURES), SEED, force=True)
+        save_insertions(
+            args.out / "insertion.npz",
+            first_of_each(insertions, SUCCESSES, FAILURES),
+            SEED,
+            force=True,
+        )
     print(write_card(args.out, args.steps, args.jobs))
 
 

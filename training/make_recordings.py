@@ -58,19 +58,29 @@ def broken(values: NDArray[np.float64], start_s: float, rate_hz: float, kind: in
     return ("", text[: text.rindex(",") - 10], text.replace("FZ_Base", "FZ"))[kind % 3]
 
 
-def write_recordings(folder: Path, n: int = 200, n_broken: int = 3, seed: int = 0, rate_hz: float = 500.0) -> list[str]:
+def write_recordings(
+    folder: Path, n: int = 200, n_broken: int = 3, seed: int = 0, rate_hz: float = 500.0
+) -> list[str]:
     """Write n files of which some are broken; returns the names of these."""
     rng, data = np.random.default_rng(seed), load_dataset("insertion")
     if not 0 <= n_broken <= n <= len(data):
-        raise SystemExit(f"Expected 0 <= --broken <= --n <= {len(data)}, got --broken {n_broken} and --n {n}.")
+        raise SystemExit(
+            f"Expected 0 <= --broken <= --n <= {len(data)}, got --broken {n_broken} and --n {n}."
+        )
     folder.mkdir(parents=True, exist_ok=True)
     rows = rng.permutation(len(data))[:n]
-    kinds = dict(zip(sorted(rng.choice(n, n_broken, replace=False).tolist()), range(n_broken), strict=True))
+    kinds = dict(
+        zip(sorted(rng.choice(n, n_broken, replace=False).tolist()), range(n_broken), strict=True)
+    )
     names = []
     for i, row in enumerate(rows):
         name = f"insertion_{i + 1:04d}_{bool(data.y[row])}.csv"
         values, start_s = record(data.X[row], rng), 1000.0 + 12.0 * i
-        text = broken(values, start_s, rate_hz, kinds[i]) if i in kinds else as_csv(values, start_s, rate_hz)
+        text = (
+            broken(values, start_s, rate_hz, kinds[i])
+            if i in kinds
+            else as_csv(values, start_s, rate_hz)
+        )
         (folder / name).write_text(text, encoding="utf-8")
         names += [name] if i in kinds else []
     return names
@@ -84,17 +94,32 @@ def write_plants(folder: Path, n: int = 120, seed: int = 0) -> None:
     FX, time = rng.normal(0.0, 0.4, FZ.shape), np.arange(FZ.shape[1]) / 100.0
     for name in ("latin", "historian", "wide", "bag", "lab"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    german, names = {"sep": ";", "decimal": ",", "encoding": "latin-1", "index": False}, [f"P{i + 1:04d}" for i in range(n)]
+    german, names = (
+        {"sep": ";", "decimal": ",", "encoding": "latin-1", "index": False},
+        [f"P{i + 1:04d}" for i in range(n)],
+    )
     for name, force in zip(names, FZ, strict=True):
-        pd.DataFrame({"Zeit": time, "Stößelkraft": force}).to_csv(folder / "latin" / f"{name}.csv", **german)
+        pd.DataFrame({"Zeit": time, "Stößelkraft": force}).to_csv(
+            folder / "latin" / f"{name}.csv", **german
+        )
     told = pd.DataFrame({"Datei": names, "Ergebnis": np.where(good, "i.O.", "n.i.O.")})
     told.to_csv(folder / "latin" / "Prüfung.csv", **german)
-    clock = pd.Timestamp("2026-03-02 06:00:00") + pd.to_timedelta((12.0 * np.arange(n)[:, None] + time).ravel(), unit="s")
-    long = {"timestamp": clock, "serial": np.repeat(np.arange(n) + 40001, len(time)), "force_z": FZ.ravel()}
+    clock = pd.Timestamp("2026-03-02 06:00:00") + pd.to_timedelta(
+        (12.0 * np.arange(n)[:, None] + time).ravel(), unit="s"
+    )
+    long = {
+        "timestamp": clock,
+        "serial": np.repeat(np.arange(n) + 40001, len(time)),
+        "force_z": FZ.ravel(),
+    }
     long["verdict"] = np.repeat(np.where(good, "OK", "NOK"), len(time))
     pd.DataFrame(long).to_parquet(folder / "historian" / "export.parquet")
-    wide = {f"{name}_{i}": X[:, i] for name, X in (("FX", FX), ("FZ", FZ)) for i in range(len(time))}
-    pd.DataFrame(wide).assign(result=np.where(good, "pass", "fail")).to_csv(folder / "wide" / "shift.csv", index=False)
+    wide = {
+        f"{name}_{i}": X[:, i] for name, X in (("FX", FX), ("FZ", FZ)) for i in range(len(time))
+    }
+    pd.DataFrame(wide).assign(result=np.where(good, "pass", "fail")).to_csv(
+        folder / "wide" / "shift.csv", index=False
+    )
     np.savez(folder / "lab" / "runs.npz", force=FZ, torque=FX, accepted=good)
     write_messages(folder / "bag" / "cell.mcap", messages_of(FZ, good))
 
@@ -107,19 +132,34 @@ KINDS = {
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
 }
 SAID = [f"{'=' * 80}\nMSG: {kind}\n{text}" for kind, text in KINDS.items()]
-STAMPED, BARE = "".join(["std_msgs/Header header\ngeometry_msgs/Wrench wrench\n", *SAID]), VECTORS + SAID[-1]
-TOPICS = {"/phase": ("std_msgs/msg/Int32", "int32 data"), "/height_check/ok": ("std_msgs/msg/Bool", "bool data")}
+STAMPED, BARE = (
+    "".join(["std_msgs/Header header\ngeometry_msgs/Wrench wrench\n", *SAID]),
+    VECTORS + SAID[-1],
+)
+TOPICS = {
+    "/phase": ("std_msgs/msg/Int32", "int32 data"),
+    "/height_check/ok": ("std_msgs/msg/Bool", "bool data"),
+}
 Message = tuple[int, str, dict[str, Any]]  # nanoseconds, topic, content
 
 
-def write_messages(path: Path, messages: Iterable[Message], stamped: bool = False, wrench: str = "/wrench") -> Path:
+def write_messages(
+    path: Path, messages: Iterable[Message], stamped: bool = False, wrench: str = "/wrench"
+) -> Path:
     """ROS 2 messages as an MCAP file: a wrench, with stamps or without, a phase, and the height check's word."""
     from mcap_ros2.writer import Writer
 
-    kind = ("geometry_msgs/msg/WrenchStamped", STAMPED) if stamped else ("geometry_msgs/msg/Wrench", BARE)
+    kind = (
+        ("geometry_msgs/msg/WrenchStamped", STAMPED)
+        if stamped
+        else ("geometry_msgs/msg/Wrench", BARE)
+    )
     with path.open("wb") as file:
         writer = Writer(file)
-        schemas = {topic: writer.register_msgdef(*kind) for topic, kind in (TOPICS | {wrench: kind}).items()}
+        schemas = {
+            topic: writer.register_msgdef(*kind)
+            for topic, kind in (TOPICS | {wrench: kind}).items()
+        }
         for number, (time, topic, message) in enumerate(messages):
             writer.write_message(topic, schemas[topic], message, time, time, number)
         writer.finish()  # type: ignore[no-untyped-call]  # it has no types
@@ -140,12 +180,22 @@ def messages_of(FZ: NDArray[np.float64], good: NDArray[np.bool_]) -> Iterator[Me
 
 def main() -> None:
     """Parse, write, say what is broken."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="the folder to write; made if need be")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, help="the folder to write; made if need be"
+    )
     parser.add_argument("--n", type=int, default=200, help="files (default: 200)")
-    parser.add_argument("--broken", type=int, default=3, help="of these so many that cannot be read (default: 3)")
-    parser.add_argument("--seed", type=int, default=0, help="the same seed, the same files (default: 0)")
-    parser.add_argument("--plants", action="store_true", help="write five folders, as five plants do")
+    parser.add_argument(
+        "--broken", type=int, default=3, help="of these so many that cannot be read (default: 3)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="the same seed, the same files (default: 0)"
+    )
+    parser.add_argument(
+        "--plants", action="store_true", help="write five folders, as five plants do"
+    )
     args = parser.parse_args()
     if args.plants:
         write_plants(args.out, args.n, args.seed)

@@ -27,7 +27,9 @@ def read_run(path: Path, samples: int) -> tuple[np.ndarray, dict[str, Any]]:
     graphs = [step["graph"] for step in run["tightening steps"]]
     seconds = np.concatenate([graph["time values"] for graph in graphs])
     torque = np.concatenate([graph["torque values"] for graph in graphs])
-    seconds, first = np.unique(seconds, return_index=True)  # a step begins with the last sample of the one before
+    seconds, first = np.unique(
+        seconds, return_index=True
+    )  # a step begins with the last sample of the one before
     return np.interp(np.arange(samples) * STEP_S, seconds, torque[first]).astype(np.float32), run
 
 
@@ -35,7 +37,9 @@ def convert(folder: Path, samples: int = SAMPLES) -> dict[str, np.ndarray]:
     """The arrays of the data set, a row a run."""
     paths = sorted(folder.glob("Ch_*.json"))
     if not paths:
-        raise SystemExit(f"Expected files Ch_*.json in {folder}, found none; give the `data` folder of the repository.")
+        raise SystemExit(
+            f"Expected files Ch_*.json in {folder}, found none; give the `data` folder of the repository."
+        )
     X, labels, parts, nth, runs = [], [], [], [], Counter[str]()
     for path in track(paths, description="reading"):
         torque, run = read_run(path, samples)
@@ -56,15 +60,26 @@ def convert(folder: Path, samples: int = SAMPLES) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Parse, convert, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, help="the folder `data` of the public repository")
-    parser.add_argument("--samples", type=int, default=SAMPLES, help="samples of a trace, 1.2 ms each (default: 800)")
-    parser.add_argument("--out", type=Path, default=Path("screw_driving.npz"), help="the .npz file to write")
+    parser.add_argument(
+        "--samples",
+        type=int,
+        default=SAMPLES,
+        help="samples of a trace, 1.2 ms each (default: 800)",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("screw_driving.npz"), help="the .npz file to write"
+    )
     args = parser.parse_args()
     arrays = convert(args.folder, args.samples)
     np.savez_compressed(args.out, **arrays)  # type: ignore[arg-type]  # its first keyword is a bool
     good, n = int(arrays["y"].sum()), len(arrays["y"])
-    print(f"Wrote {args.out}: {n} runs of {len(set(arrays['workpiece']))} workpieces, {good} OK and {n - good} NOK.")
+    print(
+        f"Wrote {args.out}: {n} runs of {len(set(arrays['workpiece']))} workpieces, {good} OK and {n - good} NOK."
+    )
 
 
 if __name__ == "__main__":

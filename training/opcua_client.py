@@ -33,7 +33,17 @@ IEC = {  # a controller's type: OPC UA's
     "WSTRING": ua.VariantType.String,
 }
 ACTIONS = ("verify", "accept", "reject")
-SHOWN = ("Decisions", "VerifiedShare", "Accepted", "Rejected", "ModelVersion", "SafeMode", "Shadow", "Alarm", "AlarmText")
+SHOWN = (
+    "Decisions",
+    "VerifiedShare",
+    "Accepted",
+    "Rejected",
+    "ModelVersion",
+    "SafeMode",
+    "Shadow",
+    "Alarm",
+    "AlarmText",
+)
 
 
 def argument(value: Any, kind: str) -> ua.Variant:
@@ -92,9 +102,15 @@ async def play(url: str, n_parts: int, empty: str | None) -> list[str]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--url", default="opc.tcp://127.0.0.1:4840/dengine", help="Of the server.")
     parser.add_argument("--parts", type=int, default=60, help="How many recorded parts are played.")
-    parser.add_argument("--empty", choices=("null", "text"), default="null", help="What an empty text is sent as.")
+    parser.add_argument(
+        "--empty", choices=("null", "text"), default="null", help="What an empty text is sent as."
+    )
     asked = parser.parse_args()
-    print(*asyncio.run(play(asked.url, asked.parts, None if asked.empty == "null" else "")), sep="\n")
+    print(
+        *asyncio.run(play(asked.url, asked.parts, None if asked.empty == "null" else "")), sep="\n"
+    )

@@ -11,7 +11,13 @@ from scipy.stats import binom
 
 from dengine import Action, DataEngine, Policy, Recipe, replay, wilson_interval
 from dengine.errors import SettingError
-from dengine.experiments.baselines import BASELINES, Baseline, guaranteed_threshold, make_baseline, risk_bound
+from dengine.experiments.baselines import (
+    BASELINES,
+    Baseline,
+    guaranteed_threshold,
+    make_baseline,
+    risk_bound,
+)
 from dengine.model import Model
 from dengine.records import Reason
 
@@ -23,7 +29,9 @@ QUICK: dict[str, dict[str, Any]] = {
 LEARN_AT_ONCE = ("knn", "wskde")  # those that take labels in between two trainings
 
 every_baseline = pytest.mark.parametrize("name", BASELINES)
-learning_baseline = pytest.mark.parametrize("name", [name for name in BASELINES if name not in ("always", "never")])
+learning_baseline = pytest.mark.parametrize(
+    "name", [name for name in BASELINES if name not in ("always", "never")]
+)
 
 
 def new(name: str, policy: Policy = LOOSE, seed: int = 0, **params: Any) -> Baseline:
@@ -46,14 +54,22 @@ def test_a_baseline_meets_the_model_contract_repeats_by_its_seed_and_is_right_on
     X, y = traces
     baseline = new(name).fit(X[:120], y[:120])
     assert isinstance(baseline, Model)
-    (lower, upper), counts, actions = baseline.predict_interval(X[120:]), baseline.count(X[120:]), baseline.decide(X[120:])
+    (lower, upper), counts, actions = (
+        baseline.predict_interval(X[120:]),
+        baseline.count(X[120:]),
+        baseline.decide(X[120:]),
+    )
     assert {item.shape for item in (lower, upper, *counts, actions)} == {(40,)}
     assert ((lower >= 0) & (lower <= upper) & (upper <= 1)).all()
     assert all(n.dtype.kind == "i" and n.min() >= 0 for n in counts)
     assert all(isinstance(action, Action) for action in actions)
-    np.testing.assert_array_equal((lower, upper), new(name).fit(X[:120], y[:120]).predict_interval(X[120:]))
+    np.testing.assert_array_equal(
+        (lower, upper), new(name).fit(X[:120], y[:120]).predict_interval(X[120:])
+    )
     assert [baseline.decide(x[None])[0] for x in X[120:130]] == list(actions[:10])
-    assert [baseline.predict_interval(x[None])[0][0] for x in X[120:130]] == pytest.approx(lower[:10], abs=1e-6)
+    assert [baseline.predict_interval(x[None])[0][0] for x in X[120:130]] == pytest.approx(
+        lower[:10], abs=1e-6
+    )
     if name not in ("always", "never"):
         for action, label, fewest in ((Action.ACCEPT, 1, 5), (Action.REJECT, 0, 3)):
             decided = y[120:][actions == action]
@@ -73,13 +89,17 @@ def test_labels_of_one_class_verify_everything(name: str, labels: np.ndarray, tr
 
 
 @every_baseline
-def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_method_learns_at_once(name, traces) -> None:
+def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_method_learns_at_once(
+    name, traces
+) -> None:
     X, y = traces
     baseline = new(name, **({"k": 1} if name == "knn" else {})).fit(X[:120], y[:120])
     before, successor = baseline.predict_interval(X[120:]), copy.deepcopy(baseline)
     for x, label in zip(X[120:], y[120:], strict=True):
         successor.add(x, 1 - label)
-    assert np.array_equal(successor.predict_interval(X[120:]), before) == (name not in LEARN_AT_ONCE)
+    assert np.array_equal(successor.predict_interval(X[120:]), before) == (
+        name not in LEARN_AT_ONCE
+    )
     successor.fit(X[40:], 1 - y[40:])
     baseline.predict_interval(X[:5])  # what it said last is remembered
     np.testing.assert_array_equal(baseline.predict_interval(X[120:]), before)
@@ -87,7 +107,12 @@ def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_m
 
 def test_the_table_is_complete_and_imports_nothing() -> None:
     code = "import sys; from dengine.experiments.baselines import BASELINES; print(*{'aeon'} & {*sys.modules})"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == []
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout.split()
+        == []
+    )
     assert all(len(kind.candidates) == 4 and 0 <= kind.chosen < 4 for kind in BASELINES.values())
     assert [name for name, kind in BASELINES.items() if not kind.bound] == ["knn", "never"]
 
@@ -124,7 +149,9 @@ def test_a_narrow_kernel_counts_a_label_at_the_very_place_twice(traces: Any) -> 
     baseline = new("wskde", bandwidth=1e-5).fit(X[:120], y[:120])
     good = X[:120][y[:120] == 1][:1]
     assert [int(n[0]) for n in baseline.count(good)] == [2, 0]
-    np.testing.assert_allclose(np.ravel(baseline.predict_interval(good)), wilson_interval(2, 0, LOOSE.alpha), atol=1e-6)
+    np.testing.assert_allclose(
+        np.ravel(baseline.predict_interval(good)), wilson_interval(2, 0, LOOSE.alpha), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(("wrong", "n", "delta"), [(0, 20, 0.1), (3, 50, 0.05), (49, 50, 0.2)])
@@ -140,12 +167,17 @@ def test_the_threshold_parts_the_confident_from_the_wrong() -> None:
     result = guaranteed_threshold(confidence, wrong, 0.1, 0.1)
     beyond = confidence >= result
     assert 0.7 < result <= 0.76
-    assert risk_bound(int(wrong[beyond].sum()), int(beyond.sum()), 0.1 / 8) < 0.1  # log2(256) = 8 looks
+    assert (
+        risk_bound(int(wrong[beyond].sum()), int(beyond.sum()), 0.1 / 8) < 0.1
+    )  # log2(256) = 8 looks
 
 
 def test_a_risk_above_the_tolerance_is_vouched_for_in_no_more_than_delta_of_all_sets() -> None:
     rng = np.random.default_rng(1)
-    results = [guaranteed_threshold(rng.random(200), rng.random(200) < 0.12, 0.1, 0.2) < np.inf for _ in range(500)]
+    results = [
+        guaranteed_threshold(rng.random(200), rng.random(200) < 0.12, 0.1, 0.2) < np.inf
+        for _ in range(500)
+    ]
     assert np.mean(results) <= 0.2
 
 
@@ -157,4 +189,7 @@ def test_a_baseline_plays_in_the_engines_loop(name: str) -> None:
     assert all(report.accepted for report in played.retrains)  # and no training failed
     assert set(played.reason) <= {Reason.NO_MODEL, Reason.UNCERTAIN, Reason.CERTAIN}
     assert (played.action[:50] == "verify").all()
-    assert name not in ("always", "never") or (played.action[50:] == {"always": "verify", "never": "accept"}[name]).all()
+    assert (
+        name not in ("always", "never")
+        or (played.action[50:] == {"always": "verify", "never": "accept"}[name]).all()
+    )

@@ -12,7 +12,16 @@ from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from torch import nn
 
-from dengine import REDUCERS, DataEngine, ModelPrediction, Policy, Reason, SqlStore, make_reducer, replay
+from dengine import (
+    REDUCERS,
+    DataEngine,
+    ModelPrediction,
+    Policy,
+    Reason,
+    SqlStore,
+    make_reducer,
+    replay,
+)
 from dengine.engine.engine import core_of
 from dengine.errors import SettingError
 from dengine.reducers import Reducer, TorchReducer
@@ -44,7 +53,9 @@ def test_a_shipped_reducer_keeps_the_contract(name: str, check: Any) -> None:
 
 
 @every_check
-@pytest.mark.parametrize("reducer", [PCA(2, random_state=0), LinearDiscriminantAnalysis()], ids=["PCA", "LDA"])
+@pytest.mark.parametrize(
+    "reducer", [PCA(2, random_state=0), LinearDiscriminantAnalysis()], ids=["PCA", "LDA"]
+)
 def test_scikit_learns_transformers_keep_it_unchanged(reducer: Any, check: Any) -> None:
     check(reducer)
 
@@ -57,7 +68,11 @@ def test_every_reducer_but_umap_learn_is_exported_restored_and_decides_at_once(n
     for x, good in zip(X, y, strict=True):
         engine.report(engine.decide(x).id, bool(good))
     assert engine.retrain().accepted
-    can = fitted.module() is not None, fitted.get_state() is not None, core_of(engine).try_decide(X[0]) is not None
+    can = (
+        fitted.module() is not None,
+        fitted.get_state() is not None,
+        core_of(engine).try_decide(X[0]) is not None,
+    )
     assert can == 3 * (name != "umap-learn",)
 
 
@@ -94,7 +109,9 @@ class Peeking(Means):
 
     uses_labels, n_spaces = True, 2
 
-    def train(self, X: Any, y: Any, folds: Any, stop: Any = None, numbers: Any = None) -> np.ndarray:
+    def train(
+        self, X: Any, y: Any, folds: Any, stop: Any = None, numbers: Any = None
+    ) -> np.ndarray:
         self.rate_ = float(np.mean(y * np.arange(len(y))))
         return self.fit(X).embed_references(X, folds)
 
@@ -189,7 +206,9 @@ EXTREME = {  # what a labelled trace may hold; the last two only in a store of b
 }
 TEACHABLE = {
     **{name: (lambda name=name: new(name)) for name in REDUCERS},
-    "a network of one's own": lambda: TorchReducer(network=Linear, folds=2, steps=4, fit_steps=30, random_state=0),
+    "a network of one's own": lambda: TorchReducer(
+        network=Linear, folds=2, steps=4, fit_steps=30, random_state=0
+    ),
     "PCA": lambda: PCA(2, random_state=0),
     "LDA": LinearDiscriminantAnalysis,
 }
@@ -214,7 +233,9 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
         assert engine.retrain().accepted
     engine.decide(X[0])  # it sets the contract
     engine.close()
-    with closing(SqlStore(str(tmp_path / "e.db"))) as store:  # as an engine stored them that found no fault
+    with closing(
+        SqlStore(str(tmp_path / "e.db"))
+    ) as store:  # as an engine stored them that found no fault
         for i, damaged in enumerate(EXTREME.values()):
             trace = np.asarray(damaged(X[150 + i]), dtype=np.float32)[None]
             item = StoredDecision(decision(f"extreme {i}"), trace, 1 + i, False, store.clock())
@@ -227,7 +248,13 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
     texts = [engine.decide(x) for x in X[160:]]
     assert not {Reason.MODEL_ERROR, Reason.NOVEL} & {report.reason for report in texts}
     middle = [
-        np.mean([report.n_success - report.n_failure for report, good in zip(texts, y[160:], strict=True) if good == k])
+        np.mean(
+            [
+                report.n_success - report.n_failure
+                for report, good in zip(texts, y[160:], strict=True)
+                if good == k
+            ]
+        )
         for k in (0, 1)
     ]
     assert middle[0] < middle[1]

@@ -19,10 +19,22 @@ from dengine.errors import StoreError
 from dengine.records import Action, Decision, Reason, Source
 from dengine.store import Event, NewLabel, Outcomes, SqlStore, StoredDecision, verify_history
 from tests.support.plans import plans
-from tests.support.stores import decision, execute, label, labelled, put_decision, put_label, put_labels, report, trace
+from tests.support.stores import (
+    decision,
+    execute,
+    label,
+    labelled,
+    put_decision,
+    put_label,
+    put_labels,
+    report,
+    trace,
+)
 
 
-def put(store: SqlStore, name: str, seed: int = 0, content_hash: int = 7, quarantined: bool = False) -> np.ndarray:
+def put(
+    store: SqlStore, name: str, seed: int = 0, content_hash: int = 7, quarantined: bool = False
+) -> np.ndarray:
     values = trace(seed)
     put_decision(store, decision(name), values, content_hash, quarantined)
     return values
@@ -31,7 +43,21 @@ def put(store: SqlStore, name: str, seed: int = 0, content_hash: int = 7, quaran
 def test_a_decision_is_found_as_it_was_put(store: SqlStore) -> None:
     assert store.get_decision("a") is None
     values = trace()
-    given = Decision("a", Action.VERIFY, Action.ACCEPT, 0.9, 1.0, 40, 0, None, 3, Reason.AUDIT, True, 0.02, "Stück 7\\0")
+    given = Decision(
+        "a",
+        Action.VERIFY,
+        Action.ACCEPT,
+        0.9,
+        1.0,
+        40,
+        0,
+        None,
+        3,
+        Reason.AUDIT,
+        True,
+        0.02,
+        "Stück 7\\0",
+    )
     put_decision(store, given, values, -(2**63), False)
     put_decision(store, decision("flat"), values[0], 1, False)
     result = store.get_decision("a")
@@ -41,13 +67,19 @@ def test_a_decision_is_found_as_it_was_put(store: SqlStore) -> None:
     assert store.get_decision("flat").trace.shape == (1, 30)
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
-    values=hnp.arrays(np.float32, st.tuples(st.integers(1, 3), st.integers(1, 40)), elements=st.floats(width=32)),
+    values=hnp.arrays(
+        np.float32, st.tuples(st.integers(1, 3), st.integers(1, 40)), elements=st.floats(width=32)
+    ),
     content_hash=st.integers(-(2**63), 2**63 - 1),
     quarantined=st.booleans(),
 )
-def test_any_trace_returns_bit_for_bit(store: SqlStore, values: np.ndarray, content_hash: int, quarantined: bool) -> None:
+def test_any_trace_returns_bit_for_bit(
+    store: SqlStore, values: np.ndarray, content_hash: int, quarantined: bool
+) -> None:
     name = uuid.uuid4().hex
     put_decision(store, decision(name), values, content_hash, quarantined)
     store.flush()
@@ -73,7 +105,10 @@ def test_labels_in_one_batch_are_numbered_in_the_order_given(store: SqlStore) ->
 def test_a_batch_longer_than_a_chunk_is_taken_whole(store: SqlStore) -> None:
     names = [str(i) for i in range(1203)]
     store.apply_records(
-        [StoredDecision(decision(name), np.zeros((1, 2), np.float32), int(name), False, 1.0) for name in names]
+        [
+            StoredDecision(decision(name), np.zeros((1, 2), np.float32), int(name), False, 1.0)
+            for name in names
+        ]
     )
     assert put_labels(store, *(label(name, silent=1) for name in names)) == list(range(1, 1204))
     assert store.labelled().hashes.tolist() == list(range(1203))
@@ -81,7 +116,9 @@ def test_a_batch_longer_than_a_chunk_is_taken_whole(store: SqlStore) -> None:
 
 
 def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: SqlStore) -> None:
-    traces = {name: put(store, name, seed, 100 + seed, name == "c") for seed, name in enumerate("abcde")}
+    traces = {
+        name: put(store, name, seed, 100 + seed, name == "c") for seed, name in enumerate("abcde")
+    }
     for name in "ecbad":
         put_label(store, name, name != "b", Source.VERIFICATION, 0, None)
     every = store.labelled()
@@ -93,7 +130,12 @@ def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: S
     newest = store.labelled(2)
     assert newest.seq.tolist() == [4, 5]
     np.testing.assert_array_equal(newest.traces, every.traces[2:])
-    assert [a.dtype for a in (every.seq, every.traces, every.labels, every.hashes)] == ["i8", "f4", "i1", "i8"]
+    assert [a.dtype for a in (every.seq, every.traces, every.labels, every.hashes)] == [
+        "i8",
+        "f4",
+        "i1",
+        "i8",
+    ]
 
 
 @pytest.mark.parametrize("limit", [None, 0, 5])
@@ -101,7 +143,11 @@ def test_an_empty_store_has_empty_arrays(store: SqlStore, limit: int | None) -> 
     result = store.labelled(limit)
     assert (result.seq.shape, result.traces.shape) == ((0,), (0, 0, 0))
     assert (store.last_version(), store.retrains()) == (None, [])
-    assert (store.unreported_accepts(), store.silent_total(), store.tally().outcomes) == ([], 0, Outcomes())
+    assert (store.unreported_accepts(), store.silent_total(), store.tally().outcomes) == (
+        [],
+        0,
+        Outcomes(),
+    )
 
 
 def test_traces_of_two_shapes_are_an_error_that_names_both(store: SqlStore) -> None:
@@ -117,50 +163,93 @@ def test_what_is_imported_is_labelled_and_numbered_after_what_was_there(store: S
     put(store, "a")
     put_label(store, "a", True, Source.VERIFICATION, 0, None)
     traces, hashes, labels = trace(1, (3, 2, 30)), [5, -5, 6], [1, 0, 1]
-    decisions = [replace(decision(name), part=part) for name, part in zip("bcd", ["x", None, "z"], strict=True)]
+    decisions = [
+        replace(decision(name), part=part)
+        for name, part in zip("bcd", ["x", None, "z"], strict=True)
+    ]
     for created, x, hash_, good in zip(decisions, traces, hashes, labels, strict=True):
-        assert len(store.apply_records(labelled(StoredDecision(created, x, hash_, False, 1.0), good))) == 1
+        assert (
+            len(store.apply_records(labelled(StoredDecision(created, x, hash_, False, 1.0), good)))
+            == 1
+        )
     assert [store.get_decision(name).decision for name in "bcd"] == decisions
     result = store.labelled(3)
     np.testing.assert_array_equal(result.traces, traces)
-    assert (result.seq.tolist(), result.hashes.tolist(), result.labels.tolist()) == ([2, 3, 4], hashes, labels)
+    assert (result.seq.tolist(), result.hashes.tolist(), result.labels.tolist()) == (
+        [2, 3, 4],
+        hashes,
+        labels,
+    )
 
 
-def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_quarantined(store: SqlStore) -> None:
+def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_quarantined(
+    store: SqlStore,
+) -> None:
     for i, quarantined in enumerate([False, True, False, False]):
         created = decision(str(i), reason=Reason.NOVEL if i == 3 else Reason.CERTAIN)
-        put_decision(store, replace(created, lower=0.1 * i, upper=0.2 * i), trace(i), i, quarantined)
+        put_decision(
+            store, replace(created, lower=0.1 * i, upper=0.2 * i), trace(i), i, quarantined
+        )
         put_label(store, str(i), i % 2 == 0, Source.VERIFICATION, 1, None, silent=i)
     result = store.outcomes_since(1)
-    assert result == [(3, 0.2, 0.4, True, False, 2, 0, 1.0), (4, 0.1 * 3, 0.2 * 3, False, True, 3, 0, 1.0)]
-    assert [type(item) for item in result[0]] == [int, float, float, bool, bool, int, int, float]  # for compiled code
+    assert result == [
+        (3, 0.2, 0.4, True, False, 2, 0, 1.0),
+        (4, 0.1 * 3, 0.2 * 3, False, True, 3, 0, 1.0),
+    ]
+    assert [type(item) for item in result[0]] == [
+        int,
+        float,
+        float,
+        bool,
+        bool,
+        int,
+        int,
+        float,
+    ]  # for compiled code
     assert store.silent_total() == 0 + 2 + 3
     assert store.outcomes_since(4) == []
 
 
-def test_unreported_accepts_are_those_without_a_label_oldest_first_whatever_the_clock_said(store: SqlStore) -> None:
+def test_unreported_accepts_are_those_without_a_label_oldest_first_whatever_the_clock_said(
+    store: SqlStore,
+) -> None:
     names = ["zoe", "amy", "kim", "eve", "bob", "ann"]  # neither sorted, nor by hash
     store.clock = iter([5.0, 5.0, 5.0, 2.0, 2.0, 1.0, *range(8, 20)]).__next__
     for name in names:
-        put_decision(store, decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, name == "eve")
+        put_decision(
+            store, decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, name == "eve"
+        )
     put_decision(store, decision("verified"), trace(), 1, False)
     put_decision(store, decision("rejected", Action.REJECT, Reason.CERTAIN), trace(), 1, False)
     assert store.unreported_accepts() == ["zoe", "amy", "kim", "bob", "ann"]
-    put_labels(store, label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED))
+    put_labels(
+        store, label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED)
+    )
     assert store.unreported_accepts() == ["amy", "kim", "ann"]
-    assert sorted(name for some in store.decision_ids() for name in some) == sorted([*names, "verified", "rejected"])
+    assert sorted(name for some in store.decision_ids() for name in some) == sorted(
+        [*names, "verified", "rejected"]
+    )
 
 
 def test_outcomes_count_what_became_of_what_was_certain(store: SqlStore) -> None:
     for i, (action, predicted, success) in enumerate(
-        [(Action.ACCEPT, Action.ACCEPT, success) for success in (None, None, None, False, False, True)]
+        [
+            (Action.ACCEPT, Action.ACCEPT, success)
+            for success in (None, None, None, False, False, True)
+        ]
         + [(Action.REJECT, Action.REJECT, None)] * 2
         + [(Action.VERIFY, Action.ACCEPT, success) for success in (True, True, False, None)]
         + [(Action.VERIFY, Action.REJECT, success) for success in (True, True, True, False, None)]
         + [(Action.VERIFY, Action.VERIFY, success) for success in (True, False, None)]
     ):
         audit = action != predicted
-        put_decision(store, replace(decision(str(i), action), predicted=predicted, audit=audit), trace(), i, False)
+        put_decision(
+            store,
+            replace(decision(str(i), action), predicted=predicted, audit=audit),
+            trace(),
+            i,
+            False,
+        )
         if success is not None:
             put_label(store, str(i), success, Source.AUDIT, 0, None)
     assert store.tally().outcomes == Outcomes(
@@ -213,8 +302,12 @@ def test_the_newest_accepted_version_returns_bit_for_bit(store: SqlStore) -> Non
     assert store.retrains() == [report(1), report(2), report(2, accepted=False)]
 
 
-@pytest.mark.parametrize(("state", "named"), [({"w": np.array([{}], dtype=object)}, "'w'"), (None, "version 1")])
-def test_an_accepted_version_needs_a_state_of_plain_arrays(store: SqlStore, state: dict | None, named: str) -> None:
+@pytest.mark.parametrize(
+    ("state", "named"), [({"w": np.array([{}], dtype=object)}, "'w'"), (None, "version 1")]
+)
+def test_an_accepted_version_needs_a_state_of_plain_arrays(
+    store: SqlStore, state: dict | None, named: str
+) -> None:
     with pytest.raises(StoreError, match=named):
         store.put_version(report(1), 0, state)
 
@@ -235,8 +328,18 @@ def test_status_counts_what_was_put(store: SqlStore) -> None:
     status = store.status()
     assert (status["decisions"], status["labels"], status["quarantined"]) == (3, 2, 1)
     assert status["actions"] == {"verify": 2, "accept": 1, "reject": 0}
-    assert (status["reasons"]["certain"], status["reasons"]["constant"], status["reasons"]["audit"]) == (1, 1, 0)
-    assert status["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0, "inspection": 0}
+    assert (
+        status["reasons"]["certain"],
+        status["reasons"]["constant"],
+        status["reasons"]["audit"],
+    ) == (1, 1, 0)
+    assert status["sources"] == {
+        "verification": 1,
+        "audit": 0,
+        "stop": 1,
+        "confirmed": 0,
+        "inspection": 0,
+    }
     assert store.tally().first <= store.tally().last <= store.tally().last_label
 
 
@@ -245,10 +348,18 @@ def test_in_memory_a_label_has_its_number_before_anything_is_written() -> None:
     items = [StoredDecision(decision(name), trace(), 1, False, 1.0) for name in "abcd"]
     store.apply_records(labelled(items[0], True)[:1])
     assert store.apply_records(labelled(items[0], True)[1:]) == [("a", 1)]
-    assert store.apply_records(labelled(items[1], False) + labelled(items[2], True)) == [("b", 2), ("c", 3)]
+    assert store.apply_records(labelled(items[1], False) + labelled(items[2], True)) == [
+        ("b", 2),
+        ("c", 3),
+    ]
     assert store.labelled().labels.tolist() == [1, 0, 1]
-    assert store.apply_records([*labelled(items[3], True), *labelled(items[1], False)]) == [("d", 4), ("b", 2)]
-    assert store.apply_records(labelled(items[3], False)) == []  # a second label, which is set aside
+    assert store.apply_records([*labelled(items[3], True), *labelled(items[1], False)]) == [
+        ("d", 4),
+        ("b", 2),
+    ]
+    assert (
+        store.apply_records(labelled(items[3], False)) == []
+    )  # a second label, which is set aside
     assert store.labelled().seq.tolist() == [1, 2, 3, 4]
     assert [event.kind for event in store.events()] == ["dead letter"]
 
@@ -259,7 +370,9 @@ def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None
         store.save_settings({"k": "v"})
         put_label(store, "a", True, Source.VERIFICATION, 1, np.array([0.5], dtype=np.float32))
         store.put_version(report(1), 1, {"w": values})
-        put_decision(store, replace(decision("accepted", Action.ACCEPT), part="SN-1"), trace(), 1, False)
+        put_decision(
+            store, replace(decision("accepted", Action.ACCEPT), part="SN-1"), trace(), 1, False
+        )
         put_decision(store, decision("silent"), trace(), 1, False)
         put_label(store, "silent", True, Source.VERIFICATION, 0, None, silent=4)
         store.put_event("started", "for the first time")
@@ -270,7 +383,11 @@ def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None
         np.testing.assert_array_equal(store.last_version().state["w"], values)
         assert store.past_labels(0, 1)[0].point.tolist() == [0.5]
         assert store.get_decision("unreported") is not None
-        assert (store.unreported_accepts(), store.silent_total(), store.tally().outcomes.accepted) == (["accepted"], 4, 1)
+        assert (
+            store.unreported_accepts(),
+            store.silent_total(),
+            store.tally().outcomes.accepted,
+        ) == (["accepted"], 4, 1)
         assert store.get_decision("accepted").decision.part == "SN-1"
         assert [event.text for event in store.events()] == ["for the first time"]
         store.put_event("started", "again")
@@ -302,7 +419,9 @@ def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str])
         np.testing.assert_array_equal(other.get_decision("a").trace, trace(2))
 
 
-def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_other_committed(place) -> None:
+def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_other_committed(
+    place,
+) -> None:
     seqs: list[int] = []
 
     def label(store: SqlStore, prefix: str) -> None:
@@ -344,14 +463,22 @@ def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
     assert len(result) >= 7
     for statement, plan in result:
         assert plan
-        assert not [step for step in plan if "SCAN" in step or "TEMP B-TREE" in step], (statement, plan)
+        assert not [step for step in plan if "SCAN" in step or "TEMP B-TREE" in step], (
+            statement,
+            plan,
+        )
 
 
 def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path: Path) -> None:
     asked: list[tuple[object, ...]] = []
 
     def ask(connection: object, *_: object) -> None:
-        asked.append(tuple(connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("journal_mode", "synchronous")))
+        asked.append(
+            tuple(
+                connection.execute(f"PRAGMA {name}").fetchone()[0]
+                for name in ("journal_mode", "synchronous")
+            )
+        )
 
     sa.event.listen(sa.pool.Pool, "checkout", ask)
     try:
@@ -409,7 +536,9 @@ def test_a_pickle_in_the_database_is_never_loaded(tmp_path: Path) -> None:
     assert zipfile.is_zipfile(evil)
     with sqlite3.connect(file) as connection:
         sum_ = hashlib.sha256(evil.read_bytes()).digest()
-        connection.execute("UPDATE model_version SET state = ?, state_sum = ?", (evil.read_bytes(), sum_))
+        connection.execute(
+            "UPDATE model_version SET state = ?, state_sum = ?", (evil.read_bytes(), sum_)
+        )
     with SqlStore(str(file)) as store:
         with pytest.raises(StoreError, match="plain arrays"):
             store.load_version(1)

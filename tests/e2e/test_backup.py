@@ -55,7 +55,9 @@ def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_ve
         assert engine.status().labels == n
 
 
-def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_on(tmp_path: Path, data: Dataset) -> None:
+def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_on(
+    tmp_path: Path, data: Dataset
+) -> None:
     acknowledged: list[str] = []
     ended = threading.Event()
 
@@ -86,7 +88,9 @@ def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_o
         worker.join()
 
 
-def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(tmp_path: Path, in_use: DataEngine) -> None:
+def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(
+    tmp_path: Path, in_use: DataEngine
+) -> None:
     journal = tmp_path / "engine.db.cell.journal"
     kept = journal.read_bytes()
     first = backup_store(tmp_path / "engine.db", tmp_path / "first.db")
@@ -113,7 +117,9 @@ def test_verify_says_what_waits_in_a_journal_and_of_a_plain_copy_that_there_is_n
     assert document("verify", store)["cells"][0]["waiting"] == 2 * IN_JOURNAL
 
 
-def test_a_plain_copy_of_the_file_alone_is_refused_where_its_tables_are_in_the_log(tmp_path: Path) -> None:
+def test_a_plain_copy_of_the_file_alone_is_refused_where_its_tables_are_in_the_log(
+    tmp_path: Path,
+) -> None:
     with DataEngine("pca", store=str(tmp_path / "engine.db")):
         shutil.copyfile(tmp_path / "engine.db", tmp_path / "plain.db")
         result = dengine("verify", tmp_path / "plain.db")
@@ -123,7 +129,9 @@ def test_a_plain_copy_of_the_file_alone_is_refused_where_its_tables_are_in_the_l
 
 def test_a_backup_of_a_copy_says_that_it_has_no_journal(tmp_path: Path, in_use: DataEngine) -> None:
     backup_store(tmp_path / "engine.db", tmp_path / "copy.db")
-    assert document("backup", tmp_path / "copy.db", "--out", tmp_path / "again.db")["without_journal"] == ["cell"]
+    assert document("backup", tmp_path / "copy.db", "--out", tmp_path / "again.db")[
+        "without_journal"
+    ] == ["cell"]
     text = line_of("backup", tmp_path / "copy.db", "--out", tmp_path / "third.db")
     assert "No journal of cell cell lies beside" in text
 
@@ -163,10 +171,14 @@ def test_a_journal_that_cannot_be_read_makes_no_backup(tmp_path: Path) -> None:
 
 def test_every_cell_of_a_file_is_in_its_backup(tmp_path: Path, data: Dataset) -> None:
     file = str(tmp_path / "line.db")
-    engines = [DataEngine("pca", retrain_every=1000, store=SqlStore(file, f"cell {name}")) for name in "AB"]
+    engines = [
+        DataEngine("pca", retrain_every=1000, store=SqlStore(file, f"cell {name}")) for name in "AB"
+    ]
     with closing(sqlite3.connect(file, isolation_level=None)) as other:
         for engine, first in zip(engines, (0, 10), strict=True):
-            learn(engine, data, [first])  # the first trace sets the contract, which waits for the store
+            learn(
+                engine, data, [first]
+            )  # the first trace sets the contract, which waits for the store
             engine.store.flush()
         other.execute("BEGIN IMMEDIATE")
         for engine, rows in zip(engines, (range(1, 10), range(11, 30)), strict=True):

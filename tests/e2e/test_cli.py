@@ -90,7 +90,9 @@ def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy() -> None:
     # Where lines break depends on the length of the program's name.
     assert done.stdout.split() == succeed("-h").replace("Usage: main", "Usage: dengine").split()
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
-    assert {"dengine.cli.options", "numpy", "torch", "pandas", "rich", "sklearn"} & imported == {"dengine.cli.options"}
+    assert {"dengine.cli.options", "numpy", "torch", "pandas", "rich", "sklearn"} & imported == {
+        "dengine.cli.options"
+    }
 
 
 def example_of(verb: str) -> list[str]:
@@ -115,9 +117,29 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_example_of_serve_listens_and_ends_when_it_is_told_to(tmp_path: Path) -> None:
     pytest.importorskip("uvicorn")
-    form = ["--samples", "40", "--rate-hz", "100", "--unit", "Nm", "--channels", "MZ,FZ", "--fit", "pad"]
-    started = [sys.executable, "-m", *example_of("serve"), "--port", "0", *form]  # of two, the last counts
-    with subprocess.Popen(started, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+    form = [
+        "--samples",
+        "40",
+        "--rate-hz",
+        "100",
+        "--unit",
+        "Nm",
+        "--channels",
+        "MZ,FZ",
+        "--fit",
+        "pad",
+    ]
+    started = [
+        sys.executable,
+        "-m",
+        *example_of("serve"),
+        "--port",
+        "0",
+        *form,
+    ]  # of two, the last counts
+    with subprocess.Popen(
+        started, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
         shown = process.stdout.readline()
         process.terminate()
         assert process.wait(120) == 0
@@ -127,7 +149,9 @@ def test_the_example_of_serve_listens_and_ends_when_it_is_told_to(tmp_path: Path
 
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "serve"])
-def test_every_help_ends_in_a_command_that_works(verb: str, folder: Path, tmp_path: Path, monkeypatch) -> None:
+def test_every_help_ends_in_a_command_that_works(
+    verb: str, folder: Path, tmp_path: Path, monkeypatch
+) -> None:
     if verb == "simulate":
         pytest.importorskip("mujoco")
     for file in () if verb in ("run", "train") else folder.iterdir():  # these two make their own
@@ -138,18 +162,35 @@ def test_every_help_ends_in_a_command_that_works(verb: str, folder: Path, tmp_pa
     succeed(named, *words, *LESS.get(verb, "").split())
 
 
-def test_every_verb_is_listed_with_its_whole_sentence_speaks_json_and_explains_each_option() -> None:
+def test_every_verb_is_listed_with_its_whole_sentence_speaks_json_and_explains_each_option() -> (
+    None
+):
     shown = succeed("--help")
     assert not [line for line in shown.splitlines()[1:] if line.endswith("...")]
     for verb in VERBS:
         assert f"  {verb} " in shown
         options = [param for param in main.commands[verb].params if isinstance(param, click.Option)]
-        assert ("--json" in {name for option in options for name in option.opts}) == (verb != "serve")
+        assert ("--json" in {name for option in options for name in option.opts}) == (
+            verb != "serve"
+        )
         assert not {option.name for option in options if not option.help}
 
 
-def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(data: Path, tmp_path: Path) -> None:
-    asked = ["replay", "--data", data, "--reducer", "pca", *POLICY, "--repeats", 2, "--check-seconds", 9]
+def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(
+    data: Path, tmp_path: Path
+) -> None:
+    asked = [
+        "replay",
+        "--data",
+        data,
+        "--reducer",
+        "pca",
+        *POLICY,
+        "--repeats",
+        2,
+        "--check-seconds",
+        9,
+    ]
     shown = line_of(*asked, "--out", tmp_path, "--explain")
     for words in ("retrains, the worst in", "FP: bad parts accepted", "pca (local)"):
         assert words in shown
@@ -160,11 +201,18 @@ def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(data: 
     assert {p.name for p in tmp_path.glob("*.png")} == {"curves.png", "map_pca.png"}
 
 
-def test_in_order_plays_the_stream_once_and_json_has_null_where_nothing_was_accepted(data: Path) -> None:
+def test_in_order_plays_the_stream_once_and_json_has_null_where_nothing_was_accepted(
+    data: Path,
+) -> None:
     words = ["replay", "--data", data, "--reducer", "pca", "--in-order", "--cycles", 20]
     shown = document(*words)
     row = shown["rows"][0]
-    assert (shown["in_order"], row["replays"], row["precision"], row["promise_kept"]) == (True, 1, None, None)
+    assert (shown["in_order"], row["replays"], row["precision"], row["promise_kept"]) == (
+        True,
+        1,
+        None,
+        None,
+    )
     assert dengine(*words, "--repeats", 3).exit_code == 2
 
 
@@ -172,17 +220,24 @@ def compare(data: Path, words: str) -> list[object]:
     return ["compare", "--data", data, "--cycles", 60, *words.split()]
 
 
-def test_the_papers_grid_writes_its_tables_its_figures_and_its_findings(data: Path, tmp_path: Path) -> None:
+def test_the_papers_grid_writes_its_tables_its_figures_and_its_findings(
+    data: Path, tmp_path: Path
+) -> None:
     shown = line_of(*compare(data, "--reducers pca --paper --repeats 1"), "--out", tmp_path)
     page = (tmp_path / "tables.md").read_text(encoding="utf-8")
     assert page.count("| alpha / LB | 80 % | 90 % | 95 % |") == 2
     assert "[36.9 / 1019.8]" in page
-    assert {path.name for path in tmp_path.glob("grid_*")} == {"grid_pca_wilson.png", "grid_pca_binomial.png"}
+    assert {path.name for path in tmp_path.glob("grid_*")} == {
+        "grid_pca_wilson.png",
+        "grid_pca_binomial.png",
+    }
     assert "of 9 cells, at most" in shown
     assert "18 replays" in shown
 
 
-def test_baselines_are_compared_under_their_names_which_the_help_says_and_leave_no_map(data: Path, tmp_path: Path) -> None:
+def test_baselines_are_compared_under_their_names_which_the_help_says_and_leave_no_map(
+    data: Path, tmp_path: Path
+) -> None:
     result = document(*compare(data, "--reducers pca,always,never --repeats 2"), "--out", tmp_path)
     rows = {row["recipe"]: row for row in result["rows"]}
     assert rows["always"]["certain"] == 0
@@ -192,27 +247,51 @@ def test_baselines_are_compared_under_their_names_which_the_help_says_and_leave_
     assert result["costs"]["core_seconds"] > 0
 
 
-def test_a_character_that_the_screen_has_not_is_a_question_mark(trained: Path, tmp_path: Path) -> None:
+def test_a_character_that_the_screen_has_not_is_a_question_mark(
+    trained: Path, tmp_path: Path
+) -> None:
     shutil.copy(trained, tmp_path / "Łódź.db")
-    environment = os.environ | {"PYTHONIOENCODING": "cp1252", "PYTHONUTF8": "0"}  # as a screen of Windows
+    environment = os.environ | {
+        "PYTHONIOENCODING": "cp1252",
+        "PYTHONUTF8": "0",
+    }  # as a screen of Windows
     for store, code, text in (("Łódź.db", 0, "?ód?.db: overview"), ("Gdańsk.db", 1, "Gda?sk.db")):
         command = [sys.executable, "-m", "dengine", "status", store]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=False)
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, check=False
+        )
         shown = (done.stdout + done.stderr).decode("cp1252")
         assert (done.returncode, text in shown) == (code, True), shown
 
 
-def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained: Path, data: Path) -> None:
+def test_a_trained_store_holds_every_label_once_and_an_answering_version(
+    trained: Path, data: Path
+) -> None:
     again = document("train", "--data", data, "--store", trained)
-    nothing = {"imported": 0, "quarantined": 0, "repeated": 160, "resumed": True, "cut": 0, "contradicted": 0}
+    nothing = {
+        "imported": 0,
+        "quarantined": 0,
+        "repeated": 160,
+        "resumed": True,
+        "cut": 0,
+        "contradicted": 0,
+    }
     nothing["set_aside"] = ""
     assert again["import"] == nothing
     shown = document("status", trained)
-    assert shown["labels"] == shown["sources"]["verification"] == shown["reasons"]["no_model"] == 160
+    assert (
+        shown["labels"] == shown["sources"]["verification"] == shown["reasons"]["no_model"] == 160
+    )
     assert (shown["version"] >= 1, shown["safe_mode"]) == (True, "")
     assert "Nothing can be said yet" in shown["certificate"]["sentence"]
     out = line_of("status", trained)
-    for words in ("alpha 0.2, lower bound 0.8", "guarantee local", "retrain every 50", "budget 450 ms", "rate 500 Hz"):
+    for words in (
+        "alpha 0.2, lower bound 0.8",
+        "guarantee local",
+        "retrain every 50",
+        "budget 450 ms",
+        "rate 500 Hz",
+    ):
         assert words in out
     with np.load(data) as file, DataEngine.open(trained) as engine:
         assert engine.decide(file["X"][0]).predicted != "verify"
@@ -224,25 +303,57 @@ def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_th
     X[0, 3], X[1], X[2:8] = np.nan, 7.0, X[2]
     first, report = import_labelled(store, (X[:70], y[:70]), "pca"), import_labelled(store, (X, y))
     assert (first.imported, first.quarantined, report.imported, report.repeated) == (68, 2, 90, 70)
-    np.testing.assert_array_equal(store.labelled().labels, y[2:])  # bad ones are kept, and never trained on
+    np.testing.assert_array_equal(
+        store.labelled().labels, y[2:]
+    )  # bad ones are kept, and never trained on
 
 
-def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, own_folder: Path, monkeypatch) -> None:
+def test_a_store_goes_on_with_a_reducer_of_this_folder(
+    data: Path, own_folder: Path, monkeypatch
+) -> None:
     for words in (["--reducer", "his:FirstAndLast"], ["--allow-import"]):  # made, and opened again
-        monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(own_folder)])
+        monkeypatch.setattr(
+            sys, "path", [folder for folder in sys.path if folder != str(own_folder)]
+        )
         sys.modules.pop("his", None)
         out = succeed("train", "--data", data, "--store", "e.db", *words)
         assert "his" in sys.modules
         assert sys.path[-1] == str(own_folder)  # last: a module of this folder shadows nothing
         assert "FirstAndLast answers" in " ".join(out.split())
     assert "his:FirstAndLast" in succeed("status", "e.db")
-    words = ["compare", "--data", data, "--reducers", "pca,his:FirstAndLast", *POLICY, "--repeats", 1, "--out", "out"]
-    assert [(row["recipe"], row["certain"] > 0) for row in document(*words)["rows"]][1] == ("FirstAndLast", True)
+    words = [
+        "compare",
+        "--data",
+        data,
+        "--reducers",
+        "pca,his:FirstAndLast",
+        *POLICY,
+        "--repeats",
+        1,
+        "--out",
+        "out",
+    ]
+    assert [(row["recipe"], row["certain"] > 0) for row in document(*words)["rows"]][1] == (
+        "FirstAndLast",
+        True,
+    )
     assert (own_folder / "out" / "map_FirstAndLast.png").is_file()
 
 
-def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data: Path, tmp_path: Path) -> None:
-    words = ["run", "--cell", "replay", "--data", data, "--store", tmp_path / "e.db", "--out", tmp_path]
+def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(
+    data: Path, tmp_path: Path
+) -> None:
+    words = [
+        "run",
+        "--cell",
+        "replay",
+        "--data",
+        data,
+        "--store",
+        tmp_path / "e.db",
+        "--out",
+        tmp_path,
+    ]
     first = document(*words, "--reducer", "pca", *POLICY, "--cycles", 110)
     assert first["stretches"][0]["verified_share"] == 1.0
     assert first["stretches"][-1]["verified_share"] < 1.0
@@ -252,7 +363,9 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data: Path
     assert "resumed" in second["title"]
     assert document("status", tmp_path / "e.db")["ever"]["decisions"] == 140
     with sqlite3.connect(tmp_path / "e.db") as connection:
-        (twice,) = connection.execute("select count(*) - count(distinct content_hash) from label").fetchone()
+        (twice,) = connection.execute(
+            "select count(*) - count(distinct content_hash) from label"
+        ).fetchone()
     assert twice == 0
     more = dengine(*words, "--cycles", 60, "--force")
     assert more.exit_code == 1
@@ -261,16 +374,34 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data: Path
 
 def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
-    words = ["run", "--cell", "simulated", "--cycles", 4, "--reducer", "pca", "--store", tmp_path / "e.db"]
+    words = [
+        "run",
+        "--cell",
+        "simulated",
+        "--cycles",
+        4,
+        "--reducer",
+        "pca",
+        "--store",
+        tmp_path / "e.db",
+    ]
     assert "simulated" in succeed(*words).lower()
     shown = document(*words)  # and the resumed run sees new parts
     assert shown["simulated"] is True
     assert shown["total"]["parts_per_hour"] > 0
     with sqlite3.connect(tmp_path / "e.db") as connection:
-        assert connection.execute("select count(distinct content_hash) from decision").fetchone() == (8,)
+        assert connection.execute(
+            "select count(distinct content_hash) from decision"
+        ).fetchone() == (8,)
     path = tmp_path / "traces.npz"
-    assert document("simulate", "--n", 4, "--out", path, "--seed", 3, "--n-jobs", 1)["simulated"] is True
-    assert document("replay", "--data", path, "--reducer", "pca", "--repeats", 1)["rows"][0]["cycles"] == 4
+    assert (
+        document("simulate", "--n", 4, "--out", path, "--seed", 3, "--n-jobs", 1)["simulated"]
+        is True
+    )
+    assert (
+        document("replay", "--data", path, "--reducer", "pca", "--repeats", 1)["rows"][0]["cycles"]
+        == 4
+    )
 
 
 FAILING = """status missing.db; replay --data missing.npz; replay --recipe missing.toml --data DATA; data DATA --label ((
@@ -279,7 +410,9 @@ run --cell replay --data DATA --store e.db --reducer nowhere:Nothing"""
 
 
 @pytest.mark.parametrize("words", re.split("; |\n", FAILING))
-def test_a_foreseen_failure_is_one_line_and_exit_code_1(words: str, data: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_foreseen_failure_is_one_line_and_exit_code_1(
+    words: str, data: Path, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     result = dengine(*words.replace("DATA", str(data)).split(), "--json")
     assert not list(tmp_path.iterdir())
@@ -293,7 +426,10 @@ def test_a_foreseen_failure_is_one_line_and_exit_code_1(words: str, data: Path, 
     [
         ("nonsense", "No such command"),
         ("replay --guarantee global", "'global' is not one of 'local', 'pooled'"),
-        ("replay --reducer missing", "'missing' is not one of 'conv', 'umap', 'umap-learn', 'pca', 'rocket', 'paper',"),
+        (
+            "replay --reducer missing",
+            "'missing' is not one of 'conv', 'umap', 'umap-learn', 'pca', 'rocket', 'paper',",
+        ),
         ("replay --audit-rate 1", "1.0 is not in the range 0.0<=x<1.0"),
         ("compare --reducers ,", "at least one value"),
         ("compare --alphas 0.1,2", "2.0 is not in the range"),
@@ -309,8 +445,12 @@ def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected(words: str, expe
     assert expected in " ".join(result.stderr.split())
 
 
-@pytest.mark.parametrize("words", ["run --cell simulated --cycles 3 --store e.db", "simulate --n 3 --out traces.npz"])
-def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(words, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    "words", ["run --cell simulated --cycles 3 --store e.db", "simulate --n 3 --out traces.npz"]
+)
+def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(
+    words, tmp_path: Path, monkeypatch
+) -> None:
     def without(name: str, package: str | None = None) -> object:
         return None if name == "mujoco" else find_spec(name, package)
 
@@ -322,10 +462,22 @@ def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(wor
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is_certified(tmp_path: Path) -> None:
+def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is_certified(
+    tmp_path: Path,
+) -> None:
     parts, store = easy_parts(700, 1, wave=slice(300, 400)), tmp_path / "engine.db"
     np.savez(tmp_path / "changing.npz", X=parts.X, y=parts.y, serial=parts.part)
-    words = ["run", "--data", tmp_path / "changing.npz", "--part", "serial", "--store", store, "--reducer", "pca"]
+    words = [
+        "run",
+        "--data",
+        tmp_path / "changing.npz",
+        "--part",
+        "serial",
+        "--store",
+        store,
+        "--reducer",
+        "pca",
+    ]
     shown = document(*words, *KNOWN, "--audit-rate", 0.1, "--cycles", 320)
     (change,) = shown["safe_mode_changes"]
     assert 300 < change["cycle"] <= 320
@@ -333,20 +485,44 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
     assert shown["stretches"][-1]["safe_mode"] == 320 - change["cycle"] + 1
     out = line_of("status", store)
     sentences = (shown["certificate"][name] for name in ("sentence", "sentence_on_rejects"))
-    for part in (*sentences, "guarantee pooled, stops all", "audit rate 10.0 %", "safe mode too many traces were novel"):
+    for part in (
+        *sentences,
+        "guarantee pooled, stops all",
+        "audit rate 10.0 %",
+        "safe mode too many traces were novel",
+    ):
         assert part in out
     assert re.search(r"safe mode time \d{4}-\d\d-\d\d ", out)
     result = document("status", store)
-    assert (result["certificate"], result["safe_mode"]) == (shown["certificate"], "too many traces were novel")
-    assert result["ever"]["novel"] == result["reasons"]["novel"] == sum(part["novel"] for part in shown["stretches"])
+    assert (result["certificate"], result["safe_mode"]) == (
+        shown["certificate"],
+        "too many traces were novel",
+    )
+    assert (
+        result["ever"]["novel"]
+        == result["reasons"]["novel"]
+        == sum(part["novel"] for part in shown["stretches"])
+    )
     ended = well(*words[:-2], "--cycles", 380)
-    assert re.findall(r"^After cycle \d+: safe mode.*$", ended.stdout, flags=re.M)[-1].endswith("safe mode ended.")
+    assert re.findall(r"^After cycle \d+: safe mode.*$", ended.stdout, flags=re.M)[-1].endswith(
+        "safe mode ended."
+    )
     assert "safe mode ended." in ended.stderr
     assert "safe mode too" not in line_of("status", store)
 
 
 def test_an_interrupted_replay_reports_what_was_finished(data: Path, own_folder: Path) -> None:
-    words = ["--reducer", "his:Interrupting", *POLICY, "--cycles", 60, "--repeats", 50, "--out", "out"]
+    words = [
+        "--reducer",
+        "his:Interrupting",
+        *POLICY,
+        "--cycles",
+        60,
+        "--repeats",
+        50,
+        "--out",
+        "out",
+    ]
     result = dengine("replay", "--data", data, *words)
     assert result.exit_code == INTERRUPTED
     assert "Interrupted: 2 of 50 replays were finished; the table shows those." in result.stderr
@@ -356,16 +532,32 @@ def test_an_interrupted_replay_reports_what_was_finished(data: Path, own_folder:
 
 
 def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own_folder: Path) -> None:
-    words = ["--data", data, "--cycles", 160, "--store", "e.db", "--reducer", "his:Interrupting", "--lower-bound", "0.99"]
+    words = [
+        "--data",
+        data,
+        "--cycles",
+        160,
+        "--store",
+        "e.db",
+        "--reducer",
+        "his:Interrupting",
+        "--lower-bound",
+        "0.99",
+    ]
     result = dengine("run", "--cell", "replay", *words)
     assert result.exit_code == INTERRUPTED
     done = int(re.search(r"Interrupted: (\d+) of 160 cycles were done", result.stderr)[1])
-    assert f"Everything up to cycle {done} is in e.db; the same command with --cycles {160 - done}" in result.stderr
+    assert (
+        f"Everything up to cycle {done} is in e.db; the same command with --cycles {160 - done}"
+        in result.stderr
+    )
     assert f"1 to {done}" in result.stdout
     assert document("status", "e.db")["ever"]["decisions"] == done > 0
 
 
-def test_an_interrupted_import_says_how_far_it_came_and_keeps_that(data: Path, tmp_path: Path, monkeypatch) -> None:
+def test_an_interrupted_import_says_how_far_it_came_and_keeps_that(
+    data: Path, tmp_path: Path, monkeypatch
+) -> None:
     def interrupted(*args: object) -> object:
         os.kill(os.getpid(), signal.SIGINT)
         return import_labelled(*args)
@@ -374,7 +566,10 @@ def test_an_interrupted_import_says_how_far_it_came_and_keeps_that(data: Path, t
     monkeypatch.setattr(importing, "import_labelled", interrupted)
     result = dengine("train", "--data", data, "--store", tmp_path / "e.db", "--reducer", "conv")
     assert result.exit_code == INTERRUPTED
-    match = re.search(r"Interrupted: (\d+) of 160 traces are in .*the same command", " ".join(result.stderr.split()))
+    match = re.search(
+        r"Interrupted: (\d+) of 160 traces are in .*the same command",
+        " ".join(result.stderr.split()),
+    )
     stored = document("status", tmp_path / "e.db")
     assert (stored["version"], stored["labels"]) == (0, int(match[1]))
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

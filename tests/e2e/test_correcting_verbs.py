@@ -28,13 +28,18 @@ def used(make_data, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def store(used: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(used.parent, tmp_path / "cell")) / used.name  # its journal's head beside it
+    return (
+        Path(shutil.copytree(used.parent, tmp_path / "cell")) / used.name
+    )  # its journal's head beside it
 
 
 def ids(store: Path) -> list[str]:
     """Of the decisions, in the order of their labels."""
     with DataEngine.open(store) as engine:
-        return [past.decision.id for past in sorted(history(engine.store), key=lambda past: past.label_seq)]
+        return [
+            past.decision.id
+            for past in sorted(history(engine.store), key=lambda past: past.label_seq)
+        ]
 
 
 def labels(store: Path) -> dict[int, int]:
@@ -47,13 +52,19 @@ def test_a_label_is_corrected_and_the_line_says_what_it_was(store: Path) -> None
     first, before = ids(store)[0], labels(store)[1]
     now = "bad" if before else "good"
     line = line_of("correct", store, first, now, "--author", "kim")
-    assert line.startswith(f"Decision {first} counts as a {'failure' if before else 'success'}, was a ")
+    assert line.startswith(
+        f"Decision {first} counts as a {'failure' if before else 'success'}, was a "
+    )
     assert line.endswith("Event 1, by kim.")
     assert labels(store)[1] == 1 - before
     assert "already; nothing changed." in line_of("correct", store, first, now)
     assert line_of("retrain", store).startswith("Version 3 answers. 1 retrain, the worst in ")
     result = document("retrain", store, "--author", "kim")
-    assert (result["retrain"]["version"], result["retrain"]["accepted"], result["author"]) == (4, True, "kim")
+    assert (result["retrain"]["version"], result["retrain"]["accepted"], result["author"]) == (
+        4,
+        True,
+        "kim",
+    )
     with DataEngine.open(store) as engine:  # and a retrain by hand learns it
         assert engine.store.last_version().state["labels"][0] == 1 - before
         assert engine.store.events(1)[0].kind == "retrain"
@@ -64,8 +75,12 @@ def test_a_part_is_found_and_reported_by_its_number(store: Path, make_data) -> N
         engine.decide(np.roll(make_data(1).X[0], 7), "P-7")
         engine.set_policy(replace(engine.policy, windows=("0:0:1000::reject",)))
         engine.decide(np.roll(make_data(1).X[0], 9), "P-8")
-        assert "or its HTTP where it is served" in dengine("report", store, "P-7", "bad").stderr  # while it runs
-    assert line_of("report", store, "P-8", "good", "--author", "kim").endswith(" was good. Event 2, by kim.")
+        assert (
+            "or its HTTP where it is served" in dengine("report", store, "P-7", "bad").stderr
+        )  # while it runs
+    assert line_of("report", store, "P-8", "good", "--author", "kim").endswith(
+        " was good. Event 2, by kim."
+    )
     (reject,) = document("history", store, "--part", "P-8")["decisions"]
     assert (reject["action"], reject["label"], reject["source"]) == ("reject", "good", "inspection")
     assert "good inspection" in line_of("history", store, "--part", "P-8")
@@ -75,7 +90,9 @@ def test_a_part_is_found_and_reported_by_its_number(store: Path, make_data) -> N
     assert "'P-9', which is unknown" in dengine("correct", store, "P-9", "good").stderr
     assert "'P-9', which is unknown" in dengine("explain", store, "P-9").stderr
     assert "'P-9', which is unknown" in dengine("report", store, "P-9", "good").stderr
-    assert line_of("report", store, "P-7", "bad", "--author", "kim").endswith(" was bad. Event 4, by kim.")
+    assert line_of("report", store, "P-7", "bad", "--author", "kim").endswith(
+        " was bad. Event 4, by kim."
+    )
     (result,) = document("history", store, "--part", "P-7")["decisions"]
     assert (result["part"], result["label"]) == ("P-7", "bad")
 
@@ -86,12 +103,18 @@ def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store: Pa
     assert (failed.exit_code, len(labels(store))) == (1, 60)
     assert "'nobody'" in failed.stderr
     line = line_of("forget", store, names[0], names[1], "--reason", "wrong part")
-    assert line.startswith(f"The labels of {names[0]}, {names[1]} are forgotten: wrong part. Event 1,")
+    assert line.startswith(
+        f"The labels of {names[0]}, {names[1]} are forgotten: wrong part. Event 1,"
+    )
     assert sorted(labels(store)) == list(range(3, 61))
     assert document("status", store)["forgotten"] == 2
     with DataEngine.open(store) as engine:
         (event,) = engine.store.events()
-    assert (event.kind, event.author, event.data["reason"]) == ("forget", getpass.getuser(), "wrong part")
+    assert (event.kind, event.author, event.data["reason"]) == (
+        "forget",
+        getpass.getuser(),
+        "wrong part",
+    )
 
 
 def test_an_earlier_version_answers_again(store: Path) -> None:
@@ -103,33 +126,54 @@ def test_an_earlier_version_answers_again(store: Path) -> None:
     assert "load one of these: 1, 2, 3" in " ".join(failed.stderr.split())
 
 
-def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path, tmp_path: Path, monkeypatch) -> None:
-    result = document("policy", store, "--alpha", 0.2, "--lower-bound", 0.8, "--stops", "all", "--audit-rate", 0.1)
-    assert result["policy"] == document("policy", store, "--alpha", 0.2)["policy"] == document("policy", store)["policy"]
+def test_a_policy_is_changed_in_what_is_given_and_stays(
+    store: Path, tmp_path: Path, monkeypatch
+) -> None:
+    result = document(
+        "policy", store, "--alpha", 0.2, "--lower-bound", 0.8, "--stops", "all", "--audit-rate", 0.1
+    )
+    assert (
+        result["policy"]
+        == document("policy", store, "--alpha", 0.2)["policy"]
+        == document("policy", store)["policy"]
+    )
     with DataEngine.open(store) as engine:
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
         assert engine.certificate().alpha == 0.2
     assert "alpha 0.2, lower bound 0.8" in line_of("status", store)
-    assert "windows none -> 0.05:0.1:-5:60:reject. Event" in line_of("policy", store, "--window", "0.05:0.1:-5:60:reject")
+    assert "windows none -> 0.05:0.1:-5:60:reject. Event" in line_of(
+        "policy", store, "--window", "0.05:0.1:-5:60:reject"
+    )
     assert document("policy", store, "--window", "")["policy"]["windows"] == []
     wrong = dengine("policy", store, "--window", "0.05:0.1:-5::channel=4")
-    assert "got '0.05:0.1:-5::channel=4'" in " ".join(wrong.stderr.split())  # and not as an option of the command
+    assert "got '0.05:0.1:-5::channel=4'" in " ".join(
+        wrong.stderr.split()
+    )  # and not as an option of the command
     shown = line_of("policy", store)
     assert all(words in shown for words in ("alpha 0.2", "audit rate 10.0 %", "stops all"))
-    assert "interval wilson -> jeffreys. Event 4, by" in line_of("policy", store, "--interval", "jeffreys")
-    assert line_of("policy", store, "--shadow", "on", "--author", "kim").startswith("Shadow mode: every part is verified")
+    assert "interval wilson -> jeffreys. Event 4, by" in line_of(
+        "policy", store, "--interval", "jeffreys"
+    )
+    assert line_of("policy", store, "--shadow", "on", "--author", "kim").startswith(
+        "Shadow mode: every part is verified"
+    )
     assert document("status", store)["shadow"] is True
     assert "already" in line_of("policy", store, "--shadow", "on")
     rule = "from dengine.decision.rule import DecisionRule\n\nclass Mine(DecisionRule): ...\n"
     (tmp_path / "own_rule.py").write_text(rule)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
-    assert "guarantee local -> own_rule:Mine" in line_of("policy", store, "--guarantee", "own_rule:Mine", "--shadow", "off")
+    assert "guarantee local -> own_rule:Mine" in line_of(
+        "policy", store, "--guarantee", "own_rule:Mine", "--shadow", "off"
+    )
     result = document("status", store)
     assert (result["shadow"], result["recipe"]["policy"]["guarantee"]) == (False, "own_rule:Mine")
 
 
-@pytest.mark.parametrize("words", ["policy STORE --alpha 2", "correct STORE x maybe", "forget STORE", "rollback STORE two"])
+@pytest.mark.parametrize(
+    "words",
+    ["policy STORE --alpha 2", "correct STORE x maybe", "forget STORE", "rollback STORE two"],
+)
 def test_a_wrong_call_ends_with_2_and_changes_nothing(words: str, store: Path) -> None:
     before = labels(store)
     assert dengine(*words.replace("STORE", str(store)).split()).exit_code == 2

@@ -25,15 +25,22 @@ from tests.support.serving import a_service, started
 REPO = Path(__file__).resolve().parents[2]
 DEPLOY = REPO / "deploy"
 CONTAINER, UNIT, OPTIONS = (
-    (DEPLOY / name).read_text(encoding="utf-8") for name in ("Containerfile", "dengine.service", "dengine.env")
+    (DEPLOY / name).read_text(encoding="utf-8")
+    for name in ("Containerfile", "dengine.service", "dengine.env")
 )
 PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
 def steps(name: str) -> list[str]:
     """What a kind of step of the container file says, continued lines in one, without comments."""
-    lines = "\n".join(line for line in CONTAINER.splitlines() if not line.startswith("#")).replace("\\\n", " ")
-    return [line.split(maxsplit=1)[1].strip() for line in lines.splitlines() if line.split(maxsplit=1)[:1] == [name]]
+    lines = "\n".join(line for line in CONTAINER.splitlines() if not line.startswith("#")).replace(
+        "\\\n", " "
+    )
+    return [
+        line.split(maxsplit=1)[1].strip()
+        for line in lines.splitlines()
+        if line.split(maxsplit=1)[:1] == [name]
+    ]
 
 
 def settings(name: str) -> list[str]:
@@ -78,18 +85,28 @@ def test_what_the_container_copies_is_there_and_its_parts_are_those_of_the_proje
     assert int(low) <= int(minor) < int(high)
 
 
-def test_the_container_runs_as_nobody_special_and_what_it_starts_is_an_option_each_of_serve() -> None:
+def test_the_container_runs_as_nobody_special_and_what_it_starts_is_an_option_each_of_serve() -> (
+    None
+):
     (user,), (volume,) = steps("USER"), steps("VOLUME")
-    assert any("useradd --system --uid 990 --user-group" in step and user in step for step in steps("RUN"))
+    assert any(
+        "useradd --system --uid 990 --user-group" in step and user in step for step in steps("RUN")
+    )
     assert json.loads(steps("ENTRYPOINT")[0]) == ["dengine"]
     given = parse(json.loads(steps("CMD")[0])).params
     assert given["store"].startswith(f"{volume}/")
     assert str(given["port"]) in steps("EXPOSE")
 
 
-def test_what_the_container_starts_is_healthy_asks_for_the_token_and_ends_in_order(tmp_path: Path) -> None:
+def test_what_the_container_starts_is_healthy_asks_for_the_token_and_ends_in_order(
+    tmp_path: Path,
+) -> None:
     token = token_file(tmp_path, 0o400)
-    changed = {"/var/lib/dengine/cell.db": str(tmp_path / "cell.db"), "/run/secrets/dengine_token": str(token), "8000": "0"}
+    changed = {
+        "/var/lib/dengine/cell.db": str(tmp_path / "cell.db"),
+        "/run/secrets/dengine_token": str(token),
+        "8000": "0",
+    }
     _, *words = [changed.get(word, word) for word in json.loads(steps("CMD")[0])]
     program, *check = json.loads(steps("HEALTHCHECK")[0].split("CMD", 1)[1])
     assert program == "python"
@@ -104,13 +121,16 @@ def test_what_the_container_starts_is_healthy_asks_for_the_token_and_ends_in_ord
 
 
 def token_file(folder: Path, mode: int) -> Path:
-    (folder / "token").write_text("a-token-of-24-characters\nanother-of-these viewer Line display\n", encoding="ascii")
+    (folder / "token").write_text(
+        "a-token-of-24-characters\nanother-of-these viewer Line display\n", encoding="ascii"
+    )
     (folder / "token").chmod(mode)
     return folder / "token"
 
 
 @pytest.mark.parametrize(
-    ("mode", "handed", "taken"), [(0o440, True, True), (0o440, False, False), (0o444, True, False), (0o460, True, False)]
+    ("mode", "handed", "taken"),
+    [(0o440, True, True), (0o440, False, False), (0o444, True, False), (0o460, True, False)],
 )
 def test_a_token_that_systemd_hands_over_is_taken_though_its_acl_shows_as_a_right_of_the_group(
     mode: int, handed: bool, taken: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -119,7 +139,10 @@ def test_a_token_that_systemd_hands_over_is_taken_though_its_acl_shows_as_a_righ
         monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
     with nullcontext() if taken else pytest.raises(SettingError, match="only its owner may use"):
         tokens = read_tokens(token_file(tmp_path, mode))
-        assert [(item.operates, item.name) for item in tokens] == [(True, ""), (False, "Line display")]
+        assert [(item.operates, item.name) for item in tokens] == [
+            (True, ""),
+            (False, "Line display"),
+        ]
 
 
 def test_the_unit_starts_serve_with_the_options_of_its_file_and_its_token_as_a_credential() -> None:
@@ -142,22 +165,41 @@ def test_dashboard_and_alerts_ask_for_metrics_that_there_are_and_for_their_label
     dashboard = json.loads((DEPLOY / "grafana.json").read_text(encoding="utf-8"))
     asked = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
     asked += re.findall(
-        r"expr: (?:>-)?\s*(.+?)\n +(?:for|annotations|labels):", (DEPLOY / "alerts.yml").read_text(), flags=re.S
+        r"expr: (?:>-)?\s*(.+?)\n +(?:for|annotations|labels):",
+        (DEPLOY / "alerts.yml").read_text(),
+        flags=re.S,
     )
-    assert {re.sub("_(count|bucket)$", "", name) for name in re.findall(r"dengine_\w+", " ".join(asked))} <= names
+    assert {
+        re.sub("_(count|bucket)$", "", name) for name in re.findall(r"dengine_\w+", " ".join(asked))
+    } <= names
     text = re.findall(r'(?:action|reason)="(\w+)"', " ".join(asked))
-    assert {"accept", "novel", "outside"} <= set(text) <= {item.value for item in (*Action, *Reason)}
-    assert set(re.findall(r'(\w+)=~?"', " ".join(asked))) == {"instance", "action", "repeated", "reason", "accepted", "job"}
+    assert (
+        {"accept", "novel", "outside"} <= set(text) <= {item.value for item in (*Action, *Reason)}
+    )
+    assert set(re.findall(r'(\w+)=~?"', " ".join(asked))) == {
+        "instance",
+        "action",
+        "repeated",
+        "reason",
+        "accepted",
+        "job",
+    }
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here")
-def test_systemd_finds_nothing_wrong_with_the_unit_and_rates_it_as_little_exposed(tmp_path: Path) -> None:
+def test_systemd_finds_nothing_wrong_with_the_unit_and_rates_it_as_little_exposed(
+    tmp_path: Path,
+) -> None:
     def analyze(*words: str) -> subprocess.CompletedProcess[str]:
         command = ["systemd-analyze", *words, str(unit)]
         return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
-    unit = tmp_path / "dengine.service"  # with a program that is here in the place of the one that it would start
-    unit.write_text(UNIT.replace(settings("ExecStart")[0].split()[0], sys.executable), encoding="utf-8")
+    unit = (
+        tmp_path / "dengine.service"
+    )  # with a program that is here in the place of the one that it would start
+    unit.write_text(
+        UNIT.replace(settings("ExecStart")[0].split()[0], sys.executable), encoding="utf-8"
+    )
     done = analyze("verify", "--man=no")
     assert (done.returncode, done.stderr) == (0, "")
     if "--offline" in analyze("--help").stdout:

@@ -22,7 +22,12 @@ import pytest
 
 REPO = Path(__file__).resolve().parents[2]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
-QUICK = {"README.md", "docs/tutorials/first_part.md", "docs/howto/own_reducer.md", "docs/howto/labels.md"}
+QUICK = {
+    "README.md",
+    "docs/tutorials/first_part.md",
+    "docs/howto/own_reducer.md",
+    "docs/howto/labels.md",
+}
 
 SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data insertion": "--repeats 1 --cycles 120",
@@ -51,10 +56,23 @@ NOT_RUN = ("make ", ". .venv", "python -m pip")  # this very suite, and what ins
 CPP = ("cmake", "build/")
 HAS_CPP = all(shutil.which(tool) for tool in ("cmake", "g++"))
 PYTHON = ("dengine ", "python training/", "python -m tests.", "python snippet.py")
-HEAVY = ("matplotlib.pyplot", "pandas", "rich.table", "scipy.special", "sklearn.linear_model", "umap")
+HEAVY = (
+    "matplotlib.pyplot",
+    "pandas",
+    "rich.table",
+    "scipy.special",
+    "sklearn.linear_model",
+    "umap",
+)
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(
-    ["dengine.cli", "dengine.engine.engine", "dengine.experiments.grid", "dengine.store.sql", *HEAVY]
+    [
+        "dengine.cli",
+        "dengine.engine.engine",
+        "dengine.experiments.grid",
+        "dengine.store.sql",
+        *HEAVY,
+    ]
 )
 RUNS, STEP_S = 80, 0.0012  # of the recordings that stand in for the public ones
 
@@ -69,12 +87,19 @@ class Block(NamedTuple):
     @property
     def commands(self) -> list[str]:
         """The lines of a shell block, without comments."""
-        return [line for line in re.sub(r"\s+#.*$", "", self.text, flags=re.M).splitlines() if line.strip()]
+        return [
+            line
+            for line in re.sub(r"\s+#.*$", "", self.text, flags=re.M).splitlines()
+            if line.strip()
+        ]
 
 
 def blocks(page: Path) -> list[Block]:
     fenced = r'^```(sh|python)(?: title="([^"]+)")?\n(.*?)^```$'
-    return [Block(*match) for match in re.findall(fenced, page.read_text(encoding="utf-8"), flags=re.S | re.M)]
+    return [
+        Block(*match)
+        for match in re.findall(fenced, page.read_text(encoding="utf-8"), flags=re.S | re.M)
+    ]
 
 
 def name(page: Path) -> str:
@@ -87,7 +112,9 @@ def desk(tmp_path: Path) -> Path:
     for folder in ("training", "tests", "models", "notebooks"):
         (tmp_path / folder).symlink_to(REPO / folder)
     X, y = recordings()
-    np.savez(tmp_path / "small.npz", X=X[:, ::5], y=y, workpiece=np.arange(len(y)))  # in the place of a large set
+    np.savez(
+        tmp_path / "small.npz", X=X[:, ::5], y=y, workpiece=np.arange(len(y))
+    )  # in the place of a large set
     return tmp_path
 
 
@@ -105,7 +132,11 @@ def record(folder: Path) -> None:
     time = (np.arange(500) * STEP_S).tolist()
     for i, (torque, good) in enumerate(zip(*recordings(), strict=True)):
         graph = {"graph": {"time values": time, "torque values": torque.tolist()}}
-        run = {"id code": str(i // 10), "result": "OK" if good else "NOK", "tightening steps": [graph]}
+        run = {
+            "id code": str(i // 10),
+            "result": "OK" if good else "NOK",
+            "tightening steps": [graph],
+        }
         (folder / f"Ch_{i:012d}.json").write_text(json.dumps(run), encoding="utf-8")
 
 
@@ -116,7 +147,9 @@ def shell(command: str, desk: Path) -> None:
         return
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     env = os.environ | {"PATH": path, "OMP_NUM_THREADS": "1", "COLUMNS": "80"}
-    done = subprocess.run(["bash", "-c", command], cwd=desk, env=env, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=desk, env=env, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, f"{command}\n{done.stdout[-2000:]}\n{done.stderr[-3000:]}"
 
 
@@ -124,7 +157,11 @@ def python(words: list[str], desk: Path) -> None:
     """Run a script or `dengine` in a fork of a process that has imported torch already: eighty would wait for it."""
     text, typed = desk / "said.txt", REPO / "tests" / "support" / "typed.py"
     given = {"WHERE": str(desk), "ARGV": words, "SAID": str(text)}
-    process = FORKS.Process(target=runpy.run_path, args=(str(typed),), kwargs={"init_globals": given, "run_name": "typed"})
+    process = FORKS.Process(
+        target=runpy.run_path,
+        args=(str(typed),),
+        kwargs={"init_globals": given, "run_name": "typed"},
+    )
     process.start()
     process.join(300)
     process.kill()
@@ -133,7 +170,12 @@ def python(words: list[str], desk: Path) -> None:
 
 def smaller(command: str) -> str:
     """The command with its quick options, where it has any."""
-    return " ".join([command, *(options for beginning, options in SMALLER.items() if command.startswith(beginning))])
+    return " ".join(
+        [
+            command,
+            *(options for beginning, options in SMALLER.items() if command.startswith(beginning)),
+        ]
+    )
 
 
 def type_in(command: str, desk: Path) -> None:
@@ -158,12 +200,16 @@ def snippet(block: Block, desk: Path) -> None:
 
 def typed_pages() -> list:
     """The pages with something to type; those that are not quick are slow."""
-    marks = {page: () if name(page) in QUICK else (pytest.mark.slow,) for page in PAGES if blocks(page)}
+    marks = {
+        page: () if name(page) in QUICK else (pytest.mark.slow,) for page in PAGES if blocks(page)
+    }
     return [pytest.param(page, marks=mark, id=name(page)) for page, mark in marks.items()]
 
 
 @pytest.mark.parametrize("page", typed_pages())
-def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(page: Path, desk: Path) -> None:
+def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(
+    page: Path, desk: Path
+) -> None:
     type_page(page, desk)
 
 
@@ -177,23 +223,38 @@ def type_page(page: Path, desk: Path) -> None:
 
 
 def test_every_shortened_command_is_on_a_page() -> None:
-    commands = [command for page in PAGES for block in blocks(page) if block.language == "sh" for command in block.commands]
-    assert [beginning for beginning in SMALLER if not any(c.startswith(beginning) for c in commands)] == []
+    commands = [
+        command
+        for page in PAGES
+        for block in blocks(page)
+        if block.language == "sh"
+        for command in block.commands
+    ]
+    assert [
+        beginning for beginning in SMALLER if not any(c.startswith(beginning) for c in commands)
+    ] == []
 
 
 @pytest.mark.slow
 @pytest.mark.merge
-def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(desk: Path) -> None:
-    (suggested,) = re.findall(r"Go on with:.*&& (dengine .*)'", (REPO / "Makefile").read_text("utf-8"))
+def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(
+    desk: Path,
+) -> None:
+    (suggested,) = re.findall(
+        r"Go on with:.*&& (dengine .*)'", (REPO / "Makefile").read_text("utf-8")
+    )
     shell(suggested.replace("--cycles 600", "--cycles 80"), desk)
     for page in ("README.md", "docs/tutorials/first_part.md", "docs/howto/production.md"):
         type_page(REPO / page, desk)
 
 
 def test_each_page_has_stores_and_folders_of_its_own() -> None:
-    written = (
-        r"[\w./-]+\.db\b|(?<=--out )(?!recordings\b|screw_driving)\S+|(?<=--keep )\S+"  # two are made alike by several
-    )
-    names = {name(page): set(re.findall(written, "\n".join(block.text for block in blocks(page)))) for page in PAGES}
-    twice = [(a, b, names[a] & names[b]) for a in names for b in names if a < b and names[a] & names[b]]
+    written = r"[\w./-]+\.db\b|(?<=--out )(?!recordings\b|screw_driving)\S+|(?<=--keep )\S+"  # two are made alike by several
+    names = {
+        name(page): set(re.findall(written, "\n".join(block.text for block in blocks(page))))
+        for page in PAGES
+    }
+    twice = [
+        (a, b, names[a] & names[b]) for a in names for b in names if a < b and names[a] & names[b]
+    ]
     assert twice == []

@@ -14,7 +14,16 @@ import pytest
 import torch
 from sklearn.decomposition import PCA
 
-from dengine import DataEngine, Dataset, ModelPrediction, Recipe, TraceSpec, export_torchscript, load_exported, make_reducer
+from dengine import (
+    DataEngine,
+    Dataset,
+    ModelPrediction,
+    Recipe,
+    TraceSpec,
+    export_torchscript,
+    load_exported,
+    make_reducer,
+)
 from dengine.decision.members import SAFE_MODES
 from dengine.decision.rule import DecisionRule
 from dengine.errors import ExportError, OutputError, TraceError
@@ -22,7 +31,17 @@ from dengine.export import read_metadata
 from dengine.export.decision import FIELDS, METHODS
 from dengine.folds import content_fold
 from dengine.records import ACTIONS, REASONS, Action, Reason
-from tests.support.exports import LIMIT, SAMPLES, WINDOWS, bad_traces, fitted, recipe, row, trained, wild_traces
+from tests.support.exports import (
+    LIMIT,
+    SAMPLES,
+    WINDOWS,
+    bad_traces,
+    fitted,
+    recipe,
+    row,
+    trained,
+    wild_traces,
+)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +61,9 @@ def file(audited: DataEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("settings", [{}, {"radius": 0.5, "windows": WINDOWS}])
-def test_the_file_decides_exactly_as_the_engine(make_data, many: np.ndarray, tmp_path: Path, settings) -> None:
+def test_the_file_decides_exactly_as_the_engine(
+    make_data, many: np.ndarray, tmp_path: Path, settings
+) -> None:
     with trained(make_data(400, SAMPLES), audit_rate=0.3, **settings) as engine:
         exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
         decisions = [engine.decide(x) for x in many]
@@ -52,15 +73,26 @@ def test_the_file_decides_exactly_as_the_engine(make_data, many: np.ndarray, tmp
         if theirs.embedding is None:
             assert np.isnan(ours.embedding).all()
         else:
-            np.testing.assert_array_equal(ours.embedding, np.array(theirs.embedding, dtype=np.float32))
+            np.testing.assert_array_equal(
+                ours.embedding, np.array(theirs.embedding, dtype=np.float32)
+            )
     reasons = {d.reason for d in result}
     outside = {d.action for d in result if d.reason is Reason.OUTSIDE}
     assert outside == ({Action.VERIFY, Action.REJECT} if "windows" in settings else set())
-    assert reasons >= {Reason.CERTAIN, Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
+    assert reasons >= {
+        Reason.CERTAIN,
+        Reason.NOVEL,
+        Reason.AUDIT,
+        Reason.NOT_FINITE,
+        Reason.CONSTANT,
+        Reason.SATURATED,
+    }
     assert {d.action for d in result} == set(Action)
 
 
-def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[tuple[np.ndarray, bool, str | int | None]]:
+def a_stream(
+    make_data: Callable[..., Dataset], n: int, seed: int
+) -> Iterator[tuple[np.ndarray, bool, str | int | None]]:
     """Traces, labels and parts' numbers: parts that come again, bad traces, novel ones, and a world that changes."""
     rng, data = np.random.default_rng(seed), make_data(n, SAMPLES, seed=seed, noise=3.0)
     for i, (x, y) in enumerate(zip(data.X.copy(), data.y, strict=True)):
@@ -81,29 +113,47 @@ def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[t
 def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fields(
     file: Path, many: np.ndarray, repo: Path
 ) -> None:
-    plain, other, exported = torch.jit.load(str(file)), torch.jit.load(str(file)), load_exported(file)
+    plain, other, exported = (
+        torch.jit.load(str(file)),
+        torch.jit.load(str(file)),
+        load_exported(file),
+    )
     for x in many[:40]:
         called = plain(torch.from_numpy(x))
         assert str(called) == str(other.decide(torch.from_numpy(x), 0))
         fields = dict(zip(FIELDS, called, strict=True))
         expected = exported.decide(x)
-        assert (ACTIONS[fields["action"]], REASONS[fields["reason"]]) == (expected.action, expected.reason)
+        assert (ACTIONS[fields["action"]], REASONS[fields["reason"]]) == (
+            expected.action,
+            expected.reason,
+        )
         assert tuple(called[2:6]) == expected[2:6]
     page = (repo / "docs" / "howto" / "controller.md").read_text("utf-8")
     table = page.partition("### By torch alone")[2].partition("\n## ")[0]
     assert [name for name in (*FIELDS, *METHODS) if f"`{name}" not in table] == []
     for expected in (ACTIONS, REASONS):
-        assert ", ".join(f"{i} {item}" for i, item in enumerate(expected)) in " ".join(table.split())
+        assert ", ".join(f"{i} {item}" for i, item in enumerate(expected)) in " ".join(
+            table.split()
+        )
 
 
 @pytest.mark.parametrize(
-    ("guarantee", "stops"), [("local", "some"), ("local", "all"), ("pooled", "some"), ("pooled", "all"), ("cost", "all")]
+    ("guarantee", "stops"),
+    [("local", "some"), ("local", "all"), ("pooled", "some"), ("pooled", "all"), ("cost", "all")],
 )
 def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
     make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any
 ) -> None:
-    settings = recipe(audit_rate=0.1, guarantee=guarantee, stops=stops, label_within=2000, windows=["0.1:0.15:-20:"])
-    engine = DataEngine(recipe=settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True)
+    settings = recipe(
+        audit_rate=0.1,
+        guarantee=guarantee,
+        stops=stops,
+        label_within=2000,
+        windows=["0.1:0.15:-20:"],
+    )
+    engine = DataEngine(
+        recipe=settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True
+    )
     rng, happened, modes, saved = np.random.default_rng(7), Counter[str](), set(), False
     with engine:
         for x, y, part in a_stream(make_data, 500, 1):
@@ -114,11 +164,17 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
             decision, result = engine.decide(x, part), exported.decide(x, part)
             assert row(result) == row(decision)
             if decision.embedding is not None:
-                np.testing.assert_array_equal(result.embedding, np.array(decision.embedding, dtype=np.float32))
+                np.testing.assert_array_equal(
+                    result.embedding, np.array(decision.embedding, dtype=np.float32)
+                )
             heard = False
             if decision.action is Action.VERIFY and rng.random() < 0.9:
                 heard = exported.learn(x, y, part) > 0
-            elif decision.action is Action.ACCEPT and not y and (stops == "all" or rng.random() < 0.5):
+            elif (
+                decision.action is Action.ACCEPT
+                and not y
+                and (stops == "all" or rng.random() < 0.5)
+            ):
                 heard = exported.stop(x, part) > 0
             elif decision.action is Action.ACCEPT and y and rng.random() < 0.1:
                 heard = exported.learn(x, True, part) > 0
@@ -128,26 +184,50 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
             happened[decision.reason] += 1
             assert exported.safe_mode == engine.safe_mode
             modes.add(engine.safe_mode)
-            if i > 600 and not saved and decision.action is Action.ACCEPT and not heard:  # one that waits
+            if (
+                i > 600 and not saved and decision.action is Action.ACCEPT and not heard
+            ):  # one that waits
                 exported, saved = load_exported(exported.save(tmp_path / "later.ts")), True
         model = engine.model
         ours = {f"references.{name}": t for name, t in model.index.state_dict().items()}
         ours |= model.rule.state_dict()
         kept = {".".join(name.split(".")[-2:]): t for name, t in exported.module.named_buffers()}
-        for name in ours.keys() & kept.keys():  # what can change; freezing made constants of the rest
+        for name in (
+            ours.keys() & kept.keys()
+        ):  # what can change; freezing made constants of the rest
             torch.testing.assert_close(kept[name], ours[name], rtol=0, atol=0)
-        assert {"references.points", "references.parts", "references.repeats", "references.total"} <= kept.keys()
+        assert {
+            "references.points",
+            "references.parts",
+            "references.repeats",
+            "references.total",
+        } <= kept.keys()
         assert (
             type(model.rule) is DecisionRule
-            or {"evidence.member_counts", "evidence.detector_sums", "evidence.thresholds"} <= kept.keys()
+            or {"evidence.member_counts", "evidence.detector_sums", "evidence.thresholds"}
+            <= kept.keys()
         )
-    assert min(happened[kind] for kind in ("verify, heard", "verify, silent", "accept, heard", "accept, silent")) > 10
-    assert happened.keys() >= {Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.SATURATED, Reason.OUTSIDE}
+    assert (
+        min(
+            happened[kind]
+            for kind in ("verify, heard", "verify, silent", "accept, heard", "accept, silent")
+        )
+        > 10
+    )
+    assert happened.keys() >= {
+        Reason.NOVEL,
+        Reason.AUDIT,
+        Reason.NOT_FINITE,
+        Reason.SATURATED,
+        Reason.OUTSIDE,
+    }
     assert len(modes) > 1 or stops == "some"
     assert saved
 
 
-def test_what_waits_is_kept_apart_from_what_is_told_out_of_turn(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_what_waits_is_kept_apart_from_what_is_told_out_of_turn(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
     exported = load_exported(export_torchscript(lenient_engine(make_data), tmp_path / "model.ts"))
     new, stored = make_data(6, SAMPLES, seed=4).X, 300
     assert exported.decide(new[0]).action is Action.ACCEPT
@@ -167,7 +247,9 @@ def lenient_engine(make_data: Callable[..., Dataset]) -> DataEngine:
     return trained(data, trace=spec, lower_bound=0.6, stops="all", radius=10.0, novelty=0.0)
 
 
-def test_checking_a_file_teaches_it_nothing(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_checking_a_file_teaches_it_nothing(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
     exported = load_exported(export_torchscript(lenient_engine(make_data), tmp_path / "model.ts"))
     golden = exported.metadata["golden"]["trace"]
     assert not exported.module.settle()
@@ -175,14 +257,20 @@ def test_checking_a_file_teaches_it_nothing(make_data: Callable[..., Dataset], t
     assert exported.module.n_references() == 300
 
 
-def test_several_channels_are_exported_too(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_several_channels_are_exported_too(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
     data = make_data(150, 40, 3)
     model = fitted(data)
     exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
     assert exported.trace.channels == 3
-    new = make_data(100, 40, 3, seed=1).X  # a reference that is asked about itself has no vote in the file
+    new = make_data(
+        100, 40, 3, seed=1
+    ).X  # a reference that is asked about itself has no vote in the file
     expected = model.predict_many(new)
-    assert [d[2:6] for d in exported.decide_many(new)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in expected]
+    assert [d[2:6] for d in exported.decide_many(new)] == [
+        (k.lower, k.upper, k.n_success, k.n_failure) for k in expected
+    ]
 
 
 def test_a_wrong_shape_says_what_was_expected(file: Path) -> None:
@@ -193,11 +281,17 @@ def test_a_wrong_shape_says_what_was_expected(file: Path) -> None:
         exported.module.decide(torch.ones(98))
 
 
-def test_the_file_says_what_it_is_without_being_loaded(audited: DataEngine, file: Path, monkeypatch) -> None:
+def test_the_file_says_what_it_is_without_being_loaded(
+    audited: DataEngine, file: Path, monkeypatch
+) -> None:
     monkeypatch.setattr(torch.jit, "load", lambda *a, **k: pytest.fail("the code was loaded"))
     metadata = read_metadata(file)
     assert metadata["schema"] == 2
-    assert (metadata["guarantee"], metadata["stops"], metadata["novelty"]) == ("local", "some", audited.recipe.novelty)
+    assert (metadata["guarantee"], metadata["stops"], metadata["novelty"]) == (
+        "local",
+        "some",
+        audited.recipe.novelty,
+    )
     assert metadata["safe_modes"] == list(SAFE_MODES)
     assert metadata["trace"] == asdict(TraceSpec(SAMPLES, limit=LIMIT)) | {"columns": []}
     assert (metadata["alpha"], metadata["lower_bound"], metadata["audit_rate"]) == (0.1, 0.9, 0.3)
@@ -208,7 +302,9 @@ def test_the_file_says_what_it_is_without_being_loaded(audited: DataEngine, file
     assert len(metadata["references_sha256"]) == 64
     assert set(metadata) >= {"dengine", "created", "golden", "fields"}
     content = file.with_name("model.ts.sha256").read_text()
-    assert content == f"{hashlib.sha256(file.read_bytes()).hexdigest()}  model.ts\n"  # as sha256sum reads it
+    assert (
+        content == f"{hashlib.sha256(file.read_bytes()).hexdigest()}  model.ts\n"
+    )  # as sha256sum reads it
 
 
 def test_loading_unpickles_nothing_in_python(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,13 +362,20 @@ def described(**changes: Any) -> Callable[[Path], Any]:
 
     def replace(path: Path) -> None:
         exported = load_exported(path)
-        torch.jit.save(exported.module, str(path), {"dengine.json": json.dumps(exported.metadata | changes).encode()})
+        torch.jit.save(
+            exported.module,
+            str(path),
+            {"dengine.json": json.dumps(exported.metadata | changes).encode()},
+        )
 
     return replace
 
 
 FOREIGN: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "garbage": (lambda path: path.write_bytes(b"no model at all" * 1000), r"it holds no dengine\.json"),
+    "garbage": (
+        lambda path: path.write_bytes(b"no model at all" * 1000),
+        r"it holds no dengine\.json",
+    ),
     "another zip": (lambda path: zipped(path, "holiday.txt", "sand"), "is not a dengine export"),
     "another TorchScript": (
         lambda path: torch.jit.save(torch.jit.script(torch.nn.ReLU()), str(path)),
@@ -321,11 +424,16 @@ def test_a_missing_file_or_sum_is_named(copy: Path) -> None:
             load_exported(copy)
 
 
-def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Dataset, tmp_path: Path) -> None:
+def test_what_cannot_be_exported_says_why_and_names_the_alternative(
+    data: Dataset, tmp_path: Path
+) -> None:
     missed = fitted(data)
     missed.rule_is_stale = True
     for value, words in (
-        (fitted(data, PCA(2)), r"PCA cannot be exported, for it has no module: give it `module\(\)`, .* nn\.Module"),
+        (
+            fitted(data, PCA(2)),
+            r"PCA cannot be exported, for it has no module: give it `module\(\)`, .* nn\.Module",
+        ),
         (fitted(data, interval="jeffreys"), "use wilson or binomial"),
         (missed, "missed what became of a part"),
         (DataEngine("pca"), "Nothing was trained yet"),
@@ -339,7 +447,9 @@ def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Datase
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(make_data, tmp_path: Path) -> None:
+def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(
+    make_data, tmp_path: Path
+) -> None:
     data, new = make_data(120, SAMPLES), make_data(60, SAMPLES, seed=1)
     model = fitted(data, make_reducer("rocket", folds=2, kernels=4), capacity=150)
     exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
@@ -347,8 +457,12 @@ def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(make_dat
         assert exported.learn(x, bool(y)) == min(121 + i, 150)
         model.add(x, y)
     buffers = exported.module.named_buffers()
-    references = {name.rsplit(".", 1)[-1]: t.numpy() for name, t in buffers if ".references." in name}
-    np.testing.assert_array_equal(references["spaces"][120:], content_fold(new.X[:30], model.n_spaces))
+    references = {
+        name.rsplit(".", 1)[-1]: t.numpy() for name, t in buffers if ".references." in name
+    }
+    np.testing.assert_array_equal(
+        references["spaces"][120:], content_fold(new.X[:30], model.n_spaces)
+    )
     for name in ("total", "labels", "spaces", "points"):
         np.testing.assert_array_equal(references[name], getattr(model.index, name).numpy())
 

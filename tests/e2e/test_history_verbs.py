@@ -42,7 +42,11 @@ def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(s
 
 def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
     asked = {"action": "accept", "reason": "certain", "label": "bad", "predicted": "accept"}
-    words = [word for name, value in asked.items() for word in (f"--{name.replace('predicted', 'model')}", value)]
+    words = [
+        word
+        for name, value in asked.items()
+        for word in (f"--{name.replace('predicted', 'model')}", value)
+    ]
     decisions = document("history", store, "--last", 1000, *words)["decisions"]
     assert {tuple(item[name] for name in asked) for item in decisions} == {tuple(asked.values())}
     assert document("history", store, "--since", "1h", "--last", 1000)["decisions"]
@@ -54,11 +58,19 @@ def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
 @pytest.mark.parametrize(
     ("verb", "words", "expected"),
     [
-        ("history", "--since yesterday", "expected 30m, 12h, 7d or 2026-03-01T14:30, got 'yesterday'"),
+        (
+            "history",
+            "--since yesterday",
+            "expected 30m, 12h, 7d or 2026-03-01T14:30, got 'yesterday'",
+        ),
         ("history", "--action pass", "'pass' is not one of"),
         ("history", "--reason why", "'why' is not one of"),
         ("history", "--last 0", "0 is not in the range"),
-        ("explain", "nonsense", "or a decision's id, got 'nonsense', which is unknown; `dengine history STORE`"),
+        (
+            "explain",
+            "nonsense",
+            "or a decision's id, got 'nonsense', which is unknown; `dengine history STORE`",
+        ),
     ],
 )
 def test_a_wrong_word_is_a_wrong_call(verb: str, words: str, expected: str, store: Path) -> None:
@@ -69,12 +81,19 @@ def test_a_wrong_word_is_a_wrong_call(verb: str, words: str, expected: str, stor
 
 def ids(store: Path) -> dict[str, str]:
     """The newest decision of each reason."""
-    return {decision["reason"]: decision["id"] for decision in document("history", store, "--last", 1000)["decisions"]}
+    return {
+        decision["reason"]: decision["id"]
+        for decision in document("history", store, "--last", 1000)["decisions"]
+    }
 
 
-def test_every_reason_is_explained_in_80_columns_with_a_picture(store: Path, tmp_path: Path) -> None:
+def test_every_reason_is_explained_in_80_columns_with_a_picture(
+    store: Path, tmp_path: Path
+) -> None:
     ids_by_reason = ids(store)
-    assert {"certain", "uncertain", "audit", "novel", "safe_mode", "no_model", "not_finite"} <= set(ids_by_reason)
+    assert {"certain", "uncertain", "audit", "novel", "safe_mode", "no_model", "not_finite"} <= set(
+        ids_by_reason
+    )
     for reason, id_ in ids_by_reason.items():
         out = tmp_path / f"{reason}.png"
         shown = succeed("explain", store, id_, "--out", out)
@@ -111,7 +130,9 @@ def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
         bad, good = accepted.count("bad"), accepted.count("good")
         lower, upper = wilson_interval(good, bad, 0.2)
         assert (span["bad_accepts"]["n_known"], span["bad_accepts"]["n_wrong"]) == (good + bad, bad)
-        assert (span["bad_accepts"]["lower"], span["bad_accepts"]["upper"]) == pytest.approx((1 - upper, 1 - lower))
+        assert (span["bad_accepts"]["lower"], span["bad_accepts"]["upper"]) == pytest.approx(
+            (1 - upper, 1 - lower)
+        )
     assert newest["quarantined"] == ever["quarantined"] == 1
     assert newest["retrains"] < ever["retrains"] == len(result["retrains"])
     assert result["last"] == 200
@@ -119,7 +140,9 @@ def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
     assert 0 <= result["new_labels"] <= result["recipe"]["retrain_every"] == 50
 
 
-def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reasons(tmp_path: Path) -> None:
+def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reasons(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "new.db"
     DataEngine("pca", store=file).close()
     assert "none is known" in succeed("status", file)
@@ -133,20 +156,30 @@ def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reas
     assert (ever["dropped"], ever["unlabelled"]) == ({dropped.reason: 2}, 1)
 
 
-def test_known_escapes_stand_first_in_status_which_never_says_that_none_is_known(stream: Dataset, tmp_path: Path) -> None:
+def test_known_escapes_stand_first_in_status_which_never_says_that_none_is_known(
+    stream: Dataset, tmp_path: Path
+) -> None:
     with DataEngine(recipe=RECIPE, store=(store := tmp_path / "engine.db")) as engine:
         cycles = drive(engine, stream, 0, 300)
         accepted = next(
-            cycle for cycle in reversed(cycles) if cycle.decision.action is Action.ACCEPT and cycle.success is None
+            cycle
+            for cycle in reversed(cycles)
+            if cycle.decision.action is Action.ACCEPT and cycle.success is None
         )
         engine.report(accepted.decision.id, False)
     words = " ".join(succeed("status", store).split())
-    assert (words.split("│")[1].strip(), document("status", store)["ever"]["false_accepts"]) == ("accepted, and bad", 1)
+    assert (words.split("│")[1].strip(), document("status", store)["ever"]["false_accepts"]) == (
+        "accepted, and bad",
+        1,
+    )
     assert "1 stop; else unknown" in words
 
 
 def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
-    some, every = Policy(alpha=0.1, lower_bound=0.9), Policy(alpha=0.1, lower_bound=0.9, stops="all")
+    some, every = (
+        Policy(alpha=0.1, lower_bound=0.9),
+        Policy(alpha=0.1, lower_bound=0.9, stops="all"),
+    )
     silent = Outcomes(50, 3, 0, 0, 0, 0, 0, 0)
     assert (bad_accepts(silent, some).basis, bad_accepts(silent, some).upper) == ("", 1.0)
     confirmed = Outcomes(50, 3, 47, 0, 0, 0, 0, 0)
@@ -155,14 +188,18 @@ def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
     audited = Outcomes(50, 3, 0, 40, 0, 0, 0, 0)
     assert (bad_accepts(audited, some).basis, bad_accepts(audited, some).n_known) == ("audits", 40)
     assert bad_accepts(audited, some).verdict == "kept"
-    assert bad_accepts(Outcomes(50, 6, 0, 40, 0, 0, 0, 0), some).verdict == "open"  # as many as 6 of 50 are known to be bad
+    assert (
+        bad_accepts(Outcomes(50, 6, 0, 40, 0, 0, 0, 0), some).verdict == "open"
+    )  # as many as 6 of 50 are known to be bad
     assert bad_accepts(Outcomes(50, 20, 0, 40, 0, 0, 0, 0), some).verdict == "broken"
     assert bad_accepts(Outcomes(50, 30, 20, 0, 0, 0, 0, 0), every).verdict == "broken"
     assert bad_accepts(Outcomes(10, 1, 9, 0, 0, 0, 0, 0), every).verdict == "open"
     assert bad_accepts(Outcomes(*[0] * 8), every).upper == 1.0
 
 
-def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_true(stream: Dataset, tmp_path: Path) -> None:
+def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_true(
+    stream: Dataset, tmp_path: Path
+) -> None:
     store = tmp_path / "engine.db"
     with DataEngine(recipe=RECIPE, store=store) as engine:
         drive(engine, stream, 0, 30)
@@ -176,16 +213,30 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
         true = [cycle.success for cycle in certain if cycle.decision.predicted is action]
         wrong = true.count(action is Action.REJECT)
         span = result["ever"][name]
-        lower, upper = wilson_interval(len(true) - wrong, wrong, 0.05)  # whatever the policy's alpha
+        lower, upper = wilson_interval(
+            len(true) - wrong, wrong, 0.05
+        )  # whatever the policy's alpha
         assert (span["n"], span["n_wrong"]) == (len(true), wrong)
         assert (span["lower"], span["upper"]) == pytest.approx((1 - upper, 1 - lower))
     accept, certified = result["ever"]["would_accept"], result["certificate"]
-    assert (accept["n"] > 50, accept["verdict"], certified["accepted"]["shadowed"]) == (True, "kept", True)
-    assert f"Of {accept['n']} parts that the model would accept, each of which was checked," in certified["sentence"]
+    assert (accept["n"] > 50, accept["verdict"], certified["accepted"]["shadowed"]) == (
+        True,
+        "kept",
+        True,
+    )
+    assert (
+        f"Of {accept['n']} parts that the model would accept, each of which was checked,"
+        in certified["sentence"]
+    )
     n, words = len(certain), line_of("status", store, "--check-seconds", "60")
-    assert f"It would have decided {n} of the {result['ever']['verified']} parts that were verified: {60 * n} s of" in words
+    assert (
+        f"It would have decided {n} of the {result['ever']['verified']} parts that were verified: {60 * n} s of"
+        in words
+    )
     assert "shadow yes" in line_of("status", store)
-    assert result["ever"]["bad_accepts"]["n_known"] == 0  # nothing was accepted, so none of it is known to be bad
+    assert (
+        result["ever"]["bad_accepts"]["n_known"] == 0
+    )  # nothing was accepted, so none of it is known to be bad
     words = line_of("status", store)
     assert f"certain but checked {n} {n}" in words
     assert words.count("bad accepts none was accepted none was accepted") == 1
@@ -194,9 +245,13 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     assert f"certain but checked {n}, " in words
 
 
-def test_each_figure_has_one_interval_prices_have_names_and_dates_are_iso(stream: Dataset, tmp_path: Path) -> None:
+def test_each_figure_has_one_interval_prices_have_names_and_dates_are_iso(
+    stream: Dataset, tmp_path: Path
+) -> None:
     policy = replace(RECIPE.policy, audit_rate=0.3)
-    with DataEngine(recipe=RECIPE.with_settings(policy=policy), store=(store := tmp_path / "engine.db")) as engine:
+    with DataEngine(
+        recipe=RECIPE.with_settings(policy=policy), store=(store := tmp_path / "engine.db")
+    ) as engine:
         drive(engine, stream, 0, 300)
     words = line_of("status", store)
     ever = document("status", store)["ever"]

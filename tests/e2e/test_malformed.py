@@ -20,7 +20,16 @@ from tests.support.driving import learn
 
 VALUES = [
     *("0", "-1", "true", "nan", "inf", "1e400", "0.5", "9" * 400, "-" + "9" * 400, "2147483648"),
-    *('""', '"x"', '"\\u0000"', '"' + "x" * 5000 + '"', "[]", '["a"]', "{a = 1}", "[" * 500 + "]" * 500),
+    *(
+        '""',
+        '"x"',
+        '"\\u0000"',
+        '"' + "x" * 5000 + '"',
+        "[]",
+        '["a"]',
+        "{a = 1}",
+        "[" * 500 + "]" * 500,
+    ),
     *("1979-05-27", "07:32:00", '":"', '".a:b"', '"dengine:Recipe"', '"json:JSONDecoder"'),
 ]
 SETTINGS = [
@@ -38,14 +47,20 @@ def refusal(text: str) -> str:
     return ""
 
 
-@pytest.mark.parametrize(("key", "text"), SETTINGS, ids=lambda value: value.split()[0] if value else value)
+@pytest.mark.parametrize(
+    ("key", "text"), SETTINGS, ids=lambda value: value.split()[0] if value else value
+)
 def test_a_setting_of_any_type_is_taken_or_refused_by_its_name(key: str, text: str) -> None:
     refused = 0
     for value in VALUES:
         output = refusal(text.replace("{}", value, 1))
         assert len(output) < 2000
         assert (
-            not output or key in output or "not TOML" in output or "module:Class" in output or "has no parameter" in output
+            not output
+            or key in output
+            or "not TOML" in output
+            or "module:Class" in output
+            or "has no parameter" in output
         ), output
         refused += output != ""
     assert refused > len(VALUES) // 3
@@ -66,7 +81,9 @@ def test_a_parameter_of_another_type_is_refused_before_any_retrain_fails_by_it(k
     ],
     ids=["Latin-1", "many megabytes"],
 )
-def test_a_recipe_that_is_no_text_or_too_much_says_so(tmp_path: Path, content: bytes, text: str) -> None:
+def test_a_recipe_that_is_no_text_or_too_much_says_so(
+    tmp_path: Path, content: bytes, text: str
+) -> None:
     (tmp_path / "mine.toml").write_bytes(content)
     with pytest.raises(SettingError, match=text):
         Recipe.load(tmp_path / "mine.toml")
@@ -84,7 +101,9 @@ def claiming(shape: str, content: bytes = b"", dtype: str = "<f8") -> bytes:
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr("X.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + content)
+        archive.writestr(
+            "X.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + content
+        )
         archive.writestr("y.npy", npy(np.ones(3)))
     return buffer.getvalue()
 
@@ -106,10 +125,22 @@ def with_field(local: int, central: int, value: int) -> bytes:
     return bytes(content)
 
 
-CLAIMS = ["(10**6,)", "(1000000000000,)", "(-1,)", "(3, -3)", "'x'", "(2.5,)", "9" * 4400, "(" * 300]
+CLAIMS = [
+    "(10**6,)",
+    "(1000000000000,)",
+    "(-1,)",
+    "(3, -3)",
+    "'x'",
+    "(2.5,)",
+    "9" * 4400,
+    "(" * 300,
+]
 ARCHIVES = {
     **{f"claims {shape[:20]}": (claiming(shape), "Cannot read") for shape in CLAIMS},
-    **{f"packed by {method}": (with_field(8, 10, method), "Cannot read") for method in (1, 9, 12, 99, 65535)},
+    **{
+        f"packed by {method}": (with_field(8, 10, method), "Cannot read")
+        for method in (1, 9, 12, 99, 65535)
+    },
     "locked": (with_field(6, 8, 1), "is encrypted"),
 }
 
@@ -122,9 +153,14 @@ def test_an_archive_that_cannot_be_what_it_says_is_a_data_error(tmp_path: Path, 
         load_dataset(tmp_path / "data.npz")
 
 
-def test_a_bomb_is_refused_by_what_it_claims(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bomb_is_refused_by_what_it_claims(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "bomb.npz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("X.npy", "w") as member:
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("X.npy", "w") as member,
+    ):
         member.write(npy(np.zeros(1))[:-8])
         for _ in range(64):
             member.write(bytes(2**20))
@@ -136,7 +172,9 @@ def test_a_bomb_is_refused_by_what_it_claims(tmp_path: Path, monkeypatch: pytest
         read_archive(path)
 
 
-def test_only_what_is_wanted_counts_and_never_over_eight_gigabytes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_what_is_wanted_counts_and_never_over_eight_gigabytes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with pytest.raises(DataError, match="GB of arrays in it, got"):
         check_size(8.1 * 2**30, "it")
     content = npz(X=np.zeros((3, 9)), big=np.zeros(10**6))
@@ -146,11 +184,19 @@ def test_only_what_is_wanted_counts_and_never_over_eight_gigabytes(monkeypatch: 
         read_archive(content)
 
 
-def test_where_every_version_is_damaged_the_engine_opens_without_one_and_says_so(tmp_path: Path, make_data) -> None:
+def test_where_every_version_is_damaged_the_engine_opens_without_one_and_says_so(
+    tmp_path: Path, make_data
+) -> None:
     data, path = make_data(70), tmp_path / "engine.db"
     with DataEngine("pca", retrain_every=60, store=path) as engine:
         learn(engine, data, range(len(data)))
-    for state in (b"", b"PK", claiming("(1000000000000,)"), with_field(8, 10, 99), npz(a=np.zeros(1))[:-9]):
+    for state in (
+        b"",
+        b"PK",
+        claiming("(1000000000000,)"),
+        with_field(8, 10, 99),
+        npz(a=np.zeros(1))[:-9],
+    ):
         with sqlite3.connect(path) as connection:
             connection.execute("UPDATE model_version SET state = ?", (state,))
         with DataEngine.open(path) as engine:
@@ -166,13 +212,19 @@ SETTINGS_OF_STORES = {
 
 
 @pytest.mark.parametrize("key", SETTINGS_OF_STORES)
-def test_junk_in_a_stores_settings_is_an_error_of_ours_in_every_verb(tmp_path: Path, key: str, make_data) -> None:
+def test_junk_in_a_stores_settings_is_an_error_of_ours_in_every_verb(
+    tmp_path: Path, key: str, make_data
+) -> None:
     path, data = tmp_path / "engine.db", make_data(3)
     with DataEngine("pca", store=path) as engine:
         learn(engine, data, range(len(data)))
     journal = tmp_path / "journal.csv"
     journal.write_text("1," + ",".join(["0.5"] * 99 + ["1"]) + "\n")
-    verbs = (["status", path], ["export", path, "--out", tmp_path / "m.ts"], ["import-labels", journal, "--store", path])
+    verbs = (
+        ["status", path],
+        ["export", path, "--out", tmp_path / "m.ts"],
+        ["import-labels", journal, "--store", path],
+    )
     for junk in SETTINGS_OF_STORES[key]:
         with sqlite3.connect(path) as connection:
             connection.execute("UPDATE setting SET value = ? WHERE key = ?", (junk, key))
@@ -181,4 +233,8 @@ def test_junk_in_a_stores_settings_is_an_error_of_ours_in_every_verb(tmp_path: P
         for words in verbs:
             done = dengine(*words)
             assert done.exit_code in (0, 1), (words, junk, done.exception)
-            assert done.exception is None or isinstance(done.exception, SystemExit), (words, junk, done.exception)
+            assert done.exception is None or isinstance(done.exception, SystemExit), (
+                words,
+                junk,
+                done.exception,
+            )

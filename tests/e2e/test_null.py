@@ -8,7 +8,16 @@ import pytest
 from sklearn.base import clone
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from dengine import DataEngine, Dataset, ModelPrediction, Policy, Recipe, Replay, WilsonRadiusClassifier, replay
+from dengine import (
+    DataEngine,
+    Dataset,
+    ModelPrediction,
+    Policy,
+    Recipe,
+    Replay,
+    WilsonRadiusClassifier,
+    replay,
+)
 from dengine.recipe import RECIPES
 from dengine.reducers.base import LabelFree, as_points
 
@@ -20,7 +29,11 @@ BY_CHANCE = 8.0  # certain cycles of 1503, on average: measured 0.1 to 0.8, in r
 def noise_labels(make_data, seed: int, n: int = CYCLES) -> Dataset:
     """Traces of two shapes, as real ones; labels, 80 % successes, that have nothing to do with them."""
     data = make_data(n, samples=100, seed=seed, noise=2.0)
-    return Dataset(data.X, (np.random.default_rng(seed + 10_000).random(n) < 0.8).astype(np.int8), name="noise labels")
+    return Dataset(
+        data.X,
+        (np.random.default_rng(seed + 10_000).random(n) < 0.8).astype(np.int8),
+        name="noise labels",
+    )
 
 
 def certain(played: Replay) -> int:
@@ -29,14 +42,21 @@ def certain(played: Replay) -> int:
 
 def error_rate(played: list[Replay]) -> float:
     """Share of the certain that were wrong."""
-    wrong = sum(int(((p.action == "accept") & ~p.truth).sum() + ((p.action == "reject") & p.truth).sum()) for p in played)
+    wrong = sum(
+        int(((p.action == "accept") & ~p.truth).sum() + ((p.action == "reject") & p.truth).sum())
+        for p in played
+    )
     return wrong / max(1, sum(map(certain, played)))
 
 
 @pytest.mark.parametrize("name", ["conv", "pca", "umap"])
-def test_labels_of_noise_yield_next_to_nothing_certain(name: str, make_data, proof_repeats: int) -> None:
+def test_labels_of_noise_yield_next_to_nothing_certain(
+    name: str, make_data, proof_repeats: int
+) -> None:
     recipe = RECIPES[name].with_policy(alpha=0.1, lower_bound=0.9)
-    played = [replay(noise_labels(make_data, seed), recipe, seed=seed) for seed in range(proof_repeats)]
+    played = [
+        replay(noise_labels(make_data, seed), recipe, seed=seed) for seed in range(proof_repeats)
+    ]
     assert np.mean([certain(p) for p in played]) <= BY_CHANCE
 
 
@@ -53,13 +73,19 @@ class SeesEverything(LabelFree):
 
 def with_lda(honest: bool, data: Dataset, seed: int) -> Replay:
     """The loop around LDA on 100 samples: cross-fitted, or fitted on all labels at once."""
-    reducer = LinearDiscriminantAnalysis() if honest else SeesEverything(LinearDiscriminantAnalysis())
-    model = ModelPrediction(reducer, WilsonRadiusClassifier(0.3, POLICY.alpha, POLICY.lower_bound), folds=2)
+    reducer = (
+        LinearDiscriminantAnalysis() if honest else SeesEverything(LinearDiscriminantAnalysis())
+    )
+    model = ModelPrediction(
+        reducer, WilsonRadiusClassifier(0.3, POLICY.alpha, POLICY.lower_bound), folds=2
+    )
     engine = DataEngine(recipe=Recipe("pca", policy=POLICY), model=model, seed=seed, replaying=True)
     return replay(data, engine, seed)
 
 
-def test_the_same_labels_counted_where_they_were_fitted_are_caught(make_data, proof_repeats: int) -> None:
+def test_the_same_labels_counted_where_they_were_fitted_are_caught(
+    make_data, proof_repeats: int
+) -> None:
     streams = [noise_labels(make_data, seed, 600) for seed in range(proof_repeats)]
     honest = [with_lda(True, data, seed) for seed, data in enumerate(streams)]
     dishonest = [with_lda(False, data, seed) for seed, data in enumerate(streams)]

@@ -12,7 +12,14 @@ onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-from dengine import Dataset, ModelPrediction, Policy, TraceSpec, export_torchscript, load_exported  # after the skips
+from dengine import (
+    Dataset,
+    ModelPrediction,
+    Policy,
+    TraceSpec,
+    export_torchscript,
+    load_exported,
+)  # after the skips
 from dengine.decision.rule import DecisionRule
 from dengine.errors import ExportError, TraceError
 from dengine.export import export_onnx, load_onnx
@@ -25,11 +32,15 @@ BALLS: list[dict[str, Any]] = [{}, {"interval": "binomial", "radius": 0.5}]
 
 @pytest.fixture(scope="module")
 def file(make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return export_onnx(fitted(make_data(300)), tmp_path_factory.mktemp("onnx") / "model.onnx", trace=SPEC)
+    return export_onnx(
+        fitted(make_data(300)), tmp_path_factory.mktemp("onnx") / "model.onnx", trace=SPEC
+    )
 
 
 @pytest.mark.parametrize("ball", BALLS)
-def test_both_formats_decide_alike(make_data: Callable[..., Dataset], tmp_path: Path, ball: dict[str, Any]) -> None:
+def test_both_formats_decide_alike(
+    make_data: Callable[..., Dataset], tmp_path: Path, ball: dict[str, Any]
+) -> None:
     model = fitted(make_data(300), **ball)
     first = load_onnx(export_onnx(model, tmp_path / "model.onnx", trace=SPEC))
     two = load_exported(export_torchscript(model, tmp_path / "model.ts", trace=SPEC))
@@ -42,7 +53,9 @@ def test_both_formats_decide_alike(make_data: Callable[..., Dataset], tmp_path: 
         assert result[2:4] == pytest.approx(expected[2:4], abs=1e-6)
         assert result[4:6] == expected[4:6]
         np.testing.assert_allclose(result.embedding, expected.embedding, rtol=1e-4, atol=1e-5)
-    assert {Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED} <= {d.reason for d in first.decide_many(bad)}
+    assert {Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED} <= {
+        d.reason for d in first.decide_many(bad)
+    }
     assert {d.reason for d in first.decide_many(novel)} == {Reason.NOVEL}
     assert Action.ACCEPT in {d.action for d in first.decide_many(X)}
 
@@ -51,22 +64,36 @@ class OwnRule(DecisionRule):
     """A rule of the user's own; the twin cannot know what it does."""
 
 
-def test_what_the_twin_cannot_do_is_refused(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_twin_cannot_do_is_refused(
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     hashes = np.arange(1, len(data) + 1)
     hashes[7] = hashes[3]
     with trained(data, audit_rate=0.1) as engine:
         for model, why in (
             (engine, "ONNX carries no audits"),
-            (ModelPrediction("pca").fit(data.X, data.y, hashes=hashes), "ONNX carries no votes: 1 of the references"),
+            (
+                ModelPrediction("pca").fit(data.X, data.y, hashes=hashes),
+                "ONNX carries no votes: 1 of the references",
+            ),
             (fitted(data, interval="jeffreys"), "use wilson or binomial"),
             *(
-                (ModelPrediction("pca", rule=rule).fit(data.X, data.y), f"no {type(rule).__name__}, a rule that learns")
-                for rule in (Policy(guarantee="pooled", stops="all").rule(), Policy(stops="all").rule(), OwnRule(0.1, 0.9))
+                (
+                    ModelPrediction("pca", rule=rule).fit(data.X, data.y),
+                    f"no {type(rule).__name__}, a rule that learns",
+                )
+                for rule in (
+                    Policy(guarantee="pooled", stops="all").rule(),
+                    Policy(stops="all").rule(),
+                    OwnRule(0.1, 0.9),
+                )
             ),
         ):
             with pytest.raises(ExportError, match=why):
                 export_onnx(model, tmp_path / "model.onnx")
-    monkeypatch.setattr("dengine.export.onnx.find_spec", lambda name: None if name == "onnxscript" else object())
+    monkeypatch.setattr(
+        "dengine.export.onnx.find_spec", lambda name: None if name == "onnxscript" else object()
+    )
     with pytest.raises(ExportError, match=r"needs onnxscript; pip install dengine\[onnx\]"):
         export_onnx(fitted(data), tmp_path / "model.onnx")
 

@@ -78,7 +78,9 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DemoCell]:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:  # each launch has a new folder for its profile
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=list(FLAGS))
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, headless=True, args=list(FLAGS)
+        )
         yield browser
         browser.close()
 
@@ -86,7 +88,9 @@ def browser() -> Iterator[Browser]:
 @contextmanager
 def looking(browser: Browser, **options: Any) -> Iterator[Page]:
     """A page of its own, which opens no dialog, for strange numbers stay text, and asks nobody but its own server."""
-    context = browser.new_context(**{"viewport": {"width": 1280, "height": 720}, "locale": "en-GB"} | options)
+    context = browser.new_context(
+        **{"viewport": {"width": 1280, "height": 720}, "locale": "en-GB"} | options
+    )
     context.set_default_timeout(PATIENT)
     page, asked, dialogs = context.new_page(), list[str](), list[str]()
     context.on("request", lambda request: asked.append(request.url))
@@ -102,7 +106,12 @@ def looking(browser: Browser, **options: Any) -> Iterator[Page]:
 def page(browser: Browser) -> Iterator[Page]:
     complaints = list[str]()
     with looking(browser) as page:
-        page.on("console", lambda text: complaints.append(text.text) if text.type in ("error", "warning") else None)
+        page.on(
+            "console",
+            lambda text: (
+                complaints.append(text.text) if text.type in ("error", "warning") else None
+            ),
+        )
         page.on("pageerror", lambda error: complaints.append(str(error)))
         yield page
     assert complaints == []
@@ -121,7 +130,9 @@ def must_suit_a_phone(page: Page, view: str) -> None:
 def opened(page: Page, demo: DemoCell, view: str = "") -> None:
     page.goto(f"{demo.url}/{view}")
     expect(page.locator("#link")).to_have_attribute("data-state", "live", timeout=PATIENT)
-    expect(page.locator("h1")).to_be_attached(timeout=PATIENT)  # of the view, once the server has answered
+    expect(page.locator("h1")).to_be_attached(
+        timeout=PATIENT
+    )  # of the view, once the server has answered
 
 
 def with_a_model(page: Page, demo: DemoCell) -> None:
@@ -140,12 +151,18 @@ def confirmed(page: Page, button: str, author: str = "") -> None:
 
 def test_a_decision_appears_and_the_next_one_takes_its_place(page: Page, demo: DemoCell) -> None:
     opened(page, demo)
-    expect(page.locator("#decision")).to_have_text(re.compile("Accept|Reject|Verify"), timeout=PATIENT)
+    expect(page.locator("#decision")).to_have_text(
+        re.compile("Accept|Reject|Verify"), timeout=PATIENT
+    )
     expect(page.locator("#trace .chart canvas")).to_be_visible()
-    expect(page.locator("#trace figcaption")).to_contain_text("Force over 2.0 s")  # what the picture says, in words
+    expect(page.locator("#trace figcaption")).to_contain_text(
+        "Force over 2.0 s"
+    )  # what the picture says, in words
     was = page.locator(".decision .about").inner_text()
     expect(page.locator(".decision .about")).not_to_have_text(was, timeout=PATIENT)
-    assert page.evaluate("performance.getEntriesByType('navigation').length") == 1  # it was told, and never loaded again
+    assert (
+        page.evaluate("performance.getEntriesByType('navigation').length") == 1
+    )  # it was told, and never loaded again
 
 
 @pytest.mark.slow
@@ -178,9 +195,13 @@ def test_the_map_is_gone_over_by_the_keyboard_alone(page: Page, demo: DemoCell) 
 
 
 @pytest.mark.slow
-def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(page: Page, demo: DemoCell) -> None:
+def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(
+    page: Page, demo: DemoCell
+) -> None:
     with demo.store() as store:
-        labelled = next(past for past in store.decisions(HistoryFilter(label="good"), 1, newest=False))
+        labelled = next(
+            past for past in store.decisions(HistoryFilter(label="good"), 1, newest=False)
+        )
     opened(page, demo, f"part?id={labelled.decision.id}")
     page.get_by_role("button", name="It was bad").focus()
     page.keyboard.press("Enter")
@@ -195,7 +216,9 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(page: Page, d
     page.keyboard.press("Enter")
     expect(page.get_by_role("dialog")).to_be_hidden(timeout=PATIENT)
     expect(page.locator("#result")).to_contain_text("counts as a failure, was a success")
-    expect(page.locator("#part .story")).to_contain_text(f"corrected from good to bad by {AUTHOR}", timeout=PATIENT)
+    expect(page.locator("#part .story")).to_contain_text(
+        f"corrected from good to bad by {AUTHOR}", timeout=PATIENT
+    )
     assert page.title().startswith("Part")  # what was typed stayed text
     with demo.store() as store:
         assert store.get_decision(labelled.decision.id, trace=False).success is False
@@ -223,7 +246,9 @@ def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell, tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_rules_of_axe_pass_and_a_phone_need_not_scroll_sideways(browser: Browser, demo: DemoCell, scheme: str) -> None:
+def test_the_rules_of_axe_pass_and_a_phone_need_not_scroll_sideways(
+    browser: Browser, demo: DemoCell, scheme: str
+) -> None:
     with looking(browser, color_scheme=scheme, **PHONE) as page:
         with_a_model(page, demo)
         part = page.locator("a.mark").first.get_attribute("href").removeprefix("/")
@@ -252,7 +277,9 @@ def played(service: CellService, data: Dataset, n: int = 70, broken: int | None 
             accepted = decision.action is Action.ACCEPT
             newest = decision if accepted else newest
             if decision.action is Action.VERIFY or (accepted and broken is not None):
-                await service.report(decision.id, bool(data.y[i]) and not (accepted and i >= broken))
+                await service.report(
+                    decision.id, bool(data.y[i]) and not (accepted and i >= broken)
+                )
             if service.engine.safe_mode:
                 break
         return newest
@@ -266,9 +293,14 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
     file = tmp_path / "cell.db"
     with a_service(file) as service, served(create_app(service, Access(tokens, rate=0.0))) as port:
         demo, part = DemoCell(f"http://127.0.0.1:{port}", file), played(service, stream).part
-        with pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"), looking(browser) as page:  # it asks for a password
+        with (
+            pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"),
+            looking(browser) as page,
+        ):  # it asks for a password
             page.goto(demo.url)
-        with looking(browser, http_credentials={"username": "wall", "password": tokens[0].secret}) as page:
+        with looking(
+            browser, http_credentials={"username": "wall", "password": tokens[0].secret}
+        ) as page:
             opened(page, demo, "actions")
             expect(page.locator("#me")).to_contain_text("Line display")
             expect(page.get_by_role("button", name="Verify everything")).to_be_disabled()
@@ -279,7 +311,12 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
                 expect(page.locator("h1")).to_have_text("That cannot be shown")
     with demo.store() as store:
         answers = [(event.kind, event.author) for event in store.events(4)]
-    assert answers == [("report", "Kim"), ("shadow", "Kim"), ("shadow", "Kim"), ("policy", "Kim")]  # nobody typed a name
+    assert answers == [
+        ("report", "Kim"),
+        ("shadow", "Kim"),
+        ("shadow", "Kim"),
+        ("policy", "Kim"),
+    ]  # nobody typed a name
 
 
 def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
@@ -306,7 +343,9 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     confirmed(page, "Verify everything")
     expect(page.locator("#banner")).to_contain_text("every part is verified", timeout=PATIENT)
     opened(page, demo, "overview")
-    expect(page.locator("#would")).to_contain_text(re.compile(r"Predicted in shadow mode\s*0 of \d\d verified parts"))
+    expect(page.locator("#would")).to_contain_text(
+        re.compile(r"Predicted in shadow mode\s*0 of \d\d verified parts")
+    )
     opened(page, demo, "actions")
     confirmed(page, "Let the model decide again")
     expect(page.locator("#mode")).to_contain_text("Decides", timeout=PATIENT)
@@ -316,13 +355,19 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     opened(page, demo, "overview?by=batch")
     expect(page.locator("#trend tbody")).to_contain_text(f"{STRANGE}-")
     page.locator("#escapes").get_by_role("link", name=part).click()
-    expect(page.locator("#part figcaption")).to_contain_text("the operator's limits are at most 30.0, else reject")
+    expect(page.locator("#part figcaption")).to_contain_text(
+        "the operator's limits are at most 30.0, else reject"
+    )
     opened(page, demo, "history?label=bad")
     with page.expect_download() as download:
         page.get_by_role("button", name="Download these as CSV").click()
     download.value.save_as(file)
-    rows = {row["part"]: row for row in csv.DictReader(file.read_text(encoding="utf-8").splitlines())}
-    assert datetime.fromisoformat(rows[part]["time"]) < datetime.fromisoformat(rows[part]["label_time"])
+    rows = {
+        row["part"]: row for row in csv.DictReader(file.read_text(encoding="utf-8").splitlines())
+    }
+    assert datetime.fromisoformat(rows[part]["time"]) < datetime.fromisoformat(
+        rows[part]["label_time"]
+    )
 
 
 def test_dark_is_dark_and_programs_find_the_document(page: Page, demo: DemoCell) -> None:
@@ -338,14 +383,22 @@ def test_dark_is_dark_and_programs_find_the_document(page: Page, demo: DemoCell)
 def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wrong_is_put_right(
     browser: Browser, tmp_path: Path, stream: Dataset
 ) -> None:
-    recipe = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9, stops="all"))
+    recipe = Recipe(
+        "pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9, stops="all")
+    )
     file = tmp_path / "cell.db"
-    with a_service(file, recipe) as service, served(create_app(service)) as port, looking(browser, **PHONE) as page:
+    with (
+        a_service(file, recipe) as service,
+        served(create_app(service)) as port,
+        looking(browser, **PHONE) as page,
+    ):
         demo = DemoCell(f"http://127.0.0.1:{port}", file)
         opened(page, demo)
         last = played(service, stream, len(stream), 120).id  # while somebody looks on
         expect(page.locator("#mode")).to_contain_text("Safe mode", timeout=PATIENT)
-        expect(page.locator("#banner")).to_contain_text("(accepted parts failed more often than the tolerance)")
+        expect(page.locator("#banner")).to_contain_text(
+            "(accepted parts failed more often than the tolerance)"
+        )
         for view in VIEWS:
             opened(page, demo, view)
             expect(page.locator("#mode")).to_contain_text("Safe mode")
@@ -357,50 +410,75 @@ def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wron
         expect(page.locator("#mode")).to_contain_text("Decides")
     with demo.store() as store:
         answers = [(event.kind, event.author, event.text) for event in store.events(3)]
-    assert [item[:2] for item in answers] == [("safe mode", ""), ("correct", "Kim"), ("safe mode ended", "")]
+    assert [item[:2] for item in answers] == [
+        ("safe mode", ""),
+        ("correct", "Kim"),
+        ("safe mode ended", ""),
+    ]
     assert answers[0][2] == "accepted parts failed more often than the tolerance"
     assert last in answers[1][2]
     assert answers[2][2] == "the corrected outcomes keep the tolerance"
 
 
-def test_what_is_said_of_several_channels_is_said_by_their_names(browser: Browser, tmp_path: Path, stream: Dataset) -> None:
+def test_what_is_said_of_several_channels_is_said_by_their_names(
+    browser: Browser, tmp_path: Path, stream: Dataset
+) -> None:
     file = tmp_path / "cell.db"
     with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
-        played(service, Dataset(np.stack([stream.X, 0 * stream.X + stream.X[:1]], axis=1), stream.y), 40)
+        played(
+            service,
+            Dataset(np.stack([stream.X, 0 * stream.X + stream.X[:1]], axis=1), stream.y),
+            40,
+        )
         opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
         caption = page.locator("#trace figcaption").nth(1)
-        expect(caption).to_contain_text(re.compile(r"Channel 2 over .*of all channels lies outside the band"))
+        expect(caption).to_contain_text(
+            re.compile(r"Channel 2 over .*of all channels lies outside the band")
+        )
 
 
 def test_each_channel_is_drawn_in_its_own_unit_and_is_no_force_for_being_drawn(
     browser: Browser, tmp_path: Path, stream: Dataset
 ) -> None:
-    file, spec = tmp_path / "cell.db", TraceSpec(stream.X.shape[-1], channels=2, unit=("kN", "mm"), columns=("FZ", "SZ"))
+    file, spec = (
+        tmp_path / "cell.db",
+        TraceSpec(stream.X.shape[-1], channels=2, unit=("kN", "mm"), columns=("FZ", "SZ")),
+    )
     DataEngine(recipe=RECIPE, store=file, trace=spec).close()
     with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
         played(service, Dataset(np.stack([stream.X, stream.X[::-1]], axis=1), stream.y), 40)
         opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
         expect(page.locator("#trace h2")).to_have_text("The trace, and good and bad parts")
         for i, (name, unit) in enumerate([("FZ", "kN"), ("SZ", "mm")]):
-            expect(page.locator("#trace figcaption").nth(i)).to_contain_text(re.compile(rf"{name} over .* {unit}\. "))
+            expect(page.locator("#trace figcaption").nth(i)).to_contain_text(
+                re.compile(rf"{name} over .* {unit}\. ")
+            )
         must_be_above_the_fold(page)
 
 
 def must_be_above_the_fold(page: Page) -> None:
     """Of a screen of 1280 x 720, as the fixture has it: every figure is seen whole without scrolling."""
-    boxes = [page.locator(f"#{name}").bounding_box() for name in ("verified", "accepted", "bad", "pace", "saved")]
+    boxes = [
+        page.locator(f"#{name}").bounding_box()
+        for name in ("verified", "accepted", "bad", "pace", "saved")
+    ]
     assert max(box["y"] + box["height"] for box in boxes) <= 720
 
 
-def test_the_key_figures_are_above_the_fold_and_the_magnifier_stands_for_verify_alone(page: Page, demo: DemoCell) -> None:
+def test_the_key_figures_are_above_the_fold_and_the_magnifier_stands_for_verify_alone(
+    page: Page, demo: DemoCell
+) -> None:
     with_a_model(page, demo)
     opened(page, demo)
     must_be_above_the_fold(page)
     shapes = {
-        name: page.locator(f"{name} path").first.get_attribute("d") for name in (".recent .verify", "#bad .verdict.open")
+        name: page.locator(f"{name} path").first.get_attribute("d")
+        for name in (".recent .verify", "#bad .verdict.open")
     }
     assert len(set(shapes.values())) == 2
-    expect(page.locator(".decision .came")).to_have_text(re.compile("It was good|It was bad|No result reported yet"))
+    expect(page.locator(".decision .came")).to_have_text(
+        re.compile("It was good|It was bad|No result reported yet")
+    )
 
 
 @pytest.mark.slow

@@ -15,7 +15,12 @@ from dengine import DataEngine, Dataset
 from tests.support.driving import learn
 from tests.support.serving import REPO
 
-AS_A_USER = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-all", "--ambient-caps=-all"]
+AS_A_USER = [
+    "setpriv",
+    "--bounding-set=-dac_override,-dac_read_search",
+    "--inh-caps=-all",
+    "--ambient-caps=-all",
+]
 # What is there: all that a closed store leaves, what a killed process leaves, and that without its index of the log.
 LEFT = {"closed": ("",), "killed": ("", "-wal", "-shm"), "copied with its log": ("", "-wal")}
 LOCKED = {"a folder": (0o555, 0o644), "a file": (0o755, 0o444), "both": (0o555, 0o444)}
@@ -27,7 +32,10 @@ def dengine(*commands: Sequence[object]) -> list[dict[str, Any]]:
     bound: list[str] = []
     if os.geteuid() == 0:
         bound = AS_A_USER
-        if shutil.which("setpriv") is None or subprocess.run([*bound, "true"], capture_output=True, check=False).returncode:
+        if (
+            shutil.which("setpriv") is None
+            or subprocess.run([*bound, "true"], capture_output=True, check=False).returncode
+        ):
             pytest.skip("permission bits do not bind root, and setpriv cannot take its rights away")
     environment = os.environ | {"PYTHONPATH": str(REPO), "PYTHONDONTWRITEBYTECODE": "1"}
     words = json.dumps([[str(word) for word in command] for command in commands])
@@ -56,7 +64,9 @@ def stores(tmp_path_factory: pytest.TempPathFactory, make_data) -> dict[str, Pat
 
 
 @pytest.fixture(params=CASES, ids=lambda case: f"{case[1]} of what was {case[0]}")
-def store(request: pytest.FixtureRequest, stores: dict[str, Path], tmp_path: Path) -> Iterator[Path]:
+def store(
+    request: pytest.FixtureRequest, stores: dict[str, Path], tmp_path: Path
+) -> Iterator[Path]:
     left, locked = request.param
     folder = tmp_path / "archive"
     shutil.copytree(stores[left], folder)
@@ -68,12 +78,16 @@ def store(request: pytest.FixtureRequest, stores: dict[str, Path], tmp_path: Pat
     folder.chmod(0o755)
 
 
-def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(stores: dict[str, Path], tmp_path: Path) -> None:
+def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(
+    stores: dict[str, Path], tmp_path: Path
+) -> None:
     store, journal = tmp_path / "engine.db", tmp_path / "engine.db.cell.journal"
     shutil.copy(stores["closed"] / "engine.db", store)
     journal.write_bytes(b"another user's")
     journal.chmod(0o000)
-    verified, refused = dengine(["verify", store, "--json"], ["backup", store, "--out", tmp_path / "copy.db"])
+    verified, refused = dengine(
+        ["verify", store, "--json"], ["backup", store, "--out", tmp_path / "copy.db"]
+    )
     assert '"waiting": null' in verified["output"]
     assert refused["exit_code"] == 1
     assert "read it as the user that its cell runs as" in " ".join(refused["output"].split())
@@ -81,7 +95,11 @@ def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(store
 
 
 def test_what_only_reads_reads_it_and_leaves_it_as_it_is(store: Path, tmp_path: Path) -> None:
-    before = {file.name: file.read_bytes() for file in store.parent.iterdir() if not file.name.endswith("-shm")}
+    before = {
+        file.name: file.read_bytes()
+        for file in store.parent.iterdir()
+        if not file.name.endswith("-shm")
+    }
     *results, refused = dengine(
         ("status", store, "--json"),
         ("data", store),
@@ -93,10 +111,14 @@ def test_what_only_reads_reads_it_and_leaves_it_as_it_is(store: Path, tmp_path: 
         ("policy", store, "--alpha", "0.2"),
     )
     assert all(result["exit_code"] == 0 for result in results), results
-    status, data, newest, explained, verified, policy, copied = (result["output"] for result in results)
+    status, data, newest, explained, verified, policy, copied = (
+        result["output"] for result in results
+    )
     assert '"decisions": 60' in status
     assert "60" in data
-    (id_,) = [line.split('"')[3] for line in newest.splitlines() if line.strip().startswith('"id":')]
+    (id_,) = [
+        line.split('"')[3] for line in newest.splitlines() if line.strip().startswith('"id":')
+    ]
     assert id_ in explained
     assert '"ok": true' in verified
     assert '"lower_bound"' in policy

@@ -18,7 +18,9 @@ from dengine.engine.engine import core_of
 from dengine.serve.retraining import RetrainingProcess
 from tests.support.driving import learn
 
-CONV = replace(Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Policy(alpha=0.1, lower_bound=0.9))
+CONV = replace(
+    Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Policy(alpha=0.1, lower_bound=0.9)
+)
 
 
 def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
@@ -28,7 +30,9 @@ def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
         time.sleep(0.01)
 
 
-def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_arrive_writable() -> None:
+def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_arrive_writable() -> (
+    None
+):
     x = torch.arange(60_000.0).reshape(300, 200)
     sent = x, x.t()[3:, 5:], torch.empty(0), torch.nn.Linear(3, 4).weight, x.numpy()[:, ::2]
     with RetrainingProcess() as process:
@@ -61,11 +65,18 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(data: Dataset) -> 
             engine = DataEngine(recipe=CONV, replaying=True, executor=executor)
             learn_and_settle(engine, data)
             assert engine.version == 1
-            decided.append([(item.embedding, item.lower, item.upper) for item in map(engine.decide, data.X[40:60])])
+            decided.append(
+                [
+                    (item.embedding, item.lower, item.upper)
+                    for item in map(engine.decide, data.X[40:60])
+                ]
+            )
     assert decided[0] == decided[1]  # bit for bit
 
 
-def test_the_log_tells_when_the_process_is_ready_and_when_the_first_retrain_begins(data: Dataset, caplog) -> None:
+def test_the_log_tells_when_the_process_is_ready_and_when_the_first_retrain_begins(
+    data: Dataset, caplog
+) -> None:
     caplog.set_level(logging.INFO, "dengine")
     with RetrainingProcess() as process:
         process.submit(os.getpid).result(300)
@@ -74,7 +85,9 @@ def test_the_log_tells_when_the_process_is_ready_and_when_the_first_retrain_begi
     assert caplog.text.count("the first retrain begins, on 30 labels") == 1
 
 
-def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retrains_in_line(data: Dataset) -> None:
+def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retrains_in_line(
+    data: Dataset,
+) -> None:
     with RetrainingProcess() as process:
         engine = DataEngine(recipe=replace(CONV, reducer="pca", params={}), executor=process)
         os.kill(process.submit(os.getpid).result(300), signal.SIGKILL)

@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
-httpx = pytest.importorskip("httpx", reason="the tests' HTTP client is not installed: pip install httpx")
+httpx = pytest.importorskip(
+    "httpx", reason="the tests' HTTP client is not installed: pip install httpx"
+)
 jsonschema = pytest.importorskip("jsonschema")
 
 from hypothesis import given
@@ -44,7 +46,9 @@ Client = Any
 
 
 @contextmanager
-def running(service: CellService, access: Access | None = None, all_: bool = False, **limits: Any) -> Iterator[Client]:
+def running(
+    service: CellService, access: Access | None = None, all_: bool = False, **limits: Any
+) -> Iterator[Client]:
     """A client of a server in front of this service.  all_ : XML-RPC and the page too."""
     app = create_app(service, access or Access(rate=0.0), xmlrpc=all_, page=all_)
     with (
@@ -78,7 +82,9 @@ def client(service: CellService) -> Iterator[Client]:
 def validate(value: Any, schema: str, client: Client) -> None:
     """Hold an answer to the document that the server itself gives."""
     document = client.get("/openapi.json").json()
-    jsonschema.validate(value, {"$ref": f"#/components/schemas/{schema}", "components": document["components"]})
+    jsonschema.validate(
+        value, {"$ref": f"#/components/schemas/{schema}", "components": document["components"]}
+    )
 
 
 def must_be_problem(answer: Any, status: int) -> dict[str, Any]:
@@ -96,11 +102,16 @@ def must_be_problem(answer: Any, status: int) -> dict[str, Any]:
 def test_a_cell_over_http_is_the_cell_without_it(client: Client, stream: Dataset) -> None:
     with DataEngine(recipe=RECIPE) as engine:
         for i in range(60):
-            here, there = engine.decide(stream.X[i]), client.post("/decide", json={"trace": stream.X[i].tolist()}).json()
+            here, there = (
+                engine.decide(stream.X[i]),
+                client.post("/decide", json={"trace": stream.X[i].tolist()}).json(),
+            )
             assert [there[name] for name in COUNTED] == [getattr(here, name) for name in COUNTED]
             if here.action == "verify":
                 engine.report(here.id, bool(stream.y[i]))
-                response = client.post("/report", json={"id": there["id"], "success": bool(stream.y[i])})
+                response = client.post(
+                    "/report", json={"id": there["id"], "success": bool(stream.y[i])}
+                )
                 assert response.json()["success"] is bool(stream.y[i])
         assert engine.version == client.get("/status").json()["version"] == 1
 
@@ -108,17 +119,26 @@ def test_a_cell_over_http_is_the_cell_without_it(client: Client, stream: Dataset
 def forms(trace: np.ndarray, request: str) -> dict[str, dict[str, Any]]:
     """The same trace as each form has it."""
     raw, text = trace.astype("<f4").tobytes(), {"request": request, "part": "P1"}
-    packed, headers = [msgpack.encode({"trace": item, **text}) for item in (trace.tolist(), raw)], {"content-type": MSGPACK}
+    packed, headers = (
+        [msgpack.encode({"trace": item, **text}) for item in (trace.tolist(), raw)],
+        {"content-type": MSGPACK},
+    )
     return {
         "JSON": {"json": {"trace": trace.tolist(), **text}},
-        "float32": {"content": raw, "params": text | {"channels": 1}, "headers": {"content-type": RAW}},
+        "float32": {
+            "content": raw,
+            "params": text | {"channels": 1},
+            "headers": {"content-type": RAW},
+        },
         "MessagePack": {"content": packed[0], "headers": headers},
         "MessagePack of float32": {"content": packed[1], "headers": headers},
     }
 
 
 @pytest.mark.parametrize("form", ["JSON", "float32", "MessagePack", "MessagePack of float32"])
-def test_a_trace_is_the_same_in_every_form(client: Client, service: CellService, stream: Dataset, form: str) -> None:
+def test_a_trace_is_the_same_in_every_form(
+    client: Client, service: CellService, stream: Dataset, form: str
+) -> None:
     answer = client.post("/decide", **forms(stream.X[7], f"form {form}")[form])
     assert answer.status_code == 200, answer.text
     validate(answer.json(), "DecideResponse", client)
@@ -129,7 +149,9 @@ def test_a_trace_is_the_same_in_every_form(client: Client, service: CellService,
 
 @pytest.mark.parametrize("form", ["whole", "fine", "of float32", "integers"])
 @pytest.mark.parametrize("fit", ["strict", "cut", "pad", "resample", "first"])
-def test_bytes_of_float64_are_named_whatever_the_contract_takes(stream: Dataset, fit: str, form: str) -> None:
+def test_bytes_of_float64_are_named_whatever_the_contract_takes(
+    stream: Dataset, fit: str, form: str
+) -> None:
     n = stream.X.shape[-1]
     spec = None if fit == "first" else TraceSpec(n, fit=fit)
     x = {
@@ -140,19 +162,30 @@ def test_bytes_of_float64_are_named_whatever_the_contract_takes(stream: Dataset,
     }[form]
     created = CellService(lambda: DataEngine(recipe=RECIPE, trace=spec), None, 60.0)
     with closing(created) as service, running(service) as client:
-        answer = client.post("/decide", content=x.astype("<f8").tobytes(), headers={"content-type": RAW})
-        assert "twice as many bytes as float32 takes: float64?" in must_be_problem(answer, 422)["detail"]
-        answer = client.post("/decide", content=x.astype("<f4").tobytes(), headers={"content-type": RAW})
+        answer = client.post(
+            "/decide", content=x.astype("<f8").tobytes(), headers={"content-type": RAW}
+        )
+        assert (
+            "twice as many bytes as float32 takes: float64?"
+            in must_be_problem(answer, 422)["detail"]
+        )
+        answer = client.post(
+            "/decide", content=x.astype("<f4").tobytes(), headers={"content-type": RAW}
+        )
         assert answer.status_code == 200, answer.text
 
 
 @given(arrays(np.float32, st.integers(1, 60), elements=st.floats(-1e4, 1e4, width=32)))
-def test_no_bytes_of_float32_are_taken_for_float64_unless_every_other_sample_is_nothing(x: np.ndarray) -> None:
+def test_no_bytes_of_float32_are_taken_for_float64_unless_every_other_sample_is_nothing(
+    x: np.ndarray,
+) -> None:
     if x[0::2].any() or len(x) % 2:
         assert np.array_equal(as_samples(x.astype("<f4").tobytes())[0], x)
 
 
-def test_a_sample_that_is_missing_is_null_and_the_part_is_verified(client: Client, stream: Dataset) -> None:
+def test_a_sample_that_is_missing_is_null_and_the_part_is_verified(
+    client: Client, stream: Dataset
+) -> None:
     trace = [*stream.X[8].tolist()[:-1], None]
     answer = client.post("/decide", json={"trace": trace, "request": "missing/sample ?"}).json()
     assert (answer["action"], answer["reason"]) == ("verify", "not_finite")
@@ -181,10 +214,14 @@ def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Da
     must_be_problem(client.post("/report", json={"id": "nobody", "success": True}), 404)
     must_be_problem(client.post("/report", json={"id": "label-0", "success": "OK"}), 422)
     must_be_problem(client.post("/report", json={"id": "", "success": True}), 422)
-    assert "label-0" not in [decision["id"] for decision in client.get("/decisions?open=true").json()["decisions"]]
+    assert "label-0" not in [
+        decision["id"] for decision in client.get("/decisions?open=true").json()["decisions"]
+    ]
     assert client.get("/decisions/label-0").json()["source"] == "verification"
     packed = msgpack.encode({"id": "label-0", "success": True})
-    assert client.post("/report", content=packed, headers={"content-type": MSGPACK}).json()["repeated"]
+    assert client.post("/report", content=packed, headers={"content-type": MSGPACK}).json()[
+        "repeated"
+    ]
 
 
 def test_what_can_be_looked_at_is_as_the_document_says(client: Client, stream: Dataset) -> None:
@@ -204,62 +241,106 @@ def test_what_can_be_looked_at_is_as_the_document_says(client: Client, stream: D
     for path in ("decisions/nobody", "explanations/nobody", "decisions?before=nobody"):
         must_be_problem(client.get(f"/{path}"), 404)
     queries = ("limit=0", "limit=x", "limit=9999", "open=yes", "label=fine", "since=monday")
-    every = [path.format(id="nobody") for path, how in client.get("/openapi.json").json()["paths"].items() if "get" in how]
+    every = [
+        path.format(id="nobody")
+        for path, how in client.get("/openapi.json").json()["paths"].items()
+        if "get" in how
+    ]
     wrong = [f"decisions?{query}" for query in queries] + [f"{path[1:]}?prat=7" for path in every]
     for path in (*wrong, "events?limit=0", "status?last=0"):
         must_be_problem(client.get(f"/{path}"), 422)
 
 
-def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another(stream: Dataset) -> None:
+def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another(
+    stream: Dataset,
+) -> None:
     with serving() as (_, client):
         for i in range(7):
-            client.post("/decide", json={"trace": stream.X[i].tolist(), "request": f"found-{i}", "part": f"F{i % 6}"})
+            client.post(
+                "/decide",
+                json={"trace": stream.X[i].tolist(), "request": f"found-{i}", "part": f"F{i % 6}"},
+            )
         client.post("/report", json={"id": "found-1", "success": False})
 
         def listed_ids(**query: Any) -> list[str]:
-            return [decision["id"] for decision in client.get("/decisions", params=query).json()["decisions"]]
+            return [
+                decision["id"]
+                for decision in client.get("/decisions", params=query).json()["decisions"]
+            ]
 
         assert listed_ids(part="F0") == ["found-6", "found-0"]
         assert listed_ids(part="F1", label="bad", action="verify") == ["found-1"]
-        assert listed_ids(part="F1", action="reject") == listed_ids(part="nobody") == listed_ids(part="F1", until=1.0) == []
+        assert (
+            listed_ids(part="F1", action="reject")
+            == listed_ids(part="nobody")
+            == listed_ids(part="F1", until=1.0)
+            == []
+        )
         pages, older = [], None
         while older is not None or not pages:
-            page = client.get("/decisions", params={"limit": 3} | ({"before": older} if older else {})).json()
+            page = client.get(
+                "/decisions", params={"limit": 3} | ({"before": older} if older else {})
+            ).json()
             pages += [decision["id"] for decision in page["decisions"]]
             older = page["older"]
         assert len(pages) == len(set(pages)) == client.get("/status").json()["ever"]["decisions"]
         # An accepted part that comes back is reported by its number; one with several decisions needs the id.
-        problem = must_be_problem(client.post("/report", json={"part": "F0", "success": False}), 409)
+        problem = must_be_problem(
+            client.post("/report", json={"part": "F0", "success": False}), 409
+        )
         assert "found-6, found-0" in problem["detail"]
-        answer = client.post("/report", json={"part": "F2", "success": False, "author": "Kim"}).json()
+        answer = client.post(
+            "/report", json={"part": "F2", "success": False, "author": "Kim"}
+        ).json()
         assert (answer["decision_id"], answer["success"]) == ("found-2", False)
         assert client.get("/events?limit=1").json()["events"][0]["author"] == "Kim"
-        assert client.post("/report", json={"part": "found-3", "success": True}).json()["decision_id"] == "found-3"
+        assert (
+            client.post("/report", json={"part": "found-3", "success": True}).json()["decision_id"]
+            == "found-3"
+        )
         must_be_problem(client.post("/report", json={"part": "nobody", "success": False}), 404)
         for both in ({}, {"id": "found-0", "part": "F0"}):
             must_be_problem(client.post("/report", json={"success": False} | both), 422)
 
 
-def test_a_rejected_part_that_was_found_good_is_reported_corrected_and_explained_by_its_number(stream: Dataset) -> None:
+def test_a_rejected_part_that_was_found_good_is_reported_corrected_and_explained_by_its_number(
+    stream: Dataset,
+) -> None:
     with serving() as (_, client):
         client.post("/decide", json={"trace": stream.X[0].tolist(), "request": "first"})
         client.post("/policy", json={"windows": ["0:0:1000000::reject"], "author": "Kim"})
-        decided = client.post("/decide", json={"trace": stream.X[1].tolist(), "request": "r", "part": "R1"}).json()
+        decided = client.post(
+            "/decide", json={"trace": stream.X[1].tolist(), "request": "r", "part": "R1"}
+        ).json()
         assert decided["action"] == "reject"
-        assert client.post("/report", json={"part": "R1", "success": True}).json()["decision_id"] == "r"
+        assert (
+            client.post("/report", json={"part": "R1", "success": True}).json()["decision_id"]
+            == "r"
+        )
         (result,) = client.get("/decisions", params={"part": "R1"}).json()["decisions"]
         assert (result["success"], result["source"]) == (True, "inspection")
         assert client.get("/status").json()["sources"]["inspection"] == 1
         assert client.get("/explanations/R1").json()["decision"]["id"] == "r"
-        assert client.post("/report", json={"part": "R1", "success": True}).json()["repeated"] is True
+        assert (
+            client.post("/report", json={"part": "R1", "success": True}).json()["repeated"] is True
+        )
         must_be_problem(client.post("/report", json={"part": "R1", "success": False}), 409)
-        assert client.post("/correct", json={"part": "R1", "success": False, "author": "Kim"}).json()["event"] is not None
+        assert (
+            client.post("/correct", json={"part": "R1", "success": False, "author": "Kim"}).json()[
+                "event"
+            ]
+            is not None
+        )
         assert client.get("/explanations/r").json()["corrections"][0]["author"] == "Kim"
         for both in ({}, {"id": "r", "part": "R1"}):
-            must_be_problem(client.post("/correct", json={"success": False, "author": "Kim"} | both), 422)
+            must_be_problem(
+                client.post("/correct", json={"success": False, "author": "Kim"} | both), 422
+            )
 
 
-def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(stream: Dataset) -> None:
+def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
+    stream: Dataset,
+) -> None:
     with serving() as (service, client):
         for i in range(3):
             client.post("/decide", json={"trace": stream.X[i].tolist(), "request": f"wrong-{i}"})
@@ -274,12 +355,24 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(st
             changed = client.post(f"/{path}", json=asked | {"author": " Kim  Lee "}).json()
             validate(changed, "Changed", client)
             assert changed["event"] is not None
-            assert client.post(f"/{path}", json=asked | {"author": "Kim Lee"}).json()["event"] is None
+            assert (
+                client.post(f"/{path}", json=asked | {"author": "Kim Lee"}).json()["event"] is None
+            )
         events = client.get("/events").json()["events"]
-        assert [event["kind"] for event in events] == ["shadow", "policy", "policy", "forget", "correct"]
+        assert [event["kind"] for event in events] == [
+            "shadow",
+            "policy",
+            "policy",
+            "forget",
+            "correct",
+        ]
         assert {event["author"] for event in events} == {"Kim Lee"}
         assert (service.engine.policy.alpha, service.engine.policy.shadow) == (0.2, True)
-        assert [client.get(f"/decisions/wrong-{i}").json()["success"] for i in range(3)] == [False, None, None]
+        assert [client.get(f"/decisions/wrong-{i}").json()["success"] for i in range(3)] == [
+            False,
+            None,
+            None,
+        ]
 
 
 @pytest.mark.parametrize(
@@ -295,16 +388,26 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(st
         (404, "rollback", {"version": 7, "author": "Kim"}),
         (422, "rollback", {"version": "../1", "author": "Kim"}),
         (422, "policy", {"alpha": 7, "author": "Kim"}),
-        (422, "policy", {"guarantee": "os:system", "author": "Kim"}),  # nothing is imported since a request names it
+        (
+            422,
+            "policy",
+            {"guarantee": "os:system", "author": "Kim"},
+        ),  # nothing is imported since a request names it
         (422, "policy", {"windows": ["0.1:0.2:high"], "author": "Kim"}),
         (422, "export", {"author": "Kim"}),  # there is no model yet
     ],
 )
-def test_what_cannot_be_put_right_so_is_refused_and_leaves_no_event(status: int, path: str, asked: dict[str, Any]) -> None:
+def test_what_cannot_be_put_right_so_is_refused_and_leaves_no_event(
+    status: int, path: str, asked: dict[str, Any]
+) -> None:
     with serving() as (_, client):
         must_be_problem(refused := client.post(f"/{path}", json=asked), status)
-        assert "--" not in refused.json()["detail"]  # a window's own channel=1 is no option of the command line
-        must_be_problem(client.post(f"/{path}", json=asked, headers={"origin": "http://evil.example"}), 403)
+        assert (
+            "--" not in refused.json()["detail"]
+        )  # a window's own channel=1 is no option of the command line
+        must_be_problem(
+            client.post(f"/{path}", json=asked, headers={"origin": "http://evil.example"}), 403
+        )
         assert client.get("/events").json()["events"] == []
 
 
@@ -312,19 +415,29 @@ def test_a_retrain_that_is_under_way_is_not_begun_once_more(stream: Dataset) -> 
     free = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         pool.submit(free.wait, 60)  # what follows waits behind it
-        with closing(CellService(lambda: DataEngine(recipe=RECIPE, executor=pool), deadline=60.0)) as service:
+        with closing(
+            CellService(lambda: DataEngine(recipe=RECIPE, executor=pool), deadline=60.0)
+        ) as service:
             with running(service) as client:
                 for i in range(20):
-                    client.post("/decide", json={"trace": stream.X[i].tolist(), "request": f"order-{i}"})
+                    client.post(
+                        "/decide", json={"trace": stream.X[i].tolist(), "request": f"order-{i}"}
+                    )
                     client.post("/report", json={"id": f"order-{i}", "success": bool(stream.y[i])})
-                texts = [client.post("/retrain", json={"author": "Kim"}).json()["text"] for _ in range(2)]
+                texts = [
+                    client.post("/retrain", json={"author": "Kim"}).json()["text"] for _ in range(2)
+                ]
             free.set()
     assert texts == ["The retrain has begun.", "A retrain is under way already; nothing changed."]
 
 
 def test_whoever_listens_is_told_of_changes_and_not_of_looks(stream: Dataset) -> None:
     with serving() as (service, client), client.stream("GET", "/changes") as answer:
-        events = (line.removeprefix("event: ") for line in answer.iter_lines() if line.startswith("event: "))
+        events = (
+            line.removeprefix("event: ")
+            for line in answer.iter_lines()
+            if line.startswith("event: ")
+        )
         assert [next(events), next(events)] == ["hello", "changed"]
         for _ in range(3):
             client.get("/status")
@@ -349,18 +462,36 @@ def test_the_page_is_files_that_may_ask_nobody_else(hasty: Client) -> None:
         assert hasty.get(unknown).status_code == 404
 
 
-def test_the_document_names_every_route_and_every_example_is_served(service: CellService, client: Client) -> None:
+def test_the_document_names_every_route_and_every_example_is_served(
+    service: CellService, client: Client
+) -> None:
     document = client.get("/openapi.json").json()
-    served_here = [route for route in create_app(service, xmlrpc=False, page=False).routes if isinstance(route, Route)]
-    routes = {(route.path.replace(":path", ""), m) for route in served_here for m in route.methods - {"HEAD"}}
-    assert routes == {(path, m.upper()) for path, methods in document["paths"].items() for m in methods}
+    served_here = [
+        route
+        for route in create_app(service, xmlrpc=False, page=False).routes
+        if isinstance(route, Route)
+    ]
+    routes = {
+        (route.path.replace(":path", ""), m)
+        for route in served_here
+        for m in route.methods - {"HEAD"}
+    }
+    assert routes == {
+        (path, m.upper()) for path, methods in document["paths"].items() for m in methods
+    }
     for path, methods in document["paths"].items():
         for content in methods.get("post", {}).get("requestBody", {}).get("content", {}).values():
             for example in content.get("examples", {}).values():
-                jsonschema.validate(example["value"], {**content["schema"], "components": document["components"]})
+                jsonschema.validate(
+                    example["value"], {**content["schema"], "components": document["components"]}
+                )
                 answer = client.post(path, json=example["value"])
-                assert answer.status_code in (200, 404, 422), answer.text  # of another contract, or unknown here
-                assert "unknown" in answer.text or "samples" in answer.text or "channel" in answer.text
+                assert answer.status_code in (200, 404, 422), (
+                    answer.text
+                )  # of another contract, or unknown here
+                assert (
+                    "unknown" in answer.text or "samples" in answer.text or "channel" in answer.text
+                )
     assert client.get("/docs").headers["content-type"].startswith("text/html")
 
 
@@ -371,11 +502,22 @@ def test_prometheus_reads_what_was_answered(stream: Dataset) -> None:
         client.post("/report", json={"id": "m-0", "success": True})
         text = client.get("/metrics").text
     result = {
-        (s.name, *sorted(s.labels.values())): s.value for f in text_string_to_metric_families(text) for s in f.samples
+        (s.name, *sorted(s.labels.values())): s.value
+        for f in text_string_to_metric_families(text)
+        for s in f.samples
     }
     assert result["dengine_decide_seconds_count", "no_model", "verify"] == 3
-    assert result["dengine_report_seconds_count", "false", "true"] == result["dengine_new_labels",] == 1
-    assert result["dengine_late_total",] == result["dengine_safe_mode",] == result["dengine_store_fault",] == 0
+    assert (
+        result["dengine_report_seconds_count", "false", "true"]
+        == result["dengine_new_labels",]
+        == 1
+    )
+    assert (
+        result["dengine_late_total",]
+        == result["dengine_safe_mode",]
+        == result["dengine_store_fault",]
+        == 0
+    )
     assert 0 <= result["dengine_store_lag_seconds",] < 60
 
 
@@ -414,7 +556,9 @@ REFUSED: dict[str, tuple[int, dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_trace_is_refused_and_leaves_nothing(client: Client, stream: Dataset, name: str) -> None:
+def test_what_is_no_trace_is_refused_and_leaves_nothing(
+    client: Client, stream: Dataset, name: str
+) -> None:
     client.post("/decide", json={"trace": stream.X[0].tolist(), "request": "the contract"})
     before = client.get("/status").json()["ever"]["decisions"]
     status, request = REFUSED[name]
@@ -422,11 +566,19 @@ def test_what_is_no_trace_is_refused_and_leaves_nothing(client: Client, stream: 
     must_be_problem(answer, status)
     assert client.get("/status").json()["ever"]["decisions"] == before
     if name == "another length":  # in the words of who sends it, and of who serves it
-        assert f"or start a new store with --samples {SAMPLES}, --fit pad." in answer.json()["detail"]
+        assert (
+            f"or start a new store with --samples {SAMPLES}, --fit pad." in answer.json()["detail"]
+        )
 
 
-def test_paths_and_methods_that_there_are_not_are_problems_too_with_every_header(client: Client) -> None:
-    for method, path, status in (("GET", "/nothing", 404), ("GET", "/decide", 405), ("DELETE", "/decisions", 405)):
+def test_paths_and_methods_that_there_are_not_are_problems_too_with_every_header(
+    client: Client,
+) -> None:
+    for method, path, status in (
+        ("GET", "/nothing", 404),
+        ("GET", "/decide", 405),
+        ("DELETE", "/decisions", 405),
+    ):
         answer = client.request(method, path)
         must_be_problem(answer, status)
         assert answer.headers["x-content-type-options"] == "nosniff"
@@ -448,16 +600,33 @@ def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None
 
 
 def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks(stream: Dataset) -> None:
-    with serving(Access((Token(TOKEN, name="Kim"), Token("a-viewer-s-password", operates=False)))) as (_, client):
+    with serving(
+        Access((Token(TOKEN, name="Kim"), Token("a-viewer-s-password", operates=False)))
+    ) as (_, client):
         for text in ("", "Bearer other", "Basic !", f"Bearer {TOKEN}x", TOKEN):
             refused = client.get("/status", headers={"authorization": text} if text else {})
             must_be_problem(refused, 401)
             asked = refused.headers.get_list("www-authenticate")
-            assert [item.split()[0] for item in asked] == ["Basic", "Bearer"]  # a line each, or no browser asks for it
-        assert client.get("/me", auth=("anybody", TOKEN)).json() == {"name": "Kim", "operates": True}
-        kim, viewer = ({"authorization": f"Bearer {item}"} for item in (TOKEN, "a-viewer-s-password"))
-        for asked, headers, status in (({}, kim, 200), ({"author": "Robin"}, kim, 422), ({"author": "Kim"}, viewer, 403)):
-            assert client.post("/policy", json={"shadow": True} | asked, headers=headers).status_code == status
+            assert [item.split()[0] for item in asked] == [
+                "Basic",
+                "Bearer",
+            ]  # a line each, or no browser asks for it
+        assert client.get("/me", auth=("anybody", TOKEN)).json() == {
+            "name": "Kim",
+            "operates": True,
+        }
+        kim, viewer = (
+            {"authorization": f"Bearer {item}"} for item in (TOKEN, "a-viewer-s-password")
+        )
+        for asked, headers, status in (
+            ({}, kim, 200),
+            ({"author": "Robin"}, kim, 422),
+            ({"author": "Kim"}, viewer, 403),
+        ):
+            assert (
+                client.post("/policy", json={"shadow": True} | asked, headers=headers).status_code
+                == status
+            )
         (event,) = client.get("/events", headers=viewer).json()["events"]
         assert (event["kind"], event["author"]) == ("shadow", "Kim")
         assert client.get("/healthz").status_code == 200
@@ -467,9 +636,17 @@ def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks(stream: Dat
 
 def test_pages_of_other_sites_are_not_served(client: Client, stream: Dataset) -> None:
     here, body = str(client.base_url).rstrip("/"), {"json": {"trace": stream.X[0].tolist()}}
-    for headers in ({"origin": "http://evil.example"}, {"origin": "null"}, {"sec-fetch-site": "cross-site"}):
+    for headers in (
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"sec-fetch-site": "cross-site"},
+    ):
         must_be_problem(client.post("/decide", headers=headers, **body), 403)
-    for headers in ({"origin": here}, {"sec-fetch-site": "same-origin"}, {"sec-fetch-site": "none"}):
+    for headers in (
+        {"origin": here},
+        {"sec-fetch-site": "same-origin"},
+        {"sec-fetch-site": "none"},
+    ):
         assert client.post("/decide", headers=headers, **body).status_code == 200
     for host in ("evil.example", "127.0.0.1.evil.example", "a@b", "localhost:x"):
         must_be_problem(client.get("/healthz", headers={"host": host}), 421)
@@ -481,10 +658,18 @@ def test_sizes_connections_and_rates_are_limited(stream: Dataset) -> None:
     access = Access(largest=4000, rate=2.0)
     with serving(access, connections=3, head_seconds=0.3) as (_, client):
         must_be_problem(client.post("/decide", **typed(b"0" * 4001, RAW)), 413)
-        must_be_problem(client.post("/decide", content=iter([b"0" * 3000] * 2), headers={"content-type": RAW}), 413)
+        must_be_problem(
+            client.post("/decide", content=iter([b"0" * 3000] * 2), headers={"content-type": RAW}),
+            413,
+        )
         at = client.base_url.host, client.base_url.port
-        fulls = [read_all(item) for item in [socket.create_connection(at, timeout=60) for _ in range(4)]]
-        assert [full[:13] for full in fulls] == [b"HTTP/1.1 503 ", *[b"HTTP/1.1 408 "] * 3]  # the oldest gives way
+        fulls = [
+            read_all(item) for item in [socket.create_connection(at, timeout=60) for _ in range(4)]
+        ]
+        assert [full[:13] for full in fulls] == [
+            b"HTTP/1.1 503 ",
+            *[b"HTTP/1.1 408 "] * 3,
+        ]  # the oldest gives way
         while (answer := client.get("/healthz")).status_code == 200:
             pass
         must_be_problem(answer, 429)
@@ -492,21 +677,38 @@ def test_sizes_connections_and_rates_are_limited(stream: Dataset) -> None:
 
 
 @pytest.mark.parametrize("addresses", [1, 20])
-def test_connections_without_a_token_keep_nobody_out_who_has_one(tmp_path: Path, addresses: int, stream: Dataset) -> None:
+def test_connections_without_a_token_keep_nobody_out_who_has_one(
+    tmp_path: Path, addresses: int, stream: Dataset
+) -> None:
     make_token(tmp_path)
-    asked, headers = b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n", {"authorization": f"Bearer {TOKEN}"}
-    with started(tmp_path, "--token-file", "token", "--no-page", "--reducer", "pca") as process, ExitStack() as others:
+    asked, headers = (
+        b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n",
+        {"authorization": f"Bearer {TOKEN}"},
+    )
+    with (
+        started(tmp_path, "--token-file", "token", "--no-page", "--reducer", "pca") as process,
+        ExitStack() as others,
+    ):
         here = {"base_url": f"http://127.0.0.1:{process.port}", "timeout": 60, "trust_env": False}
-        robot = others.enter_context(httpx.Client(headers=headers, **here))  # it came first, and keeps its connection
+        robot = others.enter_context(
+            httpx.Client(headers=headers, **here)
+        )  # it came first, and keeps its connection
         assert robot.get("/status").status_code == 200
         for i in range(150):
             at = (f"127.0.0.{1 + i % addresses}", 0)
-            other = others.enter_context(socket.create_connection(("127.0.0.1", process.port), 60, source_address=at))
+            other = others.enter_context(
+                socket.create_connection(("127.0.0.1", process.port), 60, source_address=at)
+            )
             other.sendall(asked)
             assert other.recv(1000).startswith(b"HTTP/1.1 200 ")
         for i, x in enumerate(stream.X[:20]):
             with httpx.Client(headers=headers, **here) as new:
-                assert new.post("/decide", json={"trace": x.tolist(), "request": str(i)}).json()["reason"] == "no_model"
+                assert (
+                    new.post("/decide", json={"trace": x.tolist(), "request": str(i)}).json()[
+                        "reason"
+                    ]
+                    == "no_model"
+                )
         assert robot.get("/status").json()["ever"]["decisions"] == 20
         assert robot.get("/status", headers={"authorization": "Bearer wrong"}).status_code == 401
         process.end()
@@ -542,7 +744,9 @@ def hasty(service: CellService) -> Iterator[Client]:
 
 @pytest.mark.parametrize("ended", [False, True], ids=["left open", "ended"])
 @pytest.mark.parametrize("name", HALVES)
-def test_half_a_request_is_answered_before_its_connection_is_closed(hasty: Client, name: str, ended: bool) -> None:
+def test_half_a_request_is_answered_before_its_connection_is_closed(
+    hasty: Client, name: str, ended: bool
+) -> None:
     sent, wanted = HALVES[name]
     with socket.create_connection((hasty.base_url.host, hasty.base_url.port), timeout=60) as raw:
         raw.sendall(sent)
@@ -566,24 +770,49 @@ def read_all(connection: socket.socket) -> bytes:
     return result
 
 
-def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_store(tmp_path, stream, monkeypatch) -> None:
+def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_store(
+    tmp_path, stream, monkeypatch
+) -> None:
     certificate(tmp_path)
     make_token(tmp_path)
-    words = ("--shadow", "--host", "0.0.0.0", "--token-file", "token", "--cert", "cert.pem", "--key", "key.pem")
-    monkeypatch.delenv("DENGINE_STORE_WAIT", raising=False)  # as a cell waits for its store: the tests' own wait is long
-    trusted, output = ssl.create_default_context(cafile=str(tmp_path / "cert.pem")), {"authorization": f"Bearer {TOKEN}"}
+    words = (
+        "--shadow",
+        "--host",
+        "0.0.0.0",
+        "--token-file",
+        "token",
+        "--cert",
+        "cert.pem",
+        "--key",
+        "key.pem",
+    )
+    monkeypatch.delenv(
+        "DENGINE_STORE_WAIT", raising=False
+    )  # as a cell waits for its store: the tests' own wait is long
+    trusted, output = (
+        ssl.create_default_context(cafile=str(tmp_path / "cert.pem")),
+        {"authorization": f"Bearer {TOKEN}"},
+    )
     with started(tmp_path, "--reducer", "pca", *words) as process:
         how: dict[str, Any] = {"verify": trusted, "timeout": 60, "trust_env": False}
         with httpx.Client(base_url=f"https://localhost:{process.port}", **how) as client:
             assert client.get("/healthz").json()["status"] == "ok"
             must_be_problem(client.get("/status"), 401)
             client.headers.update(output)
-            assert client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()["action"] == "verify"
+            assert (
+                client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()["action"]
+                == "verify"
+            )
             assert client.get("/status").json()["shadow"] is True
-            for store, at, text in (("cell.db", "0", "cell.db"), ("b.db", process.port, "already in use")):
+            for store, at, text in (
+                ("cell.db", "0", "cell.db"),
+                ("b.db", process.port, "already in use"),
+            ):
                 refused_in_a_line(text, "--store", tmp_path / store, "--port", at)
             assert process.end() == 0
-    assert all(" level=" in line and " message=" in line for line in process.output.splitlines()), process.output
+    assert all(" level=" in line and " message=" in line for line in process.output.splitlines()), (
+        process.output
+    )
     assert TOKEN not in process.output
     with DataEngine.open(tmp_path / "cell.db") as engine:
         assert engine.find("order-0").decision.action == "verify"
@@ -600,7 +829,9 @@ def make_token(folder: Path, text: str = TOKEN, mode: int = 0o600) -> None:
     (folder / "token").chmod(mode)
 
 
-def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp_path: Path) -> None:
+def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(
+    tmp_path: Path,
+) -> None:
     certificate(tmp_path)
     token, locked = (
         ("--token-file", tmp_path / "token"),
@@ -615,7 +846,9 @@ def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp
         ((*locked, "--host", "localhost"), "Expected a key without a password", 0o600),
     ):
         make_token(tmp_path, "short", mode)
-        refused_in_a_line(text, "--store", tmp_path / "cell.db", "--port", "0", "--host", "0.0.0.0", *words)
+        refused_in_a_line(
+            text, "--store", tmp_path / "cell.db", "--port", "0", "--host", "0.0.0.0", *words
+        )
     assert not (tmp_path / "cell.db").exists()
 
 
@@ -656,13 +889,23 @@ QUERIES = {  # every query parameter that takes a number
 
 
 @pytest.mark.parametrize(("path", "names"), QUERIES.items())
-def test_whatever_number_a_query_holds_it_is_answered_or_refused_with_its_name(path: str, names, stream: Dataset) -> None:
+def test_whatever_number_a_query_holds_it_is_answered_or_refused_with_its_name(
+    path: str, names, stream: Dataset
+) -> None:
     with serving() as (_, client):
         for i, x in enumerate(stream.X[:30]):
             client.post("/decide", **forms(x, f"order-{i}")["JSON"]).raise_for_status()
-        asked = [{"hours": "1", name: value} if name == "start" else {name: value} for name in names for value in NUMBERS]
+        asked = [
+            {"hours": "1", name: value} if name == "start" else {name: value}
+            for name in names
+            for value in NUMBERS
+        ]
         answers = [(answer, client.get(path, params=answer)) for answer in asked]
-        assert [(answer, result.text) for answer, result in answers if result.status_code not in (200, 422)] == []
+        assert [
+            (answer, result.text)
+            for answer, result in answers
+            if result.status_code not in (200, 422)
+        ] == []
         refused = must_be_problem(client.get("/course", params={"hours": "5e-324"}), 422)
         assert "hours" in refused["detail"]
 
@@ -680,7 +923,9 @@ def test_a_trace_of_any_finite_numbers_is_explained(stream: Dataset) -> None:
     with serving() as (_, client):
         for i in range(60):
             client.post("/decide", **forms(stream.X[i], f"order-{i}")["float32"]).raise_for_status()
-            client.post("/report", json={"id": f"order-{i}", "success": bool(stream.y[i])}).raise_for_status()
+            client.post(
+                "/report", json={"id": f"order-{i}", "success": bool(stream.y[i])}
+            ).raise_for_status()
         for name, size in sizes.items():
             for form, trace in (
                 ("two samples", np.where(np.arange(len(x)) == 7, -size, x)),
@@ -688,7 +933,9 @@ def test_a_trace_of_any_finite_numbers_is_explained(stream: Dataset) -> None:
             ):
                 trace[9] = size
                 id_ = f"{name} {form}"
-                client.post("/decide", **forms(trace.astype(np.float32), id_)["float32"]).raise_for_status()
+                client.post(
+                    "/decide", **forms(trace.astype(np.float32), id_)["float32"]
+                ).raise_for_status()
                 response = client.get(f"/explanations/{id_}")
                 assert response.status_code == 200, (id_, response.text)
                 assert len(response.json()["trace"][0]) == len(x)

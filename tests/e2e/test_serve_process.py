@@ -44,7 +44,9 @@ def until(true: Callable[[], Any], wait: float = WAIT) -> Any:
 def children(pid: int) -> list[int]:
     """Processes below this one."""
     try:
-        custom = [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        custom = [
+            int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        ]
     except FileNotFoundError:
         pytest.skip("this system does not say which processes are whose")
     return [*custom, *(deeper for word in custom for deeper in children(word))]
@@ -86,8 +88,12 @@ class Robots:
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is_lost(tmp_path, parts, name: str) -> None:
-    recipe = Recipe("conv", radius=0.05, retrain_every=20, budget=3.0)  # seconds: so that a retrain is met
+def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is_lost(
+    tmp_path, parts, name: str
+) -> None:
+    recipe = Recipe(
+        "conv", radius=0.05, retrain_every=20, budget=3.0
+    )  # seconds: so that a retrain is met
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
     with started(tmp_path, "--no-page", "--recipe", "recipe.toml", "--rate", "0") as process:
         robots = Robots(process.ask, parts)
@@ -108,14 +114,20 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
         assert {id_: engine.find(id_).success for id_ in robots.labels} == robots.labels
         for id_, answer in robots.answers.items():
             match = engine.find(id_)
-            assert [getattr(match.decision, name) for name in NAMES] == [answer[name] for name in NAMES]
+            assert [getattr(match.decision, name) for name in NAMES] == [
+                answer[name] for name in NAMES
+            ]
 
 
 @pytest.mark.parametrize("at_work", [False, True], ids=["at its start", "in a retrain"])
-def test_a_server_that_is_killed_leaves_no_retraining_process_behind(tmp_path: Path, parts: Dataset, at_work: bool) -> None:
+def test_a_server_that_is_killed_leaves_no_retraining_process_behind(
+    tmp_path: Path, parts: Dataset, at_work: bool
+) -> None:
     recipe = Recipe("conv", retrain_every=20, budget=300.0, max_steps=10**6)
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    with started(tmp_path, "--no-page", "--recipe", "recipe.toml", "--rate", "0", wait=at_work) as process:
+    with started(
+        tmp_path, "--no-page", "--recipe", "recipe.toml", "--rate", "0", wait=at_work
+    ) as process:
         if at_work:
             threads = Robots(process.ask, parts).start(1)
             until(lambda: process.ask("/status")["retraining"])
@@ -149,7 +161,10 @@ class Insertions:
             force = next(self._force)
         elif force is None and self._over is not None:
             self._over.set()
-        return {"actual_TCP_force[2]": force or 0.0, "output_int_register_25": float(force is not None)}
+        return {
+            "actual_TCP_force[2]": force or 0.0,
+            "output_int_register_25": float(force is not None),
+        }
 
 
 def inserted(robot: Any, program: Insertions, trace: np.ndarray) -> dict[str, Any]:
@@ -164,7 +179,9 @@ def inserted(robot: Any, program: Insertions, trace: np.ndarray) -> dict[str, An
     return until(decided)
 
 
-def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_away_in_between(tmp_path, parts) -> None:
+def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_away_in_between(
+    tmp_path, parts
+) -> None:
     program = Insertions()
     with FakeController(program) as fake:
         robot_at = ("--robot", f"127.0.0.1:{fake.port}", "--samples", str(SAMPLES))
@@ -177,7 +194,9 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
                 assert robot.report(answer["id"], bool(parts.y[i])) is True
                 record = process.ask(f"/decisions/{answer['id']}?trace=true")
                 assert record["success"] is bool(parts.y[i])
-                np.testing.assert_array_equal(np.float32(record["trace"]).ravel(), parts.X[i])  # as it was sent
+                np.testing.assert_array_equal(
+                    np.float32(record["trace"]).ravel(), parts.X[i]
+                )  # as it was sent
             fake.close()
             unknown = robot.decide_recorded(robot.begin())
             assert (unknown["action"], unknown["id"], unknown["reason"]) == (0, "", "not_recorded")
@@ -192,8 +211,14 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
     assert "Traceback" not in process.output
 
 
-def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(tmp_path: Path, make_data) -> None:
-    page, data, token = (REPO / "docs/howto/plc_and_robot.md").read_text("utf-8"), make_data(200, samples=1000), "t" * 24
+def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(
+    tmp_path: Path, make_data
+) -> None:
+    page, data, token = (
+        (REPO / "docs/howto/plc_and_robot.md").read_text("utf-8"),
+        make_data(200, samples=1000),
+        "t" * 24,
+    )
     (head,) = re.findall(r"```text\n(POST /decide.+?\n\n)```", page, flags=re.DOTALL)
     (node,) = re.findall(r"```python\n(from http.+?)```", page, flags=re.DOTALL)
     (tmp_path / "token").write_text(token)
@@ -214,5 +239,9 @@ def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(tmp_p
         exec(node, scope)
         url = f"http://127.0.0.1:{server.port}"
         asked = (url, token), (url, "another"), ("http://127.0.0.1:1", token)
-        assert [scope["decide"](x, "P-1", *item) for item in asked] == ["accept", "verify", "verify"]
+        assert [scope["decide"](x, "P-1", *item) for item in asked] == [
+            "accept",
+            "verify",
+            "verify",
+        ]
         assert action[1] == b"accept"

@@ -23,14 +23,18 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
     async def cell(service: CellService) -> None:
         free = threading.Event()
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
-        read = asyncio.create_task(asyncio.to_thread(free.wait, WAIT))  # as a store that does not answer
+        read = asyncio.create_task(
+            asyncio.to_thread(free.wait, WAIT)
+        )  # as a store that does not answer
         await service.decide(stream.X[0], "order-0")
         service.deadline = 0.05
         with busy_engine(service):
             late = await service.decide(stream.X[1], "order-1", part="P1")
             broken = await service.decide(bad, "order-2")
             with pytest.raises(TraceError, match="got another"):
-                await service.decide(stream.X[2], "order-0")  # in time or late, an answer is to one trace
+                await service.decide(
+                    stream.X[2], "order-0"
+                )  # in time or late, an answer is to one trace
             with pytest.raises(TraceError, match="60"):
                 await service.decide(stream.X[0][:10], "order-3")
             text = late.late, late.decision.action, late.decision.reason, broken.decision.reason
@@ -62,7 +66,10 @@ def test_the_engine_does_what_it_has_to_while_nobody_asks(stream: Dataset) -> No
             await asyncio.wait_for(anext(changes), 60)
         await changes.aclose()
 
-    with ThreadPoolExecutor(1) as pool, closing(CellService(lambda: DataEngine(recipe=RECIPE, executor=pool))) as created:
+    with (
+        ThreadPoolExecutor(1) as pool,
+        closing(CellService(lambda: DataEngine(recipe=RECIPE, executor=pool))) as created,
+    ):
         created.deadline = WAIT
         asyncio.run(cell(created))
 
@@ -88,11 +95,16 @@ def test_a_model_of_the_users_keeps_the_engines_thread_and_never_the_loop(stream
         asyncio.run(cell(created))
 
 
-def test_a_decision_without_an_id_is_what_the_thread_would_say_and_verify_where_that_is_held(stream: Dataset) -> None:
+def test_a_decision_without_an_id_is_what_the_thread_would_say_and_verify_where_that_is_held(
+    stream: Dataset,
+) -> None:
     async def cell(service: CellService) -> None:
         for i in range(40):
             await service.report((await service.decide(stream.X[i])).decision.id, bool(stream.y[i]))
-        at_once, thread = await service.decide(stream.X[41]), await service.decide(stream.X[41], "in-the-thread")
+        at_once, thread = (
+            await service.decide(stream.X[41]),
+            await service.decide(stream.X[41], "in-the-thread"),
+        )
         assert evidence(at_once.decision) == evidence(thread.decision)
         assert at_once.decision.model_version == 1
         service.deadline = 0.05

@@ -22,7 +22,9 @@ def test_taken_ids_are_never_taken_for_new_ones() -> None:
 
 
 @pytest.mark.parametrize("stored", [False, True])
-def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_since(stream, tmp_path, stored) -> None:
+def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_since(
+    stream, tmp_path, stored
+) -> None:
     with DataEngine(recipe=RECIPE, store=tmp_path / "engine.db" if stored else None) as engine:
         for none in ("", "two\nlines", 7, "x" * 1000):
             with pytest.raises(ReportError, match="Expected the id"):
@@ -49,7 +51,9 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_once(stream: Dataset, tmp_path: Path) -> None:
+def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_once(
+    stream: Dataset, tmp_path: Path
+) -> None:
     np.save(tmp_path / "x.npy", stream.X[:20])
     file = tmp_path / "engine.db"
     command = [sys.executable, "-c", KILLED, str(tmp_path / "x.npy"), str(file)]
@@ -64,19 +68,25 @@ def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_onc
         assert engine.store.status()["decisions"] == 20
 
 
-def test_the_shadow_lasts_over_a_restart_and_its_end_brings_the_audit_rate_back(stream: Dataset, tmp_path: Path) -> None:
+def test_the_shadow_lasts_over_a_restart_and_its_end_brings_the_audit_rate_back(
+    stream: Dataset, tmp_path: Path
+) -> None:
     recipe = replace(RECIPE, policy=replace(RECIPE.policy, audit_rate=0.05))
     with DataEngine(recipe=recipe, store=tmp_path / "engine.db") as engine:
         drive(engine, stream, 0, 200)
         engine.set_shadow(True)
         assert engine.set_shadow(True).event is None
-    with DataEngine.open_or_create(tmp_path / "engine.db", recipe=recipe) as engine:  # the program's own settings
+    with DataEngine.open_or_create(
+        tmp_path / "engine.db", recipe=recipe
+    ) as engine:  # the program's own settings
         assert engine.policy.shadow
         engine.set_policy(replace(engine.policy, lower_bound=0.8))
         cycles = drive(engine, stream, 200, 240)
         would = [cycle for cycle in cycles if cycle.decision.predicted is not Action.VERIFY]
         assert {cycle.decision.action for cycle in cycles} == {Action.VERIFY}
-        assert {(cycle.source, cycle.decision.propensity) for cycle in would} == {(Source.AUDIT, 1.0)}
+        assert {(cycle.source, cycle.decision.propensity) for cycle in would} == {
+            (Source.AUDIT, 1.0)
+        }
         engine.set_shadow(False, "kim")
         assert engine.policy == replace(recipe.policy, lower_bound=0.8)
         assert Action.ACCEPT in {cycle.decision.action for cycle in drive(engine, stream, 240, 400)}

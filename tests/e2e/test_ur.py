@@ -13,8 +13,25 @@ import pytest
 from dengine import DataEngine, Dataset, Policy, ReplayCell
 from dengine.cells import Cell, FakeController, RtdeRecorder, UrCell
 from dengine.cells.ur import RobotProgram, Trouble
-from dengine.cells.ur.cell import ANSWER, MAX_NUMBER, ORDER, PHASE, RUNTIME, ResultCode, Runtime, Verb, encode_message
-from dengine.cells.ur.protocol import CHANNELS, TYPES, Package, PackageReader, PackageType, RtdeRecipe
+from dengine.cells.ur.cell import (
+    ANSWER,
+    MAX_NUMBER,
+    ORDER,
+    PHASE,
+    RUNTIME,
+    ResultCode,
+    Runtime,
+    Verb,
+    encode_message,
+)
+from dengine.cells.ur.protocol import (
+    CHANNELS,
+    TYPES,
+    Package,
+    PackageReader,
+    PackageType,
+    RtdeRecipe,
+)
 from dengine.cells.ur.stream import RtdeClient, RtdeStream
 from dengine.datasets.triggers import Trigger
 from dengine.errors import CellError, DengineError
@@ -31,7 +48,9 @@ def parts(make_data) -> Dataset:
 
 
 def cell_of(fake: FakeController, **how) -> UrCell:
-    return UrCell(fake.host, port=fake.port, samples=SAMPLES, order_timeout=WAIT, start_timeout=WAIT, **how)
+    return UrCell(
+        fake.host, port=fake.port, samples=SAMPLES, order_timeout=WAIT, start_timeout=WAIT, **how
+    )
 
 
 def nan_places(part: int, trace: np.ndarray) -> set[tuple[int, int]]:
@@ -58,7 +77,9 @@ def test_every_type_of_the_guide_is_packed_and_unpacked(kind: str) -> None:
 def test_a_data_package_is_bytes_as_the_guide_says() -> None:
     # Header: size uint16 and kind uint8; then the recipe's number; big-endian.
     recipe = RtdeRecipe(1, ("timestamp", "output_int_register_24"), ("DOUBLE", "INT32"))
-    assert recipe.pack({"output_int_register_24": -1, "timestamp": 2.0}) == struct.pack(">HBBdi", 16, ord("U"), 1, 2.0, -1)
+    assert recipe.pack({"output_int_register_24": -1, "timestamp": 2.0}) == struct.pack(
+        ">HBBdi", 16, ord("U"), 1, 2.0, -1
+    )
 
 
 @pytest.mark.parametrize(
@@ -75,7 +96,10 @@ def test_a_data_package_is_bytes_as_the_guide_says() -> None:
 def test_what_a_controller_refuses_or_does_not_have_is_said_at_once(
     refused: PackageType | str, column: str, text: str
 ) -> None:
-    with FakeController(speed=None, refuses=[refused]) as fake, pytest.raises(DengineError, match=text):
+    with (
+        FakeController(speed=None, refuses=[refused]) as fake,
+        pytest.raises(DengineError, match=text),
+    ):
         RtdeClient(fake.host, fake.port, (column,), (ORDER,))
 
 
@@ -104,8 +128,13 @@ TROUBLES = [
 ]
 
 
-def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(parts: Dataset) -> None:
-    with FakeController(RobotProgram(parts), speed=None, troubles=TROUBLES) as fake, cell_of(fake) as cell:
+def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(
+    parts: Dataset,
+) -> None:
+    with (
+        FakeController(RobotProgram(parts), speed=None, troubles=TROUBLES) as fake,
+        cell_of(fake) as cell,
+    ):
         for part in range(16):
             trace = cell.insert()
             lost = {place for place in fake.lost if place[0] == part}
@@ -161,26 +190,46 @@ def contact() -> np.ndarray:
     ],
     ids=["contact", "digital output", "register", "bit register", "motion"],
 )
-def test_a_recorder_cuts_several_channels_by_any_trigger_with_samples_from_before_it(trigger, columns: dict) -> None:
+def test_a_recorder_cuts_several_channels_by_any_trigger_with_samples_from_before_it(
+    trigger, columns: dict
+) -> None:
     channels = {"FX_Base": contact() / 2, "FZ_Base": contact(), "actual_q[5]": contact() / 4}
-    program, how = Signals(**channels, **columns), {"samples": 60, "before": 20, "channels": tuple(channels)}
-    with FakeController(program, speed=None) as fake, RtdeRecorder(fake.host, trigger, port=fake.port, **how) as recorder:
+    program, how = (
+        Signals(**channels, **columns),
+        {"samples": 60, "before": 20, "channels": tuple(channels)},
+    )
+    with (
+        FakeController(program, speed=None) as fake,
+        RtdeRecorder(fake.host, trigger, port=fake.port, **how) as recorder,
+    ):
         for _ in range(3):
             expected = np.stack(list(channels.values()))[:, 180:240].astype(np.float32)
             np.testing.assert_array_equal(recorder.record(WAIT).trace, expected)
-    assert (recorder.spec.samples, recorder.spec.channels, recorder.spec.columns) == (60, 3, tuple(channels))
+    assert (recorder.spec.samples, recorder.spec.channels, recorder.spec.columns) == (
+        60,
+        3,
+        tuple(channels),
+    )
 
 
 def decisions(cell: Cell, n: int) -> list[dict]:
     with DataEngine("pca", retrain_every=10, policy=Policy(0.3, 0.6), seed=0) as engine:
         cycles = list(engine.run(cell, n))
-    return [asdict(cycle.decision) | {"id": "", "outcome": cycle.outcome, "success": cycle.success} for cycle in cycles]
+    return [
+        asdict(cycle.decision) | {"id": "", "outcome": cycle.outcome, "success": cycle.success}
+        for cycle in cycles
+    ]
 
 
 @pytest.mark.parametrize("confirm", [False, True])
-def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(make_data, confirm: bool) -> None:
+def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(
+    make_data, confirm: bool
+) -> None:
     data = make_data(120, samples=SAMPLES, failures=0.4)
-    with FakeController(RobotProgram(data, confirm=confirm), speed=None) as fake, cell_of(fake) as cell:
+    with (
+        FakeController(RobotProgram(data, confirm=confirm), speed=None) as fake,
+        cell_of(fake) as cell,
+    ):
         assert isinstance(cell, Cell)
         live = decisions(cell, 120)
     assert live == decisions(ReplayCell(data, confirm=confirm), 120)
@@ -247,7 +296,9 @@ def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_
         assert reconnected(anew=True) is None
 
 
-def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its_number(parts: Dataset) -> None:
+def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its_number(
+    parts: Dataset,
+) -> None:
     """The first owner goes while its order is carried out; what the next one orders has the next number."""
     program = RobotProgram(parts, approach=4000)
     with FakeController(program, speed=20.0) as fake:
@@ -256,7 +307,9 @@ def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its
             with pytest.raises(CellError, match="order 1"):
                 first.insert()
         with cell_of(fake) as second:
-            assert program.outputs[ANSWER] == encode_message(1, ResultCode.DONE)  # `open` waited for it
+            assert program.outputs[ANSWER] == encode_message(
+                1, ResultCode.DONE
+            )  # `open` waited for it
             second.reject()
             assert fake.inputs[ORDER] == encode_message(2, Verb.REJECT)
         program.step = lambda inputs: {
@@ -268,32 +321,61 @@ def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its
 
 
 def run_on(fake: FakeController, store: Path) -> tuple[object, ...]:
-    return "run", "--cell", "ur", "--host", f"{fake.host}:{fake.port}", "--samples", SAMPLES, "--store", store
+    return (
+        "run",
+        "--cell",
+        "ur",
+        "--host",
+        f"{fake.host}:{fake.port}",
+        "--samples",
+        SAMPLES,
+        "--store",
+        store,
+    )
 
 
-def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dataset, tmp_path: Path) -> None:
+def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(
+    parts: Dataset, tmp_path: Path
+) -> None:
     store = tmp_path / "cell.db"
-    with FakeController(RobotProgram(parts), speed=None, troubles=[Trouble(3, 9, "drop", 2)]) as fake:
+    with FakeController(
+        RobotProgram(parts), speed=None, troubles=[Trouble(3, 9, "drop", 2)]
+    ) as fake:
         result = document(*run_on(fake, store), "--reducer", "pca", "--cycles", 12)
         shown = line_of(*run_on(fake, store), "--cycles", 3)
     assert (result["total"]["verified"], result["cell"]["incomplete"]) == (12, 1)
     assert result["cell"]["missing"] >= 2
     assert "incomplete 0" in shown
     with DataEngine.open(store) as engine:
-        kept = engine.store.labelled().traces[:, 0]  # of a trace with a gap the label is counted, not the trace
+        kept = engine.store.labelled().traces[
+            :, 0
+        ]  # of a trace with a gap the label is counted, not the trace
         assert engine.store.status()["decisions"] == 15
-    assert {trace.tobytes() for trace in kept} == {x.tobytes() for i, x in enumerate(parts.X[:15]) if i != 3}
+    assert {trace.tobytes() for trace in kept} == {
+        x.tobytes() for i, x in enumerate(parts.X[:15]) if i != 3
+    }
 
 
-def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(parts, tmp_path: Path) -> None:
-    program, store = RobotProgram((parts.X[:10], parts.y[:10])), tmp_path / "cell.db"  # then its bin is empty
+def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(
+    parts, tmp_path: Path
+) -> None:
+    program, store = (
+        RobotProgram((parts.X[:10], parts.y[:10])),
+        tmp_path / "cell.db",
+    )  # then its bin is empty
     with FakeController(program, speed=None) as fake:
         done = dengine(*run_on(fake, store), "--reducer", "pca", "--cycles", 14)
         shown = " ".join(done.output.split())
         assert done.exit_code == 1
         assert "1 to 10 100 %" in shown
-        assert "order 21 (insert), it reported a failure; look at the part, then begin again. 10 of 14" in shown
-        assert f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there." in shown
+        assert (
+            "order 21 (insert), it reported a failure; look at the part, then begin again. 10 of 14"
+            in shown
+        )
+        assert (
+            f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there."
+            in shown
+        )
         program.played.clear()  # somebody has filled it
         succeed(*run_on(fake, store), "--cycles", 4)
     with DataEngine.open(store) as engine:

@@ -30,16 +30,40 @@ CODE = [line.partition("#")[0].rstrip() for line in TEXT.splitlines()]
 SAMPLES = 60
 BLOCK = re.compile(r"^\s*(def|thread|if|while)\b.*:$")
 MANUAL = {  # of the script manual of e-Series, version 5
-    *("movel", "stopl", "pose_trans", "sleep", "force_mode", "end_force_mode", "get_actual_tcp_pose", "zero_ftsensor"),
-    *("set_standard_digital_out", "get_standard_digital_in", "set_flag", "get_flag", "write_output_integer_register"),
+    *(
+        "movel",
+        "stopl",
+        "pose_trans",
+        "sleep",
+        "force_mode",
+        "end_force_mode",
+        "get_actual_tcp_pose",
+        "zero_ftsensor",
+    ),
+    *(
+        "set_standard_digital_out",
+        "get_standard_digital_in",
+        "set_flag",
+        "get_flag",
+        "write_output_integer_register",
+    ),
     *("socket_open", "socket_close", "textmsg", "rpc_factory"),
 }
 
 
 def test_every_block_has_its_end_and_every_function_is_known() -> None:
-    assert sum(bool(BLOCK.match(line)) for line in CODE) == sum(line.strip() == "end" for line in CODE)
+    assert sum(bool(BLOCK.match(line)) for line in CODE) == sum(
+        line.strip() == "end" for line in CODE
+    )
     names = set(re.findall(r"(?:def|thread) (\w+)\(", "\n".join(CODE)))
-    called = set(re.findall(r"(?<![.\w])(\w+)\(", "\n".join(CODE))) - {"and", "or", "not", "while", "if", "elif"}
+    called = set(re.findall(r"(?<![.\w])(\w+)\(", "\n".join(CODE))) - {
+        "and",
+        "or",
+        "not",
+        "while",
+        "if",
+        "elif",
+    }
     assert called - names == MANUAL
 
 
@@ -58,7 +82,9 @@ def as_python(code: list[str]) -> str:
     for line in code[next(i for i, line in enumerate(code) if line.startswith("def ")) + 1 :]:
         line = re.sub(r"\b(global|local) (\w+) =", r"\2 =", line[2:])
         line = re.sub(r"^(\s*)thread ", r"\1def ", line)
-        line = re.sub(r"\brun (\w+)\(\)", r"run(\1)", re.sub(r"\bkill (\w+)", r"kill(\1)", line)).replace("p[", "[")
+        line = re.sub(
+            r"\brun (\w+)\(\)", r"run(\1)", re.sub(r"\bkill (\w+)", r"kill(\1)", line)
+        ).replace("p[", "[")
         if line.strip() == "end" or not line.strip():
             continue
         lines.append(line)
@@ -78,7 +104,10 @@ class Handle(xmlrpc.client.ServerProxy):
 def cell(tmp_path: Path) -> Iterator[SimpleNamespace]:
     """A server at a port of its own, its service, and its recorder."""
     recorder, access = PushedTraces(), Access(rate=0.0)
-    with a_service(tmp_path / "cell.db") as service, served(create_app(service, access, recorder=recorder)) as port:
+    with (
+        a_service(tmp_path / "cell.db") as service,
+        served(create_app(service, access, recorder=recorder)) as port,
+    ):
         yield SimpleNamespace(service=service, recorder=recorder, port=port)
 
 
@@ -89,19 +118,39 @@ class EndOfShiftError(Exception):
 class Robot:
     """A robot of paper: its bin is a data set, its height check knows the labels; what it did with each part is noted."""
 
-    def __init__(self, data: Dataset, parts: int, cell: SimpleNamespace, patience: float = 600.0) -> None:
-        self.data, self.parts, self.port, self.recorder, self.patience = data, parts, cell.port, cell.recorder, patience
+    def __init__(
+        self, data: Dataset, parts: int, cell: SimpleNamespace, patience: float = 600.0
+    ) -> None:
+        self.data, self.parts, self.port, self.recorder, self.patience = (
+            data,
+            parts,
+            cell.port,
+            cell.recorder,
+            patience,
+        )
         self.taken, self.outputs, self.flags = -1, dict[int, bool](), dict[int, bool]()
         self.checked: list[int] = []
         self.said: list[str] = []
 
     def play(self) -> None:
         """Run the program until the shift ends."""
-        names: dict[str, Any] = {name: getattr(self, name, lambda *args, **named: [0.0] * 6) for name in MANUAL}
-        names |= {"run": self.run, "kill": lambda thread: None, "textmsg": lambda *text: self.said.append("".join(text))}
-        source = as_python(CODE).replace("192.168.1.20:8000/RPC2/TOKEN", f"127.0.0.1:{self.port}/RPC2")
-        source = source.replace('HOST = "192.168.1.20"', 'HOST = "127.0.0.1"').replace("PORT = 8000", f"PORT = {self.port}")
-        source = source.replace("MAX_S = 3.0", f"MAX_S = {self.patience}").replace("while True:", "while next_part():")
+        names: dict[str, Any] = {
+            name: getattr(self, name, lambda *args, **named: [0.0] * 6) for name in MANUAL
+        }
+        names |= {
+            "run": self.run,
+            "kill": lambda thread: None,
+            "textmsg": lambda *text: self.said.append("".join(text)),
+        }
+        source = as_python(CODE).replace(
+            "192.168.1.20:8000/RPC2/TOKEN", f"127.0.0.1:{self.port}/RPC2"
+        )
+        source = source.replace('HOST = "192.168.1.20"', 'HOST = "127.0.0.1"').replace(
+            "PORT = 8000", f"PORT = {self.port}"
+        )
+        source = source.replace("MAX_S = 3.0", f"MAX_S = {self.patience}").replace(
+            "while True:", "while next_part():"
+        )
         with pytest.raises(EndOfShiftError):
             exec(compile(source, str(SCRIPT), "exec"), names | {"next_part": self.next_part})
 
@@ -145,11 +194,15 @@ class Robot:
         return Handle(url)
 
 
-def test_a_shift_of_the_program_decides_checks_and_reports(cell: SimpleNamespace, make_data) -> None:
+def test_a_shift_of_the_program_decides_checks_and_reports(
+    cell: SimpleNamespace, make_data
+) -> None:
     data = make_data(90, samples=SAMPLES, seed=3)
     robot = Robot(data, len(data), cell)
     robot.play()
-    asked = cell.service.submit(lambda engine: (engine.flush(), engine.store.decisions(HistoryFilter(), 1000))[1])
+    asked = cell.service.submit(
+        lambda engine: (engine.flush(), engine.store.decisions(HistoryFilter(), 1000))[1]
+    )
     result = asked.result(60)
     assert len(result) == len(data)
     actions = [item.decision.action for item in result]
@@ -172,7 +225,9 @@ def test_what_is_not_answered_in_time_is_checked(cell: SimpleNamespace, make_dat
     assert sum("a label was not stored" in text for text in robot.said) == 2
 
 
-def test_a_part_that_was_left_in_the_fixture_is_checked_first(cell: SimpleNamespace, make_data) -> None:
+def test_a_part_that_was_left_in_the_fixture_is_checked_first(
+    cell: SimpleNamespace, make_data
+) -> None:
     robot = Robot(make_data(2, samples=SAMPLES, seed=3), 1, cell)
     robot.flags[7] = True
     robot.play()

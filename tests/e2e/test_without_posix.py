@@ -60,7 +60,9 @@ def hidden(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def python(*words: object, code: int = 0) -> str:
     """What a Python command prints, on either stream."""
-    done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, timeout=600, check=False)
+    done = subprocess.run(
+        [sys.executable, *map(str, words)], capture_output=True, text=True, timeout=600, check=False
+    )
     assert done.returncode == code, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout + done.stderr
 
@@ -83,7 +85,11 @@ def test_names_that_differ_in_capitals_alone_have_a_journal_each_where_files_do_
 
 @pytest.mark.merge
 def test_the_store_and_the_process_that_retrains_keep_their_contract() -> None:
-    tests = ("tests/contract/test_store.py", "tests/unit/test_incoming.py", "tests/e2e/test_retraining_process.py")
+    tests = (
+        "tests/contract/test_store.py",
+        "tests/unit/test_incoming.py",
+        "tests/e2e/test_retraining_process.py",
+    )
     text = python("-m", "pytest", "-q", "-p", "no:cacheprovider", *(REPO / test for test in tests))
     assert "passed" in text or "[100%]" in text
 
@@ -108,7 +114,12 @@ def test_a_killed_engine_gives_its_cell_free_and_loses_no_label(
     assert "StoreError" in refused
     assert len(lines) == 40
     text = "engine = DataEngine.open(sys.argv[1]); print(*[engine.find(each).success for each in sys.argv[2:]])"
-    result = python("-c", f"import sys; from dengine import DataEngine; {text}", store, *(id_ for id_, _ in lines))
+    result = python(
+        "-c",
+        f"import sys; from dengine import DataEngine; {text}",
+        store,
+        *(id_ for id_, _ in lines),
+    )
     assert result.split()[-40:] == [str(label == "1") for _, label in lines]
 
 
@@ -133,7 +144,9 @@ def test_a_tokens_file_is_read_whose_bits_say_nothing_of_who_may_read_it(tmp_pat
     (tmp_path / "token").write_text("t" * 32, encoding="utf-8")
     (tmp_path / "token").chmod(0o666)
     text = "import sys; from pathlib import Path; from dengine.serve.auth import read_tokens; "
-    assert "1 token" in python("-c", f"{text}print(len(read_tokens(Path(sys.argv[1]))), 'token')", tmp_path / "token")
+    assert "1 token" in python(
+        "-c", f"{text}print(len(read_tokens(Path(sys.argv[1]))), 'token')", tmp_path / "token"
+    )
 
 
 def test_a_served_cell_retrains_in_a_process_and_ends_in_order(tmp_path: Path, make_data) -> None:
@@ -151,7 +164,9 @@ def test_a_served_cell_retrains_in_a_process_and_ends_in_order(tmp_path: Path, m
             assert time.monotonic() < end, "no retrain came"
             time.sleep(0.05)
         labels = process.ask("/status")["labels"]
-        backup = python("-m", "dengine", "backup", tmp_path / "cell.db", "--out", tmp_path / "copy.db", "--json")
+        backup = python(
+            "-m", "dengine", "backup", tmp_path / "cell.db", "--out", tmp_path / "copy.db", "--json"
+        )
         assert process.end(signal.SIGINT) == 0
     assert "Traceback" not in process.output
     assert '"decisions": 80' in backup
@@ -170,9 +185,29 @@ def test_the_verbs_do_their_work(tmp_path: Path, make_data) -> None:
         ("verify", store),
         ("data", store),
         ("backup", store, "--out", tmp_path / "copy.db"),
-        ("run", "--cell", "replay", "--data", tmp_path / "parts.npz", "--cycles", 5, "--store", tmp_path / "run.db"),
+        (
+            "run",
+            "--cell",
+            "replay",
+            "--data",
+            tmp_path / "parts.npz",
+            "--cycles",
+            5,
+            "--store",
+            tmp_path / "run.db",
+        ),
         ("export", store, "--out", tmp_path / "model.ts"),
-        ("replay", "--data", tmp_path / "parts.npz", "--reducer", "pca", "--repeats", 1, "--cycles", 40),
+        (
+            "replay",
+            "--data",
+            tmp_path / "parts.npz",
+            "--reducer",
+            "pca",
+            "--repeats",
+            1,
+            "--cycles",
+            40,
+        ),
     ]
     words = json.dumps([[str(word) for word in command] for command in commands])
     results = json.loads(python("-m", "tests.support.verbs", words).splitlines()[-1])

@@ -34,7 +34,9 @@ class Cell:
     def robot(self) -> xmlrpc.client.ServerProxy:
         return xmlrpc.client.ServerProxy(f"http://127.0.0.1:{self.port}/RPC2")
 
-    def post(self, body: bytes, content: str = "text/xml", method: str = "POST", **headers: str) -> tuple[int, bytes]:
+    def post(
+        self, body: bytes, content: str = "text/xml", method: str = "POST", **headers: str
+    ) -> tuple[int, bytes]:
         with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)) as connection:
             connection.request(method, "/RPC2", body, {"Content-Type": content, **headers})
             answer = connection.getresponse()
@@ -74,27 +76,46 @@ def call(name: str, *arguments: object) -> bytes:
 
 def test_a_cell_over_xml_rpc_learns_and_accepts(cell: Cell, stream: Dataset) -> None:
     robot = cell.robot()
-    answers = [robot.decide(x.tolist(), f"order-{i}", f"P{i}") for i, x in enumerate(stream.X[50:90])]
-    assert robot.decide(stream.X[50].tolist(), "order-0", "P0") == answers[0]  # asked again, the same answer
+    answers = [
+        robot.decide(x.tolist(), f"order-{i}", f"P{i}") for i, x in enumerate(stream.X[50:90])
+    ]
+    assert (
+        robot.decide(stream.X[50].tolist(), "order-0", "P0") == answers[0]
+    )  # asked again, the same answer
     with pytest.raises(xmlrpc.client.Fault, match="got another"):
         robot.decide(stream.X[1].tolist(), "order-0", "P0")
     assert cell.service.engine.version >= 1
     assert ACCEPT in {answer["action"] for answer in answers}
     for i, answer in enumerate(answers):
-        assert (answer["id"], type(answer["action"]), type(answer["lower"])) == (f"order-{i}", int, float)
+        assert (answer["id"], type(answer["action"]), type(answer["lower"])) == (
+            f"order-{i}",
+            int,
+            float,
+        )
         match = cell.find(f"order-{i}")
-        assert (match.decision.part, np.array_equal(match.trace[0], stream.X[50 + i])) == (f"P{i}", True)
+        assert (match.decision.part, np.array_equal(match.trace[0], stream.X[50 + i])) == (
+            f"P{i}",
+            True,
+        )
 
 
 def test_a_trace_in_pieces_is_the_same_trace(cell: Cell, stream: Dataset) -> None:
     robot = cell.robot()
     id_ = robot.begin()
-    pieces = stream.X[1][:25].tolist(), stream.X[1][25:50].astype("<f4").tobytes(), stream.X[1][50:].tolist()
+    pieces = (
+        stream.X[1][:25].tolist(),
+        stream.X[1][25:50].astype("<f4").tobytes(),
+        stream.X[1][50:].tolist(),
+    )
     assert [robot.add(id_, piece) for piece in pieces] == [25, 50, 60]
     assert robot.decide(stream.X[1].astype("<f4").tobytes(), "whole", "P8")["id"] == "whole"
     assert np.array_equal(cell.find("whole").trace[0], stream.X[1])
     answer = robot.decide_added(id_, 7)
-    assert (answer["id"], robot.decide_added(id_, 7), robot.action_added(id_)) == (id_, answer, answer["action"])
+    assert (answer["id"], robot.decide_added(id_, 7), robot.action_added(id_)) == (
+        id_,
+        answer,
+        answer["action"],
+    )
     match = cell.find(id_)
     assert (match.decision.part, np.array_equal(match.trace[0], stream.X[1])) == ("7", True)
     ids = [robot.begin() for _ in range(9)]  # more than are kept
@@ -116,7 +137,11 @@ def test_what_a_recorder_cut_is_decided_on(cell: Cell, stream: Dataset) -> None:
     assert cell.recorder.armed > 0
     cell.recorder.traces.append(stream.X[2])
     answer = robot.decide_recorded(id_)
-    assert (answer["id"], robot.decide_recorded(id_), robot.action_recorded(id_)) == (id_, answer, answer["action"])
+    assert (answer["id"], robot.decide_recorded(id_), robot.action_recorded(id_)) == (
+        id_,
+        answer,
+        answer["action"],
+    )
     assert np.array_equal(cell.find(id_).trace[0], stream.X[2])
     robot.begin("named")
     cell.recorder.traces.append(stream.X[3])
@@ -124,7 +149,9 @@ def test_what_a_recorder_cut_is_decided_on(cell: Cell, stream: Dataset) -> None:
 
 
 @pytest.mark.parametrize("wrong", ["nothing came", "another part", "never begun"])
-def test_what_was_not_recorded_is_verified_and_no_fault(cell: Cell, stream: Dataset, wrong: str) -> None:
+def test_what_was_not_recorded_is_verified_and_no_fault(
+    cell: Cell, stream: Dataset, wrong: str
+) -> None:
     robot = cell.robot()
     id_ = robot.begin()
     if wrong == "another part":
@@ -203,7 +230,9 @@ def test_what_is_no_xml_rpc_at_all_is_refused_before_it_is_read(cell: Cell) -> N
     assert cell.post(body, "text/xml; charset=utf-8")[0] == 200
 
 
-def test_what_fails_in_the_server_is_a_fault_that_says_nothing_of_it(cell: Cell, monkeypatch, caplog) -> None:
+def test_what_fails_in_the_server_is_a_fault_that_says_nothing_of_it(
+    cell: Cell, monkeypatch, caplog
+) -> None:
     def broken(*args: object) -> None:
         raise KeyError("secret")
 
@@ -215,6 +244,8 @@ def test_what_fails_in_the_server_is_a_fault_that_says_nothing_of_it(cell: Cell,
 
 
 def test_the_page_names_every_call(cell: Cell) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "plc_and_robot.md").read_text(
+        encoding="utf-8"
+    )
     for name in RobotCalls(cell.service).table():
         assert f"`{name}" in page

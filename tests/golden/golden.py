@@ -50,7 +50,9 @@ AUDITED = LOOSE | {"audit_rate": 0.15}
 POOLED = AUDITED | {"guarantee": "pooled"}
 ALL = {"stops": "all"}  # every bad part that is accepted stops the system
 Arrays = dict[str, np.ndarray]
-Verb = Callable[[DataEngine, list[Cycle], Path], DataEngine]  # what people do to an engine between two parts
+Verb = Callable[
+    [DataEngine, list[Cycle], Path], DataEngine
+]  # what people do to an engine between two parts
 
 
 def plain(seed: int) -> Dataset:
@@ -142,19 +144,28 @@ class Story:
     def play(self, folder: Path) -> Arrays:
         engine, cycles = self.live(folder / "engine.db")
         engine.close()
-        return of_decisions([cycle.decision for cycle in cycles]) | of_retrains(cycle.retrain for cycle in cycles)
+        return of_decisions([cycle.decision for cycle in cycles]) | of_retrains(
+            cycle.retrain for cycle in cycles
+        )
 
 
 class Late(Story):
     """A program that asks and reports by itself: labels come late, and people retrain before the last parts."""
 
     def play(self, folder: Path) -> Arrays:
-        data, decisions, retrains = self.parts(self.seed), list[Decision](), list[RetrainReport | None]()
+        data, decisions, retrains = (
+            self.parts(self.seed),
+            list[Decision](),
+            list[RetrainReport | None](),
+        )
         with self.start(folder / "engine.db") as engine:
             for i in range(CYCLES):
                 decisions.append(engine.decide(data.X[i], part=str(data.part[i])))
                 due = decisions[max(0, i - LATE)]
-                if i >= LATE and (due.action is Action.VERIFY or (due.action is Action.ACCEPT and not data.y[i - LATE])):
+                if i >= LATE and (
+                    due.action is Action.VERIFY
+                    or (due.action is Action.ACCEPT and not data.y[i - LATE])
+                ):
                     engine.report(due.id, bool(data.y[i - LATE]))
                 if i == CYCLES - 40:
                     engine.retrain()
@@ -234,8 +245,13 @@ STORIES: dict[str, Story | Replayed] = {
 
 def of_answers(decisions: list[Any]) -> Arrays:
     """What an engine and an exported file both say; enumerations by name, no embedding as NaN."""
-    shape = next(np.shape(decision.embedding) for decision in decisions if decision.embedding is not None)
-    points = [np.full(shape, np.nan) if decision.embedding is None else decision.embedding for decision in decisions]
+    shape = next(
+        np.shape(decision.embedding) for decision in decisions if decision.embedding is not None
+    )
+    points = [
+        np.full(shape, np.nan) if decision.embedding is None else decision.embedding
+        for decision in decisions
+    ]
     return {
         "action": np.array([str(decision.action) for decision in decisions]),
         "reason": np.array([str(decision.reason) for decision in decisions]),
@@ -268,10 +284,17 @@ def of_retrains(retrains: Iterable[RetrainReport | None]) -> Arrays:
 def machine() -> dict[str, str]:
     """What may change the last digit of a float: libraries choose their code by the model."""
     about = Path("/proc/cpuinfo")
-    existing = dict(re.findall(r"^(.+?)\s*: (.*)$", about.read_text(encoding="utf-8"), re.M)) if about.exists() else {}
+    existing = (
+        dict(re.findall(r"^(.+?)\s*: (.*)$", about.read_text(encoding="utf-8"), re.M))
+        if about.exists()
+        else {}
+    )
     return {
         "processor": " ".join(
-            [platform.machine(), *(existing.get(key, "") for key in ("vendor_id", "cpu family", "model"))]
+            [
+                platform.machine(),
+                *(existing.get(key, "") for key in ("vendor_id", "cpu family", "model")),
+            ]
         ),
         "capability": torch.backends.cpu.get_cpu_capability(),
         "torch": torch.__version__.split("+")[0],

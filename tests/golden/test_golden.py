@@ -13,7 +13,13 @@ from tests.support.programs import Program
 
 GOLDEN = Path(__file__).parent
 sys.path.insert(0, str(GOLDEN))
-from golden import STORIES, Arrays, Exported, Replayed, machine  # the very lines that made what is kept
+from golden import (
+    STORIES,
+    Arrays,
+    Exported,
+    Replayed,
+    machine,
+)  # the very lines that made what is kept
 
 KEPT = GOLDEN / "default"
 # Another processor or another NumPy may add in another order: one decision that differs moves the retrains after it.
@@ -40,7 +46,9 @@ def assert_same(result: Arrays, expected: Arrays) -> None:
 @pytest.mark.parametrize("name", [name for name in STORIES if name not in EXPORTED])
 def test_an_engine_takes_every_decision_that_it_took(name: str, tmp_path: Path) -> None:
     if name.startswith("umap") and not SAME_MACHINE:
-        pytest.skip("another processor's umap-learn lays the traces out otherwise, and its decisions are other ones")
+        pytest.skip(
+            "another processor's umap-learn lays the traces out otherwise, and its decisions are other ones"
+        )
     assert_same(STORIES[name].play(tmp_path), kept(name))
 
 
@@ -60,12 +68,16 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 
 
 @pytest.mark.parametrize("name", EXPORTED)
-def test_an_exported_file_takes_every_decision_that_it_took(name: str, exported: Callable[[str], Path]) -> None:
+def test_an_exported_file_takes_every_decision_that_it_took(
+    name: str, exported: Callable[[str], Path]
+) -> None:
     assert_same(STORIES[name].ask(exported(name)), kept(name))
 
 
 @pytest.mark.parametrize("name", EXPORTED)
-def test_the_cell_program_takes_the_same_decisions(name: str, exported, programs: Path, tmp_path: Path) -> None:
+def test_the_cell_program_takes_the_same_decisions(
+    name: str, exported, programs: Path, tmp_path: Path
+) -> None:
     (data, labels), answers = STORIES[name].told(), []
     with Program(programs, exported(name), "--journal", tmp_path / "cell.csv") as cell:
         for x, part, label in zip(data.X, data.part, labels, strict=True):
@@ -81,7 +93,9 @@ def test_the_cell_program_takes_the_same_decisions(name: str, exported, programs
     for column, key in enumerate(("action", "reason")):
         assert words[:, column].tolist() == expected[key].tolist()
     for column, key in enumerate(("lower", "upper", "n_success", "n_failure"), start=2):
-        np.testing.assert_allclose(words[:, column].astype(float), expected[key], atol=1e-6, err_msg=key)
+        np.testing.assert_allclose(
+            words[:, column].astype(float), expected[key], atol=1e-6, err_msg=key
+        )
     points = expected["embedding"].reshape(len(words), -1)
     np.testing.assert_allclose(words[:, 6:].astype(float), points, rtol=1e-5, atol=1e-5)
 
@@ -93,9 +107,18 @@ def test_a_restart_changes_no_decision() -> None:
 
 
 def test_what_is_kept_has_met_everything_that_it_stands_for() -> None:
-    stories = {name: kept(name) for name, story in STORIES.items() if not isinstance(story, Replayed)}
+    stories = {
+        name: kept(name) for name, story in STORIES.items() if not isinstance(story, Replayed)
+    }
     reasons = set(np.concatenate([item["reason"] for item in stories.values()]))
-    never = {Reason.SATURATED, Reason.MODEL_ERROR, Reason.NO_STORE, Reason.LATE, Reason.OUTSIDE, Reason.TOO_LARGE}
+    never = {
+        Reason.SATURATED,
+        Reason.MODEL_ERROR,
+        Reason.NO_STORE,
+        Reason.LATE,
+        Reason.OUTSIDE,
+        Reason.TOO_LARGE,
+    }
     assert reasons == {str(item) for item in set(Reason) - never}
     assert all(set(item["action"]) == {str(item) for item in Action} for item in stories.values())
     assert all(item["action"].shape == item["lower"].shape for item in stories.values())

@@ -30,17 +30,24 @@ ESTIMATORS = (
     ConvReducer(fit_steps=10),
     RocketReducer(),
     PcaReducer(),
-    UmapReducer(n_neighbors=5, n_epochs=20),  # some checks have 20 rows, or 12: UMAP wants more than n_neighbors
+    UmapReducer(
+        n_neighbors=5, n_epochs=20
+    ),  # some checks have 20 rows, or 12: UMAP wants more than n_neighbors
     UmapLearnReducer(n_neighbors=5, n_epochs=20),
     CrossFitted(LinearDiscriminantAnalysis(), 2),
     CrossFitted(NeighborhoodComponentsAnalysis(n_components=2, max_iter=20, random_state=0), 2),
 )
 
 # Each row alone would mend this and break `fit_transform(X) == fit(X).transform(X)`; an engine asks for one at a time.
-BATCH = "umap-learn lays the rows of a batch out together, so a row's place depends on those beside it."
+BATCH = (
+    "umap-learn lays the rows of a batch out together, so a row's place depends on those beside it."
+)
 # By estimator, by check: why it is right that it fails.
 EXCLUDED: dict[type, dict[str, str]] = {
-    UmapLearnReducer: {"check_methods_sample_order_invariance": BATCH, "check_methods_subset_invariance": BATCH},
+    UmapLearnReducer: {
+        "check_methods_sample_order_invariance": BATCH,
+        "check_methods_subset_invariance": BATCH,
+    },
     CrossFitted: {
         "check_fit2d_1feature": "Of ten rows, those outside one of the two folds are of one class, and that is said first."
     },
@@ -57,16 +64,22 @@ SMALL: dict[str, Reducer] = {
     "label-free": LabelFree(PCA(2, random_state=0)),
 }
 every_reducer = pytest.mark.parametrize("name", SMALL)
-label_using = pytest.mark.parametrize("name", [name for name, reducer in SMALL.items() if reducer.uses_labels])
+label_using = pytest.mark.parametrize(
+    "name", [name for name, reducer in SMALL.items() if reducer.uses_labels]
+)
 
 
 # An exclusion must fail: `xfail_strict`.
-@parametrize_with_checks(list(ESTIMATORS), expected_failed_checks=lambda item: EXCLUDED.get(type(item), {}))
+@parametrize_with_checks(
+    list(ESTIMATORS), expected_failed_checks=lambda item: EXCLUDED.get(type(item), {})
+)
 def test_scikit_learns_estimator_checks_pass(estimator: Any, check: Any) -> None:
     check(estimator)
 
 
-def traces(n: int = 80, channels: int = 1, samples: int = 30, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def traces(
+    n: int = 80, channels: int = 1, samples: int = 30, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """(n, C, T) float32 ramps with noise, of two heights; y (n,): the higher ones are the successes."""
     rng = np.random.default_rng(seed)
     y = (np.arange(n) % 3 > 0).astype(np.int64)
@@ -82,7 +95,9 @@ def test_one_channel_may_be_left_out_of_the_shape(name: str) -> None:
     assert flat.trace_shape_ == full.trace_shape_ == (1, 30)
 
 
-@pytest.mark.parametrize("name", [n for n, item in SMALL.items() if "random_state" in item.get_params(deep=False)])
+@pytest.mark.parametrize(
+    "name", [n for n, item in SMALL.items() if "random_state" in item.get_params(deep=False)]
+)
 def test_random_state_is_none_an_integer_or_a_random_state(name: str) -> None:
     X, y = traces()
     fits = [
@@ -109,13 +124,18 @@ def test_of_two_classes_the_larger_is_the_success(name: str, names: tuple[Any, A
 @pytest.mark.parametrize(
     ("labels", "message"),
     [
-        (np.arange(80) % 3, "Only binary classification is supported. The type of the target is multiclass"),
+        (
+            np.arange(80) % 3,
+            "Only binary classification is supported. The type of the target is multiclass",
+        ),
         (np.linspace(0.0, 1.0, 80), "Unknown label type: continuous"),
         (np.where(np.arange(80) == 3, np.nan, 1.0), "Input y contains NaN"),
         (None, "requires y to be passed, but the target y is None"),
     ],
 )
-def test_labels_that_are_not_of_two_classes_are_refused_in_scikit_learns_words(name: str, labels, message: str) -> None:
+def test_labels_that_are_not_of_two_classes_are_refused_in_scikit_learns_words(
+    name: str, labels, message: str
+) -> None:
     with pytest.raises(SettingError, match=message):
         clone(SMALL[name]).fit(traces()[0], labels)
 
@@ -130,7 +150,9 @@ def test_labels_of_one_class_are_refused_by_regressions_and_learned_by_a_network
 @every_reducer
 def test_a_pipeline_of_a_reducer_and_our_classifier_beats_the_base_rate(name: str) -> None:
     X, y = traces()
-    pipeline = make_pipeline(clone(SMALL[name]), StandardScaler(), WilsonRadiusClassifier(radius=0.5))  # in one unit
+    pipeline = make_pipeline(
+        clone(SMALL[name]), StandardScaler(), WilsonRadiusClassifier(radius=0.5)
+    )  # in one unit
     assert cross_val_score(pipeline, X, y, cv=3, error_score="raise").mean() > y.mean() + 0.1
 
 

@@ -34,7 +34,9 @@ def forest() -> RandomForestClassifier:
     return RandomForestClassifier(30, random_state=0)
 
 
-def test_the_counts_are_those_of_the_paper_and_no_trace_comes_twice(stored: dict[str, np.ndarray], traces) -> None:
+def test_the_counts_are_those_of_the_paper_and_no_trace_comes_twice(
+    stored: dict[str, np.ndarray], traces
+) -> None:
     assert (stored["X"].shape, stored["X"].dtype) == ((1503, 1000), np.int16)
     assert np.bincount(stored["y"]).tolist() == [700, 803]
     assert len(np.unique(traces, axis=0)) == len(traces)
@@ -42,7 +44,9 @@ def test_the_counts_are_those_of_the_paper_and_no_trace_comes_twice(stored: dict
     assert (traces.std(axis=1) > 0).all()
 
 
-def test_labels_are_the_height_alone_and_every_failure_has_a_cause(stored: dict[str, np.ndarray]) -> None:
+def test_labels_are_the_height_alone_and_every_failure_has_a_cause(
+    stored: dict[str, np.ndarray],
+) -> None:
     np.testing.assert_array_equal(stored["y"] == 1, np.abs(stored["height_mm"]) <= 0.5)
     np.testing.assert_array_equal(stored["cause"] == "none", stored["y"] == 1)
     names, counts = np.unique(stored["cause"][stored["y"] == 0], return_counts=True)
@@ -50,23 +54,40 @@ def test_labels_are_the_height_alone_and_every_failure_has_a_cause(stored: dict[
     assert counts.min() >= 20
 
 
-def test_the_forces_are_those_of_real_insertions(stored: dict[str, np.ndarray], traces: np.ndarray) -> None:
+def test_the_forces_are_those_of_real_insertions(
+    stored: dict[str, np.ndarray], traces: np.ndarray
+) -> None:
     plateau = traces[:, -100:].mean(axis=1)
     rim, success = stored["cause"] == "rim_contact", stored["y"] == 1
     assert np.mean((plateau[rim] > 22) & (plateau[rim] < 68)) > 0.97
     assert np.mean((plateau[success] > 7) & (plateau[success] < 60)) > 0.95
-    middle = traces[:, 400:500].mean(axis=1)  # 0.8 to 1.0 s: on the rim by now, or still on the way down
+    middle = traces[:, 400:500].mean(
+        axis=1
+    )  # 0.8 to 1.0 s: on the rim by now, or still on the way down
     assert np.median(middle[rim]) > 20
     assert np.median(middle[success]) < 5
 
 
-def test_the_nearest_neighbour_is_right_in_92_to_96_percent(stored: dict[str, np.ndarray], traces: np.ndarray) -> None:
+def test_the_nearest_neighbour_is_right_in_92_to_96_percent(
+    stored: dict[str, np.ndarray], traces: np.ndarray
+) -> None:
     assert 0.92 <= accuracy(traces, stored["y"], KNeighborsClassifier(1)) <= 0.96
 
 
-def test_nothing_before_contact_and_nothing_of_the_sensor_tells_the_outcome(stored, traces: np.ndarray) -> None:
+def test_nothing_before_contact_and_nothing_of_the_sensor_tells_the_outcome(
+    stored, traces: np.ndarray
+) -> None:
     before, names = traces[:, :BEFORE_CONTACT], stored["condition_names"].tolist()
-    sensor = ["noise_n", "ripple_n", "ripple_hz", "bias_n", "drift_n", "step_n", "dropped_share", "delay_s"]
+    sensor = [
+        "noise_n",
+        "ripple_n",
+        "ripple_hz",
+        "bias_n",
+        "drift_n",
+        "step_n",
+        "dropped_share",
+        "delay_s",
+    ]
     features = {
         "offset": before.mean(axis=1, keepdims=True),
         "noise": np.diff(before).std(axis=1, keepdims=True),

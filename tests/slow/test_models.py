@@ -11,7 +11,9 @@ MODELS = sorted((Path(__file__).parents[2] / "models").glob("*/model.ts"))
 
 
 @pytest.mark.parametrize("path", MODELS, ids=lambda p: p.parent.name)
-def test_a_shipped_model_is_certain_and_right_of_most_of_its_own_data_and_its_card_says_what_made_it(path: Path) -> None:
+def test_a_shipped_model_is_certain_and_right_of_most_of_its_own_data_and_its_card_says_what_made_it(
+    path: Path,
+) -> None:
     model, data = load_exported(path), load_dataset("insertion")
     assert model.metadata["references"] == len(data)
     decisions = model.decide_many(data.X[:300])
@@ -19,4 +21,6 @@ def test_a_shipped_model_is_certain_and_right_of_most_of_its_own_data_and_its_ca
     rejected = np.array([d.action == "reject" for d in decisions])
     assert (accepted | rejected).mean() > 0.5
     assert data.y[:300][accepted].mean() >= Recipe.load(path.parent.name).policy.lower_bound
-    assert f"--out models/{path.parent.name}" in (path.parent / "card.md").read_text(encoding="utf-8")
+    assert f"--out models/{path.parent.name}" in (path.parent / "card.md").read_text(
+        encoding="utf-8"
+    )

@@ -51,8 +51,15 @@ class Plant:
                 await asyncio.sleep(0.05)
         return value
 
-    async def decide(self, trace: np.ndarray, request: str = "", part: str = "", channels: int = 1) -> list[Any]:
-        arguments = (trace.ravel().tolist(), FLOAT), (channels, COUNT), (request, TEXT), (part, TEXT)
+    async def decide(
+        self, trace: np.ndarray, request: str = "", part: str = "", channels: int = 1
+    ) -> list[Any]:
+        arguments = (
+            (trace.ravel().tolist(), FLOAT),
+            (channels, COUNT),
+            (request, TEXT),
+            (part, TEXT),
+        )
         return await self.call("Decide", *(ua.Variant(*argument) for argument in arguments))
 
     async def report(self, id_: str, success: bool) -> bool:
@@ -104,8 +111,12 @@ async def test_a_plc_decides_and_reports_and_a_scada_sees_it(plant: Plant, strea
     assert (match.decision.part, np.array_equal(match.trace[0], stream.X[7])) == ("P7", True)
 
 
-async def test_the_variables_and_methods_are_as_they_are_described_and_read_only(plant: Plant) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
+async def test_the_variables_and_methods_are_as_they_are_described_and_read_only(
+    plant: Plant,
+) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "plc_and_robot.md").read_text(
+        encoding="utf-8"
+    )
     for name, (type_, _, text) in opcua.VARIABLES.items():
         node = plant.node(f"Cell.{name}")
         assert await node.read_data_type_as_variant_type() is type_, name
@@ -122,8 +133,13 @@ async def test_the_variables_and_methods_are_as_they_are_described_and_read_only
     ):
         for name, arguments in (("InputArguments", taken), ("OutputArguments", given)):
             node = await plant.node(f"Cell.{method}").get_child(f"0:{name}")
-            texts = [(item.Name, item.DataType.Identifier, item.ValueRank) for item in await node.read_value()]
-            assert texts == [(name, type_.value, 1 if array else -1) for name, type_, array, _ in arguments]
+            texts = [
+                (item.Name, item.DataType.Identifier, item.ValueRank)
+                for item in await node.read_value()
+            ]
+            assert texts == [
+                (name, type_.value, 1 if array else -1) for name, type_, array, _ in arguments
+            ]
 
 
 @pytest.mark.parametrize("empty", [None, ""])
@@ -131,15 +147,24 @@ async def test_the_example_client_plays_a_shift_with_a_controllers_types_and_emp
     tmp_path: Path, repo: Path, empty: str | None
 ) -> None:
     play = runpy.run_path(str(repo / "training" / "opcua_client.py"))["play"]
-    with a_service(tmp_path / "cell.db", Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7)) as service:
+    with a_service(
+        tmp_path / "cell.db", Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7)
+    ) as service:
         async with opcua.opcua_server(service, port=0) as server:
-            counts, *variables = await play(f"opc.tcp://127.0.0.1:{server.bserver.port}/dengine", 120, empty)
+            counts, *variables = await play(
+                f"opc.tcp://127.0.0.1:{server.bserver.port}/dengine", 120, empty
+            )
             await service.call(lambda engine: engine.flush())
         expected = [past.decision for past in service.read_store.decisions(HistoryFilter(), 1000)]
-    n = {action: sum(item.action == action for item in expected) for action in ("verify", "accept", "reject")}
+    n = {
+        action: sum(item.action == action for item in expected)
+        for action in ("verify", "accept", "reject")
+    }
     assert counts == ", ".join(f"{count} {action}" for action, count in n.items())
     assert (sum(n.values()), n["accept"] > 0) == (120, True)
-    assert sum(item.part is None for item in expected) == 60  # an empty text, or none, is no part's number
+    assert (
+        sum(item.part is None for item in expected) == 60
+    )  # an empty text, or none, is no part's number
     assert all(len(item.id) > 3 for item in expected)  # nor an id of the caller's
     assert [line.partition(": ")[0] for line in variables][:2] == ["Decisions", "VerifiedShare"]
 
@@ -154,17 +179,33 @@ async def test_a_null_text_is_an_empty_one_of_whatever_form(plant: Plant, stream
 
 
 TYPES = {
-    "Trace": [([1.0] * 60, "Double", "Double array"), (1.0, "Float", "Float"), (None, "Null", "null")],
-    "Channels": [(1, "Int32", "Int32"), (1, "UInt16", "UInt16"), ([1], "UInt32", "UInt32 array"), (None, "Null", "null")],
-    "Request": [(7, "UInt32", "UInt32"), (["a"], "String", "String array"), (b"a", "ByteString", "ByteString")],
+    "Trace": [
+        ([1.0] * 60, "Double", "Double array"),
+        (1.0, "Float", "Float"),
+        (None, "Null", "null"),
+    ],
+    "Channels": [
+        (1, "Int32", "Int32"),
+        (1, "UInt16", "UInt16"),
+        ([1], "UInt32", "UInt32 array"),
+        (None, "Null", "null"),
+    ],
+    "Request": [
+        (7, "UInt32", "UInt32"),
+        (["a"], "String", "String array"),
+        (b"a", "ByteString", "ByteString"),
+    ],
     "Part": [(True, "Boolean", "Boolean")],
 }
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "kind", "called"), [(name, *item) for name, some in TYPES.items() for item in some]
+    ("name", "value", "kind", "called"),
+    [(name, *item) for name, some in TYPES.items() for item in some],
 )
-async def test_a_wrong_type_is_named(plant: Plant, name: str, value: Any, kind: str, called: str) -> None:
+async def test_a_wrong_type_is_named(
+    plant: Plant, name: str, value: Any, kind: str, called: str
+) -> None:
     given = {
         "Trace": ua.Variant([1.0] * 60, FLOAT),
         "Channels": ua.Variant(1, COUNT),
@@ -174,7 +215,9 @@ async def test_a_wrong_type_is_named(plant: Plant, name: str, value: Any, kind: 
     with pytest.raises(ua.uaerrors.BadInvalidArgument):
         await plant.call("Decide", *given.values())
     refused = await plant.value("LastRefused")
-    assert refused.startswith("Expected Trace (Float array), Channels (UInt32), Request (String), Part (String), got ")
+    assert refused.startswith(
+        "Expected Trace (Float array), Channels (UInt32), Request (String), Part (String), got "
+    )
     assert refused.endswith(f", got {name} as {called}.")
 
 
@@ -193,7 +236,9 @@ def wrong_calls() -> list[tuple[str, tuple[Any, ...], type]]:
 
 
 @pytest.mark.parametrize(("method", "arguments", "status"), wrong_calls(), ids=range(7))
-async def test_a_wrong_call_is_a_bad_status_and_says_why(plant: Plant, method: str, arguments, status: type) -> None:
+async def test_a_wrong_call_is_a_bad_status_and_says_why(
+    plant: Plant, method: str, arguments, status: type
+) -> None:
     before = await plant.decisions()
     with pytest.raises(status):
         await plant.call(method, *arguments)
@@ -201,7 +246,9 @@ async def test_a_wrong_call_is_a_bad_status_and_says_why(plant: Plant, method: s
     assert await plant.decisions() == before
 
 
-async def test_an_alarm_is_a_variable_and_an_event(plant: Plant, stream: Dataset, monkeypatch) -> None:
+async def test_an_alarm_is_a_variable_and_an_event(
+    plant: Plant, stream: Dataset, monkeypatch
+) -> None:
     heard: asyncio.Queue[Any] = asyncio.Queue()
 
     class Listener:
@@ -215,15 +262,23 @@ async def test_an_alarm_is_a_variable_and_an_event(plant: Plant, stream: Dataset
     await plant.service.call(lambda engine: engine.set_shadow(False, "the operator"))
     assert not await plant.until("Shadow", lambda on: not on)
     result = await plant.service.status()
-    monkeypatch.setattr(plant.service, "status", lambda: asyncio.sleep(0, replace(result, store_fault="disk full")))
+    monkeypatch.setattr(
+        plant.service, "status", lambda: asyncio.sleep(0, replace(result, store_fault="disk full"))
+    )
     await plant.decide(stream.X[0])
     assert await plant.until("Alarm", bool)
     event = await asyncio.wait_for(heard.get(), 60)
     assert (event.Severity, event.SourceName) == (opcua.ALARM, "Cell")
-    assert event.Message.Text == await plant.value("AlarmText") == "The store cannot be written: disk full"
+    assert (
+        event.Message.Text
+        == await plant.value("AlarmText")
+        == "The store cannot be written: disk full"
+    )
 
 
-async def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(plant: Plant, monkeypatch) -> None:
+async def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(
+    plant: Plant, monkeypatch
+) -> None:
     async def away() -> None:
         raise RuntimeError("the store is away")
 
@@ -232,7 +287,9 @@ async def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(p
     for stand_in, status in ((away, "UncertainLastUsableValue"), (plant.service.status, "Good")):
         monkeypatch.setattr(plant.service, "status", stand_in)
         async with asyncio.timeout(60):
-            while (read := await plant.read("Decisions")).StatusCode.value != getattr(ua.StatusCodes, status):
+            while (read := await plant.read("Decisions")).StatusCode.value != getattr(
+                ua.StatusCodes, status
+            ):
                 await plant.service.call(lambda engine: None)
                 await asyncio.sleep(0.05)
         assert read.Value.Value == before
@@ -245,7 +302,9 @@ async def test_elsewhere_it_wants_a_token_and_a_certificate(service: CellService
                 raise AssertionError("it must not be served")
 
 
-async def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(service, tmp_path, monkeypatch) -> None:
+async def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
+    service, tmp_path, monkeypatch
+) -> None:
     certificate(tmp_path, "urn:dengine:server")
     cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
     encrypted = f"Basic256Sha256,SignAndEncrypt,{cert},{key}"
@@ -263,11 +322,20 @@ async def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
             return await client.get_node(ua.NodeId("Cell.ModelVersion", index)).read_value()
 
     async with opcua.opcua_server(service, 0, "127.0.0.1", ["s3cret"], cert, key) as server:
-        assert await connect(server.bserver.port, encrypted, "dengine", "s3cret") == service.engine.version
-        for security, *who in ((encrypted, "dengine", "wrong"), (encrypted, "admin", "s3cret"), (encrypted, "", "")):
+        assert (
+            await connect(server.bserver.port, encrypted, "dengine", "s3cret")
+            == service.engine.version
+        )
+        for security, *who in (
+            (encrypted, "dengine", "wrong"),
+            (encrypted, "admin", "s3cret"),
+            (encrypted, "", ""),
+        ):
             with pytest.raises((ua.UaError, ConnectionError, TimeoutError)):
                 await connect(server.bserver.port, security, *who)
         # A client that does not care for what the server's endpoints are gets no session either.
-        monkeypatch.setattr(Client, "find_endpoint", staticmethod(lambda endpoints, *wanted: endpoints[0]))
+        monkeypatch.setattr(
+            Client, "find_endpoint", staticmethod(lambda endpoints, *wanted: endpoints[0])
+        )
         with pytest.raises(ua.uaerrors.BadUserAccessDenied):
             await connect(server.bserver.port, None, "dengine", "s3cret")

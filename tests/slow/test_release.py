@@ -51,12 +51,16 @@ def test_both_files_pass_the_checks_of_the_package_index(distributions: Path) ->
     files = sorted(distributions.iterdir())
     assert [file.name.split("-")[0] for file in files] == ["dengine", "dengine"]
     assert {"".join(file.suffixes)[-4:] for file in files} == {".whl", "r.gz"}
-    printed = run([sys.executable, "-m", "twine", "check", "--strict", *map(str, files)], distributions)
+    printed = run(
+        [sys.executable, "-m", "twine", "check", "--strict", *map(str, files)], distributions
+    )
     assert printed.count("PASSED") == 2
 
 
 @pytest.mark.parametrize("python", PYTHONS)
-def test_the_wheel_alone_runs_the_readmes_example(python: str, distributions: Path, repo: Path, tmp_path: Path) -> None:
+def test_the_wheel_alone_runs_the_readmes_example(
+    python: str, distributions: Path, repo: Path, tmp_path: Path
+) -> None:
     interpreter = shutil.which(python)
     if interpreter is None:
         pytest.skip(f"{python} is not on this machine")
@@ -72,7 +76,9 @@ def test_the_wheel_alone_runs_the_readmes_example(python: str, distributions: Pa
         "--no-compile",
     ]
     run([*install, "--constraint", str(repo / "constraints.txt"), str(wheel)], tmp_path)
-    example, *_ = re.findall(r"```python\n(.*?)```", (repo / "README.md").read_text("utf-8"), re.DOTALL)
+    example, *_ = re.findall(
+        r"```python\n(.*?)```", (repo / "README.md").read_text("utf-8"), re.DOTALL
+    )
     (tmp_path / "example.py").write_text(example, "utf-8")
     assert "accepted" in run(["clean/bin/python", "-I", "example.py"], tmp_path)
     assert "dengine" in run(["clean/bin/dengine", "--version"], tmp_path)

@@ -40,15 +40,32 @@ def load(name: str) -> ModuleType:
 
 
 def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run: Run, tmp_path: Path) -> None:
-    words = ["--seeds", "0:3", "--only", "conv,knn", "--sets", "opposite,screw driving", "--cycles", 150, "--n-jobs", 1]
-    first, second = (run("evidence", *words, "--out", tmp_path, "--keep", tmp_path / "kept") for _ in range(2))
+    words = [
+        "--seeds",
+        "0:3",
+        "--only",
+        "conv,knn",
+        "--sets",
+        "opposite,screw driving",
+        "--cycles",
+        150,
+        "--n-jobs",
+        1,
+    ]
+    first, second = (
+        run("evidence", *words, "--out", tmp_path, "--keep", tmp_path / "kept") for _ in range(2)
+    )
     assert "Without screw driving" in first
     assert "\n12 replays are left" in first
     assert "\n0 replays are left" in second
-    rows, answer = (pd.read_csv(tmp_path / "evidence" / f"{name}.csv") for name in ("replays", "differences"))
+    rows, answer = (
+        pd.read_csv(tmp_path / "evidence" / f"{name}.csv") for name in ("replays", "differences")
+    )
     certain = rows[rows["alpha"] == 0.1].pivot_table("certain", "seed", "recipe")
     more = answer.query("alpha == 0.1 and recipe == 'knn'").iloc[0]
-    assert more["certain_more"] == pytest.approx((certain["knn"] - certain["conv"]).mean(), abs=1e-3)
+    assert more["certain_more"] == pytest.approx(
+        (certain["knn"] - certain["conv"]).mean(), abs=1e-3
+    )
     assert more["certain_low"] < more["certain_more"] < more["certain_high"]
     assert "| opposite | " in (tmp_path / "evidence" / "tables.md").read_text(encoding="utf-8")
 
@@ -57,14 +74,20 @@ def test_a_row_of_the_evidence_gives_way_where_another_commit_plays_its_conditio
     evidence = load("evidence")
     settings = {"set": "drift", "interval": "wilson", "alpha": 0.1, "lower_bound": 0.9}
     old = pd.DataFrame(
-        [settings | {"recipe": who, "seed": seed, "commit": "a"} for who in ("pca", "conv") for seed in (1, 2)]
+        [
+            settings | {"recipe": who, "seed": seed, "commit": "a"}
+            for who in ("pca", "conv")
+            for seed in (1, 2)
+        ]
     )
     new = pd.DataFrame([settings | {"recipe": "conv", "seed": 2, "commit": "b"}])
     result = evidence.merged(old, new)[["recipe", "seed", "commit"]]
     assert result.to_numpy().tolist() == [["conv", 2, "b"], ["pca", 1, "a"], ["pca", 2, "a"]]
 
 
-def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeated(run: Run, tmp_path: Path) -> None:
+def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeated(
+    run: Run, tmp_path: Path
+) -> None:
     steps = [([0.0, 0.0024, 0.0036], [0.0, 0.2, 0.3]), ([0.0036, 0.0048], [0.3, 0.5])]
     graphs = [{"graph": {"time values": time, "torque values": torque}} for time, torque in steps]
     with pytest.raises(SystemExit, match=r"Expected files Ch_\*.json"):
@@ -78,7 +101,10 @@ def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeat
     np.testing.assert_allclose(data.X, [[0.0, 0.1, 0.2, 0.3, 0.5, 0.5, 0.5]] * 3, atol=1e-6)
     assert (data.y.tolist(), data.unit, round(data.rate_hz)) == ([1, 1, 0], "N·m", 833)
     with np.load(tmp_path / "out.npz") as stored:
-        assert (stored["workpiece"].tolist(), stored["nth_run"].tolist()) == (["a", "b", "a"], [0, 0, 1])
+        assert (stored["workpiece"].tolist(), stored["nth_run"].tolist()) == (
+            ["a", "b", "a"],
+            [0, 0, 1],
+        )
 
 
 def test_a_trained_encoder_beats_the_base_rate_and_starts_conv(run: Run, tmp_path: Path) -> None:
@@ -97,7 +123,11 @@ def test_a_trained_encoder_beats_the_base_rate_and_starts_conv(run: Run, tmp_pat
     assert (out / "curve.png").stat().st_size > 0
 
     fresh = ConvReducer(folds=2).untrained_module(X).members.state_dict()
-    started = ConvReducer(folds=2, checkpoint=str(out / "encoder.pt")).untrained_module(X).members.state_dict()
+    started = (
+        ConvReducer(folds=2, checkpoint=str(out / "encoder.pt"))
+        .untrained_module(X)
+        .members.state_dict()
+    )
     assert fresh.keys() == started.keys()
     assert not fresh["weight"].equal(started["weight"])
     assert started["weight"][0].equal(started["weight"][1])  # both members start from one encoder

@@ -22,7 +22,11 @@ def well(*words: object) -> Result:
     result = dengine(*words)
     assert result.exit_code == 0, result.output
     if not {"--json", "--help", "history"} & set(words):
-        assert not [line for line in result.stdout.splitlines() if len(line) > SCREEN_WIDTH and gettempdir() not in line]
+        assert not [
+            line
+            for line in result.stdout.splitlines()
+            if len(line) > SCREEN_WIDTH and gettempdir() not in line
+        ]
         assert "\u2026" not in result.stdout  # how rich marks what it has cut
     return result
 

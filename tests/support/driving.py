@@ -38,7 +38,9 @@ def make(recipe: Recipe = RECIPE, **options) -> DataEngine:
     return DataEngine(recipe=recipe, replaying=True, **options)
 
 
-def drive(engine: DataEngine, data: Dataset, first: int = 0, last: int | None = None, **options) -> list:
+def drive(
+    engine: DataEngine, data: Dataset, first: int = 0, last: int | None = None, **options
+) -> list:
     """The cycles of the parts first..last."""
     order = np.arange(len(data))[first:last]
     return list(engine.run(ReplayCell(data, order, **options), len(order)))
@@ -46,7 +48,17 @@ def drive(engine: DataEngine, data: Dataset, first: int = 0, last: int | None = 
 
 def evidence(d: Decision) -> tuple:
     """All of a decision but its id, which is new in every run."""
-    return (d.action, d.predicted, d.lower, d.upper, d.n_success, d.n_failure, d.embedding, d.model_version, d.reason)
+    return (
+        d.action,
+        d.predicted,
+        d.lower,
+        d.upper,
+        d.n_success,
+        d.n_failure,
+        d.embedding,
+        d.model_version,
+        d.reason,
+    )
 
 
 def learn(engine: DataEngine, data: Dataset, rows: Iterable[int]) -> None:
@@ -61,7 +73,9 @@ def easy_parts(n: int, seed: int, wave: slice = slice(0)) -> Dataset:
     """Traces of 40 samples in two easy shapes, each of a part of its own. wave : where the sensor was hit by one."""
     rng = np.random.default_rng(seed)
     y = rng.random(n) < 0.6
-    X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(0, 0.3, (n, 40))
+    X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(
+        0, 0.3, (n, 40)
+    )
     X[wave] = 2 * X[wave] + 8 * np.sin(2 * np.arange(40))
     part = np.array([f"part-number-{i:05d}" for i in range(n)])
     return Dataset(X.astype(np.float32), y.astype(np.int8), name="easy", part=part)

@@ -7,23 +7,45 @@ from typing import Any
 
 import numpy as np
 
-from dengine import DataEngine, Dataset, ForceLimits, ModelPrediction, Policy, Recipe, TraceSpec, WilsonRadiusClassifier
+from dengine import (
+    DataEngine,
+    Dataset,
+    ForceLimits,
+    ModelPrediction,
+    Policy,
+    Recipe,
+    TraceSpec,
+    WilsonRadiusClassifier,
+)
 from tests.support.driving import learn
 
 SAMPLES, LIMIT = 100, 500.0
-WINDOWS = (ForceLimits(0.02, 0.06, high=5.0), ForceLimits(0.1, 0.15, low=-20.0, high=22.5, reject=True))
+WINDOWS = (
+    ForceLimits(0.02, 0.06, high=5.0),
+    ForceLimits(0.1, 0.15, low=-20.0, high=22.5, reject=True),
+)
 OF_POLICY = {field.name for field in fields(Policy)}
 
 
 def recipe(**settings: Any) -> Recipe:
     """pca at (0.1, 90 %), which retrains when it is told to; settings of the policy too."""
-    policy = {"alpha": 0.1, "lower_bound": 0.9} | {name: settings.pop(name) for name in OF_POLICY & settings.keys()}
-    return Recipe(**{"reducer": "pca", "policy": Policy(**policy), "retrain_every": 10**6, "window": 2000} | settings)
+    policy = {"alpha": 0.1, "lower_bound": 0.9} | {
+        name: settings.pop(name) for name in OF_POLICY & settings.keys()
+    }
+    return Recipe(
+        **{"reducer": "pca", "policy": Policy(**policy), "retrain_every": 10**6, "window": 2000}
+        | settings
+    )
 
 
-def trained(data: Dataset, store: Path | None = None, trace: TraceSpec | None = None, **settings: Any) -> DataEngine:
+def trained(
+    data: Dataset, store: Path | None = None, trace: TraceSpec | None = None, **settings: Any
+) -> DataEngine:
     """An engine that saw every label and retrained on all of them."""
-    spec, place = trace or TraceSpec(data.X.shape[-1], limit=LIMIT), None if store is None else str(store)
+    spec, place = (
+        trace or TraceSpec(data.X.shape[-1], limit=LIMIT),
+        None if store is None else str(store),
+    )
     engine = DataEngine(recipe=recipe(**settings), store=place, trace=spec, seed=3, replaying=True)
     learn(engine, data, range(len(data)))
     engine.retrain()

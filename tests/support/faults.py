@@ -29,7 +29,9 @@ from typing import Any
 REPO = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_suffix(".toml")
 TIERS = {"all": [], "test": ["-m", "not slow"]}  # options of pytest
-SECONDS = 300.0  # for the tests of one fault: umap-learn compiles for a minute, more on a busy machine
+SECONDS = (
+    300.0  # for the tests of one fault: umap-learn compiles for a minute, more on a busy machine
+)
 FAILED, NONE = 1, 5  # pytest's exit codes where tests failed, and where none was selected
 
 
@@ -51,13 +53,17 @@ class Fault:
     def wrong(self) -> Iterator[str]:
         """What is wrong with it."""
         file = REPO / self.file
-        if (times := file.read_text(encoding="utf-8").count(self.before) if file.is_file() else 0) != 1:
+        if (
+            times := file.read_text(encoding="utf-8").count(self.before) if file.is_file() else 0
+        ) != 1:
             yield f"{self.file}: {self.name}: expected its text once, found it {times} times"
         if self.before == self.after or not self.tests:
             yield f"{self.file}: {self.name}: expected another text after it, and tests"
         for test in self.tests:
             path, _, function = test.partition("[")[0].partition("::")
-            there = (REPO / path).is_file() and f"def {function}" in (REPO / path).read_text(encoding="utf-8")
+            there = (REPO / path).is_file() and f"def {function}" in (REPO / path).read_text(
+                encoding="utf-8"
+            )
             if not there:
                 yield f"{self.file}: {self.name}: expected a test that is there, got {test}"
 
@@ -77,7 +83,11 @@ def read_faults(only: Sequence[str]) -> list[Fault]:
     """The faults of the list whose names contain one of `only`; ListError for one that fits no longer."""
     faults = [Fault(**row) for row in tomllib.loads(LIST.read_text(encoding="utf-8"))["fault"]]
     wrong = [item for fault in faults for item in fault.wrong()]
-    wrong += [f"no fault named {name!r}" for name in only if not any(name in fault.name for fault in faults)]
+    wrong += [
+        f"no fault named {name!r}"
+        for name in only
+        if not any(name in fault.name for fault in faults)
+    ]
     if wrong or len({fault.name for fault in faults}) < len(faults):
         raise ListError("\n".join(wrong) or "two faults of one name")
     return [fault for fault in faults if not only or any(name in fault.name for name in only)]
@@ -86,22 +96,47 @@ def read_faults(only: Sequence[str]) -> list[Fault]:
 def copied(folder: Path) -> Path:
     """A copy of the tree in a folder: what git knows of, as it stands."""
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    names = subprocess.run(listed, cwd=REPO, capture_output=True, check=True).stdout.decode().split("\0")
+    names = (
+        subprocess.run(listed, cwd=REPO, capture_output=True, check=True)
+        .stdout.decode()
+        .split("\0")
+    )
     for name in filter(None, names):
         if (source := REPO / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source, folder / name)
     # By content: a file and its fault may be of one size and one second, and one's bytecode be taken for the other's.
-    compileall.compile_dir(folder / "dengine", quiet=2, invalidation_mode=PycInvalidationMode.CHECKED_HASH)
+    compileall.compile_dir(
+        folder / "dengine", quiet=2, invalidation_mode=PycInvalidationMode.CHECKED_HASH
+    )
     return folder
 
 
-def run_tests(tests: Sequence[str], tree: Path, tier: str, seconds: float = SECONDS) -> tuple[int | None, str]:
+def run_tests(
+    tests: Sequence[str], tree: Path, tier: str, seconds: float = SECONDS
+) -> tuple[int | None, str]:
     """Pytest's exit code in a tree, None where it ran out of time, and what it said."""
     surroundings = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *TIERS[tier], *tests]
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "errors": "replace"}
-    with subprocess.Popen(command, cwd=tree, env=surroundings, start_new_session=True, **pipes) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        *TIERS[tier],
+        *tests,
+    ]
+    pipes: dict[str, Any] = {
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.STDOUT,
+        "text": True,
+        "errors": "replace",
+    }
+    with subprocess.Popen(
+        command, cwd=tree, env=surroundings, start_new_session=True, **pipes
+    ) as process:
         try:
             text, _ = process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
@@ -121,13 +156,23 @@ def try_one(fault: Fault, tree: Path, tier: str) -> Trial:
         file.write_text(text, encoding="utf-8")
     why = {None: f"no end within {SECONDS:g} s", 0: "", FAILED: "", NONE: "all its tests are slow"}
     caught = fault.hangs if code is None else code == FAILED
-    return Trial(fault.name, fault.file, caught, time.monotonic() - begin, why.get(code, "its tests could not be run"))
+    return Trial(
+        fault.name,
+        fault.file,
+        caught,
+        time.monotonic() - begin,
+        why.get(code, "its tests could not be run"),
+    )
 
 
 def check_without(tests: Sequence[str], tree: Path, tier: str) -> str:
     """What to say of tests that do not pass in the tree as it is; "" where they do."""
     code, text = run_tests(tests, tree, tier, SECONDS * len(tests))
-    return "" if code in (0, NONE) else f"tests fail without the fault: {' '.join(tests)}\n{text[-1500:]}"
+    return (
+        ""
+        if code in (0, NONE)
+        else f"tests fail without the fault: {' '.join(tests)}\n{text[-1500:]}"
+    )
 
 
 def tests_by_file(faults: Sequence[Fault]) -> list[list[str]]:
@@ -160,21 +205,33 @@ def side_by_side(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Try the faults; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="faults whose names contain one of these")
-    parser.add_argument("--tier", choices=list(TIERS), default="all", help="test: by what `make test` runs")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="faults whose names contain one of these",
+    )
+    parser.add_argument(
+        "--tier", choices=list(TIERS), default="all", help="test: by what `make test` runs"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="faults that are tried at a time")
     asked = parser.parse_args(arguments)
     try:
         faults = read_faults(asked.only)
         with tempfile.TemporaryDirectory(prefix="faults-") as folder:
             trees = [copied(Path(folder).resolve() / str(k)) for k in range(max(1, asked.jobs))]
-            if wrong := list(filter(None, side_by_side(check_without, tests_by_file(faults), trees, asked.tier))):
+            if wrong := list(
+                filter(None, side_by_side(check_without, tests_by_file(faults), trees, asked.tier))
+            ):
                 raise ListError("\n".join(wrong))
             trials = []
             for trial in side_by_side(try_one, faults, trees, asked.tier):
                 trials.append(trial)
                 word, why = "caught" if trial.caught else "MISSED", trial.why and f" ({trial.why})"
-                print(f"{word}  {trial.seconds:5.1f} s  {trial.file}: {trial.name}{why}", flush=True)
+                print(
+                    f"{word}  {trial.seconds:5.1f} s  {trial.file}: {trial.name}{why}", flush=True
+                )
     except ListError as error:
         print(error, file=sys.stderr)
         return 2

@@ -15,7 +15,9 @@ def plans(database: Path) -> Iterator[list[tuple[str, list[str]]]]:
     sent: list[tuple[str, Any]] = []
     results: list[tuple[str, list[str]]] = []
 
-    def catch(connection: Any, cursor: Any, statement: str, parameters: Any, context: Any, many: bool) -> None:
+    def catch(
+        connection: Any, cursor: Any, statement: str, parameters: Any, context: Any, many: bool
+    ) -> None:
         if statement.startswith("SELECT"):
             sent.append((statement, parameters))
 

@@ -12,7 +12,9 @@ import pytest
 class Program:
     """One that runs: dengine-cell with these arguments, or another."""
 
-    def __init__(self, programs: Path, *arguments: Any, name: str = "dengine-cell", **options: Any) -> None:
+    def __init__(
+        self, programs: Path, *arguments: Any, name: str = "dengine-cell", **options: Any
+    ) -> None:
         command = [str(programs / name), *map(str, arguments)]
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         self.process = subprocess.Popen(command, text=True, bufsize=1, **pipes, **options)
@@ -57,8 +59,14 @@ def must_agree(answers: Iterable[list[str]], decisions: list[Any], accuracy: flo
     """Assert that answers are these decisions, embeddings where they are told, and say how long they took."""
     for i, (words, decision) in enumerate(zip(answers, decisions, strict=True)):
         assert words[1:3] == [str(decision.action), str(decision.reason)], i
-        assert list(map(float, words[3:5])) == pytest.approx([decision.lower, decision.upper], abs=accuracy), i
+        assert list(map(float, words[3:5])) == pytest.approx(
+            [decision.lower, decision.upper], abs=accuracy
+        ), i
         assert list(map(int, words[5:7])) == [decision.n_success, decision.n_failure], i
-        z = np.full(len(words) - 8, np.nan) if decision.embedding is None else np.ravel(decision.embedding)
+        z = (
+            np.full(len(words) - 8, np.nan)
+            if decision.embedding is None
+            else np.ravel(decision.embedding)
+        )
         np.testing.assert_allclose(list(map(float, words[7:-1])), z, rtol=1e-5, atol=accuracy)
         assert float(words[-1]) > 0.0

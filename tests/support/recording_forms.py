@@ -13,7 +13,14 @@ END = "<!-- end of {} -->"
 STEP = 0.004  # seconds: 250 Hz
 
 # A delimiter's name -> what stands between the cells.
-DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "blank": " ", "several blanks": "   "}
+DELIMITERS = {
+    "comma": ",",
+    "semicolon": ";",
+    "tab": "\t",
+    "bar": "|",
+    "blank": " ",
+    "several blanks": "   ",
+}
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 
 # 1043.5 in a number format -> how it writes a number.
@@ -35,16 +42,94 @@ NUMBERS: Mapping[str, Callable[[float], str]] = {
 
 # What a column of seconds is called.
 CLOCK_NAMES = (
-    *("time", "Time", "TIME", "timestamp", "Timestamp", "TimeStamp", "timestamps", "time_stamp", "%time", "# time"),
-    *("__time", "Time.1", "elapsed", "elapsed_time", "Elapsed Time (s)", "Relative Time", "relative_time", "runtime"),
-    *("System Time", "Sample Time", "X_Value", "Time_s", "t", "t_s", "t [s]", "t/s", "t_rel", "Time/s", "time(s)"),
-    *("log_time", "receive_time", "header.stamp", "field.header.stamp", "stamp", "rosbagTimestamp", "ros_time"),
-    *("sec", "seconds", "epoch", "clock", "date_time", "DateTime", "Date", "Date/Time", "Zeit", "Zeit/s", "Uhrzeit"),
-    *("Messzeit", "Zeitstempel", "Temps", "heure", "tiempo", "hora", "Tempo", "tijd", "czas", "時間", "时间", "시간"),
+    *(
+        "time",
+        "Time",
+        "TIME",
+        "timestamp",
+        "Timestamp",
+        "TimeStamp",
+        "timestamps",
+        "time_stamp",
+        "%time",
+        "# time",
+    ),
+    *(
+        "__time",
+        "Time.1",
+        "elapsed",
+        "elapsed_time",
+        "Elapsed Time (s)",
+        "Relative Time",
+        "relative_time",
+        "runtime",
+    ),
+    *(
+        "System Time",
+        "Sample Time",
+        "X_Value",
+        "Time_s",
+        "t",
+        "t_s",
+        "t [s]",
+        "t/s",
+        "t_rel",
+        "Time/s",
+        "time(s)",
+    ),
+    *(
+        "log_time",
+        "receive_time",
+        "header.stamp",
+        "field.header.stamp",
+        "stamp",
+        "rosbagTimestamp",
+        "ros_time",
+    ),
+    *(
+        "sec",
+        "seconds",
+        "epoch",
+        "clock",
+        "date_time",
+        "DateTime",
+        "Date",
+        "Date/Time",
+        "Zeit",
+        "Zeit/s",
+        "Uhrzeit",
+    ),
+    *(
+        "Messzeit",
+        "Zeitstempel",
+        "Temps",
+        "heure",
+        "tiempo",
+        "hora",
+        "Tempo",
+        "tijd",
+        "czas",
+        "時間",
+        "时间",
+        "시간",
+    ),
 )
 # What a column of other units is called -> the seconds of one.
 CLOCK_UNITS = {
-    **dict.fromkeys(("time_ms", "Time (ms)", "t [ms]", "t/ms", "Millis", "millis", "ms", "timeMs", "Zeit in ms"), 1e-3),
+    **dict.fromkeys(
+        (
+            "time_ms",
+            "Time (ms)",
+            "t [ms]",
+            "t/ms",
+            "Millis",
+            "millis",
+            "ms",
+            "timeMs",
+            "Zeit in ms",
+        ),
+        1e-3,
+    ),
     **dict.fromkeys(("time [us]", "timestamp_us", "t [µs]", "micros", "Time(us)"), 1e-6),
     **dict.fromkeys(("time_ns", "epoch_ns", "Zeit(0.001 us)"), 1e-9),
     "Zeit(0.001 ms)": 1e-6,
@@ -95,7 +180,15 @@ UNITS = ("FZ [kN]", "FZ (kN)", "FZ_kN", "FZ/kN", "FZ in kN", "FZ kN", "a row of 
 # Where a name has its label -> names of good recordings, and of bad ones.
 LABEL_FORMS: Mapping[str, tuple[list[str], list[str]]] = {
     "a word at the end of the name": (
-        ["insertion_0001_True.csv", "OK.csv", "a-PASS.CSV", "sub/x good.csv", "success.csv", "0001_yes.csv", "7_gut.csv"],
+        [
+            "insertion_0001_True.csv",
+            "OK.csv",
+            "a-PASS.CSV",
+            "sub/x good.csv",
+            "success.csv",
+            "0001_yes.csv",
+            "7_gut.csv",
+        ],
         [
             "insertion_0001_False.csv",
             "NOK.csv",
@@ -116,11 +209,27 @@ LABEL_FORMS: Mapping[str, tuple[list[str], list[str]]] = {
             "OK1.csv",
             "IO_7.csv",
         ],
-        ["part_0001_NOK_1.csv", "NOK_0001.csv", "fail-1.csv", "x_false_1_1.csv", "x_bad_run1.csv", "NOK1.csv", "NIO_7.csv"],
+        [
+            "part_0001_NOK_1.csv",
+            "NOK_0001.csv",
+            "fail-1.csv",
+            "x_false_1_1.csv",
+            "x_bad_run1.csv",
+            "NOK1.csv",
+            "NIO_7.csv",
+        ],
     ),
     "i.O. and n.i.O., as Germans write them": (
         ["7_i.O..csv", "7_i.O.csv", "7_iO.csv", "7_IO.csv", "7_i_O.csv", "i.O._7.csv", "io/7.csv"],
-        ["7_n.i.O..csv", "7_n.i.O.csv", "7_niO.csv", "7_NIO.csv", "7_n_i_O.csv", "7_nicht i.O..csv", "n.i.O./7.csv"],
+        [
+            "7_n.i.O..csv",
+            "7_n.i.O.csv",
+            "7_niO.csv",
+            "7_NIO.csv",
+            "7_n_i_O.csv",
+            "7_nicht i.O..csv",
+            "n.i.O./7.csv",
+        ],
     ),
     "a word after a not": (
         ["run_7_not_failed.csv", "run_7_NotFailed.csv"],
@@ -135,7 +244,15 @@ LABEL_FORMS: Mapping[str, tuple[list[str], list[str]]] = {
         ],
     ),
     "other separators and capitals": (
-        ["part7OK.csv", "partOk.csv", "part(ok).csv", "part=pass.csv", "part.7.ok.csv", "part [OK] 7.csv", "part+true.csv"],
+        [
+            "part7OK.csv",
+            "partOk.csv",
+            "part(ok).csv",
+            "part=pass.csv",
+            "part.7.ok.csv",
+            "part [OK] 7.csv",
+            "part+true.csv",
+        ],
         [
             "part7NOK.csv",
             "partNok.csv",
@@ -174,9 +291,14 @@ def tables() -> dict[str, str]:
         "A time is written as": in_code(TIMES),
         "The unit kN of a channel": in_code(UNITS),
     }
-    lines = ["| what | forms that are read |", "| --- | --- |", *(f"| {name} | {forms} |" for name, forms in rows.items())]
+    lines = [
+        "| what | forms that are read |",
+        "| --- | --- |",
+        *(f"| {name} | {forms} |" for name, forms in rows.items()),
+    ]
     label_rows = [
-        f"| {form} | {in_code(tuple(good))} | {in_code(tuple(bad))} |" for form, (good, bad) in LABEL_FORMS.items()
+        f"| {form} | {in_code(tuple(good))} | {in_code(tuple(bad))} |"
+        for form, (good, bad) in LABEL_FORMS.items()
     ]
     empty = ", ".join(f"`{word}`" for word in NOT_CHECKED if word.strip())
     head = ["| the label is | good | bad |", "| --- | --- | --- |"]

@@ -27,9 +27,15 @@ REPO = Path(__file__).resolve().parents[2]
 WAIT = 60.0  # seconds, for what takes a fraction of one: a machine may be busy
 
 
-def a_service(file: Path | None = None, recipe: Recipe = RECIPE, deadline: float = WAIT, **options: Any) -> Any:
+def a_service(
+    file: Path | None = None, recipe: Recipe = RECIPE, deadline: float = WAIT, **options: Any
+) -> Any:
     """A service in memory, or in a file, as long as the context lasts."""
-    return closing(CellService(lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline, **options))
+    return closing(
+        CellService(
+            lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline, **options
+        )
+    )
 
 
 @contextmanager
@@ -43,7 +49,10 @@ def served(app: Any, port: int = 0, connections: int = 100, **limits: Any) -> It
     from dengine.serve.connections import ConnectionPool
     from dengine.serve.server import bound, uvicorn_options
 
-    options = {"http": ConnectionPool(connections, **limits).new_connection, "timeout_graceful_shutdown": 1}
+    options = {
+        "http": ConnectionPool(connections, **limits).new_connection,
+        "timeout_graceful_shutdown": 1,
+    }
     server = uvicorn.Server(uvicorn.Config(app, **uvicorn_options() | options))
     with bound("127.0.0.1", port) as listening:
         thread = threading.Thread(target=server.run, args=([listening],))
@@ -66,8 +75,14 @@ class Process:
     output: str = ""
 
     def ask(self, path: str, body: Any = None) -> dict[str, Any]:
-        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT)) as connection:
-            data, kind = (None, {}) if body is None else (json.dumps(body), {"content-type": "application/json"})
+        with closing(
+            http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT)
+        ) as connection:
+            data, kind = (
+                (None, {})
+                if body is None
+                else (json.dumps(body), {"content-type": "application/json"})
+            )
             connection.request("GET" if body is None else "POST", path, data, kind)
             answer = connection.getresponse()
             document: dict[str, Any] = json.loads(answer.read())
@@ -83,12 +98,26 @@ class Process:
 
 
 @contextmanager
-def started(folder: Path, *words: str, wait: bool = True, python_path: str = str(REPO)) -> Iterator[Process]:
+def started(
+    folder: Path, *words: str, wait: bool = True, python_path: str = str(REPO)
+) -> Iterator[Process]:
     """`dengine serve` and words, as they are typed in a folder. wait : until it says where it listens."""
-    command = [sys.executable, "-m", "dengine", "serve", "--store", "cell.db", "--port", "0", *words]
+    command = [
+        sys.executable,
+        "-m",
+        "dengine",
+        "serve",
+        "--store",
+        "cell.db",
+        "--port",
+        "0",
+        *words,
+    ]
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     environment = os.environ | {"PYTHONPATH": python_path}
-    process = subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True, **pipes)
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment, start_new_session=True, **pipes
+    )
     try:
         lines, match = [], None
         while wait and match is None and (line := process.stdout.readline()):
@@ -132,16 +161,24 @@ def busy_engine(service: Any) -> Iterator[None]:
 
 def certificate(folder: Path, *uris: str) -> None:
     """Files for TLS by the name of localhost: cert.pem, key.pem, and locked.pem with a password."""
-    x509 = pytest.importorskip("cryptography.x509", reason="the test's certificate needs cryptography")
+    x509 = pytest.importorskip(
+        "cryptography.x509", reason="the test's certificate needs cryptography"
+    )
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import rsa
 
     key, now = rsa.generate_private_key(65537, 2048), datetime.now(UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
-    created = x509.CertificateBuilder(name, name, key.public_key(), 7, now - timedelta(1), now + timedelta(2))
+    created = x509.CertificateBuilder(
+        name, name, key.public_key(), 7, now - timedelta(1), now + timedelta(2)
+    )
     others = [x509.DNSName("localhost"), *map(x509.UniformResourceIdentifier, uris)]
-    signed = created.add_extension(x509.SubjectAlternativeName(others), critical=False).sign(key, hashes.SHA256())
+    signed = created.add_extension(x509.SubjectAlternativeName(others), critical=False).sign(
+        key, hashes.SHA256()
+    )
     pem, form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
     (folder / "cert.pem").write_bytes(signed.public_bytes(pem))
     (folder / "key.pem").write_bytes(key.private_bytes(pem, form, serialization.NoEncryption()))
-    (folder / "locked.pem").write_bytes(key.private_bytes(pem, form, serialization.BestAvailableEncryption(b"secret")))
+    (folder / "locked.pem").write_bytes(
+        key.private_bytes(pem, form, serialization.BestAvailableEncryption(b"secret"))
+    )

@@ -10,20 +10,28 @@ from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import NewLabel, SqlStore, StoredDecision
 
 
-def decision(name: str, action: Action = Action.VERIFY, reason: Reason = Reason.UNCERTAIN, version: int = 0) -> Decision:
-    return Decision(name, action, action, 0.2, 1.0, 1, 0, ((0.1, 0.2), (0.3, 0.4)), version, reason, False, 1.0)
+def decision(
+    name: str, action: Action = Action.VERIFY, reason: Reason = Reason.UNCERTAIN, version: int = 0
+) -> Decision:
+    return Decision(
+        name, action, action, 0.2, 1.0, 1, 0, ((0.1, 0.2), (0.3, 0.4)), version, reason, False, 1.0
+    )
 
 
 def trace(seed: int = 0, shape: tuple[int, ...] = (2, 30)) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
 
 
-def label(name: str, success: bool = True, silent: int = 0, source: Source = Source.VERIFICATION) -> NewLabel:
+def label(
+    name: str, success: bool = True, silent: int = 0, source: Source = Source.VERIFICATION
+) -> NewLabel:
     return NewLabel(name, success, source, 0, None, silent)
 
 
 def report(version: int, accepted: bool = True) -> RetrainReport:
-    return RetrainReport(version, 0.25, 100, 60, accepted, "improved" if accepted else "the gate held")
+    return RetrainReport(
+        version, 0.25, 100, 60, accepted, "improved" if accepted else "the gate held"
+    )
 
 
 def execute(file: Path, *statements: str) -> None:
@@ -34,11 +42,17 @@ def execute(file: Path, *statements: str) -> None:
 
 
 def put_decision(
-    store: SqlStore, decision: Decision, trace: np.ndarray, content_hash: int = 1, quarantined: bool = False
+    store: SqlStore,
+    decision: Decision,
+    trace: np.ndarray,
+    content_hash: int = 1,
+    quarantined: bool = False,
 ) -> None:
     """A decision and its trace, (C, T) or (T,)."""
     values = np.array(trace, dtype=np.float32, ndmin=2)
-    store.apply_records([StoredDecision(decision, values, content_hash, quarantined, store.clock())])
+    store.apply_records(
+        [StoredDecision(decision, values, content_hash, quarantined, store.clock())]
+    )
 
 
 def labelled(item: StoredDecision, success: bool) -> list[StoredDecision | NewLabel]:
@@ -52,7 +66,9 @@ def put_labels(store: SqlStore, *labels: NewLabel) -> list[int]:
     now, taken = store.clock() if labels else 0.0, []
     for label in labels:
         stored = store.get_decision(label.decision_id, trace=False)
-        taken.append(replace(label, time=now, content_hash=stored.content_hash, decided=stored.time))
+        taken.append(
+            replace(label, time=now, content_hash=stored.content_hash, decided=stored.time)
+        )
     numbers = dict(store.apply_records(taken))
     return [numbers[label.decision_id] for label in labels]
 

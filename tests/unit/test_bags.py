@@ -84,10 +84,16 @@ def test_a_recording_is_cut_into_its_insertions_with_their_labels(bag: Bag, tmp_
 
 
 @pytest.mark.parametrize("signal", ["FZ", "FX_Base"])
-def test_it_is_cut_by_the_same_triggers_as_a_live_one(bag: Bag, tmp_path: Path, signal: str) -> None:
+def test_it_is_cut_by_the_same_triggers_as_a_live_one(
+    bag: Bag, tmp_path: Path, signal: str
+) -> None:
     options = {**ASKED, "trigger": Trigger("contact", 5.0, signal, quiet_s=0.05)}
-    np.testing.assert_array_equal(load_dataset(bag.write(tmp_path / "a.mcap"), **options).X, bag.traces[:, 2].astype("f4"))
-    with pytest.raises(DataError, match="it never does"):  # 0.08 s of rest are less than the 0.2 s of its text
+    np.testing.assert_array_equal(
+        load_dataset(bag.write(tmp_path / "a.mcap"), **options).X, bag.traces[:, 2].astype("f4")
+    )
+    with pytest.raises(
+        DataError, match="it never does"
+    ):  # 0.08 s of rest are less than the 0.2 s of its text
         load_dataset(tmp_path / "a.mcap", **{**ASKED, "trigger": f"contact=5@{signal}"})
 
 
@@ -105,7 +111,12 @@ def test_a_bag_of_several_files_is_one_recording(bag: Bag, tmp_path: Path) -> No
 
 def test_a_message_that_was_lost_is_a_fault_and_says_where(bag: Bag, tmp_path: Path) -> None:
     begin = bag.starts
-    bag.lost = {begin[1] + 30, *range(begin[4] + 10, begin[4] + 15), begin[5], begin[6] + SAMPLES - 1}
+    bag.lost = {
+        begin[1] + 30,
+        *range(begin[4] + 10, begin[4] + 15),
+        begin[5],
+        begin[6] + SAMPLES - 1,
+    }
     data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
     np.testing.assert_array_equal(data.X, bag.traces[[0, 2, 3, 7], 2].astype(np.float32))
     assert [str(fault) for fault in data.faults] == [
@@ -120,7 +131,9 @@ def test_a_message_that_came_late_is_not_lost(bag: Bag, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     bag.stamps = bag.stamps + rng.integers(0, STEP // 3, len(bag.stamps))
     start = bag.starts[2]
-    bag.stamps[start + 5 : start + 35] = bag.stamps[start + 34] + np.arange(30)  # all stamped in one burst
+    bag.stamps[start + 5 : start + 35] = bag.stamps[start + 34] + np.arange(
+        30
+    )  # all stamped in one burst
     data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
     np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
     assert not data.faults
@@ -131,7 +144,9 @@ def test_times_that_turn_back_are_a_fault_unless_a_rate_is_stated(bag: Bag, tmp_
     path = bag.write(tmp_path / "cell.mcap")
     data = load_dataset(path, **ASKED)
     (fault,) = data.faults
-    assert str(fault) == "cell/2: Expected later times from message to message, sample 7 is not later"
+    assert (
+        str(fault) == "cell/2: Expected later times from message to message, sample 7 is not later"
+    )
     assert len(load_dataset(path, rate_hz=500.0, **ASKED)) == 8
 
 
@@ -147,11 +162,15 @@ def test_labels_are_listed_by_number_too_with_the_parts(bag: Bag, tmp_path: Path
     assert [fault.source for fault in data.faults] == ["labels.csv", "cell/8"]
 
 
-def test_an_insertion_that_nobody_labelled_is_a_fault_and_most_of_them_an_error(bag: Bag, tmp_path: Path) -> None:
+def test_an_insertion_that_nobody_labelled_is_a_fault_and_most_of_them_an_error(
+    bag: Bag, tmp_path: Path
+) -> None:
     del bag.told[2]
     data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
     np.testing.assert_array_equal(data.y, np.delete(bag.good, 2))
-    assert str(data.faults[0]).startswith(f"cell/3: Expected a message of {CHECK} before the next insertion")
+    assert str(data.faults[0]).startswith(
+        f"cell/3: Expected a message of {CHECK} before the next insertion"
+    )
     bag.told = {0: True}
     with pytest.raises(DataError, match="7 of 8 have none"):
         load_dataset(bag.write(tmp_path / "few.mcap"), **ASKED)
@@ -160,8 +179,14 @@ def test_an_insertion_that_nobody_labelled_is_a_fault_and_most_of_them_an_error(
 def test_what_cannot_be_cut_is_said_with_what_to_give(bag: Bag, tmp_path: Path) -> None:
     path = bag.write(tmp_path / "cell.mcap")
     for change, message in (
-        ({"trigger": None}, "Expected what cuts .* as trigger='register@/phase' and label='/height_check/ok'"),
-        ({"label": None}, "Expected the labels of the insertions in .*, as label='/height_check/ok'"),
+        (
+            {"trigger": None},
+            "Expected what cuts .* as trigger='register@/phase' and label='/height_check/ok'",
+        ),
+        (
+            {"label": None},
+            "Expected the labels of the insertions in .*, as label='/height_check/ok'",
+        ),
         ({"trigger": "register@/nothing"}, "Expected the topic /nothing"),
         ({"label": "/nothing"}, "Expected the topic /nothing"),
         ({"topic": PHASE}, "Expected a topic of a wrench"),
@@ -177,7 +202,9 @@ def test_what_cannot_be_cut_is_said_with_what_to_give(bag: Bag, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_damaged_file_is_refused_or_read_and_never_raises_anything_else(bag: Bag, tmp_path: Path, seed: int) -> None:
+def test_a_damaged_file_is_refused_or_read_and_never_raises_anything_else(
+    bag: Bag, tmp_path: Path, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     raw = bytearray(bag.write(tmp_path / "cell.mcap").read_bytes())
     for place in rng.integers(0, len(raw), 6):

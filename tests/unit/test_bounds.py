@@ -8,11 +8,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from statsmodels.stats.proportion import proportion_confint
 
-from dengine import INTERVALS, binomial_interval, clopper_pearson_interval, jeffreys_interval, wilson_interval
+from dengine import (
+    INTERVALS,
+    binomial_interval,
+    clopper_pearson_interval,
+    jeffreys_interval,
+    wilson_interval,
+)
 from dengine.errors import SettingError
 
 ALPHAS = (0.001, 0.01, 0.05, 0.1, 0.2, 0.5)
-COUNTS = [(s, n - s) for n in (1, 2, 3, 7, 30, 100, 1503) for s in sorted({0, 1, n // 3, n // 2, n - 1, n})]
+COUNTS = [
+    (s, n - s)
+    for n in (1, 2, 3, 7, 30, 100, 1503)
+    for s in sorted({0, 1, n // 3, n // 2, n - 1, n})
+]
 
 intervals = pytest.mark.parametrize("interval", INTERVALS.values(), ids=INTERVALS)
 counts = st.integers(0, 2000)
@@ -23,17 +33,36 @@ def truncated(value: float, digits: int) -> float:
     return math.floor(value * 10**digits + 1e-9) / 10**digits
 
 
-TABLE_A = {0.2: (0.91, 0.97), 0.1: (0.90, 0.97), 0.05: (0.88, 0.97), 0.01: (0.86, 0.98)}  # alpha: 95 of 100
-TABLE_B = {96: (0.901, 0.984), 97: (0.915, 0.989), 98: (0.929, 0.994), 99: (0.945, 0.998), 100: (0.963, 1.0)}  # at 0.05
+TABLE_A = {
+    0.2: (0.91, 0.97),
+    0.1: (0.90, 0.97),
+    0.05: (0.88, 0.97),
+    0.01: (0.86, 0.98),
+}  # alpha: 95 of 100
+TABLE_B = {
+    96: (0.901, 0.984),
+    97: (0.915, 0.989),
+    98: (0.929, 0.994),
+    99: (0.945, 0.998),
+    100: (0.963, 1.0),
+}  # at 0.05
 
 
 @pytest.mark.parametrize(
     ("n_success", "alpha", "digits", "bounds"),
-    [(95, alpha, 2, bounds) for alpha, bounds in TABLE_A.items()] + [(n, 0.05, 3, bounds) for n, bounds in TABLE_B.items()],
+    [(95, alpha, 2, bounds) for alpha, bounds in TABLE_A.items()]
+    + [(n, 0.05, 3, bounds) for n, bounds in TABLE_B.items()],
 )
-def test_wilson_gives_the_papers_two_tables(n_success: int, alpha: float, digits: int, bounds: tuple[float, float]) -> None:
+def test_wilson_gives_the_papers_two_tables(
+    n_success: int, alpha: float, digits: int, bounds: tuple[float, float]
+) -> None:
     # "Wilson Formula results" (a) and (b), of 100 neighbours; truncated.
-    assert tuple(truncated(bound, digits) for bound in wilson_interval(n_success, 100 - n_success, alpha)) == bounds
+    assert (
+        tuple(
+            truncated(bound, digits) for bound in wilson_interval(n_success, 100 - n_success, alpha)
+        )
+        == bounds
+    )
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
@@ -56,7 +85,9 @@ def test_interval_equals_statsmodels(interval, method: str, alpha: float) -> Non
 
 @intervals
 @given(n_s=counts, n_f=counts, alpha=alphas)
-def test_bounds_enclose_the_observed_rate_and_exchanging_the_labels_mirrors_them(interval, n_s, n_f: int, alpha) -> None:
+def test_bounds_enclose_the_observed_rate_and_exchanging_the_labels_mirrors_them(
+    interval, n_s, n_f: int, alpha
+) -> None:
     lower, upper = interval(n_s, n_f, alpha)
     rate = n_s / (n_s + n_f) if n_s + n_f else 0.5
     assert 0.0 <= lower <= rate <= upper <= 1.0
@@ -75,7 +106,9 @@ def test_both_bounds_grow_with_the_number_of_successes(interval, n: int, alpha: 
 
 @intervals
 @given(n_s=counts, n_f=counts, first=alphas, other=alphas)
-def test_a_smaller_alpha_never_narrows_the_interval(interval, n_s: int, n_f: int, first: float, other: float) -> None:
+def test_a_smaller_alpha_never_narrows_the_interval(
+    interval, n_s: int, n_f: int, first: float, other: float
+) -> None:
     wide, narrow = interval(n_s, n_f, min(first, other)), interval(n_s, n_f, max(first, other))
     assert wide[0] <= narrow[0] + 1e-12
     assert narrow[1] <= wide[1] + 1e-12

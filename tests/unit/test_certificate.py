@@ -11,17 +11,23 @@ from dengine import Policy
 from dengine.decision.certificate import Certificate, Outcomes, certify, failure_bound, log_evidence
 from dengine.errors import SettingError
 
-counts = st.tuples(st.integers(0, 20_000), st.floats(0.0, 1.0)).map(lambda c: (c[0], int(c[0] * c[1])))
+counts = st.tuples(st.integers(0, 20_000), st.floats(0.0, 1.0)).map(
+    lambda c: (c[0], int(c[0] * c[1]))
+)
 alphas = st.floats(0.001, 0.5)
 propensities = st.floats(0.005, 1.0)
 
 
-def certificate(stops: str = "all", audit_rate: float = 0.0, alpha: float = 0.05, /, **counts: int) -> Certificate:
+def certificate(
+    stops: str = "all", audit_rate: float = 0.0, alpha: float = 0.05, /, **counts: int
+) -> Certificate:
     return certify(Outcomes(**counts), alpha, 0.05, stops, audit_rate)
 
 
 @given(counts, alphas, propensities)
-def test_the_bound_is_the_largest_rate_not_refuted(c: tuple[int, int], alpha: float, q: float) -> None:
+def test_the_bound_is_the_largest_rate_not_refuted(
+    c: tuple[int, int], alpha: float, q: float
+) -> None:
     upper = failure_bound(*c, alpha, q)
     assert min(1.0, c[1] / (max(1, c[0]) * q)) - 1e-9 <= upper <= 1.0
     assert log_evidence(*c, upper - 1e-6, q) < math.log(1 / alpha)
@@ -29,15 +35,24 @@ def test_the_bound_is_the_largest_rate_not_refuted(c: tuple[int, int], alpha: fl
 
 
 @given(counts, alphas, propensities)
-def test_the_bound_rises_with_a_bad_part_and_falls_with_a_good_one(c: tuple[int, int], alpha: float, q: float) -> None:
+def test_the_bound_rises_with_a_bad_part_and_falls_with_a_good_one(
+    c: tuple[int, int], alpha: float, q: float
+) -> None:
     n, n_bad = c
     upper = failure_bound(n, n_bad, alpha, q)
-    assert failure_bound(n + 1, n_bad, alpha, q) <= upper <= failure_bound(n + 1, n_bad + 1, alpha, q)
+    assert (
+        failure_bound(n + 1, n_bad, alpha, q) <= upper <= failure_bound(n + 1, n_bad + 1, alpha, q)
+    )
     assert failure_bound(n, n_bad, alpha / 2, q) >= upper
 
 
 def test_where_nothing_is_known_the_bound_is_one_and_what_cannot_be_is_named() -> None:
-    assert failure_bound(0, 0, 0.05) == failure_bound(10_000, 0, 0.05, 0.0) == failure_bound(10, 0, 0.05, 0.02) == 1.0
+    assert (
+        failure_bound(0, 0, 0.05)
+        == failure_bound(10_000, 0, 0.05, 0.0)
+        == failure_bound(10, 0, 0.05, 0.02)
+        == 1.0
+    )
     with pytest.raises(SettingError, match=r"0 < alpha < 1, got 1\.5"):
         failure_bound(10, 0, 1.5)
     with pytest.raises(ValueError, match="n_bad = 11 of n = 10"):
@@ -56,9 +71,13 @@ def test_what_is_known_one_way_and_the_other_spends_alpha_once() -> None:
 def test_where_nothing_can_be_said_the_sentence_says_what_to_set() -> None:
     silent = "a check nothing can be said beyond the known stops, for silence is no success: set audit_rate, or stops='all'"
     assert silent in certificate("some", accepted=1203).sentence
-    assert certificate("all", rejected=7).sentence_on_rejects.endswith("nobody looks at what is rejected: set audit_rate.")
+    assert certificate("all", rejected=7).sentence_on_rejects.endswith(
+        "nobody looks at what is rejected: set audit_rate."
+    )
     assert certificate("all").sentence.startswith("Nothing can be said yet")
-    assert certificate("some", 0.02, accepted=10, audited_accepts=1).sentence.endswith("too few were looked at.")
+    assert certificate("some", 0.02, accepted=10, audited_accepts=1).sentence.endswith(
+        "too few were looked at."
+    )
 
 
 @given(counts.filter(lambda c: c[0] > 5), alphas)
@@ -75,16 +94,22 @@ tolerances = st.floats(0.001, 0.999)
 
 
 @given(counts, tolerances, propensities)
-def test_it_is_the_log_of_the_capital_as_the_docstring_has_it(c: tuple[int, int], theta: float, q: float) -> None:
+def test_it_is_the_log_of_the_capital_as_the_docstring_has_it(
+    c: tuple[int, int], theta: float, q: float
+) -> None:
     n, n_bad = c[0] % 150, c[1] % (c[0] % 150 + 1)  # more would be beyond a float
     capitals = [b * (1 - b) ** n_bad / (1 - b * q * theta) ** n for b in BETS]
-    assert log_evidence(n, n_bad, theta, q) == pytest.approx(math.log(sum(capitals) / sum(BETS)), abs=1e-9)
+    assert log_evidence(n, n_bad, theta, q) == pytest.approx(
+        math.log(sum(capitals) / sum(BETS)), abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("p", [0.01, 0.1, 0.5, 0.9])
 @pytest.mark.parametrize("q", [1.0, 0.3, 0.02])
 @pytest.mark.parametrize("n", [1, 2, 7, 30, 200])
-def test_the_mean_capital_is_one_at_the_tolerance_and_less_above_it(n: int, q: float, p: float) -> None:
+def test_the_mean_capital_is_one_at_the_tolerance_and_less_above_it(
+    n: int, q: float, p: float
+) -> None:
     def mean_capital(truth: float) -> float:
         seen = stats.binom.pmf(range(n + 1), n, q * truth)
         return math.fsum(seen[k] * math.exp(log_evidence(n, k, p, q)) for k in range(n + 1))
@@ -97,37 +122,70 @@ def test_the_mean_capital_is_one_at_the_tolerance_and_less_above_it(n: int, q: f
     ("stops", "audit_rate", "seen", "expected"),
     [
         ("all", 0.0, {"accepted": 1203, "false_accepts": 24}, (1203, 1203, 24, 1.0)),
-        ("some", 0.0, {"accepted": 1203, "false_accepts": 24, "confirmed": 1179}, (1203, 1203, 24, 1.0)),
-        ("some", 0.0, {"accepted": 1203, "false_accepts": 24, "confirmed": 1178}, (1203, 0, 0, 0.0)),
-        ("some", 0.02, {"accepted": 9800, "audited_accepts": 200, "audited_accepts_bad": 3}, (10_000, 200, 3, 0.02)),
+        (
+            "some",
+            0.0,
+            {"accepted": 1203, "false_accepts": 24, "confirmed": 1179},
+            (1203, 1203, 24, 1.0),
+        ),
+        (
+            "some",
+            0.0,
+            {"accepted": 1203, "false_accepts": 24, "confirmed": 1178},
+            (1203, 0, 0, 0.0),
+        ),
+        (
+            "some",
+            0.02,
+            {"accepted": 9800, "audited_accepts": 200, "audited_accepts_bad": 3},
+            (10_000, 200, 3, 0.02),
+        ),
     ],
 )
-def test_what_is_known_of_accepted_parts(stops: str, audit_rate: float, seen: dict[str, int], expected) -> None:
+def test_what_is_known_of_accepted_parts(
+    stops: str, audit_rate: float, seen: dict[str, int], expected
+) -> None:
     accepted = certificate(stops, audit_rate, **seen).accepted
     assert (accepted.n, accepted.n_with_outcome, accepted.n_bad, accepted.propensity) == expected
-    assert accepted.upper == failure_bound(accepted.n, accepted.n_bad, accepted.alpha, accepted.propensity)
+    assert accepted.upper == failure_bound(
+        accepted.n, accepted.n_bad, accepted.alpha, accepted.propensity
+    )
 
 
 def test_by_prices_it_says_what_was_saved_at_least_and_nothing_where_that_is_not_certain() -> None:
     policy = Policy(0.05, guarantee="cost", stops="all", prices=(5, 120, 47.5))
     result = policy.certificate(Outcomes(accepted=1203, confirmed=1179, false_accepts=24))
     upper = certificate("all", accepted=1203, false_accepts=24).accepted.upper
-    assert (result.tolerance, result.saved) == (5 / 120, pytest.approx(1203 * 5 - 120 * 1203 * upper))
+    assert (result.tolerance, result.saved) == (
+        5 / 120,
+        pytest.approx(1203 * 5 - 120 * 1203 * upper),
+    )
     assert result.sentence.endswith(f"not checking them saved at least {int(result.saved):,}.")
     outcomes = Outcomes(accepted=60, confirmed=58, false_accepts=2)
     assert policy.certificate(outcomes).sentence.endswith("saved nothing for certain.")
     assert certificate("all", accepted=1203, false_accepts=24).saved is None
 
 
-def test_one_sentence_says_what_was_kept_or_what_audits_tell_which_alone_know_of_rejected_parts() -> None:
-    rejected = certificate("all", 0.1, rejected=3600, audited_rejects=400, audited_rejects_good=2).rejected
-    assert (rejected.n, rejected.n_with_outcome, rejected.n_bad, certificate("all", rejected=9).rejected.upper) == (
+def test_one_sentence_says_what_was_kept_or_what_audits_tell_which_alone_know_of_rejected_parts() -> (
+    None
+):
+    rejected = certificate(
+        "all", 0.1, rejected=3600, audited_rejects=400, audited_rejects_good=2
+    ).rejected
+    assert (
+        rejected.n,
+        rejected.n_with_outcome,
+        rejected.n_bad,
+        certificate("all", rejected=9).rejected.upper,
+    ) == (
         4000,
         400,
         2,
         1.0,
     )
-    end = " were bad on average, with 95 % confidence, however often one looks; the tolerance is 5 %."
+    end = (
+        " were bad on average, with 95 % confidence, however often one looks; the tolerance is 5 %."
+    )
     kept = certificate("all", accepted=1203, false_accepts=24)
     assert kept.kept
     assert kept.accepted.upper == pytest.approx(0.0349, abs=5e-5)  # golden

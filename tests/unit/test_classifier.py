@@ -16,7 +16,9 @@ def blobs(n: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return (rng.normal(0, 0.4, (n, 2)) + np.where(y, 1.0, -1.0)[:, None]).astype(np.float32), y
 
 
-@pytest.mark.parametrize("settings_", [{}, {"interval": "binomial"}, {"interval": "jeffreys"}, {"alpha": 0.9}])
+@pytest.mark.parametrize(
+    "settings_", [{}, {"interval": "binomial"}, {"interval": "jeffreys"}, {"alpha": 0.9}]
+)
 def test_an_empty_ball_abstains_in_decide_and_never_in_predict(settings_) -> None:
     Z, y = blobs()
     model = WilsonRadiusClassifier(radius=0.5, **settings_).fit(Z, y)
@@ -45,7 +47,9 @@ def test_predictions_are_those_of_scikit_learns_radius_neighbours() -> None:
     queries = Z[:100] + 0.01
     ours = WilsonRadiusClassifier(radius=0.5).fit(Z, y)
     theirs = RadiusNeighborsClassifier(radius=0.5).fit(Z, y)
-    np.testing.assert_allclose(ours.predict_proba(queries), theirs.predict_proba(queries), atol=1e-12)
+    np.testing.assert_allclose(
+        ours.predict_proba(queries), theirs.predict_proba(queries), atol=1e-12
+    )
 
 
 def test_scripted_the_rule_over_the_ring_answers_as_the_classifier_does() -> None:
@@ -66,7 +70,9 @@ def test_learning_in_parts_is_learning_at_once_and_knows_the_classes_of_the_firs
         parts.partial_fit(Z[:1], [2])
 
 
-@pytest.mark.parametrize("settings_", [{"radius": 0.0}, {"radius": 1e19}, {"radius": np.inf}, {"alpha": 2.0}])
+@pytest.mark.parametrize(
+    "settings_", [{"radius": 0.0}, {"radius": 1e19}, {"radius": np.inf}, {"alpha": 2.0}]
+)
 def test_settings_out_of_range_are_setting_errors(settings_) -> None:
     with pytest.raises(SettingError):
         WilsonRadiusClassifier(**settings_).fit(np.zeros((2, 2)), [0, 1])

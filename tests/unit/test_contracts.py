@@ -19,7 +19,9 @@ def place(request: pytest.FixtureRequest, tmp_path: Path):
 
 
 @pytest.mark.parametrize("reason", BAD, ids=str)
-def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(place, reason: Reason, make_data) -> None:
+def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(
+    place, reason: Reason, make_data
+) -> None:
     data = make_data(80)
     with DataEngine("pca", retrain_every=60, store=place) as engine:
         for _ in range(2):
@@ -34,9 +36,13 @@ def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(place, reason
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3, MIN_SAMPLES - 1])
-def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(place, samples: int) -> None:
+def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(
+    place, samples: int
+) -> None:
     with DataEngine("pca", store=place) as engine:
-        with pytest.raises(TraceError, match=rf"got 1 x {samples}; record longer, or start with DataEngine\(trace="):
+        with pytest.raises(
+            TraceError, match=rf"got 1 x {samples}; record longer, or start with DataEngine\(trace="
+        ):
             engine.decide(np.arange(samples))
         assert (engine.trace, engine.store.status()["decisions"]) == (None, 0)
         engine.decide(np.arange(MIN_SAMPLES))
@@ -54,14 +60,17 @@ def test_the_first_trace_of_a_lost_stop_sets_a_contract_as_any_other(place) -> N
         assert engine.store.status()["sources"]["stop"] == 2
 
 
-def test_a_wrong_contract_that_nothing_was_learned_by_says_how_to_start_over(tmp_path: Path, make_data) -> None:
+def test_a_wrong_contract_that_nothing_was_learned_by_says_how_to_start_over(
+    tmp_path: Path, make_data
+) -> None:
     data = make_data(3)
     place = tmp_path / "engine.db"
     with DataEngine("pca", store=place) as engine:
         engine.decide(np.arange(20.0))
     with DataEngine.open(place) as engine:  # it is known after a restart, too
         with pytest.raises(
-            TraceError, match=r"Expected 20 samples, got 100;.* was set by the first trace.*with a new store"
+            TraceError,
+            match=r"Expected 20 samples, got 100;.* was set by the first trace.*with a new store",
         ):
             engine.decide(data.X[0])
         engine.report(engine.decide(np.arange(20.0) ** 2).id, True)

@@ -44,7 +44,14 @@ def state(engine: DataEngine) -> tuple:
     rule = engine.model and {name: t.tolist() for name, t in engine.model.rule.state_dict().items()}
     numbers = engine.model and sorted(engine.model.index.column("numbers").tolist())
     return (
-        (engine.version, core_of(engine).new_labels, engine.safe_mode, engine.policy, engine.certificate(), rule),
+        (
+            engine.version,
+            core_of(engine).new_labels,
+            engine.safe_mode,
+            engine.policy,
+            engine.certificate(),
+            rule,
+        ),
         (stored.seq.tolist(), stored.labels.tolist(), numbers),
     )
 
@@ -55,7 +62,10 @@ def again(engine: DataEngine, place: Path, **options) -> DataEngine:
     if engine.store.wait is None:  # in memory, where nobody owns it
         return DataEngine.open(engine.store, replaying=True, **options)
     target = place / f"copy-{len(list(place.iterdir()))}.db"
-    with closing(sqlite3.connect(place / "engine.db")) as old, closing(sqlite3.connect(target)) as new:
+    with (
+        closing(sqlite3.connect(place / "engine.db")) as old,
+        closing(sqlite3.connect(target)) as new,
+    ):
         old.backup(new)
     return DataEngine.open(target, replaying=True, **options)
 
@@ -78,10 +88,16 @@ def break_stop_sensor(engine: DataEngine, data: Dataset) -> list[str]:
     raise AssertionError("no safe mode began")
 
 
-def test_a_label_is_corrected_and_forgotten_for_the_very_next_decision_and_comes_back(data: Dataset) -> None:
+def test_a_label_is_corrected_and_forgotten_for_the_very_next_decision_and_comes_back(
+    data: Dataset,
+) -> None:
     engine = make()
     cycle = next(c for c in reversed(play(engine, data, 0, 150, confirm=True)) if c.success)
-    name, probe, n = cycle.decision.id, data.X[cycle.index] + np.float32(1e-4), len(engine.model.index)
+    name, probe, n = (
+        cycle.decision.id,
+        data.X[cycle.index] + np.float32(1e-4),
+        len(engine.model.index),
+    )
     before, spaces = engine.decide(probe), engine.model.index.column("spaces").copy()
     text = engine.correct(name, False, author="kim")
     after = engine.decide(probe)
@@ -103,7 +119,9 @@ def test_a_label_is_corrected_and_forgotten_for_the_very_next_decision_and_comes
     assert evidence(engine.decide(probe)) == evidence(before)
 
 
-def test_what_is_forgotten_trains_nothing_any_more_and_what_is_corrected_trains_as_it_is_now(data: Dataset) -> None:
+def test_what_is_forgotten_trains_nothing_any_more_and_what_is_corrected_trains_as_it_is_now(
+    data: Dataset,
+) -> None:
     engine = make()
     cycles = play(engine, data, 0, 1)
     engine.correct(cycles[0].decision.id, not cycles[0].success)  # before there is a model
@@ -125,7 +143,10 @@ def test_what_was_decided_and_reported_stays_as_it_was(tmp_path: Path, data: Dat
         engine.flush()
         with closing(sqlite3.connect(tmp_path / "engine.db")) as connection:
             tables = ("decision", "label", "trace", "model_version")
-            return [connection.execute(f"SELECT * FROM {table} ORDER BY 1, 2").fetchall() for table in tables]
+            return [
+                connection.execute(f"SELECT * FROM {table} ORDER BY 1, 2").fetchall()
+                for table in tables
+            ]
 
     before = rows()
     engine.correct(cycles[3].decision.id, not cycles[3].success)
@@ -134,7 +155,9 @@ def test_what_was_decided_and_reported_stays_as_it_was(tmp_path: Path, data: Dat
     assert len(engine.store.corrections()) == 2
 
 
-def test_the_rule_is_told_again_and_safe_mode_follows_the_labels_as_they_are_now(data: Dataset) -> None:
+def test_the_rule_is_told_again_and_safe_mode_follows_the_labels_as_they_are_now(
+    data: Dataset,
+) -> None:
     engine = make(RECIPE.with_policy(stops="all"))
     play(engine, data, 0, 120, confirm=True)
     engine.forget(*break_stop_sensor(engine, data), reason="the stop sensor was broken")
@@ -160,7 +183,9 @@ def test_forgetting_never_makes_the_certificate_better(data: Dataset) -> None:
 
 
 @pytest.mark.parametrize("verb", ["correct", "forget"])
-def test_what_has_no_label_is_refused_with_advice_and_changes_nothing(verb: str, data: Dataset) -> None:
+def test_what_has_no_label_is_refused_with_advice_and_changes_nothing(
+    verb: str, data: Dataset
+) -> None:
     engine = make()
     open_ = engine.decide(data.X[0])
 
@@ -206,7 +231,9 @@ def test_a_part_that_came_twice_is_corrected_where_it_was_meant(data: Dataset) -
     assert int(engine.model.index.repeats) == 0
 
 
-def test_a_full_ring_loses_the_forgotten_reference_and_keeps_the_age_of_the_others(tmp_path: Path, data: Dataset) -> None:
+def test_a_full_ring_loses_the_forgotten_reference_and_keeps_the_age_of_the_others(
+    tmp_path: Path, data: Dataset
+) -> None:
     engine = make(replace(RECIPE, window=60), store=tmp_path / "engine.db")
     play(engine, data, 0, 130, confirm=True)
     oldest = int(engine.store.labelled(60).seq[0])
@@ -214,7 +241,9 @@ def test_a_full_ring_loses_the_forgotten_reference_and_keeps_the_age_of_the_othe
     play(engine, data, 130, 139, confirm=True)
     with again(engine, tmp_path) as reopened:
         assert asked(reopened, data) == asked(engine, data)
-        np.testing.assert_array_equal(reopened.model.index.column("points"), engine.model.index.column("points"))
+        np.testing.assert_array_equal(
+            reopened.model.index.column("points"), engine.model.index.column("points")
+        )
         assert state(reopened) == state(engine)
 
 
@@ -225,7 +254,9 @@ KINDS = {
     "audit_rate": st.sampled_from([0.02, 0.2]),
     "stops": st.sampled_from(["some", "all"]),
 }
-STEPS = st.lists(st.one_of(*(st.tuples(st.just(kind), of) for kind, of in KINDS.items())), min_size=2, max_size=8)
+STEPS = st.lists(
+    st.one_of(*(st.tuples(st.just(kind), of) for kind, of in KINDS.items())), min_size=2, max_size=8
+)
 
 
 def step(engine: DataEngine, data: Dataset, kind: str, value) -> None:
@@ -247,7 +278,9 @@ def step(engine: DataEngine, data: Dataset, kind: str, value) -> None:
 @pytest.mark.parametrize("recipe", [RECIPE, POOLED], ids=["local", "pooled"])
 @settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
 @given(steps=STEPS)
-def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(recipe, steps, make_data, tmp_path_factory) -> None:
+def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(
+    recipe, steps, make_data, tmp_path_factory
+) -> None:
     data, place = make_data(480, seed=3), tmp_path_factory.mktemp("again")
     with make(recipe, store=place / "engine.db") as engine:
         play(engine, data, 0, 90)
@@ -303,15 +336,21 @@ def test_an_earlier_version_answers_again_as_a_new_one_with_what_came_since(data
     assert engine.decide(data.X[199]).model_version == version + 1
     first = engine.store.load_version(number).state
     np.testing.assert_array_equal(engine.model.get_state()["scale"], first["scale"])
-    np.testing.assert_array_equal(engine.model.index.column("points")[: first["points"].shape[1]], first["points"].T)
-    assert engine.model.index.column("labels")[0] == (not cycles[0].success)  # as it was corrected since
+    np.testing.assert_array_equal(
+        engine.model.index.column("points")[: first["points"].shape[1]], first["points"].T
+    )
+    assert engine.model.index.column("labels")[0] == (
+        not cycles[0].success
+    )  # as it was corrected since
     play(engine, data, 100, 138, confirm=True)  # and one above: the next retrain waits for forty
     assert engine.version == version + 1
     play(engine, data, 138, 160, confirm=True)
     assert engine.version == version + 2
 
 
-def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_labelled_now(data: Dataset) -> None:
+def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_labelled_now(
+    data: Dataset,
+) -> None:
     engine = DataEngine(model=Remembering(), retrain_every=40, replaying=True)
     cycles = play(engine, data, 0, 90, confirm=True)
     version = engine.version
@@ -325,11 +364,15 @@ def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_
     assert again_.model.y.tolist() == engine.model.y.tolist()
     with pytest.raises(SettingError, match="alpha would have no effect"):
         engine.set_policy(replace(engine.policy, alpha=0.2))
-    engine.set_policy(replace(engine.policy, audit_rate=0.5, stops="all"))  # what the engine does itself
+    engine.set_policy(
+        replace(engine.policy, audit_rate=0.5, stops="all")
+    )  # what the engine does itself
     assert engine.policy.audit_rate == 0.5
 
 
-def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bounds(data: Dataset) -> None:
+def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bounds(
+    data: Dataset,
+) -> None:
     engine = make()
     play(engine, data, 0, 150, confirm=True)
     probe = data.X[160]
@@ -342,7 +385,11 @@ def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bou
     assert engine.store.get_decision(before.id).decision.lower == before.lower
     assert text.text == "The policy's alpha 0.1 -> 0.001, lower_bound 0.9 -> 0.99."
     event = engine.store.events(1)[0]
-    assert (event.data["old"]["alpha"], event.data["new"]["alpha"], event.author) == (0.1, 0.001, "kim")
+    assert (event.data["old"]["alpha"], event.data["new"]["alpha"], event.author) == (
+        0.1,
+        0.001,
+        "kim",
+    )
     assert core_of(engine).exported().recipe == engine.recipe.to_toml()
     assert "alpha = 0.001" in core_of(engine).exported().recipe
 
@@ -359,12 +406,19 @@ def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data: Dataset) -> N
     certain = [d for d in looked if d.predicted is not Action.VERIFY]
     assert sum(d.audit for d in certain) > 0.6 * len(certain) > 0
     assert {d.propensity for d in certain} == {0.9}
-    engine.set_policy(replace(engine.policy, lower_bound=0.85))  # of which the certificate speaks from now on
-    assert (engine.certificate().accepted.n, engine.certificate().tolerance) == (0, pytest.approx(0.15))
+    engine.set_policy(
+        replace(engine.policy, lower_bound=0.85)
+    )  # of which the certificate speaks from now on
+    assert (engine.certificate().accepted.n, engine.certificate().tolerance) == (
+        0,
+        pytest.approx(0.15),
+    )
     assert int(engine.model.rule.evidence.level_totals.sum()) == 0
 
 
-def test_safe_mode_outlasts_a_change_of_policy_until_fresh_evidence(tmp_path: Path, data: Dataset) -> None:
+def test_safe_mode_outlasts_a_change_of_policy_until_fresh_evidence(
+    tmp_path: Path, data: Dataset
+) -> None:
     engine = make(RECIPE.with_policy(stops="all"), store=tmp_path / "engine.db")
     play(engine, data, 0, 120, confirm=True)
     stopped = break_stop_sensor(engine, data)
@@ -377,7 +431,10 @@ def test_safe_mode_outlasts_a_change_of_policy_until_fresh_evidence(tmp_path: Pa
     engine.correct(stopped[-1], True)  # told anew: it still began in safe mode
     assert engine.safe_mode == why
     engine.set_policy(replace(engine.policy, stops="some"))  # the paper's rule has no safe mode
-    assert (engine.safe_mode, engine.store.events(1)[0].text) == ("", "the rule of the new policy has no safe mode")
+    assert (engine.safe_mode, engine.store.events(1)[0].text) == (
+        "",
+        "the rule of the new policy has no safe mode",
+    )
 
 
 def test_silence_under_an_earlier_policy_never_becomes_a_success(data: Dataset) -> None:

@@ -21,7 +21,15 @@ RECIPE = Recipe.load("pca").with_policy(stops="all")
 HOW = {"recipe": RECIPE, "alphas": (0.5,), "lower_bounds": (0.8, 0.95), "repeats": 4, "cycles": 120}
 
 
-def played(policy: Policy, seed: int, verified: int, accepted: int, bad: int, rejected: int = 0, good: int = 0) -> Replay:
+def played(
+    policy: Policy,
+    seed: int,
+    verified: int,
+    accepted: int,
+    bad: int,
+    rejected: int = 0,
+    good: int = 0,
+) -> Replay:
     """A replay with so many decisions of each kind, in that order, of which so many are wrong."""
     action = ["verify"] * verified + ["accept"] * accepted + ["reject"] * rejected
     truth = np.ones(len(action), dtype=bool)
@@ -31,7 +39,9 @@ def played(policy: Policy, seed: int, verified: int, accepted: int, bad: int, re
     return replay_of(action, truth, index=index, recipe=Recipe("pca", policy=policy), seed=seed)
 
 
-def curve(lax: Sequence[tuple[int, int]], strict: Sequence[tuple[int, int]] = ((100, 0),) * 4) -> CostCurve:
+def curve(
+    lax: Sequence[tuple[int, int]], strict: Sequence[tuple[int, int]] = ((100, 0),) * 4
+) -> CostCurve:
     """Of two policies; for each shuffle of 100 parts, how many were verified, and how many of the others were bad."""
     replays = [
         played(policy, seed, verified, 100 - verified, bad)
@@ -48,7 +58,9 @@ def test_a_parts_cost_is_checks_and_errors_over_all_parts() -> None:
 
 
 def test_one_half_of_the_shuffles_chooses_and_the_other_reports() -> None:
-    result = curve(lax=[(50, 0), (50, 0), (50, 1), (60, 1)], strict=[(90, 0), (80, 0), (70, 0), (70, 0)])
+    result = curve(
+        lax=[(50, 0), (50, 0), (50, 1), (60, 1)], strict=[(90, 0), (80, 0), (70, 0), (70, 0)]
+    )
     lax, strict = result.rows
     assert (result.choosing, result.reporting) == (2, 2)
     assert (lax.expected_cost, lax.cost) == (pytest.approx(2.5 + 50 * 0.5 / 51), (3.5 + 4.0) / 2)
@@ -58,7 +70,9 @@ def test_one_half_of_the_shuffles_chooses_and_the_other_reports() -> None:
     assert f"{lax.cost:.3g} a part" in result.sentence
 
 
-def test_the_interval_moves_the_errors_to_their_ends_and_is_wider_than_the_luck_of_the_order() -> None:
+def test_the_interval_moves_the_errors_to_their_ends_and_is_wider_than_the_luck_of_the_order() -> (
+    None
+):
     (row, _) = curve(lax=[(50, 0), (50, 0), (50, 1), (50, 0)]).rows
     assert row.lower < row.cost < row.upper
     assert row.upper == pytest.approx(5 * 0.5 + 100 * 0.5 * row.bad.upper)
@@ -75,7 +89,9 @@ def test_a_policy_pays_only_where_its_whole_interval_is_below_verifying_everythi
 
 
 @pytest.mark.parametrize(
-    "lax", [[(50, 5)] * 4, [(50, 0), (50, 0), (50, 5), (50, 5)]], ids=["never cheaper", "cheaper only where chosen"]
+    "lax",
+    [[(50, 5)] * 4, [(50, 0), (50, 0), (50, 5), (50, 5)]],
+    ids=["never cheaper", "cheaper only where chosen"],
 )
 def test_where_nothing_pays_it_says_so_and_names_no_policy(lax: list[tuple[int, int]]) -> None:
     result = curve(lax)
@@ -87,7 +103,9 @@ def test_where_nothing_pays_it_says_so_and_names_no_policy(lax: list[tuple[int, 
 
 def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear() -> None:
     replays = [played(policy, seed, 99, 1, 0) for policy in (LAX, STRICT) for seed in range(4)]
-    dear, cheap = (curve_of(replays, Costs(check=5, escape=escape, false_reject=20)) for escape in (25, 15))
+    dear, cheap = (
+        curve_of(replays, Costs(check=5, escape=escape, false_reject=20)) for escape in (25, 15)
+    )
     assert dear.cheapest.cost == cheap.cheapest.cost == 4.95
     assert (dear.verdict, cheap.verdict) == ("does not pay", "may pay")
     assert "is expected to cost 5.01 and cost 4.95 in other shuffles" in dear.sentence
@@ -105,14 +123,23 @@ def found(make_data: Callable[..., Dataset]) -> CostCurve:
     return cost_curve(make_data(160), check=5, escape=20, false_reject=11, **HOW)
 
 
-def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(found: CostCurve, make_data) -> None:
+def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(
+    found: CostCurve, make_data
+) -> None:
     asked = RECIPE.with_policy(alpha=0.5, lower_bound=0.8)
     again = [replay(make_data(160), asked, seed, 120) for seed in (2, 3)]
     assert (found.rows[0].policy, asked.policy.stops) == (asked.policy, "all")
-    assert found.rows[0].cost == pytest.approx(np.mean([cost_per_part(first, found.costs) for first in again]))
+    assert found.rows[0].cost == pytest.approx(
+        np.mean([cost_per_part(first, found.costs) for first in again])
+    )
     by_cost = found.rows[-1]
     assert (by_cost.policy.guarantee, by_cost.policy.prices) == ("cost", (5.0, 20.0, 11.0))
-    assert (found.cycles, found.choosing, found.reporting, found.dataset) == (120, 2, 2, "insertion-like")
+    assert (found.cycles, found.choosing, found.reporting, found.dataset) == (
+        120,
+        2,
+        2,
+        "insertion-like",
+    )
 
 
 def test_the_picture_names_what_it_shows_and_in_which_unit(found: CostCurve) -> None:
@@ -127,7 +154,9 @@ def test_the_picture_names_what_it_shows_and_in_which_unit(found: CostCurve) -> 
     assert "check 5 EUR, escape 20 EUR, false reject 11 EUR" in figure.get_suptitle()
 
 
-def test_the_verb_shows_a_table_and_writes_the_curve(data: Dataset, tmp_path: Path, monkeypatch) -> None:
+def test_the_verb_shows_a_table_and_writes_the_curve(
+    data: Dataset, tmp_path: Path, monkeypatch
+) -> None:
     np.savez(tmp_path / "mine.npz", X=data.X, y=data.y)
     monkeypatch.chdir(tmp_path)
     words = "costs --data mine.npz --reducer pca --cycles 90 --repeats 2 --alphas 0.5,0.1 --lower-bounds 0.8 --n-jobs 1"
@@ -143,4 +172,6 @@ def test_the_verb_shows_a_table_and_writes_the_curve(data: Dataset, tmp_path: Pa
     assert result["sentence"] in " ".join(shown.split())
     assert len(list((tmp_path / "kept").iterdir())) == 4  # played once
     assert "by cost" in succeed(*words.replace("reject 10", "reject 11").split(), "--stops", "all")
-    assert "but a list is tried here: use --alphas" in " ".join(dengine(*words.split(), "--alpha", "0.1").output.split())
+    assert "but a list is tried here: use --alphas" in " ".join(
+        dengine(*words.split(), "--alpha", "0.1").output.split()
+    )

@@ -23,7 +23,9 @@ def saved(tmp_path: Path):
 
 def test_quantised_traces_are_scaled_back(saved) -> None:
     X = np.arange(12, dtype=np.int16).reshape(3, 4)
-    loaded = load_dataset(saved(X=X, y=[1, 0, 1], scale=0.25, rate_hz=200.0, unit="mN", cause=["", "rim", ""]))
+    loaded = load_dataset(
+        saved(X=X, y=[1, 0, 1], scale=0.25, rate_hz=200.0, unit="mN", cause=["", "rim", ""])
+    )
     np.testing.assert_array_equal(loaded.X, X / 4)
     assert (loaded.rate_hz, loaded.unit, loaded.cause.tolist()) == (200.0, "mN", ["", "rim", ""])
 
@@ -35,7 +37,10 @@ def test_a_stated_unit_converts_samples_whose_own_unit_is_known_and_is_refused_w
     y = [1, 0, 1]
     archive = load_dataset(saved(X=X, y=y, unit="kN"), unit="N")
     np.testing.assert_array_equal(archive.X, 1000 * X)
-    assert (archive.unit, archive.notes) == ("N", ("channel 1 is converted from kN to N, times 1000.",))
+    assert (archive.unit, archive.notes) == (
+        "N",
+        ("channel 1 is converted from kN to N, times 1000.",),
+    )
     np.testing.assert_array_equal(load_dataset(archive, unit="kN").X, X)
     with pytest.raises(DataError, match=r"Expected data in mm, its unit is N; leave unit out"):
         load_dataset(make_dataset(X, y), unit="mm")
@@ -84,7 +89,9 @@ def test_parts_that_do_not_fit_together_are_named(X, y, message: str) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 broken", None])
-def test_a_damaged_file_or_one_of_objects_is_a_data_error(saved, tmp_path: Path, content: bytes | None) -> None:
+def test_a_damaged_file_or_one_of_objects_is_a_data_error(
+    saved, tmp_path: Path, content: bytes | None
+) -> None:
     path = saved(X=np.array([[None]], dtype=object), y=[1])  # never unpickled
     if content is not None:
         path.write_bytes(content)
@@ -95,9 +102,13 @@ def test_a_damaged_file_or_one_of_objects_is_a_data_error(saved, tmp_path: Path,
 
 
 @pytest.mark.parametrize("channels", [1, 2])
-def test_a_frame_of_a_data_set_writes_parquet_that_loads_as_it(make_data, channels: int, tmp_path: Path) -> None:
+def test_a_frame_of_a_data_set_writes_parquet_that_loads_as_it(
+    make_data, channels: int, tmp_path: Path
+) -> None:
     data = make_data(8, samples=30, channels=channels)
-    data = replace(data, part=np.array([f"P{i // 2}" for i in range(8)]), channels=("FX", "FZ")[2 - channels :])
+    data = replace(
+        data, part=np.array([f"P{i // 2}" for i in range(8)]), channels=("FX", "FZ")[2 - channels :]
+    )
     frame = data.to_frame()
     assert frame.columns[:3].tolist() == ["label", "part", f"{data.channels[0]}_0"]
     frame.to_parquet(tmp_path / "data.parquet")

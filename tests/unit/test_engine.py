@@ -52,8 +52,12 @@ def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data: Datase
     assert engine.store.get_decision(rejected).source is None
 
 
-@pytest.mark.parametrize("lacks", [["reject"], ["verify", "proceed"], ["insert", "verify", "proceed", "reject"]])
-def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part(lacks: list[str], data: Dataset) -> None:
+@pytest.mark.parametrize(
+    "lacks", [["reject"], ["verify", "proceed"], ["insert", "verify", "proceed", "reject"]]
+)
+def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part(
+    lacks: list[str], data: Dataset
+) -> None:
     inserted = []
 
     class Half:
@@ -65,7 +69,10 @@ def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part
 
     for name in lacks:
         setattr(Half, name, None)
-    with pytest.raises(SettingError, match=f"Expected a cell with the methods .*got Half without {' and '.join(lacks)};"):
+    with pytest.raises(
+        SettingError,
+        match=f"Expected a cell with the methods .*got Half without {' and '.join(lacks)};",
+    ):
         make().run(Half(), 1)
     assert inserted == []
 
@@ -84,7 +91,9 @@ def test_a_first_labelled_trace_that_is_not_finite_is_kept_without_a_traceback(
     assert caplog.records == []
 
 
-def test_the_collector_works_between_decisions_and_leaves_old_objects_alone_until_the_loop_ends(data: Dataset) -> None:
+def test_the_collector_works_between_decisions_and_leaves_old_objects_alone_until_the_loop_ends(
+    data: Dataset,
+) -> None:
     at_work = []
 
     class Watching(Counting):
@@ -121,7 +130,10 @@ def test_a_report_does_not_embed_again_what_its_version_decided_on(data: Dataset
 def test_a_trace_that_comes_again_has_no_vote_on_itself(trained: DataEngine, data: Dataset) -> None:
     decision = trained.decide(good(data))
     trained.report(decision.id, success=False)
-    assert (decision.action, trained.store.get_decision(decision.id).source) == (Action.ACCEPT, Source.STOP)
+    assert (decision.action, trained.store.get_decision(decision.id).source) == (
+        Action.ACCEPT,
+        Source.STOP,
+    )
     again, alike = trained.decide(good(data)), trained.decide(good(data) + np.float32(1e-3))
     assert (again.n_success, again.n_failure) == (decision.n_success, decision.n_failure)
     assert (alike.n_success, alike.n_failure) == (decision.n_success, decision.n_failure + 1)
@@ -138,17 +150,24 @@ def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data: Dat
     assert items == list(range(40, len(reports) + 1, 40))
     assert [r.version for r in reports if r is not None] == list(range(1, len(items) + 1))
     assert all(
-        r.accepted and r.reason == "accepted" and r.n_traces == n for r, n in zip(filter(None, reports), items, strict=True)
+        r.accepted and r.reason == "accepted" and r.n_traces == n
+        for r, n in zip(filter(None, reports), items, strict=True)
     )
 
 
-def test_an_audit_verifies_what_was_certain_by_a_coin_of_trace_and_seed_alone(data: Dataset) -> None:
+def test_an_audit_verifies_what_was_certain_by_a_coin_of_trace_and_seed_alone(
+    data: Dataset,
+) -> None:
     cycles = play(make(AUDITING, seed=5), data)
     for c in cycles:
         certain = c.decision.predicted is not Action.VERIFY
         assert c.decision.propensity == (0.3 if certain else 1.0)
         if c.decision.audit:
-            assert (c.decision.action, c.decision.reason, c.source) == (Action.VERIFY, Reason.AUDIT, Source.AUDIT)
+            assert (c.decision.action, c.decision.reason, c.source) == (
+                Action.VERIFY,
+                Reason.AUDIT,
+                Source.AUDIT,
+            )
             assert c.success is not None
         else:
             assert c.decision.predicted is c.decision.action
@@ -172,7 +191,9 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("reason", "damage"), FAULTS)
-def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(reason, damage, data: Dataset) -> None:
+def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(
+    reason, damage, data: Dataset
+) -> None:
     limit = None if reason is Reason.TOO_LARGE else 150.0
     engine = make(trace=TraceSpec(samples=100, limit=limit))
     play(engine, data, 0, 100)
@@ -203,7 +224,9 @@ def test_the_first_trace_sets_the_contract_and_a_wrong_shape_raises(data: Datase
 
 
 @pytest.mark.parametrize(("samples", "channels"), [(800, 1), (60, 3)])
-def test_other_lengths_and_several_channels_go_the_whole_way(samples: int, channels: int, make_data) -> None:
+def test_other_lengths_and_several_channels_go_the_whole_way(
+    samples: int, channels: int, make_data
+) -> None:
     data = make_data(150, samples=samples, channels=channels)
     engine = make()
     actions = Counter(c.decision.action for c in play(engine, data))
@@ -232,11 +255,17 @@ class Failing(Counting):
         def fail(*args):
             raise self.error
 
-        return fail if name in ("fit", "add", "predict_interval") and name == self.at else super().__getattribute__(name)
+        return (
+            fail
+            if name in ("fit", "add", "predict_interval") and name == self.at
+            else super().__getattribute__(name)
+        )
 
 
 @pytest.mark.parametrize("at", ["add", "predict_interval"])
-def test_a_model_that_fails_at_a_label_or_a_trace_loses_neither_it_nor_the_cell(data: Dataset, at: str) -> None:
+def test_a_model_that_fails_at_a_label_or_a_trace_loses_neither_it_nor_the_cell(
+    data: Dataset, at: str
+) -> None:
     engine = make(model=Failing(at))
     reasons = Counter(c.decision.reason for c in play(engine, data, 0, 130))
     later = Reason.MODEL_ERROR if at == "predict_interval" else Reason.UNCERTAIN
@@ -246,12 +275,16 @@ def test_a_model_that_fails_at_a_label_or_a_trace_loses_neither_it_nor_the_cell(
 
 
 @pytest.mark.parametrize("message", ["singular matrix\nand more", ""])
-def test_a_candidate_that_cannot_be_trained_is_dropped_and_recorded(data: Dataset, message: str) -> None:
+def test_a_candidate_that_cannot_be_trained_is_dropped_and_recorded(
+    data: Dataset, message: str
+) -> None:
     engine = make(model=Failing("fit", ValueError(message)))
     cycles = play(engine, data, 0, 90)
     reports = [c.retrain for c in cycles if c.retrain is not None]
     assert [r.accepted for r in reports] == [False, False]
-    assert all(r.reason.startswith("dropped: ValueError") and "and more" not in r.reason for r in reports)
+    assert all(
+        r.reason.startswith("dropped: ValueError") and "and more" not in r.reason for r in reports
+    )
     assert engine.store.retrains() == reports
     assert (engine.version, {c.decision.model_version for c in cycles}) == (0, {0})
 
@@ -278,9 +311,7 @@ def test_retrains_that_are_dropped_three_times_in_a_row_are_an_alarm_until_one_i
     for _ in range(3):
         assert not engine.retrain().accepted
         texts.append((core_of(engine).retrain_fault, engine.status().alarm))
-    alarm = (
-        "The last 3 retrains were dropped, so nothing new is learned; the last was dropped: PCA needs more than 500 traces"
-    )
+    alarm = "The last 3 retrains were dropped, so nothing new is learned; the last was dropped: PCA needs more than 500 traces"
     assert texts[:2] == [("", ""), ("", "")]
     assert texts[2][0] == texts[2][1]
     assert texts[2][0].startswith(alarm)
@@ -293,39 +324,68 @@ def test_retrains_that_are_dropped_three_times_in_a_row_are_an_alarm_until_one_i
 
 
 @pytest.mark.parametrize("second", [True, False])
-def test_a_second_report_is_an_error_and_the_first_stands(trained: DataEngine, data: Dataset, second: bool) -> None:
+def test_a_second_report_is_an_error_and_the_first_stands(
+    trained: DataEngine, data: Dataset, second: bool
+) -> None:
     decision = trained.decide(np.roll(good(data), 15))
     assert decision.action is Action.VERIFY
     trained.report(decision.id, True)
-    counts, labels, count = core_of(trained).new_labels, len(trained.store.labelled().labels), len(trained.model.index)
-    with pytest.raises(ReportError, match="success from verification was reported first and stands"):
+    counts, labels, count = (
+        core_of(trained).new_labels,
+        len(trained.store.labelled().labels),
+        len(trained.model.index),
+    )
+    with pytest.raises(
+        ReportError, match="success from verification was reported first and stands"
+    ):
         trained.report(decision.id, second)
     assert trained.store.get_decision(decision.id).success is True
     n_labels = len(trained.store.labelled().labels)
-    assert (core_of(trained).new_labels, n_labels, len(trained.model.index)) == (counts, labels, count)
+    assert (core_of(trained).new_labels, n_labels, len(trained.model.index)) == (
+        counts,
+        labels,
+        count,
+    )
 
 
-def test_a_stop_whose_decision_was_lost_is_accepted_with_its_trace(trained: DataEngine, data: Dataset) -> None:
+def test_a_stop_whose_decision_was_lost_is_accepted_with_its_trace(
+    trained: DataEngine, data: Dataset
+) -> None:
     labels = len(trained.store.labelled().labels)
     trained.set_policy(replace(trained.policy, audit_rate=0.999))
     trained.report("from-a-lost-process", success=False, trace=good(data))
     stored = trained.store.get_decision("from-a-lost-process")
-    assert (stored.decision.action, stored.success, stored.source) == (Action.ACCEPT, False, Source.STOP)
-    assert (stored.decision.audit, stored.decision.reason, stored.decision.propensity) == (False, Reason.CERTAIN, 0.999)
+    assert (stored.decision.action, stored.success, stored.source) == (
+        Action.ACCEPT,
+        False,
+        Source.STOP,
+    )
+    assert (stored.decision.audit, stored.decision.reason, stored.decision.propensity) == (
+        False,
+        Reason.CERTAIN,
+        0.999,
+    )
     np.testing.assert_array_equal(stored.trace[0], good(data))
     assert len(trained.store.labelled().labels) == labels + 1
 
 
-def test_a_lost_success_is_not_taken_since_only_stops_speak_for_themselves(trained: DataEngine, data: Dataset) -> None:
+def test_a_lost_success_is_not_taken_since_only_stops_speak_for_themselves(
+    trained: DataEngine, data: Dataset
+) -> None:
     before = trained.store.status()
     for text in ({"success": True, "trace": good(data)}, {"success": False}):
-        with pytest.raises(ReportError, match=r"'lost', which is unknown; a system stop .* can be reported with its trace"):
+        with pytest.raises(
+            ReportError,
+            match=r"'lost', which is unknown; a system stop .* can be reported with its trace",
+        ):
             trained.report("lost", **text)
     assert trained.store.status() == before
 
 
 @pytest.mark.parametrize("where", ["insert", "verify", "proceed"])
-def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(where, data, tmp_path: Path) -> None:
+def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(
+    where, data, tmp_path: Path
+) -> None:
     real = getattr(ReplayCell, where)
 
     def failing(self):
@@ -345,8 +405,12 @@ def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(w
     engine.close()
 
 
-@pytest.mark.parametrize("change", [{}, {"window": 64}, {"policy": replace(RECIPE.policy, interval="jeffreys")}], ids=str)
-def test_an_engine_that_was_opened_goes_on_as_one_that_never_closed(change: dict, data: Dataset, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "change", [{}, {"window": 64}, {"policy": replace(RECIPE.policy, interval="jeffreys")}], ids=str
+)
+def test_an_engine_that_was_opened_goes_on_as_one_that_never_closed(
+    change: dict, data: Dataset, tmp_path: Path
+) -> None:
     url, recipe = str(tmp_path / "broken.db"), replace(RECIPE, **change)
     with make(recipe, seed=3) as engine:
         whole = play(engine, data)
@@ -368,21 +432,31 @@ def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(kind: str, data: 
     def learn(engine: DataEngine) -> DataEngine:
         ids = [engine.decide(x).id for x in data.X[:100]]
         for name, y in zip(ids, data.y[:100], strict=True):
-            engine.report(name, bool(y))  # the eightieth sets the retrain off, the others come in meanwhile
+            engine.report(
+                name, bool(y)
+            )  # the eightieth sets the retrain off, the others come in meanwhile
         return engine
 
     recipe = replace(RECIPE, retrain_every=80)
     inline = learn(make(recipe))
-    pool = ThreadPoolExecutor(1) if kind == "thread" else ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+    pool = (
+        ThreadPoolExecutor(1)
+        if kind == "thread"
+        else ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+    )
     with pool:
         beside = learn(make(recipe, executor=pool))
     core_of(beside).process_retrains()  # swaps in what the pool has finished
     assert inline.version == beside.version == 1
     assert len(beside.model.index) == 100
-    assert [evidence(beside.decide(x)) for x in data.X[100:]] == [evidence(inline.decide(x)) for x in data.X[100:]]
+    assert [evidence(beside.decide(x)) for x in data.X[100:]] == [
+        evidence(inline.decide(x)) for x in data.X[100:]
+    ]
 
 
-def test_a_version_that_the_store_gives_no_number_has_the_one_that_it_was_trained_as(data: Dataset) -> None:
+def test_a_version_that_the_store_gives_no_number_has_the_one_that_it_was_trained_as(
+    data: Dataset,
+) -> None:
     class Mute(SqlStore):
         def put_version(self, *args):
             super().put_version(*args)

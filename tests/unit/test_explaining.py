@@ -20,14 +20,25 @@ LOCAL = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.1)
 POOLED = replace(LOCAL, guarantee="pooled", stops="all")
 RECIPES = {
     "local": Recipe.load("pca").with_settings(policy=LOCAL, retrain_every=40),
-    "watched": Recipe.load("pca").with_settings(policy=replace(LOCAL, stops="all"), retrain_every=40),
+    "watched": Recipe.load("pca").with_settings(
+        policy=replace(LOCAL, stops="all"), retrain_every=40
+    ),
     "pooled": Recipe.load("pca").with_settings(policy=POOLED, retrain_every=40),
-    "full block": replace(Recipe.load("pca").with_policy(alpha=0.2, lower_bound=0.8), window=60, retrain_every=25),
-    "folds": replace(Recipe.load("conv").with_policy(alpha=0.2, lower_bound=0.8), retrain_every=60, folds=2, max_steps=8),
+    "full block": replace(
+        Recipe.load("pca").with_policy(alpha=0.2, lower_bound=0.8), window=60, retrain_every=25
+    ),
+    "folds": replace(
+        Recipe.load("conv").with_policy(alpha=0.2, lower_bound=0.8),
+        retrain_every=60,
+        folds=2,
+        max_steps=8,
+    ),
 }
 
 
-def played(store: SqlStore | Path | None, data: Dataset, recipe: Recipe, **options: Any) -> DataEngine:
+def played(
+    store: SqlStore | Path | None, data: Dataset, recipe: Recipe, **options: Any
+) -> DataEngine:
     """An engine that has gone through the data, part by part; a folder: with a file in it."""
     file = store / "engine.db" if isinstance(store, Path) else store
     engine = DataEngine(recipe=recipe, store=file, replaying=True, **options)
@@ -40,17 +51,25 @@ def said_of(found: Explanation) -> str:
     return " ".join((*found.sentences, *found.notes))
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in RECIPES if name not in ("local", "pooled")]  # 10 s each
+SLOW = [
+    pytest.param(name, marks=pytest.mark.slow)
+    for name in RECIPES
+    if name not in ("local", "pooled")
+]  # 10 s each
 
 
 @pytest.mark.parametrize("name", ["local", "pooled", *SLOW])
-def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(name: str, make_data, tmp_path: Path) -> None:
+def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(
+    name: str, make_data, tmp_path: Path
+) -> None:
     data = make_data(260, samples=60)
     with played(tmp_path, data, RECIPES[name]) as engine:
         balls = 0
         for past in list(engine.history())[::6]:
             explanation = engine.explain(past.decision.id)
-            assert not any("Counted again" in note or "another bound" in note for note in explanation.notes), (
+            assert not any(
+                "Counted again" in note or "another bound" in note for note in explanation.notes
+            ), (
                 past,
                 explanation.notes,
             )
@@ -61,34 +80,52 @@ def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(nam
                     Action.ACCEPT: explanation.bound.successes_needed,
                     Action.REJECT: explanation.bound.failures_needed,
                 }
-                assert (needed.get(past.decision.predicted, 1) == 0) or past.decision.predicted is Action.VERIFY
+                assert (
+                    needed.get(past.decision.predicted, 1) == 0
+                ) or past.decision.predicted is Action.VERIFY
         assert balls > 15
 
 
-def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(store: SqlStore, make_data) -> None:
+def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(
+    store: SqlStore, make_data
+) -> None:
     data = make_data(120, samples=60)
-    data = Dataset(np.concatenate([data.X, data.X[:60]]), np.concatenate([data.y, data.y[:60]]), name="twice")
+    data = Dataset(
+        np.concatenate([data.X, data.X[:60]]), np.concatenate([data.y, data.y[:60]]), name="twice"
+    )
     with played(store, data, RECIPES["local"]) as engine:
         (past,) = engine.history(last=1, action="accept")
         explanation = engine.explain(past.decision.id, neighbours=15)
         distances = [item.distance for item in explanation.neighbours]
         assert distances == sorted(distances)
         assert explanation.radius == pytest.approx(engine.recipe.radius)
-        assert [item.inside for item in explanation.neighbours] == [item <= explanation.radius for item in distances]
+        assert [item.inside for item in explanation.neighbours] == [
+            item <= explanation.radius for item in distances
+        ]
         custom = engine.store.get_decision(past.decision.id)
         for item in explanation.neighbours:
             stored = engine.store.get_decision(item.decision_id)
             assert (stored.success, stored.source) == (item.success, item.source)
-            assert stored.content_hash != custom.content_hash  # the same part, which came before, has no vote
+            assert (
+                stored.content_hash != custom.content_hash
+            )  # the same part, which came before, has no vote
             np.testing.assert_array_equal(item.trace, stored.trace)
-            z = engine.model.predictor.embed(torch.from_numpy(np.array(stored.trace)))[item.space].numpy()
-            assert np.linalg.norm(z - custom.decision.embedding[item.space]) == pytest.approx(item.distance, abs=1e-3)
+            z = engine.model.predictor.embed(torch.from_numpy(np.array(stored.trace)))[
+                item.space
+            ].numpy()
+            assert np.linalg.norm(z - custom.decision.embedding[item.space]) == pytest.approx(
+                item.distance, abs=1e-3
+            )
 
 
-def test_of_a_version_that_is_not_kept_the_record_is_shown_and_no_neighbours(make_data, tmp_path: Path) -> None:
+def test_of_a_version_that_is_not_kept_the_record_is_shown_and_no_neighbours(
+    make_data, tmp_path: Path
+) -> None:
     with played(tmp_path, make_data(200, samples=60), RECIPES["pooled"]) as engine:
         created = (past.decision for past in engine.history())
-        old = next(item for item in created if item.model_version == 1 and item.reason is Reason.UNCERTAIN)
+        old = next(
+            item for item in created if item.model_version == 1 and item.reason is Reason.UNCERTAIN
+        )
         first = engine.explain(old.id)
         assert "the references of version 1" in said_of(first)
     execute(tmp_path / "engine.db", "UPDATE model_version SET state = NULL WHERE version = 1")
@@ -97,31 +134,44 @@ def test_of_a_version_that_is_not_kept_the_record_is_shown_and_no_neighbours(mak
     assert again.neighbours == () != first.neighbours
     assert "version 1, which answered, is not kept any more" in said_of(again)
     assert again.decision == first.decision
-    assert (again.bound.n_success, again.bound.lower) == (first.bound.n_success, first.bound.lower)  # as recorded
+    assert (again.bound.n_success, again.bound.lower) == (
+        first.bound.n_success,
+        first.bound.lower,
+    )  # as recorded
     assert (again.bound.accept_threshold, again.bound.reject_threshold) == (None, None)
     assert "the thresholds of that time are not kept" in said_of(again)
 
 
-def test_the_bound_says_how_many_more_labels_would_have_done(make_data: Callable[..., Dataset]) -> None:
+def test_the_bound_says_how_many_more_labels_would_have_done(
+    make_data: Callable[..., Dataset],
+) -> None:
     with played(None, make_data(200, samples=60), RECIPES["local"]) as engine:
         (past,) = engine.history(last=1, reason="certain")
     result = Circumstances(RECIPES["local"], TraceSpec(60))
     policy = result.recipe.policy
     for n_success, n_failure in ((38, 0), (3, 1), (0, 0), (100, 12), (0, 30), (1, 60)):
         lower, upper = policy.bound(n_success, n_failure)
-        created = replace(past.decision, n_success=n_success, n_failure=n_failure, lower=lower, upper=upper)
+        created = replace(
+            past.decision, n_success=n_success, n_failure=n_failure, lower=lower, upper=upper
+        )
         counted = replace(created, reason=Reason.UNCERTAIN)
         bound = bound_of(counted, result)
-        for needed, of_success, at in ((bound.successes_needed, 1, 0.9), (bound.failures_needed, 0, 0.1)):
+        for needed, of_success, at in (
+            (bound.successes_needed, 1, 0.9),
+            (bound.failures_needed, 0, 0.1),
+        ):
             reached = [
-                policy.bound(n_success + of_success * m, n_failure + (1 - of_success) * m) for m in (needed, needed - 1)
+                policy.bound(n_success + of_success * m, n_failure + (1 - of_success) * m)
+                for m in (needed, needed - 1)
             ]
             assert reached[0][0] >= at if of_success else reached[0][1] <= at + 1e-12
             if needed:
                 assert reached[1][0] < at if of_success else reached[1][1] > at
 
 
-def test_each_reason_is_explained_by_what_it_rests_on(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_each_reason_is_explained_by_what_it_rests_on(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
     data = make_data(260, samples=60)
     spec = TraceSpec(60, limit=200.0, unit="Nm")
     with played(tmp_path, data, RECIPES["local"], trace=spec) as engine:
@@ -130,7 +180,9 @@ def test_each_reason_is_explained_by_what_it_rests_on(make_data: Callable[..., D
         dead[:] = 4.0
         torn[7] = np.nan
         loud[30] = 200.0
-        novel, constant, cut, saturated = (engine.explain(engine.decide(x).id) for x in (bump, dead, torn, loud))
+        novel, constant, cut, saturated = (
+            engine.explain(engine.decide(x).id) for x in (bump, dead, torn, loud)
+        )
         (audit,) = engine.history(last=1, reason="audit")
         (first,) = list(engine.history())[:1]
         audited, untrained = engine.explain(audit.decision.id), engine.explain(first.decision.id)
@@ -163,13 +215,20 @@ def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
         usual = engine.decide(data.X[0] + np.float32(0.001))
         assert usual.reason is Reason.SAFE_MODE
         explanation = engine.explain(usual.id)
-        assert "in safe mode, in which every part is verified: too many traces were novel" in said_of(explanation)
-        assert "Nothing could pass, whatever the bound: too many traces were novel" in said_of(explanation)
+        assert (
+            "in safe mode, in which every part is verified: too many traces were novel"
+            in said_of(explanation)
+        )
+        assert "Nothing could pass, whatever the bound: too many traces were novel" in said_of(
+            explanation
+        )
         before = next(past for past in engine.history() if past.decision.reason is Reason.CERTAIN)
         assert "safe mode" not in said_of(engine.explain(before.decision.id))
 
 
-def test_a_baseline_has_its_own_numbers_and_no_neighbours(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_a_baseline_has_its_own_numbers_and_no_neighbours(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
     class Accepting(Counting):
         def predict_interval(self, X: Any) -> tuple[Any, Any]:
             return np.full(len(X), 0.8), np.full(len(X), 1.0)
@@ -177,11 +236,15 @@ def test_a_baseline_has_its_own_numbers_and_no_neighbours(make_data: Callable[..
         def decide(self, X: Any) -> Any:
             return np.full(len(X), Action.ACCEPT, dtype=object)
 
-    with DataEngine(model=Accepting(), store=str(tmp_path / "engine.db"), retrain_every=30, replaying=True) as engine:
+    with DataEngine(
+        model=Accepting(), store=str(tmp_path / "engine.db"), retrain_every=30, replaying=True
+    ) as engine:
         drive(engine, make_data(60, samples=60))
         (past,) = engine.history(last=1, action="accept")
         explanation = engine.explain(past.decision.id)
-        assert re.search(r"Accepting gives 30 successes, \d failures, bound 0.800 to 1.000", said_of(explanation))
+        assert re.search(
+            r"Accepting gives 30 successes, \d failures, bound 0.800 to 1.000", said_of(explanation)
+        )
         assert explanation.neighbours == ()
         assert explanation.envelope is not None
 
@@ -189,7 +252,9 @@ def test_a_baseline_has_its_own_numbers_and_no_neighbours(make_data: Callable[..
 def test_an_unknown_id_says_where_the_ids_are(make_data: Callable[..., Dataset]) -> None:
     with DataEngine("pca") as engine:
         engine.decide(np.arange(30.0))
-        with pytest.raises(ReportError, match=r"got 'x', which is unknown; `dengine history STORE` lists"):
+        with pytest.raises(
+            ReportError, match=r"got 'x', which is unknown; `dengine history STORE` lists"
+        ):
             engine.explain("x")
     with pytest.raises(StoreError, match="Expected a store that an engine has used"):
         explain(SqlStore(), "x")
@@ -226,10 +291,17 @@ def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_mad
 ) -> None:
     times = iter(np.arange(1e6) * clock_goes + 1e9)
     data, window = make_data(260, samples=60), "0:0.1:-1000:1000"
-    engine = played(SqlStore(str(tmp_path / "e.db"), clock=lambda: float(next(times))), data, RECIPES["local"])
+    engine = played(
+        SqlStore(str(tmp_path / "e.db"), clock=lambda: float(next(times))), data, RECIPES["local"]
+    )
     (past,) = engine.history(last=1, action="accept")
     trace, policies, ids = engine.find(past.decision.id).trace, [engine.policy], [past.decision.id]
-    changes = [{"lower_bound": 0.95}, {"shadow": True}, {"shadow": False, "windows": (window,)}, {"alpha": 0.3}]
+    changes = [
+        {"lower_bound": 0.95},
+        {"shadow": True},
+        {"shadow": False, "windows": (window,)},
+        {"alpha": 0.3},
+    ]
     for change in changes:
         engine.set_policy(replace(engine.policy, **change))
         policies.append(engine.policy)

@@ -10,7 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Decision, Policy, Reason, Recipe, Source, load_dataset
+from dengine import (
+    Action,
+    DataEngine,
+    Dataset,
+    Decision,
+    Policy,
+    Reason,
+    Recipe,
+    Source,
+    load_dataset,
+)
 from dengine.engine import feedback
 from dengine.engine.engine import core_of
 from dengine.errors import ReportError, StoreError
@@ -60,10 +70,14 @@ def beyond(engine: DataEngine) -> list[int]:
     return [n - len(reached), bad - reached.count(False)]
 
 
-def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_part(stream: Dataset) -> None:
+def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_part(
+    stream: Dataset,
+) -> None:
     engine = make(replace(LOCAL, stops="all"))
     cycles = play(engine, stream, 0, 200)
-    assert any(c.retrain is not None for c in cycles if c.decision.action is Action.ACCEPT)  # of confirmed parts alone
+    assert any(
+        c.retrain is not None for c in cycles if c.decision.action is Action.ACCEPT
+    )  # of confirmed parts alone
 
     def source(decision: Decision) -> Source | None:
         engine.flush()
@@ -89,7 +103,9 @@ def test_silence_says_nothing_by_default(stream: Dataset) -> None:
     assert (certificate.accepted.upper, "audit_rate" in certificate.sentence) == (1.0, True)
 
 
-@pytest.mark.parametrize(("later", "killed", "away"), [(1, False, False), (60, False, True), (1, True, False)])
+@pytest.mark.parametrize(
+    ("later", "killed", "away"), [(1, False, False), (60, False, True), (1, True, False)]
+)
 def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     stream: Dataset, tmp_path: Path, monkeypatch, later: int, killed: bool, away: bool
 ) -> None:
@@ -105,7 +121,9 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     engine.flush()
     assert engine.store.get_decision(stopped.id).source is Source.CONFIRMED
     if away:
-        monkeypatch.setattr(engine.store, "apply_records", lambda records: (_ for _ in ()).throw(StoreError("away")))
+        monkeypatch.setattr(
+            engine.store, "apply_records", lambda records: (_ for _ in ()).throw(StoreError("away"))
+        )
     engine.report(stopped.id, False)
     monkeypatch.undo()
     while core_of(engine).store_fault:
@@ -118,18 +136,36 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     (past,) = [past for past in engine.history() if past.decision.id == stopped.id]
     assert {stored.source, past.source, engine.find(stopped.id).source} == {Source.STOP}
     status = engine.status()
-    assert status.sources["stop"] == status.ever.false_accepts == engine.store.tally().outcomes.false_accepts
-    with pytest.raises(ReportError, match="failure from stop was reported first and stands, now came failure from stop"):
+    assert (
+        status.sources["stop"]
+        == status.ever.false_accepts
+        == engine.store.tally().outcomes.false_accepts
+    )
+    with pytest.raises(
+        ReportError,
+        match="failure from stop was reported first and stands, now came failure from stop",
+    ):
         engine.report(stopped.id, False)
     assert labels[engine.model.index.column("numbers") == stored.label_seq].tolist() == [0]
     assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.false_accepts > 0
     engine.close()
     with DataEngine.open(tmp_path / "late.db", replaying=True) as engine:
-        assert (engine.find(stopped.id).source, engine.find(stopped.id).success) == (Source.STOP, False)
+        assert (engine.find(stopped.id).source, engine.find(stopped.id).success) == (
+            Source.STOP,
+            False,
+        )
 
 
-def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_it_is(stream: Dataset, tmp_path) -> None:
-    engine, owed = make(replace(POOLED, stops="some", audit_rate=0.3, label_within=20), store=tmp_path / "owed.db"), {}
+def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_it_is(
+    stream: Dataset, tmp_path
+) -> None:
+    engine, owed = (
+        make(
+            replace(POOLED, stops="some", audit_rate=0.3, label_within=20),
+            store=tmp_path / "owed.db",
+        ),
+        {},
+    )
     for i, (x, y) in enumerate(zip(stream.X, stream.y, strict=True)):
         decision = engine.decide(x)
         if decision.audit and i % 3 == 0:
@@ -138,7 +174,10 @@ def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_i
             engine.report(decision.id, bool(y))
     overdue = engine.store.tally(within=20).outcomes.overdue_audited_accepts
     assert overdue > 3 > engine.store.tally().outcomes.overdue_audited_accepts == 0
-    assert engine.certificate().accepted.n_bad == overdue + engine.store.tally().outcomes.audited_accepts_bad
+    assert (
+        engine.certificate().accepted.n_bad
+        == overdue + engine.store.tally().outcomes.audited_accepts_bad
+    )
     assert beyond(engine) == [overdue, overdue]
     engine.close()
     shutil.copytree(tmp_path, tmp_path / "other")
@@ -152,7 +191,9 @@ def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_i
     assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.audited_accepts_bad
     engine = DataEngine.open(tmp_path / "other" / "owed.db", replaying=True)
     engine.set_policy(replace(engine.policy, alpha=0.2))
-    engine.report(*next(iter(owed.items())))  # the rule is told anew, of nothing that was owed under another policy
+    engine.report(
+        *next(iter(owed.items()))
+    )  # the rule is told anew, of nothing that was owed under another policy
     engine.flush()
     engine.decide(stream.X[0])
     assert engine.model.rule.evidence.level_totals.sum() == 0
@@ -163,14 +204,22 @@ HISTORIES = {
     "pooled": POOLED,
     "pooled, audits": replace(POOLED, stops="some", audit_rate=0.3),
     "cost": replace(POOLED, guarantee="cost", prices=(5.0, 40.0, 30.0)),
-    "cost, audits": replace(POOLED, guarantee="cost", stops="some", audit_rate=0.3, prices=(5.0, 40.0, 30.0)),
+    "cost, audits": replace(
+        POOLED, guarantee="cost", stops="some", audit_rate=0.3, prices=(5.0, 40.0, 30.0)
+    ),
 }
 
 
 def learned(engine: DataEngine, probes: np.ndarray) -> tuple:
     """What an engine's rule was told, and what it says of some traces."""
     rule = {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
-    return rule, engine.model.predict_many(probes), engine.safe_mode, core_of(engine).new_labels, engine.version
+    return (
+        rule,
+        engine.model.predict_many(probes),
+        engine.safe_mode,
+        core_of(engine).new_labels,
+        engine.version,
+    )
 
 
 class RandomHistory:
@@ -181,7 +230,12 @@ class RandomHistory:
 
     def __init__(self, policy: Policy, folder: Path, probes: np.ndarray, seed: int) -> None:
         (folder / "running").mkdir()
-        self.rng, self.folder, self.probes, self.compared = np.random.default_rng(seed), folder, probes, 0
+        self.rng, self.folder, self.probes, self.compared = (
+            np.random.default_rng(seed),
+            folder,
+            probes,
+            0,
+        )
         self.engine = make(replace(policy, label_within=8), store=folder / "running" / "e.db")
         self.owed: dict[str, bool] = {}
         self.labelled: list[str] = []
@@ -224,11 +278,15 @@ class RandomHistory:
         self.engine.forget(str(self.rng.choice(self.labelled)))
 
     def change_policy(self) -> None:
-        self.engine.set_policy(replace(self.engine.policy, label_within=int(self.rng.integers(1, 20))))
+        self.engine.set_policy(
+            replace(self.engine.policy, label_within=int(self.rng.integers(1, 20)))
+        )
 
     def roll_back(self) -> None:
         if self.engine.version > 1:
-            self.engine.rollback(int(self.rng.integers(max(1, self.engine.version - 2), self.engine.version)))
+            self.engine.rollback(
+                int(self.rng.integers(max(1, self.engine.version - 2), self.engine.version))
+            )
 
     def compare(self) -> None:
         self.engine.flush()
@@ -237,7 +295,9 @@ class RandomHistory:
             shutil.copytree(self.folder / "running", copied)
             with DataEngine.open(copied / "e.db", replaying=True) as again:
                 assert learned(again, self.probes) == learned(self.engine, self.probes)
-            self.compared += self.engine.store.overdue_to(self.engine.recipe.policy.label_within) > 0
+            self.compared += (
+                self.engine.store.overdue_to(self.engine.recipe.policy.label_within) > 0
+            )
 
     def reopen(self) -> None:
         self.engine.close()
@@ -304,7 +364,9 @@ def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_n
     assert verify_history(str(tmp_path / "e.db")).ok
 
 
-def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(stream: Dataset) -> None:
+def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(
+    stream: Dataset,
+) -> None:
     engine = make(POOLED)
     play(engine, stream)
     for x in stream.X[stream.y == 1][:12]:
@@ -324,12 +386,19 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
     assert engine.safe_mode
     status = engine.store.status()
     outcomes = engine.store.tally().outcomes
-    assert status["labels"] == status["actions"]["verify"] + outcomes.false_accepts + outcomes.confirmed
+    assert (
+        status["labels"]
+        == status["actions"]["verify"] + outcomes.false_accepts + outcomes.confirmed
+    )
 
 
-def test_a_decision_at_once_leaves_it_to_settle_to_say_that_safe_mode_begins(stream: Dataset) -> None:
+def test_a_decision_at_once_leaves_it_to_settle_to_say_that_safe_mode_begins(
+    stream: Dataset,
+) -> None:
     heard: list[str] = []
-    engine = make(replace(POOLED, stops="some", audit_rate=0.5, label_within=2), on_safe_mode=heard.append)
+    engine = make(
+        replace(POOLED, stops="some", audit_rate=0.5, label_within=2), on_safe_mode=heard.append
+    )
     play(engine, stream)
     assert all(core_of(engine).try_decide(x) for x in spoiled(stream).X)  # their audits are owed
     assert (bool(engine.safe_mode), heard) == (True, [])
@@ -353,7 +422,11 @@ def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_
     assert {c.decision.action for c in cycles[first + 1 :]} == {Action.VERIFY}
     assert Reason.SAFE_MODE in {c.decision.reason for c in cycles[first + 1 :]}
     play(engine, make_data(1500, samples=60, seed=9))  # more than the bad ones, which are learned
-    assert (engine.safe_mode, heard[-1], engine.store.events()[-1].kind) == ("", "", "safe mode ended")
+    assert (engine.safe_mode, heard[-1], engine.store.events()[-1].kind) == (
+        "",
+        "",
+        "safe mode ended",
+    )
 
 
 def test_traces_of_one_part_share_a_fold_whatever_they_look_like(stream: Dataset) -> None:
@@ -362,7 +435,11 @@ def test_traces_of_one_part_share_a_fold_whatever_they_look_like(stream: Dataset
     for x in stream.X[:10]:
         engine.report(engine.decide(x, part="A-17").id, True)
     hashes = store.labelled().hashes
-    for text, records in (("", 0xCBF29CE484222325), ("a", 0xAF63DC4C8601EC8C), ("foobar", 0x85944171F73967E8)):
+    for text, records in (
+        ("", 0xCBF29CE484222325),
+        ("a", 0xAF63DC4C8601EC8C),
+        ("foobar", 0x85944171F73967E8),
+    ):
         assert part_hash(text) % 2**64 == records  # FNV-1a: the vectors of its authors' reference
     assert set(hashes.tolist()) == {part_hash("A-17")} != set(content_hash(stream.X[:10]).tolist())
     assert len(set(fold_of(hashes, 5).tolist())) == 1
@@ -384,12 +461,16 @@ def test_a_part_that_comes_often_has_one_vote_and_none_on_itself(stream: Dataset
 
 
 @pytest.mark.parametrize("numbered", [False, True])
-def test_parts_that_were_each_reported_three_times_teach_as_much_as_once(make_data, numbered: bool) -> None:
+def test_parts_that_were_each_reported_three_times_teach_as_much_as_once(
+    make_data, numbered: bool
+) -> None:
     data, certain = make_data(400, samples=60, seed=5), []
     for times in (1, 2, 3):
         engine = make(replace(LOCAL, shadow=True))
         for i in np.tile(np.arange(200), times):
-            engine.report(engine.decide(data.X[i], part=int(i) if numbered else None).id, bool(data.y[i]))
+            engine.report(
+                engine.decide(data.X[i], part=int(i) if numbered else None).id, bool(data.y[i])
+            )
         engine.retrain()
         certain.append(sum(engine.decide(x).predicted is not Action.VERIFY for x in data.X[200:]))
     assert min(certain) > max(certain) - 20 > 80
@@ -405,7 +486,9 @@ def test_an_event_and_the_status_tell_where_nearly_every_trace_is_novel(stream: 
     assert "novel" in status(engine.store, last=200).alarm
 
 
-def test_repeats_that_nobody_names_are_noticed_and_named_ones_or_parts_of_their_own_are_not(make_data) -> None:
+def test_repeats_that_nobody_names_are_noticed_and_named_ones_or_parts_of_their_own_are_not(
+    make_data,
+) -> None:
     X, drawn = load_dataset("insertion").X, np.random.default_rng(0)
     for n in (100, 200) * 10:
         assert repeats_note(X[drawn.permutation(len(X))[:n], None], np.arange(n)) == ""
@@ -432,7 +515,9 @@ def told(engine: DataEngine) -> dict[str, list]:
     return {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
 
 
-@pytest.mark.parametrize("policy", [LOCAL, replace(LOCAL, stops="all"), replace(LOCAL, audit_rate=0.2), POOLED])
+@pytest.mark.parametrize(
+    "policy", [LOCAL, replace(LOCAL, stops="all"), replace(LOCAL, audit_rate=0.2), POOLED]
+)
 def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told(
     policy: Policy, stream: Dataset, tmp_path: Path
 ) -> None:
@@ -450,11 +535,17 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
         assert told(engine) == before
         assert core_of(engine).new_labels == labels + 2
         status = engine.status()
-        assert (status.sources["inspection"], status.labels, status.ever.false_rejects) == (2, n + 2, 1)
+        assert (status.sources["inspection"], status.labels, status.ever.false_rejects) == (
+            2,
+            n + 2,
+            1,
+        )
         match = engine.find(result[0].id)
         assert (match.success, match.source) == (True, Source.INSPECTION)
         assert {result[0].id} == {
-            past.decision.id for past in engine.history(label="good") if past.source is Source.INSPECTION
+            past.decision.id
+            for past in engine.history(label="good")
+            if past.source is Source.INSPECTION
         }
         assert "turned out good (inspection)" in " ".join(engine.explain(result[0].id).sentences)
         with pytest.raises(ReportError, match="success from inspection was reported first"):
@@ -472,7 +563,9 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
         assert [engine.decide(x).action for x in stream.X[:40]] == probe
 
 
-def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_they_are_many(stream: Dataset) -> None:
+def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_they_are_many(
+    stream: Dataset,
+) -> None:
     engine = make(replace(LOCAL, audit_rate=0.3))
     play(engine, stream)
     result = rejected(engine, stream)
@@ -483,5 +576,6 @@ def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_t
     status = engine.status()
     assert status.certificate.rejected.upper >= len(result) / n
     assert (
-        f"{len(result)} of the {status.newest.rejected} newest rejected parts were good: more than 10.0%." in status.alarm
+        f"{len(result)} of the {status.newest.rejected} newest rejected parts were good: more than 10.0%."
+        in status.alarm
     )

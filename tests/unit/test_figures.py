@@ -28,13 +28,19 @@ from tests.support.replays import replay_of as by_hand
 RECIPE = Recipe("pca", policy=Policy(alpha=0.1, lower_bound=0.9))
 
 
-RETRAINS = tuple(RetrainReport(i, seconds, 50, 0, seconds > 0.2, "") for i, seconds in enumerate((0.1, 0.3)))
+RETRAINS = tuple(
+    RetrainReport(i, seconds, 50, 0, seconds > 0.2, "") for i, seconds in enumerate((0.1, 0.3))
+)
 
 
-def replay_of(action: list[str], truth: list[int], recipe: Recipe = RECIPE, **fields: Any) -> Replay:
+def replay_of(
+    action: list[str], truth: list[int], recipe: Recipe = RECIPE, **fields: Any
+) -> Replay:
     good = np.array(truth, dtype=bool)
     stopped = (np.array(action) == "accept") & ~good
-    return by_hand(action, good, recipe=recipe, name=recipe.name, stopped=stopped, retrains=RETRAINS, **fields)
+    return by_hand(
+        action, good, recipe=recipe, name=recipe.name, stopped=stopped, retrains=RETRAINS, **fields
+    )
 
 
 MANY_RIGHT = replay_of(["accept"] * 300, [1] * 290 + [0] * 10)
@@ -43,8 +49,12 @@ ONE_WRONG = replay_of(["accept"] + ["verify"] * 298 + ["reject"], [0] + [1] * 29
 
 def test_pooled_precision_weighs_parts_not_replays_and_is_none_where_nothing_was_accepted() -> None:
     (row,) = pool(frame_of([MANY_RIGHT, ONE_WRONG]))
-    assert row["precision"] == pytest.approx(1 - 11 / 301)  # the mean of the two ratios would be 0.483
-    answers = [row[name] for name in ("npv", "accepted", "total_accepted", "replays", "retrain_max_s")]
+    assert row["precision"] == pytest.approx(
+        1 - 11 / 301
+    )  # the mean of the two ratios would be 0.483
+    answers = [
+        row[name] for name in ("npv", "accepted", "total_accepted", "replays", "retrain_max_s")
+    ]
     assert answers == [0.0, 150.5, 301, 2, 0.3]
     (row,) = pool(frame_of([replay_of(["verify"] * 5, [1] * 5)]))
     assert (math.isnan(row["precision"]), row["promise_kept"]) == (True, None)
@@ -57,8 +67,12 @@ def test_the_promise_is_kept_up_to_the_tolerance(bad: int, kept: bool) -> None:
     assert row["promise_kept"] is kept
 
 
-def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own_with_the_retrains_that_were_dropped() -> None:
-    pooled = replay_of(["accept"] * 300, [1] * 300, recipe=RECIPE.with_policy(guarantee="pooled", stops="all"))
+def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own_with_the_retrains_that_were_dropped() -> (
+    None
+):
+    pooled = replay_of(
+        ["accept"] * 300, [1] * 300, recipe=RECIPE.with_policy(guarantee="pooled", stops="all")
+    )
     rows = pool(frame_of(replays := [MANY_RIGHT, MANY_RIGHT, pooled]), replays)
     shown = [(row["guarantee"], row["stops"], row["retrains_dropped"]) for row in rows]
     assert shown == [("local", "some", 2), ("pooled", "all", 1)]
@@ -68,26 +82,49 @@ def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own_with_the_re
 
 
 def test_window_curves_are_shares_of_what_was_decided_in_all_replays_where_that_is_enough() -> None:
-    lines = window_curves([replay_of(["verify", "verify", "accept", "reject"], [1, 1, 0, 1])], window=2)
+    lines = window_curves(
+        [replay_of(["verify", "verify", "accept", "reject"], [1, 1, 0, 1])], window=2
+    )
     np.testing.assert_allclose(lines["certain"], [0, 0, 50, 100])
     np.testing.assert_allclose(lines["precision"], [np.nan, np.nan, 0, 0])
     np.testing.assert_allclose(lines["false_positive"], [np.nan, np.nan, 100, 100])
     np.testing.assert_allclose(lines["false_negative"], [np.nan, np.nan, np.nan, 100])
     lines = window_curves([MANY_RIGHT, ONE_WRONG], window=300)
-    assert lines["false_positive"][-1] == pytest.approx(100 * 11 / 301)  # the mean of the two shares would be 51.7
+    assert lines["false_positive"][-1] == pytest.approx(
+        100 * 11 / 301
+    )  # the mean of the two shares would be 51.7
     some = replay_of(["accept"] * 4 + ["verify"] * 4, [0] + [1] * 7)
-    assert np.isfinite(window_curves([some], window=4, fewest=3)["precision"]).tolist() == [0, 0, 1, 1, 1, 0, 0, 0]
+    assert np.isfinite(window_curves([some], window=4, fewest=3)["precision"]).tolist() == [
+        0,
+        0,
+        1,
+        1,
+        1,
+        0,
+        0,
+        0,
+    ]
 
 
 def test_the_curves_draw_the_lower_bound_and_the_tolerance_and_count_the_errors() -> None:
     top, bottom = curves({"a": [MANY_RIGHT], "b": [ONE_WRONG]}).axes
-    assert any(np.allclose(line.get_ydata(), 90.0) and line.get_linestyle() == ":" for line in top.lines)
-    assert any(np.allclose(line.get_ydata(), 10.0) and line.get_linestyle() == ":" for line in bottom.lines)
-    assert {"a: certain, of all cycles", "b: certain, of all cycles"} <= {line.get_label() for line in top.lines}
-    assert {"a: 10 bad of 300 accepted", "b: 1 good of 1 rejected"} <= {line.get_label() for line in bottom.lines}
+    assert any(
+        np.allclose(line.get_ydata(), 90.0) and line.get_linestyle() == ":" for line in top.lines
+    )
+    assert any(
+        np.allclose(line.get_ydata(), 10.0) and line.get_linestyle() == ":" for line in bottom.lines
+    )
+    assert {"a: certain, of all cycles", "b: certain, of all cycles"} <= {
+        line.get_label() for line in top.lines
+    }
+    assert {"a: 10 bad of 300 accepted", "b: 1 good of 1 rejected"} <= {
+        line.get_label() for line in bottom.lines
+    }
 
 
-def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_newest_part() -> None:
+def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_newest_part() -> (
+    None
+):
     figure = embedding_map(MANY_RIGHT)
     (ball,) = figure.axes[0].patches
     assert [axes.get_aspect() for axes in figure.axes] == [1.0, 1.0]
@@ -97,11 +134,19 @@ def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_n
 
 
 def test_an_axis_that_is_a_probability_says_so_and_the_other_is_for_the_eye() -> None:
-    left = embedding_map(replay_of(["accept"] * 50, [1] * 50, recipe=Recipe("conv", radius=0.05))).axes[0]
+    left = embedding_map(
+        replay_of(["accept"] * 50, [1] * 50, recipe=Recipe("conv", radius=0.05))
+    ).axes[0]
     assert left.get_xlabel() == "predicted probability of success"
     assert "for the eye" in left.get_ylabel()
     assert [ball.get_radius() for ball in left.patches] == [0.05]
-    asked = ("rocket", ConvReducer(), "dengine.reducers.conv:ConvReducer", PCA(2), "sklearn.decomposition:PCA")
+    asked = (
+        "rocket",
+        ConvReducer(),
+        "dengine.reducers.conv:ConvReducer",
+        PCA(2),
+        "sklearn.decomposition:PCA",
+    )
     assert [has_own_unit(reducer) for reducer in asked] == [True, True, True, False, False]
 
 
@@ -111,13 +156,17 @@ def log_of(clock_s: np.ndarray | None) -> Replay:
     return by_hand(action, truth, stopped=np.arange(100) == 89, clock_s=clock_s)
 
 
-def test_a_run_is_summed_up_by_stretches_that_add_up_and_by_an_hour_where_there_is_a_clock() -> None:
+def test_a_run_is_summed_up_by_stretches_that_add_up_and_by_an_hour_where_there_is_a_clock() -> (
+    None
+):
     log = log_of(np.cumsum(np.full(100, 36.0)))
     total, parts = log.stretch(), log.stretches(7)
     for name in ("verified", "accepted", "rejected", "false_positive", "false_negative", "stops"):
         assert total[name] == sum(part[name] for part in parts)
     assert (total["false_positive"], total["false_negative"], total["stops"]) == (1, 1, 1)
-    assert total["parts_per_hour"] == pytest.approx(88.0)  # 59 verified good and 29 accepted good in an hour
+    assert total["parts_per_hour"] == pytest.approx(
+        88.0
+    )  # 59 verified good and 29 accepted good in an hour
     assert log_of(None).stretch()["parts_per_hour"] is None
     assert [len(run_picture(item).axes) for item in (log, log_of(None))] == [3, 2]
 
@@ -141,22 +190,33 @@ PICTURES: dict[str, Callable[[], Figure]] = {
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_every_figure_is_written_as_a_png_without_pyplot_and_no_legend_lies_on_its_data(name: str, tmp_path: Path) -> None:
+def test_every_figure_is_written_as_a_png_without_pyplot_and_no_legend_lies_on_its_data(
+    name: str, tmp_path: Path
+) -> None:
     figure = PICTURES[name]()
-    assert save(figure, tmp_path / "deep" / "figure.png", dpi=40).read_bytes().startswith(b"\x89PNG")
+    assert (
+        save(figure, tmp_path / "deep" / "figure.png", dpi=40).read_bytes().startswith(b"\x89PNG")
+    )
     figure.draw_without_rendering()
     legends = [ax.get_legend() for ax in figure.axes if ax.get_legend()] + figure.legends
     assert legends
     for legend in legends:
         box = legend.get_window_extent()
-        assert [box.overlaps(axes.get_window_extent()) for axes in figure.axes] == [False] * len(figure.axes)
-        assert box.x1 <= max(axes.get_window_extent().x1 for axes in figure.axes)  # or the axes would have to shrink
+        assert [box.overlaps(axes.get_window_extent()) for axes in figure.axes] == [False] * len(
+            figure.axes
+        )
+        assert box.x1 <= max(
+            axes.get_window_extent().x1 for axes in figure.axes
+        )  # or the axes would have to shrink
 
 
 def test_every_channel_is_drawn_in_its_own_unit(data: Dataset) -> None:
     both = np.stack([data.X, data.X[::-1]], axis=1)
     named = Dataset(both, data.y, unit="kN, mm", channels=("FZ", "SZ"))
-    assert [axes.get_ylabel() for axes in data_picture(named, "x").axes[:2]] == ["FZ [kN]", "SZ [mm]"]
+    assert [axes.get_ylabel() for axes in data_picture(named, "x").axes[:2]] == [
+        "FZ [kN]",
+        "SZ [mm]",
+    ]
     with DataEngine(recipe=RECIPE, trace=named.spec) as engine:
         explained = explained_picture(engine.explain(engine.decide(both[0]).id))
     labels = [axes.get_ylabel() for axes in explained.axes]

@@ -31,15 +31,21 @@ def store(tmp_path_factory: pytest.TempPathFactory, make_data) -> Path:
 
 
 @pytest.mark.parametrize("force", [False, True])
-def test_no_folder_device_pipe_or_link_is_written_to_even_by_force(tmp_path: Path, force: bool) -> None:
+def test_no_folder_device_pipe_or_link_is_written_to_even_by_force(
+    tmp_path: Path, force: bool
+) -> None:
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "mine").write_bytes(TEXT)
     (tmp_path / "link").symlink_to(tmp_path / "mine")
     (tmp_path / "dangling").symlink_to(tmp_path / "nothing")
-    places = {name: tmp_path / name for name in ("folder", "pipe", "link", "dangling")} | {"device": Path("/dev/null")}
+    places = {name: tmp_path / name for name in ("folder", "pipe", "link", "dangling")} | {
+        "device": Path("/dev/null")
+    }
     for name, target in places.items():
-        with pytest.raises(OutputError, match=f"is a {'link' if name == 'dangling' else name}; name another one"):
+        with pytest.raises(
+            OutputError, match=f"is a {'link' if name == 'dangling' else name}; name another one"
+        ):
             write_output(target, b"new", force)
     assert (tmp_path / "mine").read_bytes() == TEXT
     assert not (tmp_path / "nothing").exists()
@@ -67,7 +73,9 @@ def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_pat
     first, second = (write_output(tmp_path / name, name.encode()) for name in ("a.csv", "b.png"))
     write_manifest(tmp_path, [first])
     listed = json.loads(write_manifest(tmp_path, [second]).read_text())["sha256"]
-    assert listed == {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in (first, second)}
+    assert listed == {
+        file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in (first, second)
+    }
     (tmp_path / "manifest.json").write_text('{"name": "my web page"}')
     with pytest.raises(OutputError, match="was left as it was"):
         write_manifest(tmp_path, [first])
@@ -84,9 +92,14 @@ def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path
     target.write_bytes(TEXT)
     (tmp_path / ".dengine-0000000000000000.partial").symlink_to(store)
     assert dengine("export", store, "--out", target, "--force").exit_code == 0
-    assert beside(target, "sha256").read_text() == f"{hashlib.sha256(target.read_bytes()).hexdigest()}  model.ts\n"
+    assert (
+        beside(target, "sha256").read_text()
+        == f"{hashlib.sha256(target.read_bytes()).hexdigest()}  model.ts\n"
+    )
     assert load_exported(target).trace.samples == 100
-    beside(target, "sha256").write_text("0" * 64 + "  model.ts\n")  # as if killed between the file and its sum
+    beside(target, "sha256").write_text(
+        "0" * 64 + "  model.ts\n"
+    )  # as if killed between the file and its sum
     with pytest.raises(ExportError, match="is damaged or truncated"):
         load_exported(target)
 
@@ -115,18 +128,26 @@ with DataEngine.open(sys.argv[1]) as engine:
 """
 
 
-def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(store: Path, tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(
+    store: Path, tmp_path: Path
+) -> None:
     with DataEngine.open(store) as engine:
         model = export_torchscript(engine, tmp_path / "model.ts")
     before = model.read_bytes()
-    done = subprocess.run([sys.executable, "-c", FULL, store, model], capture_output=True, text=True, check=False)
-    assert done.stdout.startswith(f"OutputError Cannot write {model}: File too large; choose a folder"), done.stderr
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, store, model], capture_output=True, text=True, check=False
+    )
+    assert done.stdout.startswith(
+        f"OutputError Cannot write {model}: File too large; choose a folder"
+    ), done.stderr
     assert model.read_bytes() == before
     load_exported(model)
     assert {file.name for file in tmp_path.iterdir()} == {"model.ts", "model.ts.sha256"}
 
 
-def test_a_folder_with_somebody_elses_table_keeps_it_and_the_tables_are_shown(tmp_path: Path) -> None:
+def test_a_folder_with_somebody_elses_table_keeps_it_and_the_tables_are_shown(
+    tmp_path: Path,
+) -> None:
     for name in ("data.png", "replays.csv"):
         (tmp_path / name).write_bytes(TEXT)
     words = ["replay", "--repeats", "1", "--cycles", "60", "--reducer", "pca", "--out", tmp_path]

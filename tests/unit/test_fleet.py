@@ -25,7 +25,9 @@ from tests.support.driving import learn
 from tests.support.plans import plans
 
 EVERY = 20
-RECIPE = Recipe("pca", {"n_components": 2}, radius=0.4, retrain_every=EVERY).with_policy(alpha=0.2, lower_bound=0.8)
+RECIPE = Recipe("pca", {"n_components": 2}, radius=0.4, retrain_every=EVERY).with_policy(
+    alpha=0.2, lower_bound=0.8
+)
 CONV = Recipe.load("conv").with_settings(retrain_every=EVERY, max_steps=10)
 POOLED = RECIPE.with_policy(guarantee="pooled", stops="all", lower_bound=0.7)
 
@@ -43,10 +45,14 @@ class Fleet:
     tag: str = field(default_factory=lambda: uuid.uuid4().hex)
     opened: list[DataEngine] = field(default_factory=list)
 
-    def store(self, cell: str, product: str | None = "gear", kind: Callable[..., SqlStore] = SqlStore) -> SqlStore:
+    def store(
+        self, cell: str, product: str | None = "gear", kind: Callable[..., SqlStore] = SqlStore
+    ) -> SqlStore:
         return kind(self.url, f"{cell}-{self.tag}", product=product and f"{product}-{self.tag}")
 
-    def engine(self, cell: str, product: str | None = "gear", recipe: Any = RECIPE, **options: Any) -> DataEngine:
+    def engine(
+        self, cell: str, product: str | None = "gear", recipe: Any = RECIPE, **options: Any
+    ) -> DataEngine:
         store = options.pop("store", None) or self.store(cell, product)
         options = {"clock": ticks(), "replaying": True} | options
         self.opened.append(DataEngine.open_or_create(store, recipe=recipe, **options))
@@ -73,7 +79,10 @@ def probe() -> np.ndarray:
 
 def predictions(engine: DataEngine, probe: np.ndarray) -> list[Any]:
     """What an engine says of traces that nobody learns from, to the last bit."""
-    return [(p.action, p.lower, p.upper, p.n_success, p.n_failure, p.embedding) for p in engine.model.predict_many(probe)]
+    return [
+        (p.action, p.lower, p.upper, p.n_success, p.n_failure, p.embedding)
+        for p in engine.model.predict_many(probe)
+    ]
 
 
 def counts(engine: DataEngine, probe: np.ndarray) -> list[tuple[int, int]]:
@@ -84,7 +93,9 @@ def rule(engine: DataEngine) -> dict[str, list[float]]:
     return {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
 
 
-def taught(fleet: Fleet, parts: Dataset, n: int, recipe: Recipe = RECIPE) -> tuple[DataEngine, DataEngine]:
+def taught(
+    fleet: Fleet, parts: Dataset, n: int, recipe: Recipe = RECIPE
+) -> tuple[DataEngine, DataEngine]:
     """Two cells of one product that learned n parts by turns, and know each other's."""
     cells = fleet.engine("a", recipe=recipe), fleet.engine("b", recipe=recipe)
     for i in range(n):
@@ -94,7 +105,9 @@ def taught(fleet: Fleet, parts: Dataset, n: int, recipe: Recipe = RECIPE) -> tup
     return cells
 
 
-def test_a_new_cell_decides_at_once_and_as_its_peers_do(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+def test_a_new_cell_decides_at_once_and_as_its_peers_do(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
     first = fleet.engine("a")
     learn(first, parts, range(100))
     second = fleet.engine("b")
@@ -105,7 +118,9 @@ def test_a_new_cell_decides_at_once_and_as_its_peers_do(fleet: Fleet, parts: Dat
 
 
 @pytest.mark.parametrize("recipe", [RECIPE, CONV], ids=["pca", "conv"])
-def test_one_retrain_serves_all(recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+def test_one_retrain_serves_all(
+    recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
     cells = [fleet.engine(name, recipe=recipe) for name in "abc"]
     for i in range(150):
         learn(cells[i % 3], parts, [i])
@@ -115,23 +130,34 @@ def test_one_retrain_serves_all(recipe: Recipe, fleet: Fleet, parts: Dataset, pr
     retrains = cells[0].store.retrains()
     assert [report.version for report in retrains] == list(range(1, labels // EVERY + 1))
     assert {engine.version for engine in cells} == {len(retrains)}
-    assert predictions(cells[0], probe) == predictions(cells[1], probe) == predictions(cells[2], probe)
+    assert (
+        predictions(cells[0], probe) == predictions(cells[1], probe) == predictions(cells[2], probe)
+    )
     assert {len(engine.model.index) for engine in cells} == {labels}
     assert {core_of(engine).new_labels for engine in cells} == {labels - EVERY * len(retrains)}
 
 
-def test_the_cell_whose_label_makes_it_due_retrains_and_another_where_it_does_not(fleet: Fleet, parts: Dataset) -> None:
-    first, second = fleet.engine("a"), fleet.engine("b", recipe=RECIPE.with_settings(retrain_every=1000))
+def test_the_cell_whose_label_makes_it_due_retrains_and_another_where_it_does_not(
+    fleet: Fleet, parts: Dataset
+) -> None:
+    first, second = (
+        fleet.engine("a"),
+        fleet.engine("b", recipe=RECIPE.with_settings(retrain_every=1000)),
+    )
     for start in range(0, 38, 2):
         learn(first, parts, [start])
-        learn(second, parts, [start + 1])  # the label that makes it due is always of the one that waits for 1000
+        learn(
+            second, parts, [start + 1]
+        )  # the label that makes it due is always of the one that waits for 1000
     assert first.store.retrains() == []
     learn(second, parts, [38])
     learn(first, parts, [39, 40])
     assert len(first.store.retrains()) == 1
 
 
-def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(fleet: Fleet, parts: Dataset, probe) -> None:
+def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
+    fleet: Fleet, parts: Dataset, probe
+) -> None:
     with ThreadPoolExecutor(1) as executor:
         first, second = fleet.engine("a", executor=executor), fleet.engine("b")
         learn(first, parts, range(30))
@@ -143,11 +169,19 @@ def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(f
             core_of(engine).process_retrains()
         assert first.version == second.version
         assert counts(first, probe) == counts(second, probe)
-        assert len(first.model.index) == len(second.model.index) == sum(e.store.status()["labels"] for e in (first, second))
+        assert (
+            len(first.model.index)
+            == len(second.model.index)
+            == sum(e.store.status()["labels"] for e in (first, second))
+        )
 
 
-def test_a_reducer_without_arrays_is_refitted_on_the_same_traces(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
-    first, second = (fleet.engine(name, recipe=Recipe(PCA(2), radius=0.4, retrain_every=EVERY)) for name in "ab")
+def test_a_reducer_without_arrays_is_refitted_on_the_same_traces(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
+    first, second = (
+        fleet.engine(name, recipe=Recipe(PCA(2), radius=0.4, retrain_every=EVERY)) for name in "ab"
+    )
     learn(first, parts, range(50))
     learn(second, parts, range(50, 55))
     core_of(first).process_retrains()
@@ -169,7 +203,9 @@ def test_a_trace_that_came_in_two_cells_votes_once(fleet: Fleet, parts: Dataset)
         assert sum(after) == sum(before) + 1
 
 
-def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_gaps(fleet: Fleet, parts, probe) -> None:
+def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_gaps(
+    fleet: Fleet, parts, probe
+) -> None:
     first, second = taught(fleet, parts, 60, RECIPE.with_settings(window=30))
     for i in range(60, 70):
         first.report(first.decide(np.full(100, np.nan)).id, False)
@@ -181,7 +217,9 @@ def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_g
     assert counts(first, probe) == counts(second, probe)
 
 
-def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answers(fleet: Fleet, parts, probe) -> None:
+def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answers(
+    fleet: Fleet, parts, probe
+) -> None:
     reports = []
 
     class Slow(SqlStore):
@@ -203,7 +241,9 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
     assert predictions(first, probe) == predictions(second, probe)
 
 
-def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet: Fleet, parts: Dataset, probe) -> None:
+def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(
+    fleet: Fleet, parts: Dataset, probe
+) -> None:
     first, second = taught(fleet, parts, 90)
     wrong, *gone = [past.decision.id for past in first.history() if past.success is not None][20:24]
     first.correct(wrong, not first.store.get_decision(wrong).success)
@@ -234,7 +274,10 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
     assert evidence == [engine.store.status()["labels"] for engine in (first, second)]
     assert rule(first) != rule(second)
     assert first.store.tally().outcomes != second.store.tally().outcomes
-    assert rule(second)["evidence.level_totals"] != rule(fleet.engine("c", recipe=POOLED))["evidence.level_totals"]
+    assert (
+        rule(second)["evidence.level_totals"]
+        != rule(fleet.engine("c", recipe=POOLED))["evidence.level_totals"]
+    )
     assert second.store.get_decision("nobody") is None
 
 
@@ -258,15 +301,29 @@ def reopened(fleet: Fleet, engine: DataEngine) -> SqlStore:
 
 
 @pytest.mark.parametrize("recipe", [RECIPE, POOLED], ids=["local", "pooled"])
-def test_a_reopened_cell_decides_the_same_bit_for_bit(recipe: Recipe, fleet: Fleet, parts: Dataset, probe) -> None:
+def test_a_reopened_cell_decides_the_same_bit_for_bit(
+    recipe: Recipe, fleet: Fleet, parts: Dataset, probe
+) -> None:
     for engine in taught(fleet, parts, 130, recipe):
         core_of(engine).process_retrains()
-        before = predictions(engine, probe), rule(engine), engine.version, core_of(engine).new_labels
+        before = (
+            predictions(engine, probe),
+            rule(engine),
+            engine.version,
+            core_of(engine).new_labels,
+        )
         again = fleet.engine("", recipe=None, store=reopened(fleet, engine))
-        assert (predictions(again, probe), rule(again), again.version, core_of(again).new_labels) == before
+        assert (
+            predictions(again, probe),
+            rule(again),
+            again.version,
+            core_of(again).new_labels,
+        ) == before
 
 
-def test_nothing_is_mixed_between_products_and_cells_without(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+def test_nothing_is_mixed_between_products_and_cells_without(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
     products = {"a": "gear", "b": "gear", "c": "nut", "d": None}
     cells = {name: fleet.engine(name, product) for name, product in products.items()}
     alone = DataEngine(recipe=RECIPE, store=SqlStore(), clock=ticks(), replaying=True)
@@ -287,11 +344,19 @@ def test_nothing_is_mixed_between_products_and_cells_without(fleet: Fleet, parts
         assert len(labelled.seq) == sum(cells[other].store.status()["labels"] for other in kin)
 
 
-def test_label_numbers_are_unique_and_increase_over_the_product(fleet: Fleet, parts: Dataset) -> None:
+def test_label_numbers_are_unique_and_increase_over_the_product(
+    fleet: Fleet, parts: Dataset
+) -> None:
     for name in "abcd":
         fleet.engine(name, recipe=RECIPE.with_settings(retrain_every=10_000))
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda engine, i: learn(engine, parts, range(25 * i, 25 * i + 25)), fleet.opened, range(4)))
+        list(
+            pool.map(
+                lambda engine, i: learn(engine, parts, range(25 * i, 25 * i + 25)),
+                fleet.opened,
+                range(4),
+            )
+        )
     assert [engine.store.status()["labels"] for engine in fleet.opened] == [25] * 4
     seen = fleet.opened[0].store.labelled()
     assert seen.seq.tolist() == list(range(1, 101))
@@ -310,7 +375,9 @@ class ShakyStore(SqlStore):
         return super().news_since(seq, limit)
 
 
-def test_a_cell_without_news_goes_on_and_says_so_once(fleet: Fleet, parts: Dataset, probe: np.ndarray, caplog) -> None:
+def test_a_cell_without_news_goes_on_and_says_so_once(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray, caplog
+) -> None:
     shaky = fleet.store("b", kind=ShakyStore)
     first, second = fleet.engine("a"), fleet.engine("b", store=shaky)
     learn(first, parts, range(30))
@@ -346,7 +413,9 @@ def test_a_cell_without_news_goes_on_and_says_so_once(fleet: Fleet, parts: Datas
     ],
     ids=["reducer", "folds", "window", "novelty", "seed"],
 )
-def test_what_decides_the_embedding_must_agree(change: dict[str, Any], named: str, fleet: Fleet) -> None:
+def test_what_decides_the_embedding_must_agree(
+    change: dict[str, Any], named: str, fleet: Fleet
+) -> None:
     fleet.engine("a")
     with pytest.raises(SettingError, match=f"product.*{named}"):
         fleet.engine("b", **change)
@@ -360,7 +429,9 @@ def test_the_first_trace_of_any_cell_sets_the_contract(fleet: Fleet, parts: Data
     assert second.trace == first.trace == fleet.engine("c").trace
 
 
-def test_a_cell_keeps_its_product_and_one_that_worked_alone_joins_none(fleet: Fleet, parts: Dataset) -> None:
+def test_a_cell_keeps_its_product_and_one_that_worked_alone_joins_none(
+    fleet: Fleet, parts: Dataset
+) -> None:
     fleet.engine("a").close()
     learn(fleet.engine("b", None), parts, [0])
     fleet.opened.pop().close()
@@ -370,8 +441,14 @@ def test_a_cell_keeps_its_product_and_one_that_worked_alone_joins_none(fleet: Fl
         ("c", "\n", "printable"),
     ):
         with pytest.raises(StoreError, match=message):
-            SqlStore(fleet.url, f"{cell}-{fleet.tag}", product=product if cell == "c" else f"{product}-{fleet.tag}")
-    result = {cell.cell_id: cell.product for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id}
+            SqlStore(
+                fleet.url,
+                f"{cell}-{fleet.tag}",
+                product=product if cell == "c" else f"{product}-{fleet.tag}",
+            )
+    result = {
+        cell.cell_id: cell.product for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id
+    }
     assert result == {f"a-{fleet.tag}": f"gear-{fleet.tag}", f"b-{fleet.tag}": None}
 
 
@@ -385,7 +462,9 @@ def test_questions_about_a_product_go_down_an_index(tmp_path: Path) -> None:
     assert len(result) >= 7
     tables = ("label", "trace", "model_version", "decision", "correction")
     for statement, plan in result:
-        assert not [step for step in plan if step.startswith("SCAN") and step.split()[1] in tables], (statement, plan)
+        assert not [
+            step for step in plan if step.startswith("SCAN") and step.split()[1] in tables
+        ], (statement, plan)
 
 
 def test_the_cells_of_a_database_are_listed(fleet: Fleet, parts: Dataset) -> None:
@@ -394,8 +473,14 @@ def test_the_cells_of_a_database_are_listed(fleet: Fleet, parts: Dataset) -> Non
     fleet.engine("d", None)
     for engine in fleet.opened:
         engine.store.flush()
-    result = {cell.cell_id.split("-")[0]: cell for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id}
-    assert {name: cell.product for name, cell in result.items()} == dict.fromkeys("ab", f"gear-{fleet.tag}") | {"d": None}
+    result = {
+        cell.cell_id.split("-")[0]: cell
+        for cell in list_cells(fleet.url)
+        if fleet.tag in cell.cell_id
+    }
+    assert {name: cell.product for name, cell in result.items()} == dict.fromkeys(
+        "ab", f"gear-{fleet.tag}"
+    ) | {"d": None}
     assert (result["a"].decisions, result["b"].decisions) == (30, 0)
     assert result["a"].labels == fleet.opened[0].store.status()["labels"]
     assert (result["a"].version, result["b"].version, result["d"].version) == (1, 1, None)
@@ -403,12 +488,26 @@ def test_the_cells_of_a_database_are_listed(fleet: Fleet, parts: Dataset) -> Non
     assert result["b"].last_seen is None
 
 
-def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset, tmp_path: Path) -> None:
+def test_every_verb_that_names_a_store_names_a_cell(
+    fleet: Fleet, parts: Dataset, tmp_path: Path
+) -> None:
     np.savez(tmp_path / "parts.npz", X=parts.X[:60], y=parts.y[:60])
     cell, product, data = f"a-{fleet.tag}", f"gear-{fleet.tag}", str(tmp_path / "parts.npz")
     peer = f"b-{fleet.tag}"
 
-    succeed("train", "--data", data, "--store", fleet.url, "--reducer", "pca", "--cell", cell, "--product", product)
+    succeed(
+        "train",
+        "--data",
+        data,
+        "--store",
+        fleet.url,
+        "--reducer",
+        "pca",
+        "--cell",
+        cell,
+        "--product",
+        product,
+    )
     succeed("run", "--cell", "replay", "--data", data, "--cycles", "60", "--store", fleet.url, "--cell-id", peer,
         "--product", product)  # fmt: skip
     status = document("status", fleet.url, "--cell", peer)
@@ -416,18 +515,25 @@ def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset
     assert cell in succeed("status", fleet.url, "--cell-id", cell)
     succeed("export", fleet.url, "--cell", peer, "--out", str(tmp_path / "model.ts"))
     listed = document("status", fleet.url)["cells"]
-    assert [row["product"] for row in listed if row["cell_id"] in (cell, peer)] == [product, product]
+    assert [row["product"] for row in listed if row["cell_id"] in (cell, peer)] == [
+        product,
+        product,
+    ]
     assert cell[:10] in succeed("status", fleet.url)
     with SqlStore(fleet.url, peer) as store:
         assert len(store.labelled().seq) > len(store.labelled(cell_only=True).seq) > 0
 
 
 @pytest.mark.parametrize("verb", ["status", "export"])
-def test_a_cell_that_is_not_there_is_refused_and_not_made(verb: str, tmp_path: Path, parts: Dataset) -> None:
+def test_a_cell_that_is_not_there_is_refused_and_not_made(
+    verb: str, tmp_path: Path, parts: Dataset
+) -> None:
     url = str(tmp_path / "a.db")
     with DataEngine.open_or_create(address(url, "cell-7"), recipe=RECIPE) as engine:
         learn(engine, parts, range(25))
-    words = [verb, url, "--cell", "cell-8"] + (["--out", str(tmp_path / "m.ts")] if verb == "export" else [])
+    words = [verb, url, "--cell", "cell-8"] + (
+        ["--out", str(tmp_path / "m.ts")] if verb == "export" else []
+    )
     done = dengine(*words)
     assert done.exit_code == 1
     assert "it holds cell-7" in done.output

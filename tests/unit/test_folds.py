@@ -16,7 +16,11 @@ from dengine.records import Reason
 from dengine.traces import TraceGate
 
 any_float32 = st.floats(width=32, allow_nan=True, allow_infinity=True)
-traces = hnp.arrays(np.float32, hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12), elements=any_float32)
+traces = hnp.arrays(
+    np.float32,
+    hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12),
+    elements=any_float32,
+)
 
 
 def noise(n: int, samples: int = 50, seed: int = 0) -> np.ndarray:
@@ -31,7 +35,9 @@ def audited(hashes: np.ndarray, rate: float, seed: int) -> np.ndarray:
 
 def golden_traces() -> dict[str, np.ndarray]:
     ramp = np.arange(1000, dtype=np.float32) / 8
-    odd = np.array([0.5, np.nan, -np.inf, np.inf, -1.25, 3e38, -3e38, 1e-20, -0.0], dtype=np.float32)
+    odd = np.array(
+        [0.5, np.nan, -np.inf, np.inf, -1.25, 3e38, -3e38, 1e-20, -0.0], dtype=np.float32
+    )
     return {"zeros": np.zeros(1000, np.float32), "ramp": ramp, "falling": -ramp[::-1].copy(), "odd": odd,
             "two channels": np.stack([ramp[:152], ramp[152:304]])}  # fmt: skip
 
@@ -48,7 +54,9 @@ GOLDEN = {  # (hash, toss, fold of 2, fold of 5): a store, a controller and an e
 @pytest.mark.parametrize("name", golden_traces())
 def test_the_hash_of_a_trace_never_changes(name: str) -> None:
     h = content_hash(golden_traces()[name][None])
-    assert (int(h[0]), int(toss(h)[0]), int(fold_of(h, 2)[0]), int(fold_of(h, 5)[0])) == GOLDEN[name]
+    assert (int(h[0]), int(toss(h)[0]), int(fold_of(h, 2)[0]), int(fold_of(h, 5)[0])) == GOLDEN[
+        name
+    ]
     x = np.atleast_2d(golden_traces()[name])
     gate = script(TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0])))
     assert gate(torch.from_numpy(x))[1] == h[0]  # compiled, as in an exported file
@@ -83,10 +91,14 @@ def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x: np.ndarray) -> 
     assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
 
 
-@pytest.mark.parametrize("step", [2.0**-20, 1 / 64, 1.0, 2.0])  # of a sensor: low bits of a raw hash would be zeros
+@pytest.mark.parametrize(
+    "step", [2.0**-20, 1 / 64, 1.0, 2.0]
+)  # of a sensor: low bits of a raw hash would be zeros
 @pytest.mark.parametrize("folds", [2, 3, 5, 10])
 def test_folds_are_balanced(folds: int, step: float) -> None:
-    sizes = np.bincount(content_fold(np.round(noise(10_000, 20) / step) * step, folds), minlength=folds)
+    sizes = np.bincount(
+        content_fold(np.round(noise(10_000, 20) / step) * step, folds), minlength=folds
+    )
     assert stats.chisquare(sizes).pvalue > 1e-4
 
 
@@ -95,7 +107,12 @@ def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate: float) -> None
     h = content_hash(noise(20_000, 20))
     coin, fold = audited(h, rate, seed=3), fold_of(h, 2)
     assert stats.binomtest(int(coin.sum()), len(h), rate).pvalue > 1e-4
-    assert stats.chi2_contingency([[np.sum((coin == c) & (fold == k)) for k in (0, 1)] for c in (0, 1)]).pvalue > 1e-4
+    assert (
+        stats.chi2_contingency(
+            [[np.sum((coin == c) & (fold == k)) for k in (0, 1)] for c in (0, 1)]
+        ).pvalue
+        > 1e-4
+    )
 
 
 def test_engines_of_different_seeds_audit_different_traces() -> None:
@@ -109,4 +126,8 @@ def test_the_decider_tosses_as_numpy_does_compiled_or_not() -> None:
     decider = Decider(VerifyAll(Reason.NO_MODEL), DecisionConditions(TraceSpec(20)))
     scripted = script(decider)
     hashes = content_hash(noise(200, 20))
-    assert [decider.toss(int(h)) for h in hashes] == [scripted.toss(int(h)) for h in hashes] == toss(hashes).tolist()
+    assert (
+        [decider.toss(int(h)) for h in hashes]
+        == [scripted.toss(int(h)) for h in hashes]
+        == toss(hashes).tolist()
+    )

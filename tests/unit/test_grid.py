@@ -20,27 +20,45 @@ from tests.support.driving import RECIPE
 from tests.support.replays import same
 
 TIMED = ["retrain_p50_s", "retrain_max_s", "decide_p50_us", "decide_p99_us", "seconds"]
-GRID = {"alphas": (0.1, 0.5), "lower_bounds": (0.9,), "intervals": ("wilson", "binomial"), "repeats": 2, "cycles": 70}
+GRID = {
+    "alphas": (0.1, 0.5),
+    "lower_bounds": (0.9,),
+    "intervals": ("wilson", "binomial"),
+    "repeats": 2,
+    "cycles": 70,
+}
 
 
-def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_name_is_none(data, tmp_path: Path) -> None:
+def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_name_is_none(
+    data, tmp_path: Path
+) -> None:
     kept, who = KeptReplays(tmp_path, data), Contender.load(RECIPE)
     task = Task(who, seed=1, cycles=60)
     asked = [who.with_policy(alpha=0.2), replace(RECIPE, radius=0.4), PCA(2), PCA(2, whiten=True)]
-    asked += [FunctionTransformer(np.add, kw_args={"x2": value}) for value in (np.zeros(3), np.ones(3))]
+    asked += [
+        FunctionTransformer(np.add, kw_args={"x2": value}) for value in (np.zeros(3), np.ones(3))
+    ]
     asked += [FunctionTransformer(np.abs), "knn", replace(Contender.load("knn"), params={"k": 3})]
-    others = [replace(task, **change) for change in ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})]
+    others = [
+        replace(task, **change)
+        for change in ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})
+    ]
     others += [replace(task, contender=Contender.load(first)) for first in asked]
     flipped = KeptReplays(tmp_path, replace(data, y=1 - data.y)).path(task)
     assert len({flipped, *(kept.path(item) for item in [task, *others])}) == 2 + len(others)
     assert kept.path(replace(task, contender=replace(who, name="mine"))) == kept.path(task)
-    alike = [Task(Contender.load(make_pipeline(FunctionTransformer(np.abs), PCA(2))), 0) for _ in range(2)]
+    alike = [
+        Task(Contender.load(make_pipeline(FunctionTransformer(np.abs), PCA(2))), 0)
+        for _ in range(2)
+    ]
     assert kept.path(alike[0]) == kept.path(alike[1])
     with pytest.raises(SettingError, match="define it in a module"):
         kept.path(Task(Contender.load(FunctionTransformer(lambda x: x)), 0))
 
 
-def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(data: Dataset, tmp_path: Path, monkeypatch) -> None:
+def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(
+    data: Dataset, tmp_path: Path, monkeypatch
+) -> None:
     source = "from sklearn.decomposition import PCA\n\nclass Own(PCA):\n    pass\n"
     module = tmp_path / "own_reducer_of_test_grid.py"
     module.write_text(source, encoding="utf-8")
@@ -53,13 +71,19 @@ def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(data: Dat
 
     before = paths()
     module.write_text(source + "    # changed\n", encoding="utf-8")
-    assert paths() == before  # what is being played is what was imported, not what the file says by now
+    assert (
+        paths() == before
+    )  # what is being played is what was imported, not what the file says by now
     reload(loaded)
     assert not {*paths()} & {*before}
 
 
 def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_path: Path) -> None:
-    task, kept, rng = Task(Contender.load(RECIPE), seed=1, cycles=50), KeptReplays(tmp_path, data), np.random.default_rng(0)
+    task, kept, rng = (
+        Task(Contender.load(RECIPE), seed=1, cycles=50),
+        KeptReplays(tmp_path, data),
+        np.random.default_rng(0),
+    )
     played = replay(data, RECIPE, seed=1, cycles=50)
     kept.put(task, played)
     file = kept.path(task).read_bytes()
@@ -77,7 +101,11 @@ def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_
     assert not again.kept
     back = kept.get(task)
     same(back, played)
-    assert (back.retrains, back.seconds, back.recipe) == (again.replay.retrains, again.replay.seconds, played.recipe)
+    assert (back.retrains, back.seconds, back.recipe) == (
+        again.replay.retrains,
+        again.replay.seconds,
+        played.recipe,
+    )
 
 
 def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: Path) -> None:
@@ -89,9 +117,13 @@ def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: P
     assert len(files) == len(first) == 8
 
 
-def test_a_baseline_without_its_library_is_refused_before_anything_is_played(data, tmp_path: Path, monkeypatch) -> None:
+def test_a_baseline_without_its_library_is_refused_before_anything_is_played(
+    data, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setattr(BASELINES["always"], "library", "no_such_library")
-    with pytest.raises(SettingError, match=r'always needs no_such_library.*pip install "dengine\[baselines\]"'):
+    with pytest.raises(
+        SettingError, match=r'always needs no_such_library.*pip install "dengine\[baselines\]"'
+    ):
         run_grid(data, [RECIPE, "always"], **GRID, n_jobs=1, keep=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
@@ -115,8 +147,15 @@ def test_two_of_one_name_and_policy_are_refused_and_a_policy_has_columns_of_its_
         Contender("narrow", replace(plain, radius=0.3)),
         "conv",
     ]
-    assert [contender.name for contender in load_contenders(asked)] == ["pca", "pca", "narrow", "conv"]
+    assert [contender.name for contender in load_contenders(asked)] == [
+        "pca",
+        "pca",
+        "narrow",
+        "conv",
+    ]
     for twice in ([plain, replace(plain, radius=0.3)], [PCA(1), PCA(2)]):
-        with pytest.raises(SettingError, match=r"a name of its own for each.*by Contender\(name, recipe\)"):
+        with pytest.raises(
+            SettingError, match=r"a name of its own for each.*by Contender\(name, recipe\)"
+        ):
             load_contenders(twice)
     assert set(BASELINES) & set(RECIPES) == set()

@@ -35,11 +35,15 @@ def tell(rule: DecisionRule, lower: float, *outcomes: bool, upper: float = 1.0) 
 
 def enough(alpha: float, tolerance: float) -> int:
     """Good parts in a row that are evidence enough."""
-    return next(n for n in range(1, 1000) if -n * math.log1p(-BET * tolerance) >= math.log(1 / alpha))
+    return next(
+        n for n in range(1, 1000) if -n * math.log1p(-BET * tolerance) >= math.log(1 / alpha)
+    )
 
 
 @pytest.mark.parametrize(("alpha", "lower_bound"), [(0.1, 0.9), (0.05, 0.95), (0.2, 0.8)])
-def test_a_level_opens_with_the_part_that_makes_the_evidence_enough(alpha: float, lower_bound: float) -> None:
+def test_a_level_opens_with_the_part_that_makes_the_evidence_enough(
+    alpha: float, lower_bound: float
+) -> None:
     rule, n = pooled(alpha, lower_bound), enough(alpha, 1 - lower_bound)
     assert rule(1000, 0)[0] == rule.action(1.0, 1.0) == VERIFY  # however good the ball looks
     tell(rule, lower_bound, *[True] * (n - 1))
@@ -73,7 +77,9 @@ def test_the_newest_of_a_level_may_hold_so_many_wrong_ones_and_no_more() -> None
     assert rule.action(0.6, 1.0) == ACCEPT
 
 
-def test_stops_that_come_unasked_are_no_evidence_where_not_all_are_known_and_audits_weigh_by_their_propensity() -> None:
+def test_stops_that_come_unasked_are_no_evidence_where_not_all_are_known_and_audits_weigh_by_their_propensity() -> (
+    None
+):
     rule = PooledRule(0.1, 0.9, inclusion_probability=0.1)
     for _ in range(5000):
         rule.update(0.95, 1.0, True, predicted=1, inclusion_probability=0.0)
@@ -82,7 +88,9 @@ def test_stops_that_come_unasked_are_no_evidence_where_not_all_are_known_and_aud
     while rule.action(0.95, 1.0) == VERIFY:
         rule.update(0.95, 1.0, True, predicted=0, inclusion_probability=1.0)
         n += 1
-    assert 9 * enough(0.1, 0.1) < n < 11 * enough(0.1, 0.1)  # what is to come is looked at in one of ten
+    assert (
+        9 * enough(0.1, 0.1) < n < 11 * enough(0.1, 0.1)
+    )  # what is to come is looked at in one of ten
     for _ in range(100):
         rule.update(0.95, 1.0, True, predicted=1, inclusion_probability=0.0)
     rule.update(0.95, 1.0, False, predicted=1, inclusion_probability=0.1)  # it stands for ten
@@ -90,10 +98,17 @@ def test_stops_that_come_unasked_are_no_evidence_where_not_all_are_known_and_aud
 
 
 def test_a_pooled_guarantee_of_which_nobody_hears_is_refused() -> None:
-    with pytest.raises(SettingError, match="Expected audits, or stops='all', beside the pooled guarantee"):
+    with pytest.raises(
+        SettingError, match="Expected audits, or stops='all', beside the pooled guarantee"
+    ):
         Policy(guarantee="pooled")
     assert Policy(guarantee="pooled", audit_rate=0.02).rule().evidence.inclusion_probability == 0.02
-    assert Policy(guarantee="pooled", stops="all", audit_rate=0.02).rule().evidence.inclusion_probability == 1.0
+    assert (
+        Policy(guarantee="pooled", stops="all", audit_rate=0.02)
+        .rule()
+        .evidence.inclusion_probability
+        == 1.0
+    )
 
 
 def adversary(rule: PooledRule, rng: np.random.Generator, tolerance: float) -> bool:
@@ -122,7 +137,9 @@ def test_an_adversary_who_sees_the_levels_makes_a_false_claim_no_more_often_than
     assert stats.binomtest(honest, 40, 0.2, alternative="greater").pvalue > 1e-3
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MemberEvidence, "choose_threshold", each_level_by_itself)
-        assert stats.binomtest(false_claims(), 40, 0.2, alternative="greater").pvalue < 1e-3  # it is an adversary
+        assert (
+            stats.binomtest(false_claims(), 40, 0.2, alternative="greater").pvalue < 1e-3
+        )  # it is an adversary
 
 
 def test_a_level_that_its_members_contradict_stays_shut_below_the_ones_that_hold() -> None:
@@ -138,7 +155,9 @@ def priced(inclusion_probability: float = 1.0) -> PricedRule:
 
 
 @pytest.mark.parametrize("share_bad", [0.02, 0.06, 0.3])
-def test_by_costs_a_part_passes_only_while_the_members_had_cost_at_most_one_escape_beyond_their_checks(share_bad) -> None:
+def test_by_costs_a_part_passes_only_while_the_members_had_cost_at_most_one_escape_beyond_their_checks(
+    share_bad,
+) -> None:
     for seed in range(20):
         rule, rng, cost, passed = priced(), np.random.default_rng(seed), 0.0, 0
         for _ in range(400):
@@ -160,7 +179,9 @@ def test_by_costs_nothing_passes_that_is_expected_to_cost_more_than_its_check() 
     assert [rule.action(0.0, p) for p in (0.105, 0.106)] == [REJECT, VERIFY]
 
 
-def test_by_costs_an_audit_stands_for_as_many_as_it_was_drawn_from_and_a_stop_that_came_unasked_for_none() -> None:
+def test_by_costs_an_audit_stands_for_as_many_as_it_was_drawn_from_and_a_stop_that_came_unasked_for_none() -> (
+    None
+):
     rule = priced(inclusion_probability=0.1)
     tell(rule, 1.0, *[True] * 30)
     rule.update(1.0, 1.0, False, predicted=1, inclusion_probability=0.0)
@@ -169,7 +190,9 @@ def test_by_costs_an_audit_stands_for_as_many_as_it_was_drawn_from_and_a_stop_th
     assert rule.action(1.0, 1.0) == VERIFY
 
 
-def test_after_an_alarm_costs_alone_let_nothing_pass_until_fresh_members_show_that_it_pays() -> None:
+def test_after_an_alarm_costs_alone_let_nothing_pass_until_fresh_members_show_that_it_pays() -> (
+    None
+):
     rule = priced()
     tell(rule, 1.0, *[True] * 400, *[False] * 12)
     assert (rule.safe_mode(), rule.action(1.0, 1.0)) == (1, VERIFY)
@@ -181,9 +204,14 @@ def test_after_an_alarm_costs_alone_let_nothing_pass_until_fresh_members_show_th
     assert n >= enough(0.1, 5 / 120)
 
 
-@pytest.mark.parametrize("prices", [(5, 120), (0, 120, 47.5), (5, 9, 47.5), (5, 120, math.inf), ("5", 120, 47.5), 5])
+@pytest.mark.parametrize(
+    "prices", [(5, 120), (0, 120, 47.5), (5, 9, 47.5), (5, 120, math.inf), ("5", 120, 47.5), 5]
+)
 def test_prices_that_give_no_tolerance_below_one_half_are_refused(prices: object) -> None:
-    with pytest.raises(SettingError, match="prices of a check, an escape and a false reject, errors above two checks"):
+    with pytest.raises(
+        SettingError,
+        match="prices of a check, an escape and a false reject, errors above two checks",
+    ):
         Policy(prices=prices)
 
 
@@ -197,7 +225,9 @@ def test_a_part_that_both_sides_claim_is_verified() -> None:
 
 
 @pytest.mark.parametrize("kind", [PooledRule, WatchedRule])
-def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts_and_verified_until_fresh_evidence(kind) -> None:
+def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts_and_verified_until_fresh_evidence(
+    kind,
+) -> None:
     rule = kind(0.1, 0.9)
     tell(rule, 0.95, *[True] * 500)
     bad = fresh = 0
@@ -216,7 +246,9 @@ def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts_and_verified
 
 
 @pytest.mark.parametrize(("alpha", "lower_bound", "soon"), [(0.1, 0.9, 106), (0.05, 0.95, 441)])
-def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever(alpha, lower_bound, soon: int) -> None:
+def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever(
+    alpha, lower_bound, soon: int
+) -> None:
     rng, mean = np.random.default_rng(1), []
     for rate in (1.0 - lower_bound, 2.0 - 2.0 * lower_bound):
         n, rules = 0, [WatchedRule(alpha, lower_bound) for _ in range(40)]
@@ -233,7 +265,9 @@ def test_silence_is_no_success_for_a_level_and_no_failure_for_the_watch() -> Non
     silent, answer = pooled(), pooled()
     for rule in (silent, answer):
         tell(rule, 0.95, *[True] * 100)
-    before = {name: value.clone() for name, value in silent.state_dict().items() if "counts" in name}
+    before = {
+        name: value.clone() for name, value in silent.state_dict().items() if "counts" in name
+    }
     silent.observe(50, False)
     assert all(torch.equal(silent.state_dict()[name], value) for name, value in before.items())
     for _ in range(50):
@@ -264,7 +298,10 @@ def test_too_many_novel_traces_start_safe_mode_and_a_few_do_not() -> None:
     assert many.safe_mode() == 0
 
 
-@pytest.mark.parametrize(("guarantee", "stops"), [("local", "some"), ("local", "all"), ("pooled", "all"), ("cost", "all")])
+@pytest.mark.parametrize(
+    ("guarantee", "stops"),
+    [("local", "some"), ("local", "all"), ("pooled", "all"), ("cost", "all")],
+)
 def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(guarantee: str, stops: str) -> None:
     policy = Policy(0.1, 0.9, guarantee=guarantee, stops=stops)
     eager, scripted = policy.rule(), script(policy.rule())
@@ -272,7 +309,11 @@ def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(guarantee: str, st
     for _ in range(400):
         lower = float(rng.random())
         upper = float(rng.uniform(lower, 1.0))
-        success, silent, novel = bool(rng.random() < 0.97), int(rng.integers(0, 3)), bool(rng.random() < 0.05)
+        success, silent, novel = (
+            bool(rng.random() < 0.97),
+            int(rng.integers(0, 3)),
+            bool(rng.random() < 0.05),
+        )
         for rule in (eager, scripted):
             rule.observe(silent, novel)
             rule.update(lower, upper, success)
@@ -286,7 +327,10 @@ def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(guarantee: str, st
 @pytest.mark.parametrize("first", [0, 1])
 def test_after_safe_mode_each_side_opens_by_its_own_evidence(first: int) -> None:
     rule = WatchedRule(0.1, 0.9)
-    shown = [lambda n: tell(rule, 0.95, *[True] * n), lambda n: tell(rule, 0.0, *[False] * n, upper=0.02)]
+    shown = [
+        lambda n: tell(rule, 0.95, *[True] * n),
+        lambda n: tell(rule, 0.0, *[False] * n, upper=0.02),
+    ]
     tell(rule, 0.95, *[True] * 100, *[False] * 6)
     assert rule.safe_mode() != 0
     shown[first](100)

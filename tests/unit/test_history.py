@@ -40,16 +40,43 @@ def store(store: SqlStore) -> SqlStore:
     for i in range(N):
         action, predicted, reason, audit = KINDS[int(rng.integers(len(KINDS)))]
         decision = Decision(
-            f"d{i:03d}", action, predicted, 0.2, 0.9, i, 1, ((0.1, 0.2),), i // 10, reason, audit, 0.1, f"LOT/{i // 5}-{i}"
+            f"d{i:03d}",
+            action,
+            predicted,
+            0.2,
+            0.9,
+            i,
+            1,
+            ((0.1, 0.2),),
+            i // 10,
+            reason,
+            audit,
+            0.1,
+            f"LOT/{i // 5}-{i}",
         )
         put_decision(store, decision, np.full((1, 5), i, np.float32), i, quarantined=i % 13 == 5)
         if action is not Action.REJECT and rng.random() < 0.6:
-            source = Source.STOP if action is Action.ACCEPT else Source.AUDIT if audit else Source.VERIFICATION
+            source = (
+                Source.STOP
+                if action is Action.ACCEPT
+                else Source.AUDIT
+                if audit
+                else Source.VERIFICATION
+            )
             put_label(
-                store, decision.id, action is not Action.ACCEPT and i % 3 > 0, source, i // 10, np.ones(2, np.float32)
+                store,
+                decision.id,
+                action is not Action.ACCEPT and i % 3 > 0,
+                source,
+                i // 10,
+                np.ones(2, np.float32),
             )
         if i % 10 == 9:
-            store.put_version(RetrainReport(i // 10 + 1, 0.1, i, 3, True, "accepted"), i // 2, {"w": np.full(3, i)})
+            store.put_version(
+                RetrainReport(i // 10 + 1, 0.1, i, 3, True, "accepted"),
+                i // 2,
+                {"w": np.full(3, i)},
+            )
     store.put_event("safe mode", "too many traces were novel")
     store.put_event("safe mode ended", "fresh evidence keeps the tolerance")
     return store
@@ -59,7 +86,9 @@ def everything(store: SqlStore) -> list[StoredDecision]:
     return list(history(store))
 
 
-def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(store: SqlStore, monkeypatch) -> None:
+def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(
+    store: SqlStore, monkeypatch
+) -> None:
     whole = everything(store)
     assert [past.decision.id for past in whole] == [f"d{i:03d}" for i in range(N)]
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 7)
@@ -70,19 +99,30 @@ def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(store: SqlSt
 
 def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    store, kind = SqlStore(*place, clock=lambda: now[0]), (0.9, 1.0, 40, 0, ((0.1, 0.2),), 0, Reason.CERTAIN, False, 1.0)
+    store, kind = (
+        SqlStore(*place, clock=lambda: now[0]),
+        (0.9, 1.0, 40, 0, ((0.1, 0.2),), 0, Reason.CERTAIN, False, 1.0),
+    )
     times, ids = [5.0, 9.0, 2.0, 2.0, 1.0, 7.0], ["d5", "d1", "d4", "d0", "d3", "d2"]
     for now[0], id_ in zip(times, ids, strict=True):
         put_decision(store, Decision(id_, Action.ACCEPT, Action.ACCEPT, *kind), np.ones(5))
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 2)
     for result in (history(store), history(store, last=6)):
-        assert [(past.decision.id, past.time) for past in result] == list(zip(ids, times, strict=True))
+        assert [(past.decision.id, past.time) for past in result] == list(
+            zip(ids, times, strict=True)
+        )
     assert [past.decision.id for past in history(store, last=2, since=2.0)] == ["d0", "d2"]
-    assert (store.unreported_accepts(), store.tally(2).count(), store.tally(2).last) == (ids, 2, 7.0)
+    assert (store.unreported_accepts(), store.tally(2).count(), store.tally(2).last) == (
+        ids,
+        2,
+        7.0,
+    )
     store.close()
 
 
-def test_a_filter_takes_what_it_says_and_the_newest_of_that(store: SqlStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_filter_takes_what_it_says_and_the_newest_of_that(
+    store: SqlStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 4)
     whole = everything(store)
     middle = whole[N // 2].time
@@ -96,7 +136,9 @@ def test_a_filter_takes_what_it_says_and_the_newest_of_that(store: SqlStore, mon
         ({"until": middle}, lambda past: past.time < middle),
         (
             {"action": "verify", "label": "bad", "since": middle},
-            lambda past: (past.decision.action, past.label) == (Action.VERIFY, "bad") and past.time >= middle,
+            lambda past: (
+                (past.decision.action, past.label) == (Action.VERIFY, "bad") and past.time >= middle
+            ),
         ),
     ):
         expected = [past for past in whole if takes(past)]
@@ -122,17 +164,32 @@ def test_counts_of_a_store_are_those_of_its_history(store: SqlStore) -> None:
         some = whole if last is None else whole[-last:]
         result = store.tally(last)
         kinds = Counter(
-            (*(getattr(p.decision, name) for name in KIND), p.quarantined, False, p.success, p.source) for p in some
+            (
+                *(getattr(p.decision, name) for name in KIND),
+                p.quarantined,
+                False,
+                p.success,
+                p.source,
+            )
+            for p in some
         )
-        assert {astuple(group) for group in result.groups} == {(*kind, n) for kind, n in kinds.items()}
+        assert {astuple(group) for group in result.groups} == {
+            (*kind, n) for kind, n in kinds.items()
+        }
         assert (result.first, result.last) == (some[0].time, some[-1].time)
 
 
 def counted(some: list[StoredDecision]) -> Stretch:
     actions = [past.decision.action for past in some]
     bad = sum(past.success is False and past.decision.action is Action.ACCEPT for past in some)
-    novel, outside = (sum(past.decision.reason is item for past in some) for item in (Reason.NOVEL, Reason.OUTSIDE))
-    total = sum((past.decision.action, past.decision.reason) == (Action.REJECT, Reason.CERTAIN) for past in some)
+    novel, outside = (
+        sum(past.decision.reason is item for past in some)
+        for item in (Reason.NOVEL, Reason.OUTSIDE)
+    )
+    total = sum(
+        (past.decision.action, past.decision.reason) == (Action.REJECT, Reason.CERTAIN)
+        for past in some
+    )
     verified, accepted = (actions.count(item) for item in (Action.VERIFY, Action.ACCEPT))
     return Stretch(len(some), some[-1].time, verified, novel, accepted, bad, total, outside)
 
@@ -145,14 +202,23 @@ def test_stretches_are_consecutive_and_hold_everything(store: SqlStore, n: int) 
     assert store.stretches(n) == expected
     shifts = [[item for item in whole if item.time // (10.0 * n) == k] for k in range(N)]
     assert store.stretches(seconds=10.0 * n) == [counted(item) for item in shifts if item]
-    for batch, name in (("5", lambda part: part[:5]), ("-/", lambda part: part[: part.rindex("-") + 1])):
+    for batch, name in (
+        ("5", lambda part: part[:5]),
+        ("-/", lambda part: part[: part.rindex("-") + 1]),
+    ):
         sizes = Counter(name(item.decision.part) for item in whole)
         assert {item.batch: item.n for item in store.stretches(batch=batch)} == sizes
 
 
 def test_an_empty_store_has_no_past() -> None:
     empty = SqlStore()
-    assert everything(empty) == list(history(empty, last=5)) == empty.stretches(10) == empty.past_labels(0) == []
+    assert (
+        everything(empty)
+        == list(history(empty, last=5))
+        == empty.stretches(10)
+        == empty.past_labels(0)
+        == []
+    )
     assert (empty.tally().count(), empty.tally().first) == (0, None)
 
 
@@ -163,7 +229,9 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: SqlS
     assert all(label.point == pytest.approx(np.ones(2)) for label in every)
     expected = store.outcomes_since(0)
     answers = [label for label in every if not label.quarantined]
-    assert [(label.seq, label.novel) for label in answers] == [(item.seq, item.novel) for item in expected]
+    assert [(label.seq, label.novel) for label in answers] == [
+        (item.seq, item.novel) for item in expected
+    ]
     by_id = {past.decision.id: past for past in everything(store)}
     assert all(label.decided == by_id[label.decision_id].time for label in every)
 
@@ -171,7 +239,10 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: SqlS
 def test_retrains_and_events_are_those_of_the_time_that_is_asked_for(store: SqlStore) -> None:
     whole = everything(store)
     every = read_retrains_and_events(store)
-    assert (len(every["retrains"]), [item.text[:5] for item in every["events"]]) == (6, ["too m", "fresh"])
+    assert (len(every["retrains"]), [item.text[:5] for item in every["events"]]) == (
+        6,
+        ["too m", "fresh"],
+    )
     late = read_retrains_and_events(store, since=whole[-1].time)
     assert [len(item) for item in late.values()] == [1, 2]
     assert read_retrains_and_events(store, until=whole[0].time)["retrains"] == []

@@ -12,8 +12,13 @@ from tests.support.faults import read_faults
 
 REPO = Path(__file__).resolve().parents[2]
 PACKAGE = REPO / "dengine"
-FILES = {".".join(file.relative_to(REPO).with_suffix("").parts): file for file in sorted(PACKAGE.rglob("*.py"))}
-MODULES = {name: ast.parse(file.read_text("utf-8")) for name, file in FILES.items()}  # a family's is named NAME.__init__
+FILES = {
+    ".".join(file.relative_to(REPO).with_suffix("").parts): file
+    for file in sorted(PACKAGE.rglob("*.py"))
+}
+MODULES = {
+    name: ast.parse(file.read_text("utf-8")) for name, file in FILES.items()
+}  # a family's is named NAME.__init__
 
 
 NODES = 240_000
@@ -22,22 +27,32 @@ KNOWN = {name.removesuffix(".__init__") for name in MODULES} - {"dengine"}
 
 def test_at_most_ten_modules_stand_at_the_top() -> None:
     top = sorted(file.name for file in PACKAGE.glob("*.py") if not file.name.startswith("__"))
-    assert len(top) <= 10, f"{len(top)} modules stand at the top; put one into a family: {', '.join(top)}"
+    assert len(top) <= 10, (
+        f"{len(top)} modules stand at the top; put one into a family: {', '.join(top)}"
+    )
 
 
 def test_the_package_keeps_its_size_in_syntax_nodes() -> None:
     nodes = sum(1 for tree in MODULES.values() for _ in ast.walk(tree))
-    assert nodes <= NODES, f"dengine has {nodes} syntax nodes, {nodes - NODES} too many: take something out"
+    assert nodes <= NODES, (
+        f"dengine has {nodes} syntax nodes, {nodes - NODES} too many: take something out"
+    )
 
 
 def names(module: str) -> dict[str, str]:
     """The classes of a module and what it imports from ours, each with the module that it comes from."""
-    sources = {node.name: f"{module}.{node.name}" for node in MODULES[module].body if isinstance(node, ast.ClassDef)}
+    sources = {
+        node.name: f"{module}.{node.name}"
+        for node in MODULES[module].body
+        if isinstance(node, ast.ClassDef)
+    }
     for node in ast.walk(MODULES[module]):
         if isinstance(node, ast.ImportFrom) and node.level:
             source = ".".join([*module.split(".")[: -node.level], *filter(None, [node.module])])
             source = source if source in MODULES else f"{source}.__init__"
-            sources |= {alias.asname or alias.name: f"{source}.{alias.name}" for alias in node.names}
+            sources |= {
+                alias.asname or alias.name: f"{source}.{alias.name}" for alias in node.names
+            }
     return sources
 
 
@@ -59,18 +74,34 @@ def bases(module: str) -> Iterable[tuple[str, str]]:
 
 def test_no_base_of_ours_has_a_single_subclass() -> None:
     pairs = [pair for module in MODULES for pair in bases(module)]
-    aside = {name for name, base in pairs if base in ("Protocol", "typing.Protocol", "Exception") or name.endswith("Error")}
+    aside = {
+        name
+        for name, base in pairs
+        if base in ("Protocol", "typing.Protocol", "Exception") or name.endswith("Error")
+    }
     # Users derive from these, too.
     aside |= {"dengine.reducers.torch_reducer.TorchReducer", "dengine.decision.rule.DecisionRule"}
-    subclasses = {base: [name for name, of in pairs if of == base] for _, base in pairs if base.startswith("dengine.")}
-    alone = {base: names[0] for base, names in subclasses.items() if len(names) == 1 and base not in aside}
+    subclasses = {
+        base: [name for name, of in pairs if of == base]
+        for _, base in pairs
+        if base.startswith("dengine.")
+    }
+    alone = {
+        base: names[0]
+        for base, names in subclasses.items()
+        if len(names) == 1 and base not in aside
+    }
     text = ", ".join(f"{base} (of {name})" for base, name in alone.items())
-    assert not alone, f"{len(alone)} bases have one subclass; make the two one class, or compose them: {text}"
+    assert not alone, (
+        f"{len(alone)} bases have one subclass; make the two one class, or compose them: {text}"
+    )
 
 
 def test_the_engine_keeps_a_public_face_of_at_most_25_members() -> None:
     public = [name for name in dir(DataEngine) if not name.startswith("_")]
-    assert len(public) <= 25, f"{len(public)} public members; what only a server needs belongs to `EngineCore`: {public}"
+    assert len(public) <= 25, (
+        f"{len(public)} public members; what only a server needs belongs to `EngineCore`: {public}"
+    )
 
 
 def test_no_module_is_imported_by_a_string() -> None:
@@ -79,9 +110,13 @@ def test_no_module_is_imported_by_a_string() -> None:
         f"{node.value} ({module}, line {node.lineno})"
         for module, tree in MODULES.items()
         for node in ast.walk(tree)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and {node.value.partition(":")[0]} & KNOWN
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and {node.value.partition(":")[0]} & KNOWN
     }
-    assert not strings, f"import them, or move what needs them; a string only hides a layer: {', '.join(sorted(strings))}"
+    assert not strings, (
+        f"import them, or move what needs them; a string only hides a layer: {', '.join(sorted(strings))}"
+    )
 
 
 def test_each_fault_of_the_net_fits_the_code_and_names_tests_that_are_there() -> None:
@@ -91,7 +126,11 @@ def test_each_fault_of_the_net_fits_the_code_and_names_tests_that_are_there() ->
 def test_tests_go_through_public_faces() -> None:
     private = re.compile(r"\b(?:engine|store)\._[a-z]\w*")
     files = [file for folder in ("tests", "training") for file in (REPO / folder).rglob("*.py")]
-    result = {f"{result} ({file.name})" for file in files for result in private.findall(file.read_text("utf-8"))}
+    result = {
+        f"{result} ({file.name})"
+        for file in files
+        for result in private.findall(file.read_text("utf-8"))
+    }
     assert not result, f"say it by a public face, or leave it out: {', '.join(sorted(result))}"
 
 
@@ -107,7 +146,9 @@ HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "onnxruntime", "umap"}
 
 
 def test_an_engine_with_pca_in_memory_loads_nothing_heavy() -> None:
-    done = subprocess.run([sys.executable, "-c", LOOK], cwd=REPO, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", LOOK], cwd=REPO, capture_output=True, text=True, check=True
+    )
     assert HEAVY & set(done.stdout.split()) == set(), "import it in the function that uses it"
 
 

@@ -49,10 +49,14 @@ def engine(data: Dataset) -> DataEngine:
     return engine
 
 
-def test_a_decision_brings_a_version_in_by_one_step_of_a_few_labels(engine: DataEngine, data: Dataset) -> None:
+def test_a_decision_brings_a_version_in_by_one_step_of_a_few_labels(
+    engine: DataEngine, data: Dataset
+) -> None:
     before = Slow.now
     decisions = [engine.decide(x) for x in data.X[100:109]]
-    assert [d.model_version for d in decisions] == [0] * 8 + [1]  # it is taken; then sixteen labels, two a step
+    assert [d.model_version for d in decisions] == [0] * 8 + [
+        1
+    ]  # it is taken; then sixteen labels, two a step
     assert (decisions[-1].n_success, decisions[-1].n_failure) == (40, 16)
     assert Slow.now - before == pytest.approx(16 * STEP / 2)
     assert not core_of(engine).is_swapping
@@ -65,7 +69,9 @@ def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(engine: D
     assert (report.version, report.n_traces, report.accepted, engine.version) == (1, 40, True, 1)
 
 
-def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides_the_same(data, tmp_path: Path) -> None:
+def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides_the_same(
+    data, tmp_path: Path
+) -> None:
     probe = data.X[180:]
     for n in (55, 83, 97, 121):
         with ThreadPoolExecutor(1) as pool:

@@ -47,10 +47,16 @@ def write_lines(path: Path, X: np.ndarray, lines: list[str]) -> Path:
 
 def write(path: Path, X: np.ndarray, y: np.ndarray) -> Path:
     """A journal of verified parts."""
-    return write_lines(path, X, [f"part,a-{i},{label},,verify,verify,no_model,0,1,0,0" for i, label in enumerate(y)])
+    return write_lines(
+        path,
+        X,
+        [f"part,a-{i},{label},,verify,verify,no_model,0,1,0,0" for i, label in enumerate(y)],
+    )
 
 
-def test_each_line_counts_once(store: str, make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_each_line_counts_once(
+    store: str, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
     new = make_data(30, seed=4)
     new.X[3, 5] = np.nan
     part = write(tmp_path / "cell.csv", new.X[:20], new.y[:20])
@@ -62,7 +68,9 @@ def test_each_line_counts_once(store: str, make_data: Callable[..., Dataset], tm
         assert engine.retrain().n_traces == 200 + 29
 
 
-def test_a_journal_reads_as_it_was_written(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_a_journal_reads_as_it_was_written(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
     new = make_data(10, 40, 3)
     back = read_journal(write(tmp_path / "cell.csv", new.X, new.y), TraceSpec(40, channels=3)).lines
     np.testing.assert_array_equal([line.trace for line in back], new.X)
@@ -82,34 +90,55 @@ CELL = [
 
 
 @pytest.mark.parametrize("stops", ["some", "all"])
-def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp_path: Path, stops: Any) -> None:
+def test_a_journal_brings_bounds_parts_and_sources(
+    data: Dataset, make_data, tmp_path: Path, stops: Any
+) -> None:
     path = new_store(data, tmp_path / "engine.db", stops=stops, guarantee="pooled", audit_rate=0.1)
     journal = write_lines(tmp_path / "cell.csv", make_data(7, seed=4).X, CELL)
     for again in (False, True):  # the same file twice counts nothing twice
         report = import_journal(path, journal)
         n = 6 if stops == "all" else 5
-        assert (report.imported, report.quarantined, report.repeated) == ((0, 0, n) if again else (n, 0, 0))
+        assert (report.imported, report.quarantined, report.repeated) == (
+            (0, 0, n) if again else (n, 0, 0)
+        )
         with DataEngine.open(path) as engine:
             records, last = engine.store.outcomes_since(200), engine.store.labelled(n)
             outcomes, sources = engine.store.tally().outcomes, engine.store.status()["sources"]
             members = engine.model.rule.state_dict()["evidence.level_totals"].clone()
-        lower, success = [0.25, 0.925, 0.9375, 0.9375, 0.9375, 0.0], [True, True, False, True, False, False]
+        lower, success = (
+            [0.25, 0.925, 0.9375, 0.9375, 0.9375, 0.0],
+            [True, True, False, True, False, False],
+        )
         hashes = [part_hash(p) for p in ("P1", "P2", "P3", "P6", "P4", "P1")]
         silent = [0, 0, 0, 0, 0, 0]
         if stops == "some":  # of the second nothing is known
-            lower, success, hashes = (values[:1] + values[2:] for values in (lower, success, hashes))
+            lower, success, hashes = (
+                values[:1] + values[2:] for values in (lower, success, hashes)
+            )
             silent = [0, 1, 0, 0, 0]
         answers = [(item.lower, item.success, item.silent, item.novel) for item in records]
         assert answers == list(zip(lower, success, silent, [False] * (n - 1) + [True], strict=True))
         assert last.hashes.tolist() == hashes
-        assert (outcomes.false_accepts, outcomes.audited_accepts, outcomes.audited_accepts_bad) == (1, 1, 1)
+        assert (outcomes.false_accepts, outcomes.audited_accepts, outcomes.audited_accepts_bad) == (
+            1,
+            1,
+            1,
+        )
         assert (outcomes.accepted, outcomes.confirmed) == ((3, 2) if stops == "all" else (4, 1))
-        assert sources == {"verification": 202, "audit": 1, "stop": 1, "confirmed": outcomes.confirmed, "inspection": 0}
+        assert sources == {
+            "verification": 202,
+            "audit": 1,
+            "stop": 1,
+            "confirmed": outcomes.confirmed,
+            "inspection": 0,
+        }
         assert int(members.sum()) > 0
 
 
 @pytest.mark.parametrize("stops", ["some", "all"])
-def test_a_journal_that_grew_adds_what_is_new(data: Dataset, make_data, tmp_path: Path, stops: Any) -> None:
+def test_a_journal_that_grew_adds_what_is_new(
+    data: Dataset, make_data, tmp_path: Path, stops: Any
+) -> None:
     X, result = make_data(7, seed=4).X, {}
     new = new_store(data, tmp_path / "new.db", stops=stops, audit_rate=0.1)
     for cuts in ([7], [2, 3, 7], range(1, 8)):
@@ -118,9 +147,14 @@ def test_a_journal_that_grew_adds_what_is_new(data: Dataset, make_data, tmp_path
             import_journal(path, write_lines(tmp_path / "cell.csv", X, CELL[:n]))
         with DataEngine.open(path) as engine:
             records = engine.store.outcomes_since(200)
-            result[len(cuts)] = ([(item.lower, item.silent) for item in records], engine.store.tally().outcomes)
+            result[len(cuts)] = (
+                [(item.lower, item.silent) for item in records],
+                engine.store.tally().outcomes,
+            )
             engine.decide(X[0])
-            engine.report(engine.decide(make_data(1, seed=8, noise=9.0).X[0]).id, True)  # silence adds up: no StoreError
+            engine.report(
+                engine.decide(make_data(1, seed=8, noise=9.0).X[0]).id, True
+            )  # silence adds up: no StoreError
     assert result[1] == result[3] == result[7]
 
 
@@ -138,8 +172,12 @@ LATE = [
 ]
 
 
-def test_labels_that_came_late_stand_where_they_came(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
-    journal = read_journal(write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE), TraceSpec(100))
+def test_labels_that_came_late_stand_where_they_came(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    journal = read_journal(
+        write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE), TraceSpec(100)
+    )
     results = [(line.decision.id, line.label, line.late) for line in journal.lines]
     assert results == [
         ("a-1", True, True),
@@ -153,21 +191,36 @@ def test_labels_that_came_late_stand_where_they_came(make_data: Callable[..., Da
 
 
 @pytest.mark.parametrize("stops", ["some", "all"])
-def test_late_labels_are_imported_once_by_their_own_ids(data: Dataset, make_data, tmp_path: Path, stops: Any) -> None:
+def test_late_labels_are_imported_once_by_their_own_ids(
+    data: Dataset, make_data, tmp_path: Path, stops: Any
+) -> None:
     path, X = new_store(data, tmp_path / "engine.db", stops=stops), make_data(9, seed=4).X
     for again in (False, True):
         report = import_journal(path, write_lines(tmp_path / "cell.csv", X, LATE))
-        assert (report.imported, report.repeated, report.contradicted) == ((0, 4, 0) if again else (4, 0, 0))
+        assert (report.imported, report.repeated, report.contradicted) == (
+            (0, 4, 0) if again else (4, 0, 0)
+        )
     with DataEngine.open(path) as engine:
         stored = [engine.store.get_decision(f"a-{i}") for i in range(1, 7)]
-        assert [records and records.success for records in stored] == [True, False, None, True, True, None]
+        assert [records and records.success for records in stored] == [
+            True,
+            False,
+            None,
+            True,
+            True,
+            None,
+        ]
         outcomes = engine.store.tally().outcomes
         assert (outcomes.accepted, outcomes.false_accepts, outcomes.confirmed) == (3, 1, 2)
-    contrary = write_lines(tmp_path / "contrary.csv", X, [line.replace("label,a-5,1", "label,a-5,0") for line in LATE])
+    contrary = write_lines(
+        tmp_path / "contrary.csv", X, [line.replace("label,a-5,1", "label,a-5,0") for line in LATE]
+    )
     assert import_journal(path, contrary).contradicted == 1
 
 
-def test_a_last_line_that_was_cut_anywhere_is_left_out_and_said(store: str, make_data, tmp_path: Path) -> None:
+def test_a_last_line_that_was_cut_anywhere_is_left_out_and_said(
+    store: str, make_data, tmp_path: Path
+) -> None:
     path = write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE[:9])
     text = path.read_text()
     write_lines(path, make_data(9, seed=4).X, LATE[:8])  # the head is written after its line
@@ -176,10 +229,14 @@ def test_a_last_line_that_was_cut_anywhere_is_left_out_and_said(store: str, make
         path.write_text(text[:end])
         journal = read_journal(path, TraceSpec(100))
         assert (len(journal.lines), journal.cut) == (5, end - begin)
-    assert f"cut {journal.cut:,} " in line_of("import-labels", path, "--store", store, "--any-model")
+    assert f"cut {journal.cut:,} " in line_of(
+        "import-labels", path, "--store", store, "--any-model"
+    )
 
 
-def test_a_changed_missing_moved_or_doubled_line_is_named_and_those_before_are_taken(make_data, tmp_path: Path) -> None:
+def test_a_changed_missing_moved_or_doubled_line_is_named_and_those_before_are_taken(
+    make_data, tmp_path: Path
+) -> None:
     path = write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE)
     lines, rng = path.read_bytes().splitlines(), np.random.default_rng(0)
 
@@ -190,7 +247,10 @@ def test_a_changed_missing_moved_or_doubled_line_is_named_and_those_before_are_t
             results.append(read_journal(path, TraceSpec(100)))
         assert f"line {number} of" in results[1].set_aside
         assert "does not hold line 11, which its head knows" in results[0].set_aside
-        answers = [[(line.decision.id, line.label, line.late) for line in journal.lines] for journal in results]
+        answers = [
+            [(line.decision.id, line.label, line.late) for line in journal.lines]
+            for journal in results
+        ]
         assert answers[0] == answers[1]
 
     for i in range(4, len(lines) - 1):  # before the fourth line nothing is labelled
@@ -213,13 +273,25 @@ PART = "Expected 100 samples in line 2 of .*, got 1; it is damaged, or of anothe
     [
         (f"part,a-1,1,P1,{DECIDED},7", PART),
         ("part,a-1,1", "The decision in line 2"),
-        (f"part,a-1,1,P1,think,verify,uncertain,0,1,0,0{SAMPLES}", "The decision in line 2 .*'think' is not a valid"),
+        (
+            f"part,a-1,1,P1,think,verify,uncertain,0,1,0,0{SAMPLES}",
+            "The decision in line 2 .*'think' is not a valid",
+        ),
         (f"part,a-1,2,P1,{DECIDED}{SAMPLES}", "a label of 1, 0 or nothing in line 2"),
         (f"part,,1,P1,{DECIDED}{SAMPLES}", "Expected an id"),
-        (f"part,a-1,0,P1,reject,reject,certain,0,0.1,0,9{SAMPLES}", "a label of 1, 0 or nothing in line 2"),
+        (
+            f"part,a-1,0,P1,reject,reject,certain,0,0.1,0,9{SAMPLES}",
+            "a label of 1, 0 or nothing in line 2",
+        ),
         (f"part,a-1,1,P1,{DECIDED},x{SAMPLES[2:]}", "line 2 of .* are no row of numbers: .*'x'"),
-        (f"part,a-1,1,P1,verify,verify,uncertain,-1,1,0,0{SAMPLES}", "Expected bounds between 0 and 1"),
-        (f"part,a-1,1,P1,verify,verify,uncertain,0,nan,0,0{SAMPLES}", "Expected bounds between 0 and 1"),
+        (
+            f"part,a-1,1,P1,verify,verify,uncertain,-1,1,0,0{SAMPLES}",
+            "Expected bounds between 0 and 1",
+        ),
+        (
+            f"part,a-1,1,P1,verify,verify,uncertain,0,nan,0,0{SAMPLES}",
+            "Expected bounds between 0 and 1",
+        ),
         (f"part,a-1,1,P1,verify,verify,uncertain,0,1,{2**70},0{SAMPLES}", "and counts in line 2"),
         ("1,P1,verify", "begins with part or label in line 2"),
         ("label,a-1,1", "Expected an earlier part's id"),
@@ -230,17 +302,23 @@ PART = "Expected 100 samples in line 2 of .*, got 1; it is damaged, or of anothe
         (cell_journal(b"\xff"), "Expected UTF-8 in line 2"),
     ],
 )
-def test_what_is_no_journal_or_a_line_that_does_not_fit_is_named(tmp_path: Path, line: str | bytes, message: str) -> None:
+def test_what_is_no_journal_or_a_line_that_does_not_fit_is_named(
+    tmp_path: Path, line: str | bytes, message: str
+) -> None:
     path = tmp_path / "cell.csv"
     path.write_bytes(line if isinstance(line, bytes) else cell_journal(line))
     with pytest.raises(DataError, match=message):
         read_journal(path, TraceSpec(100))
 
 
-def test_the_verbs_export_and_import(store: str, make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_the_verbs_export_and_import(
+    store: str, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
     out = tmp_path / "model.ts"
     assert "version 1 with 200 labelled references" in line_of("export", store, "--out", out)
     assert load_exported(out).metadata["references"] == 200
     new = make_data(30, seed=4)
     journal = write(tmp_path / "cell.csv", new.X, new.y)
-    assert '"imported": 30' in succeed("import-labels", journal, "--store", store, "--any-model", "--json")
+    assert '"imported": 30' in succeed(
+        "import-labels", journal, "--store", store, "--any-model", "--json"
+    )

@@ -23,7 +23,9 @@ def kept(store: SqlStore) -> list[int]:
     return [row.report.version for row in store.versions() if row.kept]
 
 
-def test_the_newest_the_first_and_ever_fewer_of_the_older_ones_keep_their_states(store: SqlStore) -> None:
+def test_the_newest_the_first_and_ever_fewer_of_the_older_ones_keep_their_states(
+    store: SqlStore,
+) -> None:
     put(store, 34)
     assert kept(store) == [1, 10, 20, 30, 31, 32, 33, 34]
 
@@ -42,11 +44,18 @@ def test_a_version_is_loaded_by_its_number(store: SqlStore) -> None:
     put(store, 12)
     for version in (1, 10, 12):
         result = store.load_version(version)
-        assert (result.version, result.last_seq, result.state["w"].tolist()) == (version, version, [float(version)] * 20)
+        assert (result.version, result.last_seq, result.state["w"].tolist()) == (
+            version,
+            version,
+            [float(version)] * 20,
+        )
     result.state["w"][:] = 0  # an array of its own
     assert store.load_version(12).state["w"][0] == 12
     for version in (2, 13, 0):
-        with pytest.raises(StoreError, match=rf"got {version}, which is not kept; load one of these: 1, 8, 9, 10, 11, 12"):
+        with pytest.raises(
+            StoreError,
+            match=rf"got {version}, which is not kept; load one of these: 1, 8, 9, 10, 11, 12",
+        ):
             store.load_version(version)
 
 
@@ -68,7 +77,9 @@ def test_every_retrain_is_listed_for_ever(store: SqlStore) -> None:
     assert [row.n_bytes > 0 for row in rows] == [row.kept for row in rows]
 
 
-def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall_back_on(tmp_path: Path) -> None:
+def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall_back_on(
+    tmp_path: Path,
+) -> None:
     with SqlStore(str(tmp_path / "a.db"), keep_versions=None) as store:
         put(store, 12)
         assert len(kept(store)) == 12
@@ -84,7 +95,10 @@ def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall
 def damage(file: Path, *versions: int) -> None:
     execute(
         file,
-        *(f"UPDATE model_version SET state = zeroblob(length(state)) WHERE version = {version}" for version in versions),
+        *(
+            f"UPDATE model_version SET state = zeroblob(length(state)) WHERE version = {version}"
+            for version in versions
+        ),
     )
 
 
@@ -97,12 +111,18 @@ def test_a_damaged_version_is_passed_over_and_told_of_once(tmp_path: Path) -> No
         with SqlStore(str(file)) as store:
             assert store.last_version().version == 10
             answers = [event.text for event in store.events() if event.kind == "damaged"]
-            assert ["version 12" in answers[0], "version 11" in answers[1], len(answers)] == [True, True, 2]
+            assert ["version 12" in answers[0], "version 11" in answers[1], len(answers)] == [
+                True,
+                True,
+                2,
+            ]
             with pytest.raises(StoreError, match=r"state of version 12.*bytes have changed"):
                 store.load_version(12)
 
 
-def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_nothing_was(data, tmp_path: Path) -> None:
+def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_nothing_was(
+    data, tmp_path: Path
+) -> None:
     file = tmp_path / "engine.db"
     with DataEngine("pca", store=file, retrain_every=30) as engine:
         learn(engine, data, range(100))
@@ -113,13 +133,17 @@ def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_no
         assert engine.model is not None
         decision = engine.decide(data.X[101])
         assert decision.model_version == 2
-        assert engine.report(decision.id, True).version == 4  # with the labels that came after version 2
+        assert (
+            engine.report(decision.id, True).version == 4
+        )  # with the labels that came after version 2
         assert [event.kind for event in engine.store.events()] == ["damaged"]
     with DataEngine.open(str(file)) as engine:
         assert engine.version == 4
 
 
-def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damaged(data: Dataset, tmp_path: Path) -> None:
+def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damaged(
+    data: Dataset, tmp_path: Path
+) -> None:
     """Fitted on the others, its references would lie elsewhere: the engine verifies, and learns anew."""
     file = tmp_path / "engine.db"
     baseline = AgreeingNeighbours(Policy(0.1, 0.9))

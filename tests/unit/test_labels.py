@@ -14,11 +14,49 @@ from dengine.engine.engine import core_of
 from dengine.errors import ReportError, TraceError, shortened
 from dengine.records import LONGEST, as_success
 
-GOOD = [True, np.True_, 1, 1.0, np.int8(1), np.uint64(1), np.float32(1), np.array(1), np.array(True), Fraction(1)]
+GOOD = [
+    True,
+    np.True_,
+    1,
+    1.0,
+    np.int8(1),
+    np.uint64(1),
+    np.float32(1),
+    np.array(1),
+    np.array(True),
+    Fraction(1),
+]
 BAD = [False, np.False_, 0, 0.0, -0.0, np.int8(0), np.float64(0), np.array(0.0), Fraction(0)]
 HUGE = [10**5000, "x" * 2**20, list(range(10**5))]
-NONE = [100, -1, 2**70, *HUGE, 0.5, 1.0000001, float("nan"), float("inf"), 1j, None, "1", "NG", "True", b"\x01", ""]
-NONE += [np.array([1]), np.array([]), np.array("1"), np.nan, np.float16("nan"), [True], (), {}, {1}, torch.tensor(1)]
+NONE = [
+    100,
+    -1,
+    2**70,
+    *HUGE,
+    0.5,
+    1.0000001,
+    float("nan"),
+    float("inf"),
+    1j,
+    None,
+    "1",
+    "NG",
+    "True",
+    b"\x01",
+    "",
+]
+NONE += [
+    np.array([1]),
+    np.array([]),
+    np.array("1"),
+    np.nan,
+    np.float16("nan"),
+    [True],
+    (),
+    {},
+    {1},
+    torch.tensor(1),
+]
 
 
 def test_a_bool_and_exactly_one_or_zero_are_labels() -> None:
@@ -39,19 +77,37 @@ def engine(tmp_path: Path):
         yield engine
 
 
-NO_IDS = [None, float("nan"), 7, b"a", "", "a\0b", "\ud800", "x" * (LONGEST + 1), "x" * 2**20, "line\nbreak", ["a"], {}]
+NO_IDS = [
+    None,
+    float("nan"),
+    7,
+    b"a",
+    "",
+    "a\0b",
+    "\ud800",
+    "x" * (LONGEST + 1),
+    "x" * 2**20,
+    "line\nbreak",
+    ["a"],
+    {},
+]
 
 
 NO_PARTS = ["", "x" * (LONGEST + 1), "SN\0", "\ud800", "a\nb", 10**4200, 1.5, True, ["a"]]
 
 
-def test_a_report_without_id_part_or_label_queues_nothing_and_the_store_goes_on(engine: DataEngine, make_data) -> None:
+def test_a_report_without_id_part_or_label_queues_nothing_and_the_store_goes_on(
+    engine: DataEngine, make_data
+) -> None:
     x = make_data(2).X
     for id_ in NO_IDS:
         with pytest.raises(ReportError, match="Expected the id of a decision"):
             engine.report(id_, False, trace=x[0])
     for part in NO_PARTS:
-        for call in (partial(engine.decide, x[0]), partial(engine.report, "lost", False, trace=x[0])):
+        for call in (
+            partial(engine.decide, x[0]),
+            partial(engine.report, "lost", False, trace=x[0]),
+        ):
             with pytest.raises(TraceError, match="part's number"):
                 call(part=part)
     engine.flush()
@@ -62,7 +118,13 @@ def test_a_report_without_id_part_or_label_queues_nothing_and_the_store_goes_on(
         with pytest.raises(ReportError):
             engine.report(decision.id, value)
     engine.report(decision.id, 1)
-    assert engine.store.status()["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0, "inspection": 0}
+    assert engine.store.status()["sources"] == {
+        "verification": 1,
+        "audit": 0,
+        "stop": 1,
+        "confirmed": 0,
+        "inspection": 0,
+    }
 
 
 class Baseline:
@@ -78,7 +140,9 @@ class Baseline:
 
 
 @pytest.mark.parametrize("answer", ["NG", None, 100, float("nan")])
-def test_a_check_that_answers_no_label_ends_the_run_and_its_decision_is_kept(answer, make_data) -> None:
+def test_a_check_that_answers_no_label_ends_the_run_and_its_decision_is_kept(
+    answer, make_data
+) -> None:
     engine, cell = DataEngine("pca"), ReplayCell(make_data(5))
     cell.verify = lambda: answer
     with pytest.raises(ReportError, match=r"of decision \S+, by verify\(\)") as caught:
@@ -90,8 +154,13 @@ def test_a_check_that_answers_no_label_ends_the_run_and_its_decision_is_kept(ans
 
 
 @pytest.mark.parametrize("answer", ["STOP", None, True, 0])
-def test_a_cell_that_goes_on_with_no_outcome_is_told_so_and_the_stop_is_not_taken_for_silence(answer, make_data) -> None:
-    engine, cell = DataEngine(model=Baseline(9, 0, 1.0, 1.0, Action.ACCEPT), retrain_every=3), ReplayCell(make_data(9))
+def test_a_cell_that_goes_on_with_no_outcome_is_told_so_and_the_stop_is_not_taken_for_silence(
+    answer, make_data
+) -> None:
+    engine, cell = (
+        DataEngine(model=Baseline(9, 0, 1.0, 1.0, Action.ACCEPT), retrain_every=3),
+        ReplayCell(make_data(9)),
+    )
     cell.proceed = lambda: answer
     with pytest.raises(ReportError, match=r"Expected an Outcome"):
         list(engine.run(cell, 9))
@@ -107,9 +176,13 @@ WRONG = [
 
 
 @pytest.mark.parametrize("wrong", WRONG, ids=repr)
-def test_a_baseline_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(wrong, make_data, tmp_path: Path) -> None:
+def test_a_baseline_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(
+    wrong, make_data, tmp_path: Path
+) -> None:
     data = make_data(6)
-    with DataEngine(model=Baseline(**wrong), retrain_every=3, store=tmp_path / "engine.db") as engine:
+    with DataEngine(
+        model=Baseline(**wrong), retrain_every=3, store=tmp_path / "engine.db"
+    ) as engine:
         for x, y in zip(data.X, data.y, strict=True):
             decision = engine.decide(x)
             engine.report(decision.id, y)

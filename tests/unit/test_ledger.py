@@ -22,7 +22,15 @@ from dengine.store import Change, NewLabel, SqlStore, StoredDecision, verify_his
 from dengine.store.ledger import KEY_VARIABLE, START, entry_digest, row_sum, rows_digest
 from dengine.store.schema import CHAINED
 from tests.support.command_line import dengine
-from tests.support.stores import decision, execute, labelled, put_decision, put_label, put_labels, report
+from tests.support.stores import (
+    decision,
+    execute,
+    labelled,
+    put_decision,
+    put_label,
+    put_labels,
+    report,
+)
 
 TABLES = ("decision", "trace", "label", "model_version", "event", "correction", "ledger", "setting")
 T = 200
@@ -38,15 +46,26 @@ def write(store: SqlStore, n: int = 12) -> SqlStore:
     store.flush()
     points = rng.normal(size=(n, 2)).astype(np.float32)
     put_label(store, "d0", True, Source.VERIFICATION, 1, points[0], silent=2)
-    put_labels(store, *[NewLabel(f"d{i}", i % 2 == 0, Source.AUDIT, 1, points[i], overdue_to=i) for i in range(1, n - 2)])
-    imported = (labelled(StoredDecision(decision(f"i{i}"), traces[i], i, False, 1.0), True) for i in range(4))
+    put_labels(
+        store,
+        *[
+            NewLabel(f"d{i}", i % 2 == 0, Source.AUDIT, 1, points[i], overdue_to=i)
+            for i in range(1, n - 2)
+        ],
+    )
+    imported = (
+        labelled(StoredDecision(decision(f"i{i}"), traces[i], i, False, 1.0), True)
+        for i in range(4)
+    )
     store.apply_records([record for pair in imported for record in pair])
     for version in (1, 2):
         store.put_version(report(version), 5, {"w": rng.normal(size=40)})
     store.put_version(report(2, accepted=False), 6, None)
     store.save_settings({"recipe": "a = 2", "trace": "{}"})
     store.put_event("note", "Prüfung wörtlich")
-    store.apply_change(Change("correct", "no success", {"decisions": ["d6"]}, "kim", ("d6",), False))
+    store.apply_change(
+        Change("correct", "no success", {"decisions": ["d6"]}, "kim", ("d6",), False)
+    )
     store.apply_change(Change("forget", "forgotten", {"decisions": ["d7"]}, "kim", ("d7",), None))
     return store
 
@@ -77,7 +96,9 @@ def test_what_a_store_wrote_is_whole_in_every_database(place: tuple[str, str]) -
     assert result.cells[0].rows == 2 * 16 + 14 + 3 + 3 + 2
 
 
-def test_the_digest_depends_on_what_was_written_and_not_on_the_database(place: tuple[str, str], tmp_path: Path) -> None:
+def test_the_digest_depends_on_what_was_written_and_not_on_the_database(
+    place: tuple[str, str], tmp_path: Path
+) -> None:
     at, cell = place
     digests = []
     for url in (at, str(tmp_path / "other.db")):
@@ -87,7 +108,9 @@ def test_the_digest_depends_on_what_was_written_and_not_on_the_database(place: t
     assert digests[0] == digests[1]
 
 
-def test_every_transaction_is_an_entry_and_an_empty_one_or_one_that_fails_is_none(place: tuple[str, str]) -> None:
+def test_every_transaction_is_an_entry_and_an_empty_one_or_one_that_fails_is_none(
+    place: tuple[str, str],
+) -> None:
     with SqlStore(*place) as store:
         store.flush()
         with pytest.raises(StoreError):
@@ -106,11 +129,30 @@ def test_every_transaction_is_an_entry_and_an_empty_one_or_one_that_fails_is_non
 
 def test_values_that_databases_hold_in_their_own_way_are_whole(place: tuple[str, str]) -> None:
     odd = Decision(
-        "Ünïcode ✓", Action.VERIFY, Action.VERIFY, -0.0, 1.0, 0, 0, None, 0, Reason.CONSTANT, False, 1.0, "Stück 7\\0"
+        "Ünïcode ✓",
+        Action.VERIFY,
+        Action.VERIFY,
+        -0.0,
+        1.0,
+        0,
+        0,
+        None,
+        0,
+        Reason.CONSTANT,
+        False,
+        1.0,
+        "Stück 7\\0",
     )
     with SqlStore(*place, clock=lambda: 7) as store:
         put_decision(store, odd, np.array([np.nan, np.inf, -0.0], np.float32), -(2**63), True)
-        put_label(store, np.str_("Ünïcode ✓"), np.bool_(True), Source.VERIFICATION, np.int64(0), np.zeros(2, np.float32))
+        put_label(
+            store,
+            np.str_("Ünïcode ✓"),
+            np.bool_(True),
+            Source.VERIFICATION,
+            np.int64(0),
+            np.zeros(2, np.float32),
+        )
         assert verify_history(*place).ok
 
 
@@ -149,7 +191,11 @@ def flipped(value: object, rng: random.Random) -> object:
 
 def changed_columns(file: Path) -> list[tuple[str, str]]:
     with sqlite3.connect(file) as connection:
-        return [(table, row[1]) for table in TABLES for row in connection.execute(f"PRAGMA table_info({table})")]
+        return [
+            (table, row[1])
+            for table in TABLES
+            for row in connection.execute(f"PRAGMA table_info({table})")
+        ]
 
 
 def found_wrong(file: Path) -> bool:
@@ -159,18 +205,24 @@ def found_wrong(file: Path) -> bool:
         return True
 
 
-def test_one_byte_changed_in_any_column_of_any_table_is_found(written: Path, tmp_path: Path) -> None:
+def test_one_byte_changed_in_any_column_of_any_table_is_found(
+    written: Path, tmp_path: Path
+) -> None:
     rng, tried, missed = random.Random(0), 0, []
     for table, column in changed_columns(written) * 3:
         file = Path(shutil.copy(written, tmp_path / "changed.db"))
         connection = sqlite3.connect(file)
-        rows = connection.execute(f'SELECT rowid, "{column}" FROM {table} WHERE "{column}" IS NOT NULL').fetchall()
+        rows = connection.execute(
+            f'SELECT rowid, "{column}" FROM {table} WHERE "{column}" IS NOT NULL'
+        ).fetchall()
         row, value = rng.choice(rows)
         new = flipped(value, rng)
         if new is not None and new == new:
             typed = "CAST(? AS TEXT)" if isinstance(value, str) else "?"
             with suppress(sqlite3.IntegrityError):  # a key that is taken: SQLite itself refuses
-                connection.execute(f'UPDATE {table} SET "{column}" = {typed} WHERE rowid = ?', (new, row))
+                connection.execute(
+                    f'UPDATE {table} SET "{column}" = {typed} WHERE rowid = ?', (new, row)
+                )
                 connection.commit()
                 tried += 1
                 missed += [] if found_wrong(file) else [(table, column, value, new)]
@@ -200,7 +252,10 @@ def test_a_row_that_was_deleted_is_found(file: Path, table: str) -> None:
         ("DELETE FROM decision WHERE id = 'd7'", ("decision", "d7")),
         ("UPDATE ledger SET time = time + 1 WHERE number = 3", ("ledger", "entry 3")),
         ("DELETE FROM ledger WHERE number = 3", ("ledger", "entry 3")),
-        ("INSERT INTO event VALUES ('cell', 4, 1.0, 'note', 'slipped in', NULL, '', NULL, NULL)", ("event", "4")),
+        (
+            "INSERT INTO event VALUES ('cell', 4, 1.0, 'note', 'slipped in', NULL, '', NULL, NULL)",
+            ("event", "4"),
+        ),
         ("UPDATE label SET entry = 2 WHERE seq = 3", ("label", "d2")),
     ],
 )
@@ -215,13 +270,18 @@ def test_a_changed_row_with_a_sum_that_fits_is_found_in_its_entry(file: Path) ->
         connection.row_factory = sqlite3.Row
         row = dict(connection.execute("SELECT * FROM label WHERE seq = 2").fetchone())
         row["success"] = 1 - row["success"]
-        connection.execute("UPDATE label SET success = ?, sum = ? WHERE seq = 2", (row["success"], row_sum("label", row)))
+        connection.execute(
+            "UPDATE label SET success = ?, sum = ? WHERE seq = 2",
+            (row["success"], row_sum("label", row)),
+        )
     assert faults(file) == [("ledger", f"entry {row['entry']}")]
     with SqlStore(str(file)) as store:  # as an engine does that opens it, whatever it reads of it
         assert [store.database.check_integrity(window) for window in (100, 10)] == [
             "the rows of label are not those of the ledger"
         ] * 2
-        assert store.database.check_integrity(3) == store.database.check_integrity(100, since=10) == ""
+        assert (
+            store.database.check_integrity(3) == store.database.check_integrity(100, since=10) == ""
+        )
 
 
 def test_entries_after_a_changed_one_are_not_blamed(file: Path) -> None:
@@ -238,7 +298,9 @@ def cut_off(file: Path) -> None:
         connection.execute(f"DELETE FROM ledger WHERE number = {last}")
 
 
-def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere(file: Path) -> None:
+def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere(
+    file: Path,
+) -> None:
     kept = verify_history(str(file)).cells[0].digest
     with SqlStore(str(file)) as store:
         store.put_event("note", "later")
@@ -252,18 +314,26 @@ def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere
         verify_history(str(file), expect="newest")
 
 
-def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file, key = tmp_path / "engine.db", str(make_key(tmp_path / "ledger.key"))
     monkeypatch.setenv(KEY_VARIABLE, key)
     write(SqlStore(str(file))).close()
     assert verify_history(str(file)).ok
-    with sqlite3.connect(file) as connection:  # as somebody does who has the right to write, and this file of Python
+    with sqlite3.connect(
+        file
+    ) as connection:  # as somebody does who has the right to write, and this file of Python
         connection.row_factory = sqlite3.Row
         previous = START
-        for entry in map(dict, connection.execute("SELECT * FROM ledger ORDER BY number").fetchall()):
+        for entry in map(
+            dict, connection.execute("SELECT * FROM ledger ORDER BY number").fetchall()
+        ):
             del entry["digest"]
             previous = entry_digest(previous, entry)
-            connection.execute("UPDATE ledger SET digest = ? WHERE number = ?", (previous, entry["number"]))
+            connection.execute(
+                "UPDATE ledger SET digest = ? WHERE number = ?", (previous, entry["number"])
+            )
     assert {table for table, _ in faults(file)} == {"ledger"}
     other = str(make_key(tmp_path / "other.key"))
     for text, named in (("with a key", ""), ("with another key", other), ("without a key", key)):
@@ -279,7 +349,9 @@ def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path: Path, monkeypa
 
 def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file: Path) -> None:
     with sqlite3.connect(file) as connection:
-        root = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'event'").fetchone()[0]
+        root = connection.execute(
+            "SELECT rootpage FROM sqlite_master WHERE name = 'event'"
+        ).fetchone()[0]
         size = connection.execute("PRAGMA page_size").fetchone()[0]
     data = bytearray(file.read_bytes())
     data[(root - 1) * size : (root - 1) * size + 100] = bytes(100)
@@ -299,8 +371,13 @@ def test_another_cells_faults_are_its_own(file: Path) -> None:
         verify_history(str(file), "a third")
 
 
-@pytest.mark.parametrize("created", [lambda path: None, lambda path: sqlite3.connect(path).execute("CREATE TABLE t (id)")])
-def test_what_is_no_store_is_refused_and_nothing_is_made(created: Callable[[Path], object], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "created",
+    [lambda path: None, lambda path: sqlite3.connect(path).execute("CREATE TABLE t (id)")],
+)
+def test_what_is_no_store_is_refused_and_nothing_is_made(
+    created: Callable[[Path], object], tmp_path: Path
+) -> None:
     created(tmp_path / "a.db")
     before = (tmp_path / "a.db").exists()
     with pytest.raises(StoreError, match="Expected a"):
@@ -359,7 +436,9 @@ def test_the_verb_shows_the_digest_and_names_what_is_wrong_with_exit_code_1(file
         ({"a": ""}, {}),
     ],
 )
-def test_rows_that_differ_have_sums_that_differ(first: dict[str, object], other: dict[str, object]) -> None:
+def test_rows_that_differ_have_sums_that_differ(
+    first: dict[str, object], other: dict[str, object]
+) -> None:
     assert row_sum("label", first) != row_sum("label", other)
     assert row_sum("label", first) != row_sum("event", first)
 
@@ -368,11 +447,17 @@ def test_a_sum_is_what_it_was() -> None:
     """Stores hold sums that were made years ago: these numbers change never."""
     row = {"cell_id": "cell", "number": 1, "time": 1.5, "kind": "note", "text": "é"}
     row |= {"ok": True, "none": None, "data": b"\0"}
-    plain = b"event\ncell_id=s4:celldata=b1:\0kind=s4:notenumber=i1;ok=i1;text=s2:\xc3\xa9time=f" + struct.pack(">d", 1.5)
+    plain = (
+        b"event\ncell_id=s4:celldata=b1:\0kind=s4:notenumber=i1;ok=i1;text=s2:\xc3\xa9time=f"
+        + struct.pack(">d", 1.5)
+    )
     assert row_sum("event", row) == hashlib.sha256(plain).digest()
     later = row | {"column of a later schema": None, "sum": b"x", "state": b"y"}
     assert row_sum("event", later) == row_sum("event", row)
     head = hashlib.sha256(b"ledger\nnumber=i1;").digest()
-    assert entry_digest(START, {"number": 1}) == hashlib.sha256(b"dengine ledger 2\n" + bytes(32) + head).digest()
+    assert (
+        entry_digest(START, {"number": 1})
+        == hashlib.sha256(b"dengine ledger 2\n" + bytes(32) + head).digest()
+    )
     rows = hashlib.sha256(b"event=2;" + b"a" * 32 + b"b" * 32).digest()
     assert rows_digest({"event": [b"b" * 32, b"a" * 32]}) == rows

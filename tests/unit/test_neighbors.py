@@ -27,7 +27,9 @@ def brute(Z: np.ndarray, y: np.ndarray, q: np.ndarray, radius: float) -> tuple[i
     return int(y[inside].sum()), int((1 - y[inside]).sum())
 
 
-def filled(Z: np.ndarray, y: np.ndarray, spaces: np.ndarray | None = None, capacity: int = 10_000) -> RadiusIndex:
+def filled(
+    Z: np.ndarray, y: np.ndarray, spaces: np.ndarray | None = None, capacity: int = 10_000
+) -> RadiusIndex:
     index = RadiusIndex(Z.shape[1], capacity)
     index.add(Z, y, spaces)
     return index
@@ -56,8 +58,12 @@ def test_a_full_ring_holds_exactly_the_newest_points(batches: list[int], capacit
 
 
 @settings(deadline=None)
-@given(K=st.integers(1, 4), d=st.integers(1, 5), radius=st.floats(0.1, 3.0), seed=st.integers(0, 2**16))
-def test_counts_over_k_spaces_are_the_sum_of_the_counts_in_each(K: int, d: int, radius: float, seed: int) -> None:
+@given(
+    K=st.integers(1, 4), d=st.integers(1, 5), radius=st.floats(0.1, 3.0), seed=st.integers(0, 2**16)
+)
+def test_counts_over_k_spaces_are_the_sum_of_the_counts_in_each(
+    K: int, d: int, radius: float, seed: int
+) -> None:
     Z, y = points(80, d, seed)
     spaces = np.random.default_rng(seed).integers(0, K, 80)
     queries = np.random.default_rng(seed + 1).normal(0, 1, (6, K, d)).astype(np.float32)
@@ -86,9 +92,12 @@ def repeats(n_parts: int, times: int, agree: float, seed: int = 0) -> tuple[np.n
 
 
 @pytest.mark.parametrize(
-    ("parts", "agree", "least", "most"), [(80, 1.0, 0.9, 1.0), (300, 0.0, 0.0, 0.1), (FEWEST_PARTS - 1, 0.0, 1.0, 1.0)]
+    ("parts", "agree", "least", "most"),
+    [(80, 1.0, 0.9, 1.0), (300, 0.0, 0.0, 0.1), (FEWEST_PARTS - 1, 0.0, 1.0, 1.0)],
 )
-def test_agreement_is_what_it_was_planted_as_and_one_where_few_parts_came_again(parts, agree, least, most) -> None:
+def test_agreement_is_what_it_was_planted_as_and_one_where_few_parts_came_again(
+    parts, agree, least, most
+) -> None:
     points, labels, spaces, part = repeats(parts, 5, agree)
     assert least <= label_agreement(points, labels, spaces, part) <= most
     assert label_agreement(points, labels, spaces, np.zeros_like(part)) == 1.0  # of no known part
@@ -101,7 +110,9 @@ def test_the_bound_lies_above_the_truth_in_nearly_all_draws() -> None:
 
 
 @pytest.mark.parametrize(("agreement", "votes"), [(1.0, (1, 0)), (0.0, (6, 0)), (0.2, (3, 0))])
-def test_m_points_of_a_part_are_worth_m_over_one_plus_m_minus_one_times_its_agreement(agreement: float, votes) -> None:
+def test_m_points_of_a_part_are_worth_m_over_one_plus_m_minus_one_times_its_agreement(
+    agreement: float, votes
+) -> None:
     index = RadiusIndex(dim=1)
     index.add(np.zeros((6, 1)), np.ones(6), parts=np.full(6, 7))
     index.agreement.fill_(agreement)

@@ -54,7 +54,9 @@ GARBAGE: dict[str, Callable[[Traces, np.random.Generator], Traces]] = {
     "offset": lambda x, _: x + np.float32(SD),
     "drift": lambda x, _: x - np.linspace(0, SD, x.shape[2], dtype=np.float32),
     "late": lambda x, _: np.concatenate([np.repeat(x[..., :1], 270, 2), x[..., :-270]], 2),
-    "gap": lambda x, _: np.concatenate([x[..., :600], np.repeat(x[..., 600:601], 20, 2), x[..., 620:]], 2),
+    "gap": lambda x, _: np.concatenate(
+        [x[..., :600], np.repeat(x[..., 600:601], 20, 2), x[..., 620:]], 2
+    ),
     "reversed": lambda x, _: x[..., ::-1],
     "silent": lambda x, _: np.zeros_like(x),
     "stuck": lambda x, _: np.full_like(x, MEAN),
@@ -74,7 +76,10 @@ def test_clean_traces_are_hardly_ever_novel(gate: NoveltyGate) -> None:
 @pytest.mark.parametrize("n", [50, 100, 200])
 def test_few_references_do_not_make_clean_traces_novel(n: int) -> None:
     starts = range(0, 500, 100)
-    assert np.mean([share(fit_novelty(TRACES[i : i + n], 1.5), HELD_OUT[:300]) for i in starts]) <= 0.015
+    assert (
+        np.mean([share(fit_novelty(TRACES[i : i + n], 1.5), HELD_OUT[:300]) for i in starts])
+        <= 0.015
+    )
 
 
 def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are() -> None:
@@ -83,12 +88,18 @@ def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are() -> None:
         some = GARBAGE[kind](HELD_OUT[:100], rng)
         gate = fit_novelty(np.concatenate([KNOWN, some[:50]]), 1.5)
         assert share(gate, some[50:]) <= (0.2 if kind == "noise" else 0.1)
-        others = {other: share(gate, make(HELD_OUT[100:150], rng)) for other, make in GARBAGE.items() if other != kind}
+        others = {
+            other: share(gate, make(HELD_OUT[100:150], rng))
+            for other, make in GARBAGE.items()
+            if other != kind
+        }
         assert np.mean(list(others.values())) >= 0.75, (kind, others)
 
 
 @pytest.mark.parametrize("size", [1e6, 1e30, 3e38, -3e38])
-def test_huge_values_are_novel_to_a_gate_that_learned_and_to_no_other(gate: NoveltyGate, size: float) -> None:
+def test_huge_values_are_novel_to_a_gate_that_learned_and_to_no_other(
+    gate: NoveltyGate, size: float
+) -> None:
     x = torch.from_numpy(HELD_OUT[0].copy())
     x[0, 500] = size
     for trace in (x, torch.full_like(x, size), size * torch.sin(torch.arange(1000.0))[None]):
@@ -125,12 +136,16 @@ def test_a_channel_that_dies_is_novel(channel: int) -> None:
 
 def test_compiled_and_eager_agree_to_the_bit(gate: NoveltyGate) -> None:
     compiled = script(gate)
-    for x in torch.from_numpy(np.concatenate([HELD_OUT[:50], hum(HELD_OUT[:50], np.random.default_rng(0))])):
+    for x in torch.from_numpy(
+        np.concatenate([HELD_OUT[:50], hum(HELD_OUT[:50], np.random.default_rng(0))])
+    ):
         assert torch.equal(compiled.scores(x), gate.scores(x))
         assert compiled(x) == gate(x) == (not bool((gate.scores(x) <= 1).all()))
 
 
-@pytest.mark.parametrize(("channels", "samples"), [(1, 1), (1, 2), (1, 30), (2, 399), (6, 101), (50, 20)])
+@pytest.mark.parametrize(
+    ("channels", "samples"), [(1, 1), (1, 2), (1, 30), (2, 399), (6, 101), (50, 20)]
+)
 def test_shapes_depend_on_channels_and_samples_alone(channels: int, samples: int) -> None:
     fresh = {name: t.shape for name, t in NoveltyGate(channels, samples).state_dict().items()}
     for n in (10, 40, 1100):

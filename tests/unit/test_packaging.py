@@ -14,7 +14,9 @@ import dengine
 
 def fresh(code: str, *flags: str, cwd: Path | None = None) -> str:
     """What code prints in a fresh interpreter."""
-    done = subprocess.run([sys.executable, *flags, "-c", code], capture_output=True, text=True, cwd=cwd)
+    done = subprocess.run(
+        [sys.executable, *flags, "-c", code], capture_output=True, text=True, cwd=cwd
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 
@@ -39,13 +41,24 @@ def test_every_public_name_is_there_and_listed() -> None:
 def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     # From a copy: setuptools leaves build/ behind and must not meet an old one.
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    shutil.copytree(repo / "dengine", source / "dengine", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        repo / "dengine", source / "dengine", ignore=shutil.ignore_patterns("__pycache__")
+    )
     for folder in ("models", "training", "tests", "notebooks"):
         (source / folder).mkdir()
         (source / folder / "__init__.py").touch()  # a trap: none of these may be packaged
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(repo / name, source / name)
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(source)]
+    command = [
+        sys.executable,
+        "-m",
+        "build",
+        "--wheel",
+        "--no-isolation",
+        "--outdir",
+        str(out),
+        str(source),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     (built,) = out.glob("*.whl")
@@ -54,17 +67,30 @@ def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_has_dengine_whole_and_no_other_top_level_name(wheel: Path, repo: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {name.split("/")[0] for name in names} == {"dengine", f"dengine-{dengine.__version__}.dist-info"}
+    assert {name.split("/")[0] for name in names} == {
+        "dengine",
+        f"dengine-{dengine.__version__}.dist-info",
+    }
     modules = {str(p.relative_to(repo)) for p in (repo / "dengine").rglob("*.py")}
     assert modules <= names
-    assert {"dengine/py.typed", "dengine/data/insertion.npz", "dengine/serve/page/static/uplot.LICENSE"} <= names
-    sources = {p.relative_to(repo).as_posix() for p in (repo / "dengine" / "export" / "cpp").rglob("*") if p.is_file()}
+    assert {
+        "dengine/py.typed",
+        "dengine/data/insertion.npz",
+        "dengine/serve/page/static/uplot.LICENSE",
+    } <= names
+    sources = {
+        p.relative_to(repo).as_posix()
+        for p in (repo / "dengine" / "export" / "cpp").rglob("*")
+        if p.is_file()
+    }
     assert len(sources) > 10
     assert sources <= names
     assert f"dengine-{dengine.__version__}.dist-info/licenses/LICENSE" in names
 
 
-def test_the_wheel_works_where_there_is_no_checkout(wheel: Path, repo: Path, tmp_path: Path) -> None:
+def test_the_wheel_works_where_there_is_no_checkout(
+    wheel: Path, repo: Path, tmp_path: Path
+) -> None:
     target = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(target)  # what installing a pure wheel with --target does
     code = (

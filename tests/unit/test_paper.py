@@ -5,10 +5,20 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from dengine.experiments.paper import ALPHAS, INTERVALS, LOWER_BOUNDS, PUBLISHED, findings, grid_lines, paper_table
+from dengine.experiments.paper import (
+    ALPHAS,
+    INTERVALS,
+    LOWER_BOUNDS,
+    PUBLISHED,
+    findings,
+    grid_lines,
+    paper_table,
+)
 
 
-def frame(interval: str = "wilson", recipe: str = "conv", retrain: float = 0.1, **cells) -> pd.DataFrame:
+def frame(
+    interval: str = "wilson", recipe: str = "conv", retrain: float = 0.1, **cells
+) -> pd.DataFrame:
     """Two replays a cell: those of the paper, one a little above and one below; or what `cells` says of all."""
     rows = []
     for alpha in ALPHAS:
@@ -18,7 +28,11 @@ def frame(interval: str = "wilson", recipe: str = "conv", retrain: float = 0.1, 
                 row = {"recipe": recipe, "interval": interval, "alpha": alpha, "lower_bound": bound}
                 row |= {"guarantee": "local", "stops": "some", "confirm": False}
                 row |= {"certain": certain + sign, "false_positive": false_positive + sign}
-                row |= {"first_certain": 10.0 / alpha, "retrain_p50_s": retrain, "retrain_max_s": retrain}
+                row |= {
+                    "first_certain": 10.0 / alpha,
+                    "retrain_p50_s": retrain,
+                    "retrain_max_s": retrain,
+                }
                 rows.append(row | cells)
     return pd.DataFrame(rows)
 
@@ -33,10 +47,15 @@ def test_the_published_figures_are_the_papers(repo: Path) -> None:
         pytest.skip("the paper's source is not beside this checkout")
     text = paper.read_text(encoding="utf-8")
     assert len(PUBLISHED) == 18
-    for interval, label in (("wilson", "tab:wsFalsePositiveCount"), ("binomial", "tab:biFalsePositiveCount")):
+    for interval, label in (
+        ("wilson", "tab:wsFalsePositiveCount"),
+        ("binomial", "tab:biFalsePositiveCount"),
+    ):
         table = text[: text.index(label)].rsplit("tabular", 2)[-2]
         for alpha in ALPHAS:
-            output = " & ".join("{}/{}".format(*PUBLISHED[interval, alpha, bound]) for bound in LOWER_BOUNDS)
+            output = " & ".join(
+                "{}/{}".format(*PUBLISHED[interval, alpha, bound]) for bound in LOWER_BOUNDS
+            )
             assert f"{alpha} & {output}" in table
 
 
@@ -47,20 +66,38 @@ def test_a_table_has_the_papers_form_with_ours_and_theirs() -> None:
     assert "36.9 ± 1.4 / 1019.8 ± 1.4 [36.9 / 1019.8]" in rows[1]
     some = frame().query("alpha == 0.1 or lower_bound == 0.8").replace({"alpha": {0.5: 0.4}})
     table = paper_table(some, "conv", "wilson")
-    assert "| 0.05 | 39.6 ± 1.4 / 1151.4 ± 1.4 [39.6 / 1151.4] | - | - |" in table  # two cells were not played
+    assert (
+        "| 0.05 | 39.6 ± 1.4 / 1151.4 ± 1.4 [39.6 / 1151.4] | - | - |" in table
+    )  # two cells were not played
     assert "| 0.4 | 36.1 ± 1.4 / 1317.1 ± 1.4 | - | - |" in table  # and one not published
 
 
 def test_the_papers_own_figures_bear_its_findings_out() -> None:
     lines = findings(pd.concat([frame(), frame("binomial")]))
-    claims = ("Wilson answers", "Binomial does not answer", "share of false positives", "delays the first", "a retrain of")
-    assert [by_claim(lines, claim) for claim in claims] == [[True], [True], [True] * 2, [True] * 3, [True]]
+    claims = (
+        "Wilson answers",
+        "Binomial does not answer",
+        "share of false positives",
+        "delays the first",
+        "a retrain of",
+    )
+    assert [by_claim(lines, claim) for claim in claims] == [
+        [True],
+        [True],
+        [True] * 2,
+        [True] * 3,
+        [True],
+    ]
     answer = findings(frame(recipe="knn k=5"))  # no interval of ours
     assert [by_claim(answer, claim) for claim in claims] == [[], [], [True], [], [True]]
 
 
-def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_nothing_breaks_no_tolerance() -> None:
-    lines = findings(pd.concat([frame(certain=900), frame("binomial", certain=500, false_positive=60)]))
+def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_nothing_breaks_no_tolerance() -> (
+    None
+):
+    lines = findings(
+        pd.concat([frame(certain=900), frame("binomial", certain=500, false_positive=60)])
+    )
     assert by_claim(lines, "Wilson answers") == [False]
     assert by_claim(lines, "share of false positives") == [True, False]
     assert any("in 3 of 9 cells, at most 12.0 %" in line for line in lines)  # not at LB 90 and 95 %
@@ -73,6 +110,10 @@ def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_not
 
 def test_the_page_has_a_part_for_each_feedback() -> None:
     page = "\n".join(grid_lines(pd.concat([frame(), frame("binomial", confirm=True)])))
-    counts = {"## Guarantee local": 2, "good accepted parts confirmed": 1, "false positives / certain": 2}
+    counts = {
+        "## Guarantee local": 2,
+        "good accepted parts confirmed": 1,
+        "false positives / certain": 2,
+    }
     assert {text: page.count(text) for text in counts} == counts
     assert all(f"**conv, {interval}**" in page for interval in INTERVALS)

@@ -20,7 +20,11 @@ from tests.support.command_line import dengine
 SECRET = "hunter2"
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES", "")
 NOBODY = f"postgresql+psycopg://robot:{SECRET}@127.0.0.1:1/cell"
-ERRORS = [value for value in vars(all_errors).values() if isinstance(value, type) and issubclass(value, DengineError)]
+ERRORS = [
+    value
+    for value in vars(all_errors).values()
+    if isinstance(value, type) and issubclass(value, DengineError)
+]
 
 
 @pytest.mark.parametrize(
@@ -30,9 +34,19 @@ ERRORS = [value for value in vars(all_errors).values() if isinstance(value, type
         (f"'postgresql://u:a@b:{SECRET}/x@host/db'", "'postgresql://u:***@host/db'"),
         (f"postgresql://:{SECRET}@host/db", "postgresql://:***@host/db"),
         (f"postgresql://u:my {SECRET}@host/db", "postgresql://u:***@host/db"),
-        (f"postgresql://h/db?user=u&password={SECRET}&x=1", "postgresql://h/db?user=u&password=***&x=1"),
+        (
+            f"postgresql://h/db?user=u&password={SECRET}&x=1",
+            "postgresql://h/db?user=u&password=***&x=1",
+        ),
         (f"host=h password={SECRET} user=u", "host=h password=*** user=u"),
-        *((text, text) for text in ("postgresql://user@host:5432/db", "sqlite:///a.db and me@home", "C:\\cell.db, 12:30")),
+        *(
+            (text, text)
+            for text in (
+                "postgresql://user@host:5432/db",
+                "sqlite:///a.db and me@home",
+                "C:\\cell.db, 12:30",
+            )
+        ),
     ],
 )
 def test_a_password_is_masked_and_all_else_stays(text: str, shown: str) -> None:
@@ -51,7 +65,9 @@ NO_URLS += "sqlite:// sqlite:///:memory: nonsense://x a://:b:c"
 
 
 @pytest.mark.parametrize("url", NO_URLS.split())
-def test_a_url_that_cannot_be_used_is_refused_without_its_password_in_the_whole_chain(url: str) -> None:
+def test_a_url_that_cannot_be_used_is_refused_without_its_password_in_the_whole_chain(
+    url: str,
+) -> None:
     with pytest.raises(StoreError) as caught:
         SqlStore(url)
     error: BaseException | None = caught.value
@@ -73,8 +89,14 @@ CALLS = [  # every verb that takes a store, and what click repeats
 
 
 @pytest.mark.parametrize("words", CALLS)
-def test_no_verb_shows_the_password_of_what_it_cannot_use(words: str, tmp_path: Path, monkeypatch) -> None:
-    takes = {name for name, verb in main.commands.items() if any(option.name == "store" for option in verb.params)}
+def test_no_verb_shows_the_password_of_what_it_cannot_use(
+    words: str, tmp_path: Path, monkeypatch
+) -> None:
+    takes = {
+        name
+        for name, verb in main.commands.items()
+        if any(option.name == "store" for option in verb.params)
+    }
     assert takes <= {words.split()[0] for words in CALLS}
     monkeypatch.chdir(tmp_path)
     Path("journal.csv").write_text("1,0.0\n")
@@ -84,7 +106,9 @@ def test_no_verb_shows_the_password_of_what_it_cannot_use(words: str, tmp_path: 
 
 
 def test_json_and_progress_mask_it(capsys: pytest.CaptureFixture) -> None:
-    assert SECRET not in json.dumps(to_jsonable({"store": NOBODY, "all": [NOBODY, (NOBODY,)], "path": Path(NOBODY)}))
+    assert SECRET not in json.dumps(
+        to_jsonable({"store": NOBODY, "all": [NOBODY, (NOBODY,)], "path": Path(NOBODY)})
+    )
     with progress_bar(f"importing {NOBODY}", 3) as advance:
         advance(3)
     assert SECRET not in "".join(capsys.readouterr())
@@ -94,5 +118,7 @@ def test_json_and_progress_mask_it(capsys: pytest.CaptureFixture) -> None:
 def test_the_environment_gives_the_password(monkeypatch) -> None:
     with_it = sa.make_url(POSTGRES).set(password=SECRET)
     monkeypatch.setenv("PGPASSWORD", SECRET)
-    with make_engine(with_it._replace(password=None).render_as_string(hide_password=False)).connect() as connection:
+    with make_engine(
+        with_it._replace(password=None).render_as_string(hide_password=False)
+    ).connect() as connection:
         assert connection.connection.driver_connection.info.password == SECRET

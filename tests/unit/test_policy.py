@@ -21,7 +21,9 @@ def test_both_thresholds_are_met_with_equality() -> None:
     policy = Policy(lower_bound=0.75)  # exact in binary, so is its complement
     assert policy.action(0.75, 1.0) is Action.ACCEPT
     assert policy.action(0.0, 0.25) is Action.REJECT
-    assert {policy.action(math.nextafter(0.75, 0), 1.0), policy.action(0.0, 0.2500001)} == {Action.VERIFY}
+    assert {policy.action(math.nextafter(0.75, 0), 1.0), policy.action(0.0, 0.2500001)} == {
+        Action.VERIFY
+    }
 
 
 @given(policies)
@@ -30,7 +32,9 @@ def test_without_evidence_every_policy_verifies(policy: Policy) -> None:
 
 
 @given(policies, st.integers(0, 300), st.integers(0, 300))
-def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n_s: int, n_f: int) -> None:
+def test_a_stricter_policy_is_certain_only_where_the_looser_is(
+    policy: Policy, n_s: int, n_f: int
+) -> None:
     strict = Policy(policy.alpha / 2, (policy.lower_bound + 1) / 2)
     action = strict.action(*strict.bound(n_s, n_f))
     assert action in (Action.VERIFY, policy.action(*policy.bound(n_s, n_f)))
@@ -54,7 +58,9 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n
         ({"windows": ["0.1:0.2:1::channel=F Z"]}, "or names"),
     ],
 )
-def test_a_setting_out_of_range_is_named_with_what_was_expected(settings: dict[str, object], message: str) -> None:
+def test_a_setting_out_of_range_is_named_with_what_was_expected(
+    settings: dict[str, object], message: str
+) -> None:
     with pytest.raises(SettingError, match=message):
         Policy(**settings)  # type: ignore[arg-type]
 
@@ -74,7 +80,9 @@ HELD = {  # by seconds, or by channel 1, of samples 0 to 5 ten a second, and of 
 
 
 @pytest.mark.parametrize(("window", "expected"), HELD.items())
-def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits(window: str, expected: int) -> None:
+def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits(
+    window: str, expected: int
+) -> None:
     x = torch.arange(6, dtype=torch.float32)
     limited = recipe(windows=(window,))
     spec = TraceSpec(6, rate_hz=10.0, channels=2, columns=("F", "Z"))
@@ -83,24 +91,38 @@ def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits
     assert str(*limited.policy.windows) == window
 
 
-def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts_it(make_data, tmp_path: Path) -> None:
+def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts_it(
+    make_data, tmp_path: Path
+) -> None:
     data = make_data(300, SAMPLES)
     with trained(data, tmp_path / "cell.db") as engine:
         x = next(x for x in data.X if engine.decide(x).action is Action.ACCEPT)
         engine.set_policy(replace(engine.policy, windows=(f"0:0.1::{x[:50].max() - 0.1}:reject",)))
         decision = engine.decide(x)
-        assert (decision.action, decision.predicted, decision.reason) == (Action.REJECT, Action.VERIFY, Reason.OUTSIDE)
+        assert (decision.action, decision.predicted, decision.reason) == (
+            Action.REJECT,
+            Action.VERIFY,
+            Reason.OUTSIDE,
+        )
         assert (decision.propensity, "alone the model" in repr(decision)) == (0.0, False)
         engine.set_shadow(True)
         assert engine.decide(x).action is Action.VERIFY
         for nowhere in ("0.3:0.4:0:", "0.1001:0.1019:0:", "0:1:0::channel=1", "0:1:0::along=FZ"):
-            with pytest.raises(SettingError, match="on some of 1 x 100 samples"):  # beyond the last, and between two
+            with pytest.raises(
+                SettingError, match="on some of 1 x 100 samples"
+            ):  # beyond the last, and between two
                 engine.set_policy(Policy(windows=(nowhere,)))
     with DataEngine.open(tmp_path / "cell.db") as engine:
         status = engine.status()
-        assert (status.newest.outside, status.newest.rejected, status.actions["reject"]) == (2, 0, 1)
+        assert (status.newest.outside, status.newest.rejected, status.actions["reject"]) == (
+            2,
+            0,
+            1,
+        )
         assert (status.certificate.rejected.n, status.certificate.accepted.n) == (0, 0)
         assert "leaves an operator's window, 0:0.1::" in engine.explain(decision.id).sentences[0]
         assert engine.status(last=3).alarm == "2 of the newest parts leave a window."
-    with pytest.raises(SettingError, match=r"\(windows 0:0\.1::.*:reject\), got windows 0:0\.2:0:;"):
+    with pytest.raises(
+        SettingError, match=r"\(windows 0:0\.1::.*:reject\), got windows 0:0\.2:0:;"
+    ):
         DataEngine.open_or_create(tmp_path / "cell.db", recipe=recipe(windows=["0:0.2:0:"]))

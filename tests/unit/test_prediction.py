@@ -26,17 +26,39 @@ def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(make_
     data = make_data(120, samples=40)
     model = ModelPrediction("conv", WilsonRadiusClassifier(radius=0.05), 5).fit(data.X, data.y)
     conditions = DecisionConditions(TraceSpec(40))
-    queries = [*data.X[100:, None], *make_data(20, samples=40, seed=9).X[:, None], np.ones((1, 40), np.float32)]
+    queries = [
+        *data.X[100:, None],
+        *make_data(20, samples=40, seed=9).X[:, None],
+        np.ones((1, 40), np.float32),
+    ]
     for x in queries:
         result = trace_gate(*x.shape)(torch.from_numpy(x))
         for part in (0, 7):
-            fault, content, action, predicted, reason, lower, upper, n_success, n_failure, z, propensity = model.decide_one(
-                x, part, conditions
-            )
+            (
+                fault,
+                content,
+                action,
+                predicted,
+                reason,
+                lower,
+                upper,
+                n_success,
+                n_failure,
+                z,
+                propensity,
+            ) = model.decide_one(x, part, conditions)
             assert (fault, content) == result
             if not fault:  # without a vote on itself
                 embedding = tuple(map(tuple, z.tolist()))
-                text = (ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
+                text = (
+                    ACTIONS[action],
+                    lower,
+                    upper,
+                    n_success,
+                    n_failure,
+                    embedding,
+                    REASONS[reason],
+                )
                 assert model.predict_one(x, part or content) == text
             assert (action, propensity) == (predicted, 0.0 if action else 1.0)
 
@@ -44,10 +66,15 @@ def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(make_
 @pytest.mark.parametrize("folds", [2, 3])
 @pytest.mark.parametrize(
     "reducer",
-    [LinearDiscriminantAnalysis(), NeighborhoodComponentsAnalysis(n_components=2, max_iter=5, random_state=0)],
+    [
+        LinearDiscriminantAnalysis(),
+        NeighborhoodComponentsAnalysis(n_components=2, max_iter=5, random_state=0),
+    ],
     ids=["lda", "nca"],
 )
-def test_labels_of_fold_k_move_neither_its_references_nor_any_query_in_space_k(reducer, folds: int, make_data) -> None:
+def test_labels_of_fold_k_move_neither_its_references_nor_any_query_in_space_k(
+    reducer, folds: int, make_data
+) -> None:
     data = make_data(120, samples=40)
     queries = make_data(15, samples=40, seed=9).X[:, None, :]
     fold = content_fold(data.X, folds)
@@ -56,14 +83,20 @@ def test_labels_of_fold_k_move_neither_its_references_nor_any_query_in_space_k(r
         y, inside = data.y.copy(), fold == k
         y[inside] = np.random.default_rng(k).permutation(y[inside])
         other = ModelPrediction(reducer, classifier(), folds).fit(data.X, y)
-        np.testing.assert_array_equal(other.spaces.embed(queries)[:, k], honest.spaces.embed(queries)[:, k])
+        np.testing.assert_array_equal(
+            other.spaces.embed(queries)[:, k], honest.spaces.embed(queries)[:, k]
+        )
         points, spaces = honest.index.points, honest.index.spaces
         n = len(data)
         assert (spaces[:n].numpy() == fold).all()
-        np.testing.assert_array_equal(other.index.points[:, :n][:, inside], points[:, :n][:, inside])
+        np.testing.assert_array_equal(
+            other.index.points[:, :n][:, inside], points[:, :n][:, inside]
+        )
         assert other.scale[k] == honest.scale[k]
         moved = [j for j in range(folds) if j != k]
-        assert not np.array_equal(other.spaces.embed(queries)[:, moved], honest.spaces.embed(queries)[:, moved])
+        assert not np.array_equal(
+            other.spaces.embed(queries)[:, moved], honest.spaces.embed(queries)[:, moved]
+        )
 
 
 def test_a_label_added_later_is_counted_in_its_own_folds_space(data: Dataset) -> None:
@@ -73,7 +106,10 @@ def test_a_label_added_later_is_counted_in_its_own_folds_space(data: Dataset) ->
     ring, fold = model.index, content_fold(data.X, 2)
     assert (ring.spaces[:200].numpy() == fold).all()
     assert (ring.labels[1, :200].numpy() == data.y).all()
-    custom = model.spaces.embed_references(data.X[150:, None, :], fold[150:]) / model.scale[fold[150:], None]
+    custom = (
+        model.spaces.embed_references(data.X[150:, None, :], fold[150:])
+        / model.scale[fold[150:], None]
+    )
     np.testing.assert_allclose(ring.points[:, 150:200].numpy().T, custom, atol=1e-5)
 
 
@@ -99,7 +135,9 @@ def test_a_reducer_that_does_not_say_it_uses_labels_is_never_handed_any(data: Da
 def test_the_unit_of_the_traces_does_not_matter(reducer, data: Dataset) -> None:
     X, y, queries, hashes = data.X[:150], data.y[:150], data.X[150:], content_hash(data.X[:150])
     newtons = ModelPrediction(reducer, classifier()).fit(X, y, hashes=hashes)
-    smaller = ModelPrediction(reducer, classifier()).fit(1024 * X, y, hashes=hashes)  # a power of two: exact in floats
+    smaller = ModelPrediction(reducer, classifier()).fit(
+        1024 * X, y, hashes=hashes
+    )  # a power of two: exact in floats
     assert newtons.predict_interval(queries)[0].max() > 0.8
     np.testing.assert_array_equal(smaller.count(1024 * queries), newtons.count(queries))
 
@@ -132,7 +170,9 @@ def test_a_state_restores_every_judgement_bit_for_bit(data: Dataset) -> None:
     assert restored.predict_many(data.X) == model.predict_many(data.X)
 
 
-def test_without_a_state_of_its_own_a_reducer_is_refitted_to_the_same_judgements(data: Dataset) -> None:
+def test_without_a_state_of_its_own_a_reducer_is_refitted_to_the_same_judgements(
+    data: Dataset,
+) -> None:
     model = fitted("lda", data)
     state = model.get_state()
     assert not any(name.startswith("reducer.") for name in state)
@@ -140,10 +180,14 @@ def test_without_a_state_of_its_own_a_reducer_is_refitted_to_the_same_judgements
     assert restored.predict_many(data.X) == model.predict_many(data.X)
 
 
-def test_what_will_answer_is_compiled_before_there_is_anything_to_learn(data: Dataset, monkeypatch) -> None:
+def test_what_will_answer_is_compiled_before_there_is_anything_to_learn(
+    data: Dataset, monkeypatch
+) -> None:
     with DataEngine("conv", replaying=True) as engine:
         for x, y in zip(data.X, data.y, strict=True):
             engine.report(engine.decide(x).id, bool(y))
-            monkeypatch.setattr(neighbours, "script", None)  # in a retrain there is no time for that
+            monkeypatch.setattr(
+                neighbours, "script", None
+            )  # in a retrain there is no time for that
         assert engine.retrain().accepted
         assert isinstance(engine.model.predictor, torch.jit.ScriptModule)

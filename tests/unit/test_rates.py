@@ -15,11 +15,20 @@ from dengine.experiments.metrics import Costs, pooled_error
 from tests.support.replays import replay_of
 
 
-@given(st.lists(st.tuples(st.sampled_from(["accept", "reject", "verify"]), st.booleans()), min_size=1, max_size=60))
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["accept", "reject", "verify"]), st.booleans()),
+        min_size=1,
+        max_size=60,
+    )
+)
 def test_the_rates_are_those_of_scikit_learn_over_what_was_decided(cycles) -> None:
     action, truth = np.array([a for a, _ in cycles]), np.array([t for _, t in cycles])
     accepted, certain = action == "accept", action != "verify"
-    result, expected = replay_of(action, truth).summary(), dict.fromkeys(("accuracy", "precision", "npv"), math.nan)
+    result, expected = (
+        replay_of(action, truth).summary(),
+        dict.fromkeys(("accuracy", "precision", "npv"), math.nan),
+    )
     if certain.any():
         expected["accuracy"] = accuracy_score(truth[certain], accepted[certain])
     if accepted.any():
@@ -32,7 +41,9 @@ def test_the_rates_are_those_of_scikit_learn_over_what_was_decided(cycles) -> No
 TWENTY = replay_of(["accept"] * 400, np.arange(400) % 20 != 0)
 
 
-def test_different_traces_have_nearly_wilsons_interval_and_shuffles_of_the_same_make_it_no_narrower() -> None:
+def test_different_traces_have_nearly_wilsons_interval_and_shuffles_of_the_same_make_it_no_narrower() -> (
+    None
+):
     error, often = pooled_error([TWENTY]), pooled_error([TWENTY] * 30)
     assert (error.decided, error.wrong, error.traces, error.rate) == (400, 20, 400, 0.05)
     assert (error.lower, error.upper) == pytest.approx(wilson_interval(20, 380), abs=1e-3)
@@ -60,7 +71,10 @@ def test_the_interval_covers_the_true_share_of_other_parts() -> None:
     for _ in range(300):
         truth = rng.random(200) >= share
         orders = [rng.permutation(200) for _ in range(5)]
-        replays = [replay_of(np.where(rng.random(200) < 0.75, "accept", "verify"), truth[o], index=o) for o in orders]
+        replays = [
+            replay_of(np.where(rng.random(200) < 0.75, "accept", "verify"), truth[o], index=o)
+            for o in orders
+        ]
         error = pooled_error(replays)
         covered += error.lower <= share <= error.upper
     assert 0.95 - 3 * math.sqrt(0.05 * 0.95 / 300) <= covered / 300
@@ -79,7 +93,14 @@ def test_an_accept_is_worth_the_risk_up_to_check_by_escape() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("check", 0), ("escape", -1), ("false_reject", math.inf), ("escape", math.nan), ("check", "5")]
+    ("name", "value"),
+    [
+        ("check", 0),
+        ("escape", -1),
+        ("false_reject", math.inf),
+        ("escape", math.nan),
+        ("check", "5"),
+    ],
 )
 def test_a_cost_that_is_none_is_refused_by_its_name(name: str, value: Any) -> None:
     with pytest.raises(SettingError, match=name):

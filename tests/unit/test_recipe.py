@@ -16,7 +16,9 @@ from dengine.experiments.replay import Contender
 from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
 
-values = st.one_of(st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), st.text())
+values = st.one_of(
+    st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), st.text()
+)
 
 
 @st.composite
@@ -43,7 +45,10 @@ def recipes(draw) -> Recipe:
 def test_toml_gives_back_the_recipe(recipe: Recipe) -> None:
     assert Recipe.from_toml(recipe.to_toml()) == recipe
     rate = np.float64(recipe.policy.alpha)  # NumPy's numbers are written as plain ones
-    assert replace(recipe, folds=np.int64(recipe.folds)).with_policy(alpha=rate).to_toml() == recipe.to_toml()
+    assert (
+        replace(recipe, folds=np.int64(recipe.folds)).with_policy(alpha=rate).to_toml()
+        == recipe.to_toml()
+    )
 
 
 def test_the_recipe_files_equal_the_defaults_in_the_code(repo: Path) -> None:
@@ -66,7 +71,9 @@ def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path: Path) -> None
     assert Recipe.load(str(path)) == loaded
     assert Recipe.load(loaded) is loaded
     assert Recipe.load("pca") is base
-    with pytest.raises(SettingError, match=r"conv, umap, umap-learn, pca, rocket, paper.*covn is none"):
+    with pytest.raises(
+        SettingError, match=r"conv, umap, umap-learn, pca, rocket, paper.*covn is none"
+    ):
         Recipe.load("covn")
 
 
@@ -108,7 +115,9 @@ OWN = [  # a reducer, its radius, its retrain_every
 
 
 @pytest.mark.parametrize(("reducer", "radius", "retrain_every"), OWN)
-def test_radius_and_retrain_every_are_the_reducers_own_wherever_none_is_given(reducer, radius, retrain_every) -> None:
+def test_radius_and_retrain_every_are_the_reducers_own_wherever_none_is_given(
+    reducer, radius, retrain_every
+) -> None:
     toml = f'reducer = "{reducer}"\nradius = "none"\n' if isinstance(reducer, str) else ""
     ways = [
         Recipe(reducer),
@@ -124,7 +133,9 @@ def test_radius_and_retrain_every_are_the_reducers_own_wherever_none_is_given(re
     assert Recipe(reducer, radius=0.5).radius == 0.5
 
 
-def test_a_class_by_its_name_and_what_is_wrong_with_its_own_radius_are_read(tmp_path: Path, monkeypatch) -> None:
+def test_a_class_by_its_name_and_what_is_wrong_with_its_own_radius_are_read(
+    tmp_path: Path, monkeypatch
+) -> None:
     code = "from dengine import ConvReducer\nclass Own(ConvReducer):\n    default_radius = 0.05\n"
     (tmp_path / "own_radius_of_test_recipe.py").write_text(code, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
@@ -163,6 +174,8 @@ def test_a_stored_recipe_imports_nothing_to_learn_a_radius() -> None:
         ("budget = 0", "budget > 0"),
     ],
 )
-def test_what_is_wrong_with_a_recipe_is_a_setting_error_that_names_it(text: str, message: str) -> None:
+def test_what_is_wrong_with_a_recipe_is_a_setting_error_that_names_it(
+    text: str, message: str
+) -> None:
     with pytest.raises(SettingError, match=message):
         Recipe.from_toml(text, where="mine")

@@ -12,19 +12,35 @@ from dengine import Dataset, load_dataset
 from dengine.errors import DataError
 from tests.support import recording_forms
 from tests.support.command_line import dengine, document
-from tests.support.recording_forms import CLOCK_NAMES, CLOCK_UNITS, DELIMITERS, NUMBERS, STEP, SUFFIXES, TIMES, UNITS
+from tests.support.recording_forms import (
+    CLOCK_NAMES,
+    CLOCK_UNITS,
+    DELIMITERS,
+    NUMBERS,
+    STEP,
+    SUFFIXES,
+    TIMES,
+    UNITS,
+)
 
 N = 120
 VALUES = np.round(np.linspace(-400.0, 2600.0, N) + 90.0 * np.sin(np.arange(N)), 1)
 
 
 def write(
-    path: Path, header: Sequence[str], *columns: Sequence[str], delimiter: str = ",", above: Sequence[str] = ()
+    path: Path,
+    header: Sequence[str],
+    *columns: Sequence[str],
+    delimiter: str = ",",
+    above: Sequence[str] = (),
 ) -> Path:
     """Texts as a file, in quotes where the delimiter is in them."""
     path.parent.mkdir(parents=True, exist_ok=True)
     marked = delimiter.strip() or delimiter[:1]
-    quoted = [[f'"{cell}"' if marked in cell else cell for cell in row] for row in zip(*columns, strict=True)]
+    quoted = [
+        [f'"{cell}"' if marked in cell else cell for cell in row]
+        for row in zip(*columns, strict=True)
+    ]
     rows = [delimiter.join(row) for row in quoted]
     path.write_text("\n".join([*above, delimiter.join(header), *rows]) + "\n", "utf-8")
     return path
@@ -58,13 +74,21 @@ def test_numbers_are_read_as_they_were_written(form: str, delimiter: str, tmp_pa
 
 
 WHOLE = np.r_[np.arange(20, 2600, 30), 998.0, 1001.0]  # newtons
-DECIDED: dict[str, tuple[list[list[str]], str]] = {  # cells of a clock and of whole newtons, and the delimiter
+DECIDED: dict[
+    str, tuple[list[list[str]], str]
+] = {  # cells of a clock and of whole newtons, and the delimiter
     "German thousands, by the clock": ([german(times(len(WHOLE))), german(english(WHOLE))], ";"),
     "German thousands in tabs": ([german(times(len(WHOLE))), german(english(WHOLE))], "\t"),
     "English thousands, by the clock": ([times(len(WHOLE)), english(WHOLE)], ";"),
     "English thousands in quotes": ([times(len(WHOLE)), english(WHOLE)], ","),
-    "German thousands, by smaller ones": ([[str(4 * i) for i in range(len(WHOLE))], german(english(WHOLE))], ";"),
-    "Swiss thousands": ([times(len(WHOLE)), [cell.replace(",", "'") for cell in english(WHOLE)]], ","),
+    "German thousands, by smaller ones": (
+        [[str(4 * i) for i in range(len(WHOLE))], german(english(WHOLE))],
+        ";",
+    ),
+    "Swiss thousands": (
+        [times(len(WHOLE)), [cell.replace(",", "'") for cell in english(WHOLE)]],
+        ",",
+    ),
 }
 
 
@@ -89,7 +113,9 @@ def test_millions_prove_which_mark_groups_thousands(tmp_path: Path) -> None:
     assert load_dataset(tmp_path, channel="F").X.tolist() == [[1043.0, 1043500.0]] * 2
 
 
-def test_a_file_that_does_not_tell_its_decimal_mark_is_refused_until_somebody_states_it(tmp_path: Path) -> None:
+def test_a_file_that_does_not_tell_its_decimal_mark_is_refused_until_somebody_states_it(
+    tmp_path: Path,
+) -> None:
     cells = ["1.043", "1.102", "2.250", "2.375"] * 5
     for name in ("a_OK.csv", "b_NOK.csv"):
         write(tmp_path / "a" / name, ["Kraft"], cells, delimiter=";")
@@ -97,16 +123,24 @@ def test_a_file_that_does_not_tell_its_decimal_mark_is_refused_until_somebody_st
     assert refused.exit_code == 1
     refusal = "1.043 in column Kraft may be 1.043 or 1043; say which, --decimal . or --thousands ."
     assert refusal in refused.stderr
-    for words, first in ((("--decimal", "."), 1.043), (("--decimal", ","), 1043.0), (("--thousands", "."), 1043.0)):
+    for words, first in (
+        (("--decimal", "."), 1.043),
+        (("--decimal", ","), 1043.0),
+        (("--thousands", "."), 1043.0),
+    ):
         assert document("data", tmp_path / "a", *words)["survey"]["traces"] == 2
         data = load_dataset(tmp_path / "a", **{words[0].strip("-"): words[1]})
         assert data.X[0, 0] == np.float32(first)
-    write(tmp_path / "a" / "c_OK.csv", ["Kraft"], german(texts(VALUES[:20], "{:.2f}")), delimiter=";")
+    write(
+        tmp_path / "a" / "c_OK.csv", ["Kraft"], german(texts(VALUES[:20], "{:.2f}")), delimiter=";"
+    )
     decided = load_dataset(tmp_path / "a")  # by the only one that tells
     assert decided.X[:2, 0].tolist() == [1043.0, 1043.0]
     with pytest.raises(DataError, match=r"decimal mark, '.' or ','"):
         load_dataset(tmp_path / "a", decimal=";")
-    with pytest.raises(DataError, match=r"Expected no decimal for .*: only text files are written so"):
+    with pytest.raises(
+        DataError, match=r"Expected no decimal for .*: only text files are written so"
+    ):
         load_dataset((np.zeros((2, 3)), [0, 1]), decimal=",")
 
 
@@ -124,13 +158,23 @@ def test_a_number_in_another_format_than_its_files_is_a_fault_with_its_line(tmp_
         write(tmp_path / name, ["Zeit", "Kraft"], german(times()), cells, delimiter=";")
     data = load_dataset(tmp_path)
     assert [(f.source, f.line) for f in data.faults] == [("b_OK.csv", 9)]
-    refusal = "Expected a number in column Kraft with ',' before decimals, as the file has, got '12.5'"
+    refusal = (
+        "Expected a number in column Kraft with ',' before decimals, as the file has, got '12.5'"
+    )
     assert refusal in data.faults[0].message
 
 
 def test_a_column_that_contradicts_the_files_decimal_mark_is_named(tmp_path: Path) -> None:
-    write(tmp_path / "a_OK.csv", ["t", "Kraft"], times(len(WHOLE)), german(english(WHOLE)), delimiter=";")
-    with pytest.raises(DataError, match=r"Kraft has '.' before thousands, other columns have it before decimals"):
+    write(
+        tmp_path / "a_OK.csv",
+        ["t", "Kraft"],
+        times(len(WHOLE)),
+        german(english(WHOLE)),
+        delimiter=";",
+    )
+    with pytest.raises(
+        DataError, match=r"Kraft has '.' before thousands, other columns have it before decimals"
+    ):
         load_dataset(tmp_path)
 
 
@@ -150,7 +194,9 @@ def pd_pair(folder: Path) -> tuple[list[pd.DataFrame], list[int]]:
 
 
 @pytest.mark.parametrize("form", TIMES)
-def test_times_are_read_in_all_forms_and_a_long_table_is_sorted_by_them(form: str, tmp_path: Path) -> None:
+def test_times_are_read_in_all_forms_and_a_long_table_is_sorted_by_them(
+    form: str, tmp_path: Path
+) -> None:
     cells = [TIMES[form](i) for i in range(N)]
     order = np.random.default_rng(0).permutation(N)
     write(tmp_path / "cell" / "a_OK.csv", ["Time", "FZ"], cells, texts(), delimiter=";")
@@ -158,7 +204,12 @@ def test_times_are_read_in_all_forms_and_a_long_table_is_sorted_by_them(form: st
     np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
     assert data.rate_hz == pytest.approx(250.0, rel=1e-3)
     rows = [[cells[i], "S1", "OK", texts()[i]] for i in order]
-    write(tmp_path / "long.csv", ["Time", "part", "label", "FZ"], *zip(*rows, strict=True), delimiter=";")
+    write(
+        tmp_path / "long.csv",
+        ["Time", "part", "label", "FZ"],
+        *zip(*rows, strict=True),
+        delimiter=";",
+    )
     for stated in ({}, {"rate_hz": 250}):
         table = load_dataset(tmp_path / "long.csv", time="Time", **stated)
         np.testing.assert_array_equal(table.X, data.X)
@@ -203,7 +254,9 @@ def test_a_date_beside_the_time_of_day_is_not_the_clock(tmp_path: Path) -> None:
     assert load_dataset(tmp_path).rate_hz == 250.0
 
 
-def test_without_a_clock_the_rate_is_unknown_and_a_column_that_rises_is_offered(tmp_path: Path) -> None:
+def test_without_a_clock_the_rate_is_unknown_and_a_column_that_rises_is_offered(
+    tmp_path: Path,
+) -> None:
     for name in ("a_OK.csv", "b_NOK.csv"):
         write(tmp_path / name, ["Weg", "Kraft"], times(form="{:.4f}", step=0.02), texts())
     words = ("data", tmp_path, "--channel", "Kraft")
@@ -215,14 +268,31 @@ def test_without_a_clock_the_rate_is_unknown_and_a_column_that_rises_is_offered(
     assert document(*words)["survey"]["rate_hz"] is None
     assert document(*words, "--time", "Weg")["survey"]["rate_hz"] == 50.0
     assert document(*words, "--rate-hz", "250")["survey"]["rate_hz"] == 250.0
-    trained = dengine("train", "--data", tmp_path, "--channel", "Kraft", "--store", tmp_path / "a.db", "--reducer", "pca")
+    trained = dengine(
+        "train",
+        "--data",
+        tmp_path,
+        "--channel",
+        "Kraft",
+        "--store",
+        tmp_path / "a.db",
+        "--reducer",
+        "pca",
+    )
     assert "The rate is unknown" in trained.stderr
     assert "unknown rate" in repr(load_dataset(tmp_path, channel="Kraft"))
 
 
 def test_a_clock_is_named_in_any_case_and_without_its_unit(tmp_path: Path) -> None:
     write(tmp_path / "folder" / "a_OK.csv", ["Takt [s]", "F"], times(), texts())
-    long = write(tmp_path / "long.csv", ["part", "Takt", "F", "label"], ["1"] * N, times(), texts(), ["OK"] * N)
+    long = write(
+        tmp_path / "long.csv",
+        ["part", "Takt", "F", "label"],
+        ["1"] * N,
+        times(),
+        texts(),
+        ["OK"] * N,
+    )
     for time in ("Takt", "TAKT", "takt [s]"):
         assert load_dataset(tmp_path / "folder", time=time).rate_hz == 250.0
         assert load_dataset(long, time=time, channel="F").rate_hz == 250.0
@@ -238,8 +308,16 @@ def test_a_count_of_samples_is_no_clock(tmp_path: Path) -> None:
 
 def test_lost_messages_are_found_by_any_clock(tmp_path: Path) -> None:
     stamps = [str(1_700_000_000_000_000_000 + 4_000_000 * i) for i in range(N)]
-    for name, kept in (("a_OK.csv", range(N)), ("b_OK.csv", [i for i in range(N) if not 40 <= i < 60])):
-        write(tmp_path / name, ["%time", "field.wrench.force.z"], [stamps[i] for i in kept], [texts()[i] for i in kept])
+    for name, kept in (
+        ("a_OK.csv", range(N)),
+        ("b_OK.csv", [i for i in range(N) if not 40 <= i < 60]),
+    ):
+        write(
+            tmp_path / name,
+            ["%time", "field.wrench.force.z"],
+            [stamps[i] for i in kept],
+            [texts()[i] for i in kept],
+        )
     data = load_dataset(tmp_path)
     assert [(f.source, f.line) for f in data.faults] == [("b_OK.csv", 42)]
     assert "Expected a step of 0.004 s in time, got a gap of 0.084 s" in data.faults[0].message
@@ -255,14 +333,17 @@ UNBELIEVED = {
 
 
 @pytest.mark.parametrize("case", UNBELIEVED)
-def test_a_rate_or_duration_that_cannot_be_is_refused_until_a_rate_is_stated(case: str, tmp_path: Path) -> None:
+def test_a_rate_or_duration_that_cannot_be_is_refused_until_a_rate_is_stated(
+    case: str, tmp_path: Path
+) -> None:
     name, form, step = UNBELIEVED[case]
     n = 5000 if case == "too long" else N
     write(tmp_path / "a_OK.csv", [name, "FZ"], times(n, step, form), texts(np.arange(n)))
     refused = dengine("data", tmp_path)
     assert refused.exit_code == 1
     assert re.search(
-        r"Expected a clock of 1 Hz to 1 MHz over 1 ms to 1 h, column time.* tells .* Hz over .*--rate-hz", refused.stderr
+        r"Expected a clock of 1 Hz to 1 MHz over 1 ms to 1 h, column time.* tells .* Hz over .*--rate-hz",
+        refused.stderr,
     )
     assert load_dataset(tmp_path, rate_hz=250).rate_hz == 250.0
 
@@ -277,8 +358,15 @@ def test_a_clock_that_names_no_unit_is_read_by_its_size_and_that_is_said(tmp_pat
         assert f"is read as {unit}" in " ".join(dengine("data", tmp_path).stdout.split()), form
 
 
-def test_a_clock_of_whole_milliseconds_tells_the_rate_that_it_has_on_average(tmp_path: Path) -> None:
-    write(tmp_path / "a_OK.csv", ["time_ms", "FZ"], [str(int(i * 1000 / 300)) for i in range(N)], texts())
+def test_a_clock_of_whole_milliseconds_tells_the_rate_that_it_has_on_average(
+    tmp_path: Path,
+) -> None:
+    write(
+        tmp_path / "a_OK.csv",
+        ["time_ms", "FZ"],
+        [str(int(i * 1000 / 300)) for i in range(N)],
+        texts(),
+    )
     assert load_dataset(tmp_path).rate_hz == pytest.approx(300.0, rel=0.01)
 
 
@@ -290,10 +378,18 @@ def in_unit(form: str, unit: str) -> tuple[list[str], list[str]]:
 
 
 @pytest.mark.parametrize("form", UNITS)
-def test_recordings_in_another_unit_are_converted_and_that_is_said(form: str, tmp_path: Path) -> None:
+def test_recordings_in_another_unit_are_converted_and_that_is_said(
+    form: str, tmp_path: Path
+) -> None:
     for i, (unit, scale) in enumerate([("N", 1.0), ("kN", 1e-3), ("N", 1.0), ("mN", 1e3)]):
         header, row = in_unit(form, unit)
-        path = write(tmp_path / f"{i}_OK.csv", header, times(), texts(VALUES * scale, "{:.6f}"), delimiter=";")
+        path = write(
+            tmp_path / f"{i}_OK.csv",
+            header,
+            times(),
+            texts(VALUES * scale, "{:.6f}"),
+            delimiter=";",
+        )
         head, *rows = path.read_text().splitlines()
         path.write_text("\n".join([head, *row, *rows]))
     data = load_dataset(tmp_path, channel="FZ")
@@ -308,12 +404,21 @@ def test_recordings_in_another_unit_are_converted_and_that_is_said(form: str, tm
 
 
 @pytest.mark.parametrize(
-    ("row", "step"), [("ms;;;kN", 4), ("[ms];;;[kN]", 4), ("0.001 ms;-;-;kN", 4000), ("Sek.;;;kN", 0.004)]
+    ("row", "step"),
+    [("ms;;;kN", 4), ("[ms];;;[kN]", 4), ("0.001 ms;-;-;kN", 4000), ("Sek.;;;kN", 0.004)],
 )
-def test_a_row_of_units_is_of_the_clock_too_and_of_a_long_table(row: str, step: float, tmp_path: Path) -> None:
+def test_a_row_of_units_is_of_the_clock_too_and_of_a_long_table(
+    row: str, step: float, tmp_path: Path
+) -> None:
     cells = [f"{step * i:g}" for i in range(N)]
     path = write(
-        tmp_path / "long.csv", ["Zeit", "part", "label", "FZ"], cells, ["7"] * N, ["OK"] * N, texts(), delimiter=";"
+        tmp_path / "long.csv",
+        ["Zeit", "part", "label", "FZ"],
+        cells,
+        ["7"] * N,
+        ["OK"] * N,
+        texts(),
+        delimiter=";",
     )
     head, *rows = path.read_text().splitlines()
     path.write_text("\n".join([head, row, *rows]))
@@ -329,7 +434,9 @@ def test_the_unit_of_frames_is_that_of_their_columns() -> None:
 
 def test_a_unit_that_nothing_converts_or_that_is_not_told_is_a_fault(tmp_path: Path) -> None:
     for i, unit in enumerate(["kN", "kN", "mm", ""]):
-        write(tmp_path / f"{i}_OK.csv", ["time", f"FZ [{unit}]" if unit else "FZ"], times(), texts())
+        write(
+            tmp_path / f"{i}_OK.csv", ["time", f"FZ [{unit}]" if unit else "FZ"], times(), texts()
+        )
     data = load_dataset(tmp_path, channel="FZ")
     assert (data.unit, [f.source for f in data.faults]) == ("kN", ["2_OK.csv", "3_OK.csv"])
     assert [f.message.partition(";")[0] for f in data.faults] == [
@@ -337,7 +444,9 @@ def test_a_unit_that_nothing_converts_or_that_is_not_told_is_a_fault(tmp_path: P
         "Expected FZ in kN, as the others are, got no unit",
     ]
     assert "unit='kN'" in data.faults[1].message
-    assert [f.source for f in load_dataset(tmp_path, channel="FZ", unit="kN").faults] == ["2_OK.csv"]
+    assert [f.source for f in load_dataset(tmp_path, channel="FZ", unit="kN").faults] == [
+        "2_OK.csv"
+    ]
 
 
 def test_each_channels_unit_is_the_headers(tmp_path: Path) -> None:
@@ -348,9 +457,17 @@ def test_each_channels_unit_is_the_headers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("delimiter", DELIMITERS)
-def test_files_of_any_suffix_and_delimiter_are_read(suffix: str, delimiter: str, tmp_path: Path) -> None:
+def test_files_of_any_suffix_and_delimiter_are_read(
+    suffix: str, delimiter: str, tmp_path: Path
+) -> None:
     for name in ("a_OK", "b_NOK"):
-        write(tmp_path / f"{name}{suffix}", ["time", "FZ"], times(), texts(), delimiter=DELIMITERS[delimiter])
+        write(
+            tmp_path / f"{name}{suffix}",
+            ["time", "FZ"],
+            times(),
+            texts(),
+            delimiter=DELIMITERS[delimiter],
+        )
     (tmp_path / ("readme.txt" if suffix != ".txt" else "readme.dat")).write_text("of cell 3")
     data = load_dataset(tmp_path)
     np.testing.assert_array_equal(data.X, np.tile(VALUES.astype(np.float32), (2, 1)))
@@ -373,12 +490,21 @@ def test_columns_without_a_header_are_named_as_the_error_advises(tmp_path: Path)
         load_dataset(tmp_path, columns="time,fx")
 
 
-def test_a_header_that_is_a_comment_or_below_a_preamble_is_named_by_its_line(tmp_path: Path) -> None:
+def test_a_header_that_is_a_comment_or_below_a_preamble_is_named_by_its_line(
+    tmp_path: Path,
+) -> None:
     np.savetxt(tmp_path / "a_OK.txt", np.c_[STEP * np.arange(N), VALUES], header="time FZ")
     assert load_dataset(tmp_path).channels == ("FZ",)
     for name in ("b_OK.txt", "c_NOK.txt"):
         path = tmp_path / "press" / name
-        write(path, ["time", "FX"], times(), texts(), delimiter=";", above=["Presse 3", "Teil;7;x", "", "Bediener;K"])
+        write(
+            path,
+            ["time", "FX"],
+            times(),
+            texts(),
+            delimiter=";",
+            above=["Presse 3", "Teil;7;x", "", "Bediener;K"],
+        )
     with pytest.raises(DataError, match=r"b_OK.txt, line 5: Expected a column FZ, got time, FX"):
         load_dataset(tmp_path / "press", channel="FZ")
 
@@ -390,7 +516,9 @@ def uneven(rate_hz: float, seconds: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("as_long", [True, False])
-def test_recordings_at_several_rates_are_resampled_by_their_own_times(as_long: bool, tmp_path: Path) -> None:
+def test_recordings_at_several_rates_are_resampled_by_their_own_times(
+    as_long: bool, tmp_path: Path
+) -> None:
     rates = [228.0, 236.0, 244.0, 250.0, 256.0, 270.0, 280.0]
     for i, rate in enumerate(rates):
         curve = uneven(rate, 2.0 if as_long else 500 / rate)
@@ -401,20 +529,32 @@ def test_recordings_at_several_rates_are_resampled_by_their_own_times(as_long: b
     data = load_dataset(tmp_path, fit="resample")
     assert (len(data), data.fit) == (len(rates), "resample" if as_long else "pad")
     t = np.arange(440) / data.rate_hz
-    np.testing.assert_allclose(data.X[:, :440], np.tile(20 * np.sin(3 * t) + 30 * t, (len(rates), 1)), atol=0.3)
+    np.testing.assert_allclose(
+        data.X[:, :440], np.tile(20 * np.sin(3 * t) + 30 * t, (len(rates), 1)), atol=0.3
+    )
     assert "are put on" in data.notes[0]
     assert data.rates.tolist() == pytest.approx(rates, rel=1e-3)
 
 
 def test_resampled_recordings_are_imported_once_also_when_others_are_added(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    words = ("train", "--data", tmp_path / "cell", "--fit", "resample", "--store", tmp_path / "a.db")
+    words = (
+        "train",
+        "--data",
+        tmp_path / "cell",
+        "--fit",
+        "resample",
+        "--store",
+        tmp_path / "a.db",
+    )
     (tmp_path / "cell").mkdir()
     for first, until in ((0, 30), (30, 30), (30, 34)):
         for i in range(first, until):
-            pd.DataFrame(uneven(rate := rng.uniform(228, 280), 500 / rate), columns=["time", "FZ"]).assign(
-                FZ=lambda frame: frame["FZ"] + rng.normal(size=len(frame))
-            ).to_csv(tmp_path / "cell" / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False)
+            pd.DataFrame(
+                uneven(rate := rng.uniform(228, 280), 500 / rate), columns=["time", "FZ"]
+            ).assign(FZ=lambda frame: frame["FZ"] + rng.normal(size=len(frame))).to_csv(
+                tmp_path / "cell" / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False
+            )
         record = document(*words, *(() if first else ("--reducer", "pca")))["import"]
         assert (record["imported"], record["repeated"]) == (until - first, first)
 
@@ -427,10 +567,14 @@ def left_out(data: Dataset) -> list[str]:
 
 def test_a_jittered_clock_puts_the_samples_where_they_were_measured(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    steps = rng.uniform(0.5, 1.5, (3, 499)) * np.repeat([1.0, 1.8, 1.0], [200, 99, 200])  # slower in between
+    steps = rng.uniform(0.5, 1.5, (3, 499)) * np.repeat(
+        [1.0, 1.8, 1.0], [200, 99, 200]
+    )  # slower in between
     for i, t in enumerate(np.c_[np.zeros(3), np.cumsum(steps, axis=1)]):
         t *= STEP * 499 / t[-1]
-        pd.DataFrame({"time": t, "FZ": 30 * np.sin(3 * t)}).to_csv(tmp_path / f"{i}_OK.csv", index=False)
+        pd.DataFrame({"time": t, "FZ": 30 * np.sin(3 * t)}).to_csv(
+            tmp_path / f"{i}_OK.csv", index=False
+        )
     data = load_dataset(tmp_path, fit="resample")
     t = np.linspace(0, STEP * 499, 500)
     assert np.abs(data.X - 30 * np.sin(3 * t)).max() < 0.1
@@ -450,10 +594,17 @@ def test_a_column_twice_is_one_line_that_says_what_to_do(tmp_path: Path) -> None
                 delimiter=";",
             )
     assert "--channel Y" in one_line("data", tmp_path / "0")
-    assert "Expected a label for each recording" in one_line("data", tmp_path / "0", "--channel", "Y")
+    assert "Expected a label for each recording" in one_line(
+        "data", tmp_path / "0", "--channel", "Y"
+    )
     assert "--channel Y" in one_line("data", tmp_path / "1")
-    advised = re.search(r"name them anew, --columns (\S+?);", one_line("data", tmp_path / "1", "--channel", "X"))[1]
-    assert document("data", tmp_path / "1", "--channel", "X", "--columns", advised)["survey"]["traces"] == 4
+    advised = re.search(
+        r"name them anew, --columns (\S+?);", one_line("data", tmp_path / "1", "--channel", "X")
+    )[1]
+    assert (
+        document("data", tmp_path / "1", "--channel", "X", "--columns", advised)["survey"]["traces"]
+        == 4
+    )
 
 
 def one_line(*words: object) -> str:
@@ -466,8 +617,12 @@ def one_line(*words: object) -> str:
 
 
 def test_lists_in_cells_are_one_line_that_says_what_to_do(tmp_path: Path) -> None:
-    pd.DataFrame({"force": [[1.0, 2.0], [2.0, 3.0]], "label": [1, 0]}).to_parquet(tmp_path / "a.parquet")
-    assert "column force holds lists; give a trace a row" in one_line("data", tmp_path / "a.parquet")
+    pd.DataFrame({"force": [[1.0, 2.0], [2.0, 3.0]], "label": [1, 0]}).to_parquet(
+        tmp_path / "a.parquet"
+    )
+    assert "column force holds lists; give a trace a row" in one_line(
+        "data", tmp_path / "a.parquet"
+    )
 
 
 def test_what_is_not_finite_is_named_by_its_file(tmp_path: Path) -> None:
@@ -482,7 +637,12 @@ def test_what_is_not_finite_is_named_by_its_file(tmp_path: Path) -> None:
 
 WRITERS: dict[str, Callable[[Path], object]] = {
     "excel": lambda path: write(
-        path, ["Zeit [s]", "Kraft [kN]"], german(times()), german(texts()), delimiter=";", above=["sep=;"]
+        path,
+        ["Zeit [s]", "Kraft [kN]"],
+        german(times()),
+        german(texts()),
+        delimiter=";",
+        above=["sep=;"],
     ),
     "lvm": lambda path: write(
         path,

@@ -17,7 +17,11 @@ from tests.support.recording_forms import LABEL_FORMS
 
 
 def write_csv(
-    path: Path, values: np.ndarray, names: tuple[str, ...] = ("FZ_Base",), rate_hz: float = 500.0, **how: Any
+    path: Path,
+    values: np.ndarray,
+    names: tuple[str, ...] = ("FZ_Base",),
+    rate_hz: float = 500.0,
+    **how: Any,
 ) -> Path:
     """(C, T) as a file with timestamps."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -29,7 +33,9 @@ def write_csv(
 
 def write_folder(folder: Path, data: Dataset, **how: Any) -> Path:
     for i, (x, y) in enumerate(zip(data.X, data.y, strict=True)):
-        write_csv(folder / f"insertion_{i + 1}_{bool(y)}.csv", x, data.channels or ("FZ_Base",), **how)
+        write_csv(
+            folder / f"insertion_{i + 1}_{bool(y)}.csv", x, data.channels or ("FZ_Base",), **how
+        )
     return folder
 
 
@@ -57,13 +63,21 @@ FORMS: dict[str, Callable[[Dataset, Path], Any]] = {
     "folder": lambda data, tmp: write_folder(tmp / "cell", data),
     "semicolons": lambda data, tmp: write_folder(tmp / "excel", data, **EXCEL),
     "tabs": lambda data, tmp: write_folder(tmp / "tabs", data, sep="\t"),
-    "wide csv": lambda data, tmp: written(tmp / "wide.csv", lambda path: wide(data).to_csv(path, index=False)),
-    "wide excel": lambda data, tmp: written(tmp / "wide.csv", lambda path: wide(data).to_csv(path, index=False, **EXCEL)),
+    "wide csv": lambda data, tmp: written(
+        tmp / "wide.csv", lambda path: wide(data).to_csv(path, index=False)
+    ),
+    "wide excel": lambda data, tmp: written(
+        tmp / "wide.csv", lambda path: wide(data).to_csv(path, index=False, **EXCEL)
+    ),
     "parquet": lambda data, tmp: written(tmp / "wide.parquet", wide(data).to_parquet),
     "frame": lambda data, tmp: wide(data),
-    "npz": lambda data, tmp: written(tmp / "data.npz", lambda path: np.savez(path, X=data.X, y=data.y)),
+    "npz": lambda data, tmp: written(
+        tmp / "data.npz", lambda path: np.savez(path, X=data.X, y=data.y)
+    ),
     "words": lambda data, tmp: (data.X, words(data)),
-    "npz of words": lambda data, tmp: written(tmp / "data.npz", lambda path: np.savez(path, X=data.X, y=words(data))),
+    "npz of words": lambda data, tmp: written(
+        tmp / "data.npz", lambda path: np.savez(path, X=data.X, y=words(data))
+    ),
     "list": lambda data, tmp: (list(data.X), [bool(y) for y in data.y]),
     "series": lambda data, tmp: ([pd.Series(x) for x in data.X], data.y),
     "frames": lambda data, tmp: (
@@ -77,40 +91,71 @@ HERTZ = dict.fromkeys(("folder", "semicolons", "tabs", "frames"), 500.0)  # of t
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_every_form_gives_the_same_traces_and_labels(form: str, small: Dataset, tmp_path: Path) -> None:
+def test_every_form_gives_the_same_traces_and_labels(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
     data = load_dataset(source := FORMS[form](small, tmp_path))
     np.testing.assert_array_equal(data.X, small.X)
     np.testing.assert_array_equal(data.y, small.y)
-    assert (data.X.dtype, data.y.dtype, data.fit, data.faults) == (np.float32, np.int8, "strict", ())
+    assert (data.X.dtype, data.y.dtype, data.fit, data.faults) == (
+        np.float32,
+        np.int8,
+        "strict",
+        (),
+    )
     assert data.rate_hz == HERTZ.get(form)
     assert data.spec.samples == 50
     np.testing.assert_array_equal(load_dataset(source, samples=30).X, small.X[:, :30])
 
 
-def test_several_channels_are_picked_by_name_in_any_order(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+def test_several_channels_are_picked_by_name_in_any_order(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
     data = make_data(6, samples=40, channels=3)
     names = ("FX_Base", "FY_Base", "FZ_Base")
     folder = write_folder(tmp_path / "cell", Dataset(data.X, data.y, channels=names))
     both = load_dataset(folder, channel="FZ_Base,FX_Base")
     np.testing.assert_array_equal(both.X, data.X[:, [2, 0]])
-    assert (both.channels, both.spec.channels, both.spec.columns) == (("FZ_Base", "FX_Base"), 2, ("FZ_Base", "FX_Base"))
-    np.testing.assert_array_equal(load_dataset(folder).X, data.X[:, 2])  # the force along the insertion
+    assert (both.channels, both.spec.channels, both.spec.columns) == (
+        ("FZ_Base", "FX_Base"),
+        2,
+        ("FZ_Base", "FX_Base"),
+    )
+    np.testing.assert_array_equal(
+        load_dataset(folder).X, data.X[:, 2]
+    )  # the force along the insertion
     np.testing.assert_array_equal(load_dataset(both, channel="FX_Base").X, data.X[:, 0])
     columns = {f"{name}_{i}": data.X[:, c, i] for c, name in enumerate(names) for i in range(40)}
     table = pd.DataFrame(columns).assign(y=data.y)
     np.testing.assert_array_equal(load_dataset(table, channel="FZ_Base,FX_Base").X, both.X)
 
 
-ROWS = write_csv(Path(tempfile.mkdtemp()) / "x.csv", np.linspace(0.0, 20.0, 40)).read_text().splitlines()
+ROWS = (
+    write_csv(Path(tempfile.mkdtemp()) / "x.csv", np.linspace(0.0, 20.0, 40))
+    .read_text()
+    .splitlines()
+)
 TIME, CELL = ROWS[7].split(",")
 # file -> its lines among good ones, the fault's line and words
 BROKEN: dict[str, tuple[list[str], int, str]] = {
-    "text_True.csv": ([*ROWS[:7], f"{TIME},12N", *ROWS[8:]], 8, "Expected a number in column FZ_Base, got '12N'"),
+    "text_True.csv": (
+        [*ROWS[:7], f"{TIME},12N", *ROWS[8:]],
+        8,
+        "Expected a number in column FZ_Base, got '12N'",
+    ),
     "short_row_True.csv": ([*ROWS[:-1], "17.0"], 41, "Expected 2 columns, got 1"),
     "long_row_True.csv": ([*ROWS[:5], ROWS[5] + ",1", *ROWS[6:]], 6, "Expected 2 columns, got 3"),
     "header_False.csv": (ROWS[:1], 1, "Expected samples below the header, found none"),
-    "back_True.csv": ([*ROWS[:20], "", ROWS[19], *ROWS[20:]], 22, "Expected a later time than that of the row before"),
-    "gap_True.csv": ([*ROWS[:10], *ROWS[25:]], 11, "Expected a step of 0.002 s in time, got a gap of 0.032 s"),
+    "back_True.csv": (
+        [*ROWS[:20], "", ROWS[19], *ROWS[20:]],
+        22,
+        "Expected a later time than that of the row before",
+    ),
+    "gap_True.csv": (
+        [*ROWS[:10], *ROWS[25:]],
+        11,
+        "Expected a step of 0.002 s in time, got a gap of 0.032 s",
+    ),
     "too_short_True.csv": (ROWS[:12], 0, "Expected 20 to 80 samples, to pad them to 40, got 11"),
     "unlabelled.csv": (ROWS, 0, "Expected a label at the end of the name"),
     "twice_True.csv": (
@@ -118,10 +163,22 @@ BROKEN: dict[str, tuple[list[str], int, str]] = {
         1,
         "Expected a column FZ_Base, got it twice or more",
     ),
-    "late_True.csv": ([*ROWS[:8], f"late,{CELL}", *ROWS[9:]], 9, "Expected a time in column Timestamp, in seconds or"),
+    "late_True.csv": (
+        [*ROWS[:8], f"late,{CELL}", *ROWS[9:]],
+        9,
+        "Expected a time in column Timestamp, in seconds or",
+    ),
     "empty_True.csv": ([], 0, "Expected a header and rows, it is empty"),
-    "no_force_True.csv": ([row.replace("FZ", "FX") for row in ROWS], 1, "Expected a column FZ_Base, got Timestamp, FX"),
-    "latin_OK.csv": ([*ROWS[:3], "0,1 \xb5m", *ROWS[3:]], 4, "Expected a number in column FZ_Base, got '1 µm'"),
+    "no_force_True.csv": (
+        [row.replace("FZ", "FX") for row in ROWS],
+        1,
+        "Expected a column FZ_Base, got Timestamp, FX",
+    ),
+    "latin_OK.csv": (
+        [*ROWS[:3], "0,1 \xb5m", *ROWS[3:]],
+        4,
+        "Expected a number in column FZ_Base, got '1 µm'",
+    ),
     "slow_True.csv": (
         [ROWS[0], *(f"{i / 250},{CELL}" for i in range(40))],
         *(0, "Expected timestamps at 500 Hz, as the others have, got 250 Hz"),
@@ -129,7 +186,9 @@ BROKEN: dict[str, tuple[list[str], int, str]] = {
 }
 
 
-def test_each_fault_is_named_with_file_and_line_and_nothing_else_is_lost(make_data, tmp_path: Path) -> None:
+def test_each_fault_is_named_with_file_and_line_and_nothing_else_is_lost(
+    make_data, tmp_path: Path
+) -> None:
     data = make_data(30, samples=40)
     write_folder(tmp_path, data)
     for name, (rows, *_) in BROKEN.items():
@@ -175,7 +234,8 @@ def test_two_labels_in_a_name_that_contradict_each_other_are_an_error(name: str)
 def test_a_number_is_a_label_of_a_name_where_somebody_says_so_and_never_against_a_word() -> None:
     source_of_labels = labels_in_names(None, {"1": True, "0": False})
     assert [
-        source_of_labels.find(name)[0] for name in ("run_1.csv", "part_003/run_0.csv", "1/7.csv", "0/a.csv", "x-1.csv")
+        source_of_labels.find(name)[0]
+        for name in ("run_1.csv", "part_003/run_0.csv", "1/7.csv", "0/a.csv", "x-1.csv")
     ] == [
         1,
         0,
@@ -197,7 +257,14 @@ def test_labels_come_from_folders_a_pattern_or_a_file(small: Dataset, tmp_path: 
         write_csv(tmp_path / "sorted" / ("good" if y else "bad") / f"{i}.csv", x)
         write_csv(tmp_path / "coded" / f"{i}_{'q1' if y else 'q0'}_cell3.csv", x)
         names.append(write_csv(tmp_path / "plain" / f"{i}.csv", x).name)
-        rows.append({"file": names[-1], "operator": "a", "result": "pass" if y else "fail", "part": f"P{i // 2}"})
+        rows.append(
+            {
+                "file": names[-1],
+                "operator": "a",
+                "result": "pass" if y else "fail",
+                "part": f"P{i // 2}",
+            }
+        )
     pd.DataFrame(rows).to_csv(tmp_path / "plain" / "labels.csv", index=False)
     order = [int(p.split("/")[1][:-4]) for p in load_dataset(tmp_path / "sorted").source]
     assert load_dataset(tmp_path / "sorted").y.tolist() == small.y[order].tolist()
@@ -208,19 +275,48 @@ def test_labels_come_from_folders_a_pattern_or_a_file(small: Dataset, tmp_path: 
     assert listed.faults == ()
 
 
-def test_a_labels_file_that_does_not_fit_is_named_line_by_line(small: Dataset, tmp_path: Path) -> None:
+def test_a_labels_file_that_does_not_fit_is_named_line_by_line(
+    small: Dataset, tmp_path: Path
+) -> None:
     for i, x in enumerate(small.X[:8]):
         write_csv(tmp_path / "cell" / f"{i}.csv", x)
-    rows = ["0.csv,OK", "1,NOK", "2.csv,perhaps", "3.csv", "ghost.csv,OK", "4.csv,OK", "4.csv,NOK", "5.csv,1", "6.csv,0"]
+    rows = [
+        "0.csv,OK",
+        "1,NOK",
+        "2.csv,perhaps",
+        "3.csv",
+        "ghost.csv,OK",
+        "4.csv,OK",
+        "4.csv,NOK",
+        "5.csv,1",
+        "6.csv,0",
+    ]
     (tmp_path / "labels.csv").write_text("\n".join(["file,label", *rows]) + "\n")
     data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
-    assert (data.source.tolist(), data.y.tolist()) == ([f"{i}.csv" for i in (0, 1, 4, 5, 6)], [1, 0, 1, 1, 0])
+    assert (data.source.tolist(), data.y.tolist()) == (
+        [f"{i}.csv" for i in (0, 1, 4, 5, 6)],
+        [1, 0, 1, 1, 0],
+    )
     places = [(f.source, f.line) for f in data.faults]
-    assert places == [("labels.csv", 5), ("labels.csv", 8), ("labels.csv", 6), ("2.csv", 0), ("3.csv", 0), ("7.csv", 0)]
+    assert places == [
+        ("labels.csv", 5),
+        ("labels.csv", 8),
+        ("labels.csv", 6),
+        ("2.csv", 0),
+        ("3.csv", 0),
+        ("7.csv", 0),
+    ]
     assert "in labels.csv, line 4" in data.faults[3].message
 
 
-PATHS = ["run_0.csv", "./sub/Run_1.csv", "C:\\data\\sub\\Run_2.CSV", "/old/cell/sub/Run_3.csv", "Run_4", '"sub/Run_5.csv"']
+PATHS = [
+    "run_0.csv",
+    "./sub/Run_1.csv",
+    "C:\\data\\sub\\Run_2.CSV",
+    "/old/cell/sub/Run_3.csv",
+    "Run_4",
+    '"sub/Run_5.csv"',
+]
 NAMED = [f"{file},{'nok' if i % 2 else 'ok'}" for i, file in enumerate(PATHS)]
 LISTS = {
     "a header": ["note,path,verdict", *(f'"a, b",{row}' for row in NAMED)],
@@ -231,7 +327,9 @@ LISTS = {
 
 
 @pytest.mark.parametrize("form", LISTS)
-def test_a_labels_file_names_recordings_as_people_write_paths(form: str, small: Dataset, tmp_path: Path) -> None:
+def test_a_labels_file_names_recordings_as_people_write_paths(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
     for i, x in enumerate(small.X[:6]):
         write_csv(tmp_path / "cell" / "sub" / f"Run_{i}.CSV", x)
     (tmp_path / "labels.csv").write_text("\n".join(LISTS[form]))
@@ -242,11 +340,17 @@ def test_a_labels_file_names_recordings_as_people_write_paths(form: str, small: 
 @pytest.fixture(scope="module")
 def uneven() -> tuple[list[np.ndarray], list[int]]:
     rng = np.random.default_rng(0)
-    return [np.linspace(0.0, 20.0, n) + rng.normal(0, 0.1, n) for n in rng.integers(90, 111, 15)], [1, 0, 1] * 5
+    return [np.linspace(0.0, 20.0, n) + rng.normal(0, 0.1, n) for n in rng.integers(90, 111, 15)], [
+        1,
+        0,
+        1,
+    ] * 5
 
 
 @pytest.mark.parametrize("fit", ["cut", "pad", "resample"])
-def test_lengths_are_fitted_in_a_file_as_they_are_live(fit: str, uneven: tuple[list[np.ndarray], list[int]]) -> None:
+def test_lengths_are_fitted_in_a_file_as_they_are_live(
+    fit: str, uneven: tuple[list[np.ndarray], list[int]]
+) -> None:
     data = load_dataset(uneven, fit=fit)
     lengths = [len(x) for x in uneven[0]]
     assert data.X.shape == (15, min(lengths) if fit == "cut" else int(np.median(lengths)))
@@ -257,20 +361,31 @@ def test_lengths_are_fitted_in_a_file_as_they_are_live(fit: str, uneven: tuple[l
             np.testing.assert_array_equal(kept, data.X[i : i + 1])
 
 
-def test_unasked_lengths_that_differ_are_padded_and_never_resampled(uneven: tuple[list[np.ndarray], list[int]]) -> None:
+def test_unasked_lengths_that_differ_are_padded_and_never_resampled(
+    uneven: tuple[list[np.ndarray], list[int]],
+) -> None:
     assert load_dataset(uneven).fit == "pad"
     short = load_dataset(uneven, samples=60)
     assert (short.spec, short.X.shape) == (TraceSpec(60, fit="cut"), (15, 60))
-    with pytest.raises(DataError, match=r"Expected recordings of one length, got 9\d to 110 samples; choose fit='pad'"):
+    with pytest.raises(
+        DataError,
+        match=r"Expected recordings of one length, got 9\d to 110 samples; choose fit='pad'",
+    ):
         load_dataset(uneven, fit="strict")
 
 
-def test_what_cannot_honestly_be_fitted_is_a_fault(uneven: tuple[list[np.ndarray], list[int]]) -> None:
+def test_what_cannot_honestly_be_fitted_is_a_fault(
+    uneven: tuple[list[np.ndarray], list[int]],
+) -> None:
     X = [*uneven[0], np.ones(20), np.ones(300), np.array([])]
     y = [*uneven[1], 1, 1, 1]
     data = load_dataset((X, y))
     assert len(data) == 15
-    assert [(f.source, f.line) for f in data.faults] == [("data", 18), ("trace 16", 0), ("trace 17", 0)]
+    assert [(f.source, f.line) for f in data.faults] == [
+        ("data", 18),
+        ("trace 16", 0),
+        ("trace 17", 0),
+    ]
     assert np.isfinite(data.X).all()
     with pytest.raises(DataError, match="found none of 18"):
         load_dataset((X, y), samples=5000)
@@ -291,7 +406,9 @@ CLOCKS = {  # name -> its times, and hertz
 
 @pytest.mark.parametrize("name", CLOCKS)
 def test_timestamps_tell_the_rate_whatever_their_unit(name: str, tmp_path: Path) -> None:
-    pd.DataFrame({name: CLOCKS[name][0], "FZ_Base": np.sin(STEPS)}).to_csv(tmp_path / "a_OK.csv", index=False)
+    pd.DataFrame({name: CLOCKS[name][0], "FZ_Base": np.sin(STEPS)}).to_csv(
+        tmp_path / "a_OK.csv", index=False
+    )
     data = load_dataset(tmp_path)
     assert (data.rate_hz, data.channels) == (pytest.approx(CLOCKS[name][1]), ("FZ_Base",))
     assert load_dataset(tmp_path, rate_hz=100.0).rate_hz == 100.0
@@ -306,7 +423,11 @@ def test_rows_of_a_table_that_cannot_be_read_are_named(small: Dataset, tmp_path:
     lines[12] = "," + lines[12].split(",", 1)[1]  # an empty cell is a NaN, for the engine to find
     path.write_text("\n".join(lines) + "\n")
     data = load_dataset(path)
-    assert [(f.source, f.line) for f in data.faults] == [("wide.csv", 4), ("wide.csv", 7), ("wide.csv", 10)]
+    assert [(f.source, f.line) for f in data.faults] == [
+        ("wide.csv", 4),
+        ("wide.csv", 7),
+        ("wide.csv", 10),
+    ]
     assert "Expected 51 columns, got 46" in data.faults[0].message
     assert "Expected a number in column FZ_0, got 'abc'" in data.faults[1].message
     kept = [i for i in range(24) if i not in (2, 5, 8)]
@@ -323,8 +444,12 @@ def few(small: Dataset, tmp_path: Path) -> Path:
     return write_folder(tmp_path / "cell", Dataset(small.X[:4], small.y[:4]))
 
 
-def test_a_header_is_found_in_any_case_and_a_comma_at_the_end_of_lines_is_no_column(few: Path, small: Dataset) -> None:
-    for path, (head, row) in zip(sorted(few.iterdir()), (("", ""), (",", ","), ("", ","), (",", "")), strict=True):
+def test_a_header_is_found_in_any_case_and_a_comma_at_the_end_of_lines_is_no_column(
+    few: Path, small: Dataset
+) -> None:
+    for path, (head, row) in zip(
+        sorted(few.iterdir()), (("", ""), (",", ","), ("", ","), (",", "")), strict=True
+    ):
         first, *lines = path.read_text(encoding="utf-8").splitlines()
         path.write_text("\n".join([first.lower() + head, *(line + row for line in lines)]) + "\n")
     data = load_dataset(few)
@@ -333,7 +458,9 @@ def test_a_header_is_found_in_any_case_and_a_comma_at_the_end_of_lines_is_no_col
     np.testing.assert_array_equal(load_dataset(few, channel="fz_base").X, small.X[:4])
 
 
-def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(few: Path, small: Dataset) -> None:
+def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(
+    few: Path, small: Dataset
+) -> None:
     write_csv(few / ".ipynb_checkpoints" / "x_True.csv", small.X[5])
     write_csv(few / "__MACOSX" / "._x_True.csv", small.X[5])
     (few / "readme.txt").write_text("of cell 3")
@@ -350,31 +477,46 @@ def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(few
         ({}, r"4 of 4 have none.*give the pattern of it in the path \(label\), or list the files"),
         ({"label": "("}, "regular expression"),
         ({"label": "ok"}, "one group"),
-        ({"labels": True}, r"4 of 4 have none.*labels\.csv names OK, NOK: call its columns file and label"),
+        (
+            {"labels": True},
+            r"4 of 4 have none.*labels\.csv names OK, NOK: call its columns file and label",
+        ),
         ({"labels": True, "part": "workpiece"}, "Expected a column workpiece of parts' numbers in"),
         ({"labels": True, "label": "_(OK)_"}, "got both; leave one out"),
         ({"part": "workpiece"}, "Expected a file of labels with a column workpiece"),
     ],
 )
-def test_where_a_folders_labels_are_not_is_said(small: Dataset, tmp_path: Path, options: dict, words: str) -> None:
+def test_where_a_folders_labels_are_not_is_said(
+    small: Dataset, tmp_path: Path, options: dict, words: str
+) -> None:
     for i, x in enumerate(small.X[2:6], start=2):
         write_csv(tmp_path / "cell" / f"run_{i}.csv", x)
     (tmp_path / "labels.csv").write_text("a,b\nOK,1\nNOK,2\n")
     with pytest.raises(DataError, match=words):
-        load_dataset(tmp_path / "cell", **(options | ({"labels": tmp_path / "labels.csv"} if "labels" in options else {})))
+        load_dataset(
+            tmp_path / "cell",
+            **(options | ({"labels": tmp_path / "labels.csv"} if "labels" in options else {})),
+        )
 
 
-def test_parts_keep_their_whole_names_and_a_row_without_one_is_a_part_of_its_own(small: Dataset) -> None:
+def test_parts_keep_their_whole_names_and_a_row_without_one_is_a_part_of_its_own(
+    small: Dataset,
+) -> None:
     names = [None, *(f"P{i // 2}" for i in range(1, 24))]
     table = wide(small).rename(columns={"label": "Height check"}).assign(workpiece=names)
     data = load_dataset(table, part="workpiece", label="Height check")
     np.testing.assert_array_equal(data.X, small.X)
     assert data.part.tolist() == ["row, line 1", *names[1:]]
     numbers = [np.nan, *(float(i) for i in range(1, 24))]
-    assert load_dataset(wide(small).assign(part=numbers)).part.tolist() == ["row, line 1", *map(str, range(1, 24))]
+    assert load_dataset(wide(small).assign(part=numbers)).part.tolist() == [
+        "row, line 1",
+        *map(str, range(1, 24)),
+    ]
 
 
-def test_a_row_whose_last_cells_are_empty_is_a_shorter_trace(small: Dataset, tmp_path: Path) -> None:
+def test_a_row_whose_last_cells_are_empty_is_a_shorter_trace(
+    small: Dataset, tmp_path: Path
+) -> None:
     table = wide(small)
     lengths = [45 + i % 6 for i in range(24)]
     for i, length in enumerate(lengths):
@@ -385,7 +527,8 @@ def test_a_row_whose_last_cells_are_empty_is_a_shorter_trace(small: Dataset, tmp
         assert (data.fit, data.lengths.tolist(), data.X.shape) == ("pad", lengths, (24, 47))
         assert np.isfinite(data.X).all()
         np.testing.assert_array_equal(
-            data.X, load_dataset(([x[:n] for x, n in zip(small.X, lengths, strict=True)], small.y)).X
+            data.X,
+            load_dataset(([x[:n] for x, n in zip(small.X, lengths, strict=True)], small.y)).X,
         )
 
 
@@ -395,25 +538,51 @@ def written_text(path: Path) -> Path:
 
 
 REFUSED: dict[str, tuple[Callable[[Dataset, Path], Any], str]] = {
-    "a sample left out": (lambda data, tmp: wide(data).drop(columns="FZ_5"), "after FZ_4 comes FZ_6"),
-    "columns twice": (lambda data, tmp: pd.concat([wide(data), wide(data)], axis=1), "Expected each column once"),
+    "a sample left out": (
+        lambda data, tmp: wide(data).drop(columns="FZ_5"),
+        "after FZ_4 comes FZ_6",
+    ),
+    "columns twice": (
+        lambda data, tmp: pd.concat([wide(data), wide(data)], axis=1),
+        "Expected each column once",
+    ),
     "no header": (
-        lambda data, tmp: written(tmp / "bare.csv", lambda path: wide(data).to_csv(path, index=False, header=False)),
+        lambda data, tmp: written(
+            tmp / "bare.csv", lambda path: wide(data).to_csv(path, index=False, header=False)
+        ),
         "its first line is of numbers",
     ),
     "recordings without a header": (
-        lambda data, tmp: write_folder(tmp / "bare", Dataset(data.X[:3], data.y[:3]), header=False).parent / "bare",
+        lambda data, tmp: (
+            write_folder(tmp / "bare", Dataset(data.X[:3], data.y[:3]), header=False).parent
+            / "bare"
+        ),
         "found none of 3.*its first line is of numbers",
     ),
     "one recording": (
         lambda data, tmp: write_csv(tmp / "one_True.csv", data.X[0]),
         "as in one recording; give a folder of such CSV files",
     ),
-    "no labels": (lambda data, tmp: wide(data).drop(columns="label"), "a column of labels, y or label, found FZ_0"),
-    "no samples": (lambda data, tmp: pd.DataFrame({"FZ": [1.0], "label": [1]}), "Expected samples in numbered columns"),
-    "transposed": (lambda data, tmp: (np.zeros((5, 100, 2)), [1] * 5), r"looks transposed; pass X\.transpose"),
-    "transposed in a list": (lambda data, tmp: ([np.zeros((100, 2))] * 3, [1, 0, 1]), "looks transposed"),
-    "a word that is no label": (lambda data, tmp: (data.X[:2], ["OK", "perhaps"]), r"as True/False.*got 'perhaps'"),
+    "no labels": (
+        lambda data, tmp: wide(data).drop(columns="label"),
+        "a column of labels, y or label, found FZ_0",
+    ),
+    "no samples": (
+        lambda data, tmp: pd.DataFrame({"FZ": [1.0], "label": [1]}),
+        "Expected samples in numbered columns",
+    ),
+    "transposed": (
+        lambda data, tmp: (np.zeros((5, 100, 2)), [1] * 5),
+        r"looks transposed; pass X\.transpose",
+    ),
+    "transposed in a list": (
+        lambda data, tmp: ([np.zeros((100, 2))] * 3, [1, 0, 1]),
+        "looks transposed",
+    ),
+    "a word that is no label": (
+        lambda data, tmp: (data.X[:2], ["OK", "perhaps"]),
+        r"as True/False.*got 'perhaps'",
+    ),
     "no label at all": (
         lambda data, tmp: (data.X[:2], ["", None]),
         "labelled traces in data, got .2 that have no label yet",
@@ -446,7 +615,9 @@ def test_recordings_that_are_added_do_not_make_those_before_count_again(tmp_path
         write_csv(tmp_path / "cell" / f"{i}_NOK.csv", rng.normal(size=96))
     again = import_labelled(store, tmp_path / "cell")
     assert (first.imported, again.imported, again.repeated) == (9, 20, 9)
-    with pytest.raises(TraceError, match="to 104 samples by pad, cell was to 96 by pad; load it with samples=104"):
+    with pytest.raises(
+        TraceError, match="to 104 samples by pad, cell was to 96 by pad; load it with samples=104"
+    ):
         import_labelled(store, load_dataset(tmp_path / "cell"))
     with pytest.raises(TraceError, match="was to 104 by resample"):
         import_labelled(store, load_dataset(tmp_path / "cell", samples=104, fit="resample"))

@@ -20,7 +20,9 @@ def played(data: Dataset) -> Replay:
     return replay(data, RECIPE, seed=1)
 
 
-@pytest.mark.parametrize("recipe", [RECIPE, RECIPE.with_policy(audit_rate=0.3), KNOWN], ids=["plain", "audited", "known"])
+@pytest.mark.parametrize(
+    "recipe", [RECIPE, RECIPE.with_policy(audit_rate=0.3), KNOWN], ids=["plain", "audited", "known"]
+)
 def test_a_seed_repeats_exactly(data: Dataset, recipe: Recipe) -> None:
     first, other = (replay(data, recipe, seed=1) for _ in range(2))
     assert first.accepted.sum() > 20
@@ -31,15 +33,21 @@ def test_a_budget_of_wall_time_changes_nothing_in_a_replay(data: Dataset, played
     same(replay(data, replace(RECIPE, budget=1e-9), seed=1), played, "recipe")
 
 
-def test_a_stream_is_played_as_recorded_or_in_its_seeds_order(data: Dataset, played: Replay) -> None:
+def test_a_stream_is_played_as_recorded_or_in_its_seeds_order(
+    data: Dataset, played: Replay
+) -> None:
     other = replay(data, RECIPE, seed=2)
     assert not np.array_equal(other.truth, played.truth)
     assert other.truth.sum() == played.truth.sum()
     for seed in (0, 1):
-        np.testing.assert_array_equal(replay(data, RECIPE, seed, shuffle=False).truth, data.y.astype(bool))
+        np.testing.assert_array_equal(
+            replay(data, RECIPE, seed, shuffle=False).truth, data.y.astype(bool)
+        )
 
 
-def test_fewer_cycles_are_the_beginning_of_the_same_pass_told_one_by_one(data: Dataset, played: Replay) -> None:
+def test_fewer_cycles_are_the_beginning_of_the_same_pass_told_one_by_one(
+    data: Dataset, played: Replay
+) -> None:
     seen: list[int] = []
     short = replay(data, RECIPE, seed=1, cycles=90, on_cycle=seen.append)
     assert seen == list(range(1, 91))
@@ -50,7 +58,9 @@ def test_fewer_cycles_are_the_beginning_of_the_same_pass_told_one_by_one(data: D
             replay(data, RECIPE, cycles=cycles)
 
 
-def test_a_replays_repr_shows_its_policy_whose_two_numbers_may_be_given_directly(data: Dataset) -> None:
+def test_a_replays_repr_shows_its_policy_whose_two_numbers_may_be_given_directly(
+    data: Dataset,
+) -> None:
     plain = replay(data, "pca", cycles=30)
     assert "alpha 0.05, LB 95 %, local" in repr(plain)
     run = replay(data, "pca", cycles=30, alpha=0.3, lower_bound=0.7)
@@ -65,10 +75,17 @@ class Silent:
     """A cell as real ones are: it tells nothing but what it is asked for."""
 
     def __init__(self, cell: ReplayCell) -> None:
-        self.insert, self.verify, self.proceed, self.reject = cell.insert, cell.verify, cell.proceed, cell.reject
+        self.insert, self.verify, self.proceed, self.reject = (
+            cell.insert,
+            cell.verify,
+            cell.proceed,
+            cell.reject,
+        )
 
 
-def test_a_live_run_and_a_replay_by_recipe_or_engine_keep_the_same_record(data: Dataset, played: Replay) -> None:
+def test_a_live_run_and_a_replay_by_recipe_or_engine_keep_the_same_record(
+    data: Dataset, played: Replay
+) -> None:
     def engine() -> DataEngine:
         return DataEngine(recipe=RECIPE, seed=1, replaying=True)
 
@@ -77,7 +94,9 @@ def test_a_live_run_and_a_replay_by_recipe_or_engine_keep_the_same_record(data: 
     same(log, played, "index", "dataset", "seed")
     assert played.stretches(4) == log.stretches(4)
     same(replay(data, engine(), seed=1), played)
-    log = watch(engine(), Silent(ReplayCell(data, order)), 200)  # what the cell does not tell stays unknown
+    log = watch(
+        engine(), Silent(ReplayCell(data, order)), 200
+    )  # what the cell does not tell stays unknown
     answer = log.verified | log.stopped
     assert 0 < answer.sum() < 200
     np.testing.assert_array_equal(log.truth[answer], played.truth[answer])
@@ -92,8 +111,17 @@ def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(playe
     assert (accepted.sum(), rejected.sum()) == (row["accepted"], row["rejected"])
     assert (accepted & ~frame["truth"]).sum() == row["false_positive"]
     assert (rejected & frame["truth"]).sum() == row["false_negative"]
-    assert accepted.sum() + rejected.sum() == row["certain"] == (frame["reason"] == "certain").sum() > 50
-    assert (row["saved_s"], row["cycles"], row["retrains"]) == (5.0 * row["certain"], 200, len(played.retrains))
+    assert (
+        accepted.sum() + rejected.sum()
+        == row["certain"]
+        == (frame["reason"] == "certain").sum()
+        > 50
+    )
+    assert (row["saved_s"], row["cycles"], row["retrains"]) == (
+        5.0 * row["certain"],
+        200,
+        len(played.retrains),
+    )
     assert frame["reason"].eq("no_model").sum() == 40 == frame["version"].eq(0).sum()
     assert frame.loc[row["first_certain"], "action"] != "verify"
     assert np.isnan(played.position[:40]).all()
@@ -101,34 +129,54 @@ def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(playe
     np.testing.assert_array_equal(frame[["embedding_1", "embedding_2"]].to_numpy(), played.position)
 
 
-def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(data: Dataset, played: Replay) -> None:
+def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(
+    data: Dataset, played: Replay
+) -> None:
     highest = data.X.max(axis=1)
     window = f"0:1:-1e9:{np.quantile(highest, 0.8)}:reject"
     with pytest.raises(DataError, match="because windows are in seconds; give rate_hz"):
         replay(data, RECIPE.with_policy(windows=[window]))
     data = replace(data, rate_hz=500.0)
-    log, wide = (replay(data, RECIPE.with_policy(windows=[item]), seed=1) for item in (window, "0:1:-1e9:"))
+    log, wide = (
+        replay(data, RECIPE.with_policy(windows=[item]), seed=1) for item in (window, "0:1:-1e9:")
+    )
     same(wide, played, "recipe")
     out = highest[log.index] > np.quantile(highest, 0.8)
     np.testing.assert_array_equal(log.outside, out)
     assert set(log.action[out]) == {"reject"}
     row = log.summary()
-    assert row["certain"] == row["accepted"] + row["rejected"] == (log.action[~out] != "verify").sum() > 20
-    assert (row["outside"], row["false_negative"]) == (out.sum(), (log.truth & (log.action == "reject"))[~out].sum())
+    assert (
+        row["certain"]
+        == row["accepted"] + row["rejected"]
+        == (log.action[~out] != "verify").sum()
+        > 20
+    )
+    assert (row["outside"], row["false_negative"]) == (
+        out.sum(),
+        (log.truth & (log.action == "reject"))[~out].sum(),
+    )
     assert not log.finished[out].any()
 
 
-def test_a_notebook_sees_short_records_the_status_and_times_as_datetimes(data: Dataset, played: Replay) -> None:
+def test_a_notebook_sees_short_records_the_status_and_times_as_datetimes(
+    data: Dataset, played: Replay
+) -> None:
     engine = DataEngine("pca")
     decision = [cycle.decision for cycle in engine.run(ReplayCell(data), 80)][-1]
     frame = engine.history_frame(last=5)
-    assert (frame["time"].dt.tz is not None, frame.index[-1], engine.status().ever.decisions) == (True, decision.id, 80)
+    assert (frame["time"].dt.tz is not None, frame.index[-1], engine.status().ever.decisions) == (
+        True,
+        decision.id,
+        80,
+    )
     for item in (engine, decision, data, played, engine.explain(decision.id), engine.status()):
         assert len(repr(item)) < 240
         assert item._repr_html_().startswith("<table>")
 
 
-def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Dataset, tmp_path) -> None:
+def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(
+    data: Dataset, tmp_path
+) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(RECIPE.to_toml(), encoding="utf-8")
     asked = ["paper", str(path), path, RECIPE, PCA(2), "sklearn.decomposition:PCA", Recipe(PCA(2))]
@@ -138,8 +186,13 @@ def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Datase
 
 
 @pytest.mark.parametrize("confirm", [False, True])
-def test_after_an_accept_a_failure_stops_and_a_success_is_silent_unless_confirmed(data: Dataset, confirm: bool) -> None:
-    for label, outcome in ((0, Outcome.STOPPED), (1, Outcome.CONFIRMED if confirm else Outcome.UNKNOWN)):
+def test_after_an_accept_a_failure_stops_and_a_success_is_silent_unless_confirmed(
+    data: Dataset, confirm: bool
+) -> None:
+    for label, outcome in (
+        (0, Outcome.STOPPED),
+        (1, Outcome.CONFIRMED if confirm else Outcome.UNKNOWN),
+    ):
         cell = ReplayCell(data, np.flatnonzero(data.y == label), confirm)
         cell.insert()
         assert cell.proceed() is outcome

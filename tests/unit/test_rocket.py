@@ -62,7 +62,9 @@ def test_space_k_is_the_same_bit_for_bit_whatever_the_labels_of_fold_k_also_over
     for n in (60, 110, 160):
         first.train(X[:n], y[:n], folds[:n])
         two.train(X[:n], other[:n], folds[:n])
-        other[folds == k] = rng.permutation(other[folds == k])  # other labels again at the next warm start
+        other[folds == k] = rng.permutation(
+            other[folds == k]
+        )  # other labels again at the next warm start
         a, b = first.embed(X), two.embed(X)
         assert np.array_equal(a[:, k], b[:, k])
         assert first.holdout_losses_[k] == two.holdout_losses_[k]
@@ -107,7 +109,9 @@ def test_no_step_begins_after_the_deadline():
     X, y = traces()
     ticks = iter(range(1000))
     reducer = RocketReducer()
-    reducer.train(X, y, content_fold(X, 5), StopRule(deadline=5.0, clock=lambda: float(next(ticks))))
+    reducer.train(
+        X, y, content_fold(X, 5), StopRule(deadline=5.0, clock=lambda: float(next(ticks)))
+    )
     assert reducer.n_iter_ == 5
     before = reducer.embed(X)
     reducer.train(X, y, content_fold(X, 5), stop := StopRule(deadline=-1.0, clock=lambda: 0.0))
@@ -169,7 +173,9 @@ def test_a_setting_out_of_range_is_named(params, message):
 
 def test_a_trace_of_another_shape_is_an_error_that_names_both():
     reducer, X, _ = fitted()
-    with pytest.raises(TraceError, match=r"1 channels x 152 samples, as in fit, got 1 channels x 150"):
+    with pytest.raises(
+        TraceError, match=r"1 channels x 152 samples, as in fit, got 1 channels x 150"
+    ):
         reducer.embed(X[:, :, :150])
     assert reducer.embed(X[:0]).shape == (0, 5, 2)
 
@@ -177,9 +183,15 @@ def test_a_trace_of_another_shape_is_an_error_that_names_both():
 def test_a_head_that_would_do_worse_than_the_base_rate_says_it_and_the_others_do_not():
     rng = np.random.default_rng(0)
     g = torch.from_numpy(rng.normal(size=(940, 50)).astype(np.float32))
-    y = torch.from_numpy((rng.random(940) < 1 / (1 + np.exp(-2 * g[:, 0].numpy()))).astype(np.int64))
-    outside = torch.arange(940) < torch.tensor([[900], [40]])  # head 1 learns from forty rows, head 0 from enough
-    w, left_out, unsure, steps = fit_heads(g, y, outside, torch.zeros(2, 51, dtype=torch.float64), 0.01, 30, None)
+    y = torch.from_numpy(
+        (rng.random(940) < 1 / (1 + np.exp(-2 * g[:, 0].numpy()))).astype(np.int64)
+    )
+    outside = torch.arange(940) < torch.tensor(
+        [[900], [40]]
+    )  # head 1 learns from forty rows, head 0 from enough
+    w, left_out, unsure, steps = fit_heads(
+        g, y, outside, torch.zeros(2, 51, dtype=torch.float64), 0.01, 30, None
+    )
     assert unsure == [1]
     assert not w[1, :-1].any()
     assert torch.sigmoid(w[1, -1]) == pytest.approx(float(y[:40].double().mean()))
@@ -195,7 +207,13 @@ def test_heads_end_where_scikit_learns_logistic_regression_does():
     folds = rng.integers(0, 3, 400)
     outside = folds != np.arange(3)[:, None]
     w, *_ = fit_heads(
-        torch.from_numpy(g), torch.from_numpy(y), torch.from_numpy(outside), torch.zeros(3, 13).double(), 1.0, 30, None
+        torch.from_numpy(g),
+        torch.from_numpy(y),
+        torch.from_numpy(outside),
+        torch.zeros(3, 13).double(),
+        1.0,
+        30,
+        None,
     )
     for k in range(3):
         theirs = LogisticRegression(C=1.0, tol=1e-8).fit(g[folds != k], y[folds != k])
@@ -215,7 +233,9 @@ def test_the_components_are_found_anew_where_the_traces_grew_by_half_and_the_sec
 
 
 @pytest.mark.parametrize("kind", [partial(RocketReducer, groups=0), RocketReducer])
-def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_tower(kind: Any) -> None:
+def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_tower(
+    kind: Any,
+) -> None:
     X, y = traces(100)
     reducer = kind(folds=3).fit(X, y)
     with torch.no_grad():
@@ -226,12 +246,16 @@ def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_to
         for tower, custom, variance in zip(reducer.towers_, seen, variances, strict=False):
             g = custom.double() @ tower.axes.double() + tower.centre
             logits.append((g @ tower.w[:, :-1].T + tower.w[:, -1]).numpy())
-            assert g.var(0).sum() == pytest.approx(variance, rel=0.05)  # what a ridge of 1 is weighed against
+            assert g.var(0).sum() == pytest.approx(
+                variance, rel=0.05
+            )  # what a ridge of 1 is weighed against
     for k, text in enumerate(reducer.embed(X)[..., 0].T):
         mixed = [logits[0][:, k]]
         for logit in logits[1:]:
             mixed = [
-                logit[:, k] + share * (first - logit[:, k]) for first in mixed for share in np.linspace(0.0, 1.0, N_SHARES)
+                logit[:, k] + share * (first - logit[:, k])
+                for first in mixed
+                for share in np.linspace(0.0, 1.0, N_SHARES)
             ]
         assert min(np.abs(expit(first) - text).max() for first in mixed) < 1e-5
 
@@ -240,7 +264,11 @@ def test_where_good_of_one_product_is_bad_of_the_other_the_products_of_component
     rng = np.random.default_rng(0)
     levels = rng.choice([-1.0, 1.0], (400, 2, 1)) + 0.3 * rng.standard_normal((400, 2, 1))
     time, y = np.linspace(0.0, 1.0, 200), (levels[:, 0, 0] * levels[:, 1, 0] > 0).astype(np.int64)
-    X = levels[:, 0] * (time < 0.1) + levels[:, 1] * (time > 0.9) + 0.3 * rng.standard_normal((400, 200))
+    X = (
+        levels[:, 0] * (time < 0.1)
+        + levels[:, 1] * (time > 0.9)
+        + 0.3 * rng.standard_normal((400, 200))
+    )
     reducer = RocketReducer().fit(X[:150], y[:150])
     assert roc_auc_score(y[150:], reducer.embed(X[150:, None])[..., 0].mean(1)) > 0.9
 
@@ -250,10 +278,14 @@ def test_where_a_resonance_tells_it_kernels_that_compete_sort_better_than_ramps_
     y = rng.integers(2, size=500)
     noise = rng.standard_normal((500, 1, 410))
     echo = np.cos((0.9 + 0.06 * y) * np.arange(10)[:, None]) * 0.8 ** np.arange(10)[:, None]
-    X = sum(noise[..., i : 400 + i] * custom[:, None, None] for i, custom in enumerate(echo)).astype(np.float32)
+    X = sum(
+        noise[..., i : 400 + i] * custom[:, None, None] for i, custom in enumerate(echo)
+    ).astype(np.float32)
     auc = [
         roc_auc_score(y[300:], reducer.embed(X[300:])[..., 0].mean(1))
-        for reducer in (item.fit(X[:300], y[:300]) for item in (RocketReducer(groups=0), RocketReducer()))
+        for reducer in (
+            item.fit(X[:300], y[:300]) for item in (RocketReducer(groups=0), RocketReducer())
+        )
     ]
     assert auc[1] > auc[0] + 0.02
 
@@ -271,17 +303,26 @@ def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkey
     X, y = traces(90)
     reducer, folds, computed, results = RocketReducer(), content_fold(X, 5), [], []
     raw = RocketEncoder.raw_features
-    monkeypatch.setattr(RocketEncoder, "raw_features", lambda self, x: (computed.append(len(x)), raw(self, x))[1])
+    monkeypatch.setattr(
+        RocketEncoder, "raw_features", lambda self, x: (computed.append(len(x)), raw(self, x))[1]
+    )
     for first, last in ((0, 60), (30, 90), (30, 90), (0, 60)):
-        reducer.train(X[first:last], y[first:last], folds[first:last], numbers=np.arange(1 + first, 1 + last))
+        reducer.train(
+            X[first:last], y[first:last], folds[first:last], numbers=np.arange(1 + first, 1 + last)
+        )
         results.append(sum(computed))
         computed.clear()
     assert results == [64, 32, 0, 32]  # whole chunks
 
 
 def test_features_of_very_many_traces_are_those_of_each_to_the_bit() -> None:
-    X, features = traces(PARALLEL_TRACES + 50)[0], RocketReducer(folds=2).fit(*traces(100)).raw_features
-    assert torch.equal(features(X), torch.cat([features(X[i : i + 7]) for i in range(0, len(X), 7)]))
+    X, features = (
+        traces(PARALLEL_TRACES + 50)[0],
+        RocketReducer(folds=2).fit(*traces(100)).raw_features,
+    )
+    assert torch.equal(
+        features(X), torch.cat([features(X[i : i + 7]) for i in range(0, len(X), 7)])
+    )
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -290,16 +331,22 @@ def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(cha
     encoder = RocketEncoder(channels, samples, 1, kernels, dilations, 3, 0)
     a = torch.randn(5, channels, samples, generator=torch.Generator().manual_seed(0))
     encoder.learn_filters(a, np.random.default_rng(0))
-    result = torch.bmm(encoder.kernel, encoder.as_windows(encoder.read_taps(a), dilations)).view(dilations, kernels, -1, 5)
+    result = torch.bmm(encoder.kernel, encoder.as_windows(encoder.read_taps(a), dilations)).view(
+        dilations, kernels, -1, 5
+    )
     middle = encoder.taps.view(dilations, 9, -1)[:, 4]
     for d, spread in enumerate((1, 2, 7)):  # 2 ** 0, and up to the length over 8
         weight = encoder.kernel[d].reshape(kernels, channels, 9)
-        whole = torch.nn.functional.conv1d(a, weight, padding=4 * spread, dilation=spread)  # (5, kernels, samples)
+        whole = torch.nn.functional.conv1d(
+            a, weight, padding=4 * spread, dilation=spread
+        )  # (5, kernels, samples)
         torch.testing.assert_close(result[d], whole[:, :, middle[d]].permute(1, 2, 0))
 
 
 @pytest.mark.parametrize("samples", [400, 1000, 5000])
-def test_traces_are_averaged_to_two_hundred_samples_but_not_where_that_loses_an_oscillation(samples: int) -> None:
+def test_traces_are_averaged_to_two_hundred_samples_but_not_where_that_loses_an_oscillation(
+    samples: int,
+) -> None:
     t = np.arange(samples)
     rng = np.random.default_rng(0)
     slow = np.sin(2 * np.pi * (3 * t / samples + rng.random((20, 1, 1)))).astype(np.float32)
@@ -310,7 +357,9 @@ def test_traces_are_averaged_to_two_hundred_samples_but_not_where_that_loses_an_
 
 @pytest.mark.parametrize("channels", [1, 3, 12])
 @pytest.mark.parametrize("samples", [2, 3, 9, 64, 152, 5000])
-def test_traces_of_any_shape_have_finite_features_the_same_when_scripted(samples: int, channels: int) -> None:
+def test_traces_of_any_shape_have_finite_features_the_same_when_scripted(
+    samples: int, channels: int
+) -> None:
     rng = np.random.default_rng(0)
     X = torch.from_numpy(rng.normal(size=(24, channels, samples)).cumsum(2).astype(np.float32))
     encoder = RocketEncoder(channels, samples, averaging(X), 28, 5, 3, 2).eval()
@@ -322,8 +371,13 @@ def test_traces_of_any_shape_have_finite_features_the_same_when_scripted(samples
 
 
 @pytest.mark.parametrize("retrained_before", [True, False])
-def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(tmp_path, monkeypatch, retrained_before) -> None:
-    url, recipe = str(tmp_path / "cell.sqlite"), Recipe("rocket", params={"kernels": 6, "width": 8}, retrain_every=40)
+def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(
+    tmp_path, monkeypatch, retrained_before
+) -> None:
+    url, recipe = (
+        str(tmp_path / "cell.sqlite"),
+        Recipe("rocket", params={"kernels": 6, "width": 8}, retrain_every=40),
+    )
     X, y = traces(120 if retrained_before else 520)
     if retrained_before:
         with DataEngine(recipe=recipe, store=url, replaying=True) as engine:

@@ -12,7 +12,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dengine import INTERVALS, Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, export_torchscript
+from dengine import (
+    INTERVALS,
+    Action,
+    DataEngine,
+    Dataset,
+    Policy,
+    Recipe,
+    ReplayCell,
+    export_torchscript,
+)
 from dengine.decision.intervals import SCALAR_BOUNDS
 from dengine.decision.rule import DecisionRule, action_of
 from dengine.errors import ExportError, SettingError
@@ -26,10 +35,14 @@ ACTIONS = tuple(Action)
 
 @pytest.mark.parametrize("interval", SCALAR_BOUNDS)
 @given(n_success=counts, n_failure=counts, alpha=alphas, lower_bound=bounds)
-def test_the_scalar_rule_is_the_interval_and_the_policy(interval, n_success, n_failure, alpha, lower_bound) -> None:
+def test_the_scalar_rule_is_the_interval_and_the_policy(
+    interval, n_success, n_failure, alpha, lower_bound
+) -> None:
     policy = Policy(alpha, lower_bound, interval)
     action, lower, upper = policy.rule()(n_success, n_failure)
-    assert (lower, upper) == pytest.approx(INTERVALS[interval](n_success, n_failure, alpha), abs=1e-12)
+    assert (lower, upper) == pytest.approx(
+        INTERVALS[interval](n_success, n_failure, alpha), abs=1e-12
+    )
     assert ACTIONS[action] is policy.action(lower, upper)
     assert 0.0 <= lower <= upper <= 1.0
 
@@ -58,7 +71,12 @@ class FuseRule(DecisionRule):
 
     @torch.jit.export
     def update(
-        self, lower: float, upper: float, success: bool, predicted: int = 0, inclusion_probability: float = 1.0
+        self,
+        lower: float,
+        upper: float,
+        success: bool,
+        predicted: int = 0,
+        inclusion_probability: float = 1.0,
     ) -> None:
         """A stop sets the fuse; each label after it burns a little of it."""
         if not success and lower >= self.accept_threshold:
@@ -80,7 +98,12 @@ class FailingRule(FuseRule):
     """Cannot be told anything."""
 
     def update(
-        self, lower: float, upper: float, success: bool, predicted: int = 0, inclusion_probability: float = 1.0
+        self,
+        lower: float,
+        upper: float,
+        success: bool,
+        predicted: int = 0,
+        inclusion_probability: float = 1.0,
     ) -> None:
         raise RuntimeError("update failed")
 
@@ -105,7 +128,9 @@ def good(data: Dataset) -> np.ndarray:
     return data.X[np.flatnonzero(data.y == 1)[-1]]
 
 
-def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(outside, data, tmp_path: Path) -> None:
+def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(
+    outside, data, tmp_path: Path
+) -> None:
     recipe = Recipe.from_toml(recipe_with(outside).to_toml())
     url = str(tmp_path / "engine.db")
     with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
@@ -129,7 +154,9 @@ def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(ou
         assert engine.decide(good(data)).action is Action.ACCEPT
 
 
-def test_a_rule_that_does_not_compile_decides_and_is_not_exported(outside, data, tmp_path: Path) -> None:
+def test_a_rule_that_does_not_compile_decides_and_is_not_exported(
+    outside, data, tmp_path: Path
+) -> None:
     with DataEngine(recipe=recipe_with("fuse:SpokenRule"), replaying=True) as engine:
         actions = [c.decision.action for c in engine.run(ReplayCell(data), len(data))]
         assert actions.count(Action.ACCEPT) > 50
@@ -138,7 +165,9 @@ def test_a_rule_that_does_not_compile_decides_and_is_not_exported(outside, data,
             export_torchscript(engine, tmp_path / "model.ts")
 
 
-def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(outside, data, tmp_path: Path) -> None:
+def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(
+    outside, data, tmp_path: Path
+) -> None:
     url = str(tmp_path / "engine.db")
     with DataEngine(recipe=recipe_with("fuse:FailingRule"), store=url, replaying=True) as engine:
         cycles = list(engine.run(ReplayCell(data), 100))
@@ -152,7 +181,11 @@ def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(outsi
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("globl", "a guarantee among local"), ("nowhere:Rule", "can be imported here"), ("dengine.recipe:Recipe", "subclass")],
+    [
+        ("globl", "a guarantee among local"),
+        ("nowhere:Rule", "can be imported here"),
+        ("dengine.recipe:Recipe", "subclass"),
+    ],
 )
 def test_a_rule_that_cannot_be_had_is_named(name: str, message: str) -> None:
     with pytest.raises(SettingError, match=message):
@@ -201,11 +234,15 @@ CHANGES = {  # of a rule's module, whose rule accepts: what is replaced, by what
 }
 
 
-def rule_module(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, accept: int = 1) -> ModuleType:
+def rule_module(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, accept: int = 1
+) -> ModuleType:
     """A module of an outside author with `MyRule`, and beside it the constant that it reads."""
     monkeypatch.syspath_prepend(str(folder))
     (folder / f"limits_{name}.py").write_text("LIMIT = 0.5\n", encoding="utf-8")
-    (folder / f"{name}.py").write_text(RULE.format(limits=f"limits_{name}", accept=accept), encoding="utf-8")
+    (folder / f"{name}.py").write_text(
+        RULE.format(limits=f"limits_{name}", accept=accept), encoding="utf-8"
+    )
     module = importlib.import_module(name)
     module.limits = getattr(module, f"limits_{name}")
     return module
@@ -213,7 +250,9 @@ def rule_module(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, accept
 
 def says(rule: type[DecisionRule], data: Dataset) -> tuple[Action, ModelPrediction]:
     """What a model under this rule decides on a trace whose neighbours are good."""
-    model = ModelPrediction("pca", rule=rule(0.2, 0.8), novelty=0.0).fit(data.X, np.ones(len(data), dtype=int))
+    model = ModelPrediction("pca", rule=rule(0.2, 0.8), novelty=0.0).fit(
+        data.X, np.ones(len(data), dtype=int)
+    )
     return model.decide(good(data)[None])[0], model
 
 
@@ -227,19 +266,32 @@ def test_a_rule_whose_code_was_changed_in_this_process_is_asked_as_it_is_now_and
     monkeypatch.setattr(owner(rules), name, value)
     result, model = says(rules.MyRule, data)
     assert result is action
-    with pytest.raises(ExportError, match="MyRule was changed after it was compiled; start Python anew"):
+    with pytest.raises(
+        ExportError, match="MyRule was changed after it was compiled; start Python anew"
+    ):
         export_torchscript(model, tmp_path / "model.ts")
 
 
 def test_two_rules_of_one_name_and_a_notebook_cell_that_is_run_again_are_each_asked_for_themselves(
     data: Dataset, tmp_path: Path, monkeypatch
 ) -> None:
-    accepts, rejects = (rule_module(tmp_path, monkeypatch, name, action) for name, action in (("rule_a", 1), ("rule_b", 2)))
-    assert [says(module.MyRule, data)[0] for module in (accepts, rejects)] == [Action.ACCEPT, Action.REJECT]
+    accepts, rejects = (
+        rule_module(tmp_path, monkeypatch, name, action)
+        for name, action in (("rule_a", 1), ("rule_b", 2))
+    )
+    assert [says(module.MyRule, data)[0] for module in (accepts, rejects)] == [
+        Action.ACCEPT,
+        Action.REJECT,
+    ]
     texts = []
     for number, action in enumerate((1, 2, 0)):
-        cell, named = RULE.format(limits="math", accept=action).replace("math.LIMIT", "0.5"), f"<cell {number}>"
-        monkeypatch.setitem(linecache.cache, named, (len(cell), None, cell.splitlines(keepends=True), named))
+        cell, named = (
+            RULE.format(limits="math", accept=action).replace("math.LIMIT", "0.5"),
+            f"<cell {number}>",
+        )
+        monkeypatch.setitem(
+            linecache.cache, named, (len(cell), None, cell.splitlines(keepends=True), named)
+        )
         notebook: dict[str, type[DecisionRule]] = {"__name__": "__main__"}
         exec(compile(cell, named, "exec"), notebook)  # as a notebook does
         result, model = says(notebook["MyRule"], data)

@@ -35,8 +35,12 @@ POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)
 
 
 def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
-    engine = DataEngine(recipe="conv", policy=POLICY, radius=0.07, folds=3, retrain_every=20, budget=0.3)
-    expected = replace(RECIPES["conv"], policy=POLICY, radius=0.07, folds=3, retrain_every=20, budget=0.3)
+    engine = DataEngine(
+        recipe="conv", policy=POLICY, radius=0.07, folds=3, retrain_every=20, budget=0.3
+    )
+    expected = replace(
+        RECIPES["conv"], policy=POLICY, radius=0.07, folds=3, retrain_every=20, budget=0.3
+    )
     assert engine.recipe == expected
     assert engine.policy is engine.recipe.policy
     assert engine.store.settings()["recipe"] == expected.to_toml()
@@ -68,7 +72,9 @@ REFUSED = [  # settings, and the words that say why not
 
 
 @pytest.mark.parametrize(("given", "words"), REFUSED)
-def test_what_contradicts_itself_or_has_no_effect_is_refused_and_spoils_no_store(given, words: str, tmp_path: Path) -> None:
+def test_what_contradicts_itself_or_has_no_effect_is_refused_and_spoils_no_store(
+    given, words: str, tmp_path: Path
+) -> None:
     for begin in (DataEngine, DataEngine.open_or_create):
         with pytest.raises(SettingError, match=words):
             begin(store=tmp_path / "engine.db", **given)
@@ -76,8 +82,14 @@ def test_what_contradicts_itself_or_has_no_effect_is_refused_and_spoils_no_store
 
 
 def test_the_audit_rate_and_the_loops_settings_count_for_a_baseline_too() -> None:
-    engine = DataEngine(model=Counting(), policy=Policy(audit_rate=0.3), retrain_every=7, budget=0.2)
-    assert (engine.policy.audit_rate, engine.recipe.retrain_every, engine.recipe.budget) == (0.3, 7, 0.2)
+    engine = DataEngine(
+        model=Counting(), policy=Policy(audit_rate=0.3), retrain_every=7, budget=0.2
+    )
+    assert (engine.policy.audit_rate, engine.recipe.retrain_every, engine.recipe.budget) == (
+        0.3,
+        7,
+        0.2,
+    )
     assert engine.store.settings()["model"] == "Counting"
 
 
@@ -102,36 +114,59 @@ def test_the_same_line_begins_and_goes_on(data: Dataset, tmp_path: Path) -> None
         ({"trace": TraceSpec(99)}, "trace"),
     ],
 )
-def test_other_settings_than_the_stores_are_an_error_that_names_both(other, named, data: Dataset, tmp_path: Path) -> None:
+def test_other_settings_than_the_stores_are_an_error_that_names_both(
+    other, named, data: Dataset, tmp_path: Path
+) -> None:
     url = tmp_path / "engine.db"
     with DataEngine("pca", POLICY, radius=0.5, store=url) as engine:
         engine.decide(data.X[0])
-    with pytest.raises(SettingError, match=rf"the store's own settings \(.*{named} .*\), got .*{named} "):
+    with pytest.raises(
+        SettingError, match=rf"the store's own settings \(.*{named} .*\), got .*{named} "
+    ):
         DataEngine.open_or_create(url, **other)
-    for given in ({"reducer": "pca"}, {"policy": POLICY}, {"radius": 0.5}, {"seed": 0}):  # the rest is not asked for
+    for given in (
+        {"reducer": "pca"},
+        {"policy": POLICY},
+        {"radius": 0.5},
+        {"seed": 0},
+    ):  # the rest is not asked for
         DataEngine.open_or_create(url, **given).close()
 
 
 def ours(**changes) -> ModelPrediction:
-    return ModelPrediction("pca", WilsonRadiusClassifier(**({"radius": 0.5, "alpha": 0.2, "lower_bound": 0.8} | changes)))
+    return ModelPrediction(
+        "pca",
+        WilsonRadiusClassifier(**({"radius": 0.5, "alpha": 0.2, "lower_bound": 0.8} | changes)),
+    )
 
 
 @pytest.mark.parametrize(
     ("first", "then"),
     [
-        ({"model": ours(), "policy": Policy(audit_rate=0.1)}, {"model": ours(alpha=0.5, lower_bound=0.6)}),
+        (
+            {"model": ours(), "policy": Policy(audit_rate=0.1)},
+            {"model": ours(alpha=0.5, lower_bound=0.6)},
+        ),
         ({"model": ours(), "recipe": "conv"}, {"model": ours(radius=0.9)}),
-        ({"model": Counting(), "retrain_every": 30, "policy": Policy(audit_rate=0.1)}, {"model": ours()}),
+        (
+            {"model": Counting(), "retrain_every": 30, "policy": Policy(audit_rate=0.1)},
+            {"model": ours()},
+        ),
         ({"reducer": "pca"}, {"model": ours()}),
         ({"recipe": Recipe(PCA(2), policy=POLICY)}, {"reducer": PCA(3)}),
         ({"reducer": PCA(2)}, {"reducer": LinearDiscriminantAnalysis()}),
         ({"reducer": "pca"}, {"reducer": PCA(2)}),
         ({"reducer": "conv"}, {"reducer": ConvReducer(folds=3)}),
-        ({"reducer": make_pipeline(StandardScaler(), PCA(2)), "policy": POLICY}, {"reducer": make_pipeline(PCA(3))}),
+        (
+            {"reducer": make_pipeline(StandardScaler(), PCA(2)), "policy": POLICY},
+            {"reducer": make_pipeline(PCA(3))},
+        ),
         ({"reducer": make_pipeline(PCA(2))}, {"reducer": PCA(2)}),
     ],
 )
-def test_a_used_store_takes_the_object_it_was_made_with_and_no_other(first, then, data: Dataset, tmp_path: Path) -> None:
+def test_a_used_store_takes_the_object_it_was_made_with_and_no_other(
+    first, then, data: Dataset, tmp_path: Path
+) -> None:
     with DataEngine.open_or_create(tmp_path / "engine.db", **first) as engine:
         drive(engine, data, 0, 60)
     with pytest.raises(SettingError):
@@ -158,8 +193,12 @@ def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     sys.modules.pop("theirs", None)
 
 
-def test_an_own_reducer_enters_by_name_replay_grid_recipe_and_engine(outside, data: Dataset, tmp_path: Path) -> None:
-    recipe = replace(Recipe.from_toml(f'reducer = "{outside}"\n[params]\nn_components = 2\n'), policy=POLICY)
+def test_an_own_reducer_enters_by_name_replay_grid_recipe_and_engine(
+    outside, data: Dataset, tmp_path: Path
+) -> None:
+    recipe = replace(
+        Recipe.from_toml(f'reducer = "{outside}"\n[params]\nn_components = 2\n'), policy=POLICY
+    )
     assert set(replay(data, recipe, cycles=120).action) >= {"verify", "accept"}
     frame = run_grid(data, [outside, "pca"], [0.2], [0.8], repeats=1, n_jobs=1, cycles=100)
     assert list(frame["recipe"]) == [outside, "pca"]
@@ -167,7 +206,9 @@ def test_an_own_reducer_enters_by_name_replay_grid_recipe_and_engine(outside, da
     assert (run.position.shape, np.isfinite(run.position[100:]).all()) == ((120, 100), True)
     import theirs
 
-    for i, reducer in enumerate((outside, theirs.Own(3))):  # by its name, and as an object that has one
+    for i, reducer in enumerate(
+        (outside, theirs.Own(3))
+    ):  # by its name, and as an object that has one
         with DataEngine(reducer, POLICY, store=tmp_path / f"{i}.db") as engine:
             assert 'reducer = "theirs:Own"' in engine.recipe.to_toml()
             drive(engine, data, 0, 60)
@@ -177,8 +218,12 @@ def test_an_own_reducer_enters_by_name_replay_grid_recipe_and_engine(outside, da
             assert engine.decide(data.X[70]).embedding == before.embedding
 
 
-@pytest.mark.parametrize("mine", [{"reducer": "theirs:Own"}, {"policy": replace(POLICY, guarantee="theirs:Rule")}])
-def test_what_a_store_names_is_imported_only_where_its_caller_says_so(outside, mine, data, tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    "mine", [{"reducer": "theirs:Own"}, {"policy": replace(POLICY, guarantee="theirs:Rule")}]
+)
+def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
+    outside, mine, data, tmp_path, monkeypatch
+) -> None:
     module, ran, url = tmp_path / "theirs.py", tmp_path / "ran", str(tmp_path / "engine.db")
     created = {"reducer": "pca", "policy": POLICY, "retrain_every": 40} | mine
     with DataEngine(store=address(url, "a", "nut"), **created) as engine:
@@ -189,10 +234,15 @@ def test_what_a_store_names_is_imported_only_where_its_caller_says_so(outside, m
     def exit_code(verb: str, *words: str) -> int:
         return dengine(verb, url, *words, "--cell", "a").exit_code
 
-    assert [exit_code(*words) for words in (("status",), ("verify",), ("history",), ("explain", "last"))] == [0] * 4
+    assert [
+        exit_code(*words) for words in (("status",), ("verify",), ("history",), ("explain", "last"))
+    ] == [0] * 4
     assert [exit_code(verb) for verb in ("retrain", "policy")] == [2] * 2
     for opened in (DataEngine.open, DataEngine.open_or_create):
-        with pytest.raises(ImportRefusedError, match=r"theirs:.*, which .* names: name it again .*allow_import=True"):
+        with pytest.raises(
+            ImportRefusedError,
+            match=r"theirs:.*, which .* names: name it again .*allow_import=True",
+        ):
             opened(address(url, "a"))
     with pytest.raises(ImportRefusedError, match=r"theirs:.*, which a peer"):
         DataEngine.open_or_create(address(url, "b", "nut"))
@@ -204,30 +254,41 @@ def test_what_a_store_names_is_imported_only_where_its_caller_says_so(outside, m
     DataEngine.open_or_create(address(url, "b", "nut"), allow_import=True).close()
 
 
-def test_an_object_without_a_name_runs_and_is_handed_in_again(data: Dataset, tmp_path: Path) -> None:
+def test_an_object_without_a_name_runs_and_is_handed_in_again(
+    data: Dataset, tmp_path: Path
+) -> None:
     def pipeline():
         return make_pipeline(StandardScaler(), PCA(2, random_state=0))
 
     for params in ({"segments": [1]}, {"a b": 1}, {"inner": PCA(2)}):  # that TOML cannot say
         with pytest.raises(SettingError, match="params of plain names and values"):
             Recipe("conv", params)
-    assert set(replay(data, Recipe(pipeline(), policy=POLICY), cycles=150).action) >= {"verify", "accept"}
+    assert set(replay(data, Recipe(pipeline(), policy=POLICY), cycles=150).action) >= {
+        "verify",
+        "accept",
+    }
     with DataEngine(pipeline(), POLICY, store=tmp_path / "engine.db") as engine:
         drive(engine, data, 0, 60)
         before = engine.decide(data.X[70])
-    with pytest.raises(SettingError, match=r"object Pipeline, has no name in TOML: hand it in again"):
+    with pytest.raises(
+        SettingError, match=r"object Pipeline, has no name in TOML: hand it in again"
+    ):
         DataEngine.open(tmp_path / "engine.db")
     with DataEngine.open(tmp_path / "engine.db", reducer=pipeline()) as engine:
         assert engine.decide(data.X[70]).embedding == before.embedding
 
 
-def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was_handed_in(data: Dataset) -> None:
+def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was_handed_in(
+    data: Dataset,
+) -> None:
     for steps in (1, 3):
         engine = DataEngine(recipe=replace(RECIPES["conv"], max_steps=steps), replaying=True)
         drive(engine, data, 0, 60)
         assert {r.n_steps for r in engine.store.retrains()} == {steps}
     ticks = count()
-    engine = DataEngine("conv", POLICY, retrain_every=1000, clock=lambda: float(next(ticks)))  # a second a look
+    engine = DataEngine(
+        "conv", POLICY, retrain_every=1000, clock=lambda: float(next(ticks))
+    )  # a second a look
     learn(engine, data, range(80))
     before = next(ticks)
     report = engine.retrain()

@@ -37,22 +37,33 @@ def test_a_key_is_new_secret_and_never_replaced(key: Path, tmp_path: Path) -> No
     with pytest.raises(ExportError, match="is there already"):
         make_key(tmp_path / "link.key")
     done = command("export", "--make-key", tmp_path / "nowhere" / "cell.key")
-    assert (done.exit_code, "choose a folder that exists" in " ".join(done.output.split())) == (1, True)
+    assert (done.exit_code, "choose a folder that exists" in " ".join(done.output.split())) == (
+        1,
+        True,
+    )
     assert key.read_text() == kept
     assert not (tmp_path / "planted").exists()
 
 
-def test_the_signature_is_that_of_the_standard(model: ModelPrediction, key: Path, tmp_path: Path) -> None:
+def test_the_signature_is_that_of_the_standard(
+    model: ModelPrediction, key: Path, tmp_path: Path
+) -> None:
     file = export_torchscript(model, tmp_path / "model.ts", key=key)
-    expected = hmac.new(key.read_text().strip().encode(), file.read_bytes(), hashlib.sha256).hexdigest()
+    expected = hmac.new(
+        key.read_text().strip().encode(), file.read_bytes(), hashlib.sha256
+    ).hexdigest()
     assert (tmp_path / "model.ts.sig").read_text() == f"hmac-sha256:{expected}  model.ts\n"
     assert load_exported(file, key=key).trace == TraceSpec(40)
     again = load_exported(file, key=key).save(tmp_path / "saved.ts", key=key)
     assert read_metadata(again, key=key)["references"] == 60
 
 
-@pytest.mark.parametrize("kind", ["unsigned", "another key", "changed", "a short key", "no key", "not text"])
-def test_what_is_not_signed_with_the_key_is_refused_before_torch_sees_it(model, key, tmp_path, kind, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    "kind", ["unsigned", "another key", "changed", "a short key", "no key", "not text"]
+)
+def test_what_is_not_signed_with_the_key_is_refused_before_torch_sees_it(
+    model, key, tmp_path, kind, monkeypatch
+) -> None:
     file = export_torchscript(model, tmp_path / "model.ts", key=key)
     if kind == "unsigned":
         file.with_name("model.ts.sig").unlink()
@@ -62,7 +73,9 @@ def test_what_is_not_signed_with_the_key_is_refused_before_torch_sees_it(model, 
         content = bytearray(file.read_bytes())
         content[100] ^= 1
         file.write_bytes(content)
-        file.with_name("model.ts.sha256").write_text(f"{hashlib.sha256(content).hexdigest()}  model.ts\n")
+        file.with_name("model.ts.sha256").write_text(
+            f"{hashlib.sha256(content).hexdigest()}  model.ts\n"
+        )
     elif kind == "a short key":
         key.write_text("secret\n")
     elif kind == "no key":

@@ -28,7 +28,9 @@ def fill(store: SqlStore, n: int = 5) -> None:
 
 def correct(store: SqlStore, success: bool | None, *names: str, author: str = "kim") -> int:
     kind = "forget" if success is None else "correct"
-    return store.apply_change(Change(kind, f"{kind} {', '.join(names)}", {"names": list(names)}, author, names, success))
+    return store.apply_change(
+        Change(kind, f"{kind} {', '.join(names)}", {"names": list(names)}, author, names, success)
+    )
 
 
 def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: SqlStore) -> None:
@@ -44,11 +46,21 @@ def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: SqlStore) ->
     assert store.labelled(2).seq.tolist() == [3, 5]
     assert [item.seq for item in store.outcomes_since(0)] == [1, 3, 5]
     stored = store.get_decision("1")
-    assert (stored.success, stored.source, stored.trace.tolist()) == (None, Source.VERIFICATION, trace(1).tolist())
-    assert (store.status()["labels"], store.status()["forgotten"], store.status()["corrected"]) == (3, 2, 0)
+    assert (stored.success, stored.source, stored.trace.tolist()) == (
+        None,
+        Source.VERIFICATION,
+        trace(1).tolist(),
+    )
+    assert (store.status()["labels"], store.status()["forgotten"], store.status()["corrected"]) == (
+        3,
+        2,
+        0,
+    )
 
 
-def test_labels_are_read_as_they_stood_after_any_correction_and_between_two_numbers(store: SqlStore) -> None:
+def test_labels_are_read_as_they_stood_after_any_correction_and_between_two_numbers(
+    store: SqlStore,
+) -> None:
     fill(store)
     correct(store, False, "0")
     correct(store, None, "0", "2")
@@ -67,7 +79,9 @@ def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: 
     put_labels(store, label("late"))
     assert correct(store, None, "late", author="") == 3
     result = store.corrections()
-    assert [(c.number, c.decision_id, c.success, c.author, c.event, c.newest_seq, c.seq) for c in result] == [
+    assert [
+        (c.number, c.decision_id, c.success, c.author, c.event, c.newest_seq, c.seq) for c in result
+    ] == [
         (1, "2", False, "kim", 2, 3, 3),
         (2, "0", False, "kim", 2, 3, 1),
         (3, "late", None, "", 3, 4, 4),
@@ -80,21 +94,33 @@ def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: 
     assert (store.events()[0].data, store.events()[0].author) == (None, "")
 
 
-@pytest.mark.parametrize(("name", "text"), [("nobody", "does not hold"), ("open", "report its label")])
-def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is_kept(store, name: str, text: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "text"), [("nobody", "does not hold"), ("open", "report its label")]
+)
+def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is_kept(
+    store, name: str, text: str
+) -> None:
     fill(store, 2)
     put(store, "open")
     store.save_settings({"a": "1"})
     with pytest.raises(ReportError, match=text):
-        store.apply_change(Change("correct", "", decisions=("0", name), success=False, settings={"a": "2"}))
+        store.apply_change(
+            Change("correct", "", decisions=("0", name), success=False, settings={"a": "2"})
+        )
     assert (store.events(), store.corrections(), store.settings()) == ([], [], {"a": "1"})
     assert store.labelled().labels.tolist() == [1, 0]
 
 
 def test_an_event_a_version_and_settings_are_kept_together(store: SqlStore) -> None:
     report = RetrainReport(1, 0.0, 2, 0, True, "rolled back")
-    store.apply_change(Change("rollback", "to 1", version=(report, 7, {"w": np.ones(2)}), settings={"b": "2"}))
-    assert (store.retrains(), store.settings(), store.last_version().last_seq) == ([report], {"b": "2"}, 7)
+    store.apply_change(
+        Change("rollback", "to 1", version=(report, 7, {"w": np.ones(2)}), settings={"b": "2"})
+    )
+    assert (store.retrains(), store.settings(), store.last_version().last_seq) == (
+        [report],
+        {"b": "2"},
+        7,
+    )
 
 
 def test_an_events_data_that_json_has_not_is_refused(store: SqlStore) -> None:
@@ -103,14 +129,18 @@ def test_an_events_data_that_json_has_not_is_refused(store: SqlStore) -> None:
     assert store.events() == []
 
 
-def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itself(store: SqlStore) -> None:
+def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itself(
+    store: SqlStore,
+) -> None:
     kinds = [
         (Action.ACCEPT, Action.ACCEPT, False),
         (Action.VERIFY, Action.ACCEPT, True),
         (Action.VERIFY, Action.REJECT, True),
     ]
     for i, (action, predicted, audit) in enumerate(kinds * 2):
-        created = Decision(str(i), action, predicted, 0.9, 1.0, 9, 0, None, i // 3, Reason.CERTAIN, audit, 0.1)
+        created = Decision(
+            str(i), action, predicted, 0.9, 1.0, 9, 0, None, i // 3, Reason.CERTAIN, audit, 0.1
+        )
         put_decision(store, created, trace(i), i, False)
         put_labels(store, NewLabel(str(i), True, Source.AUDIT, 0, None))
     correct(store, False, "0", "1", "2")
@@ -120,24 +150,55 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
     assert (o.audited_accepts, o.audited_accepts_bad, o.forgotten_audited_accepts) == (1, 1, 1)
     assert (o.audited_rejects, o.audited_rejects_good, o.forgotten_audited_rejects) == (1, 0, 1)
     later = store.tally(since_version=1).outcomes
-    assert (later.accepted, later.false_accepts, later.forgotten_accepts, later.audited_accepts) == (1, 0, 1, 0)
+    assert (
+        later.accepted,
+        later.false_accepts,
+        later.forgotten_accepts,
+        later.audited_accepts,
+    ) == (1, 0, 1, 0)
 
 
 def test_what_an_earlier_version_decided_can_be_left_out(store: SqlStore) -> None:
     for version in (1, 2):
         for i in range(3):
             name = f"{version}-{i}"
-            accept = Decision(name, Action.ACCEPT, Action.ACCEPT, 0.9, 1.0, 9, 0, None, version, Reason.CERTAIN, False, 0.1)
+            accept = Decision(
+                name,
+                Action.ACCEPT,
+                Action.ACCEPT,
+                0.9,
+                1.0,
+                9,
+                0,
+                None,
+                version,
+                Reason.CERTAIN,
+                False,
+                0.1,
+            )
             put_decision(store, accept, trace(i), i, False)
-        put_labels(store, NewLabel(f"{version}-0", True, Source.CONFIRMED, version, None, silent=version))
+        put_labels(
+            store, NewLabel(f"{version}-0", True, Source.CONFIRMED, version, None, silent=version)
+        )
     assert store.unreported_accepts(2) == ["2-1", "2-2"]
     assert (store.silent_total(2), store.silent_total()) == (2, 3)
-    assert ([item.seq for item in store.outcomes_since(0, 2)], len(store.outcomes_since(0))) == ([2], 2)
+    assert ([item.seq for item in store.outcomes_since(0, 2)], len(store.outcomes_since(0))) == (
+        [2],
+        2,
+    )
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(changes=st.lists(st.tuples(st.integers(0, 5), st.sampled_from([True, False, None])), max_size=12))
-def test_any_corrections_leave_what_plain_python_would(store: SqlStore, changes: list[tuple[int, bool | None]]) -> None:
+@settings(
+    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    changes=st.lists(
+        st.tuples(st.integers(0, 5), st.sampled_from([True, False, None])), max_size=12
+    )
+)
+def test_any_corrections_leave_what_plain_python_would(
+    store: SqlStore, changes: list[tuple[int, bool | None]]
+) -> None:
     run = uuid.uuid4().hex[:8]
     begin = store.status()["labels"] + store.status()["forgotten"]
     before = len(store.corrections())
@@ -166,7 +227,9 @@ def test_corrections_survive_closing_and_belong_to_their_cell(place: tuple[str, 
         assert (other.corrections(), other.labelled().seq.tolist()) == ([], [])
 
 
-def test_the_newest_labels_are_found_along_indexes_where_there_are_corrections(tmp_path: Path) -> None:
+def test_the_newest_labels_are_found_along_indexes_where_there_are_corrections(
+    tmp_path: Path,
+) -> None:
     with SqlStore(str(tmp_path / "a.db"), "cell") as store:
         fill(store)
         correct(store, None, "0")

@@ -10,9 +10,12 @@ from dengine.store import SqlStore, open_store
 
 
 @pytest.mark.parametrize(
-    ("text", "argument", "wait"), [(None, None, 0.4), ("7.5", None, 7.5), ("7.5", 2.0, 2.0), ("", None, 0.4)]
+    ("text", "argument", "wait"),
+    [(None, None, 0.4), ("7.5", None, 7.5), ("7.5", 2.0, 2.0), ("", None, 0.4)],
 )
-def test_the_argument_comes_before_the_environment_before_the_default(text, argument, wait, tmp_path, monkeypatch) -> None:
+def test_the_argument_comes_before_the_environment_before_the_default(
+    text, argument, wait, tmp_path, monkeypatch
+) -> None:
     monkeypatch.delenv("DENGINE_STORE_WAIT")
     if text is not None:
         monkeypatch.setenv("DENGINE_STORE_WAIT", text)
@@ -24,7 +27,9 @@ def test_the_argument_comes_before_the_environment_before_the_default(text, argu
 
 
 @pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf"])
-def test_an_environment_that_says_no_seconds_is_named(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_that_says_no_seconds_is_named(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("DENGINE_STORE_WAIT", text)
     with pytest.raises(StoreError, match="Expected DENGINE_STORE_WAIT above 0 seconds"):
         DataEngine(store=tmp_path / "a.db")

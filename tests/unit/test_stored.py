@@ -25,17 +25,26 @@ def store(stream: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_in_the_shadow_mode_every_part_is_in_it_in_order_and_replays_as_its_recording(store: Path, stream: Dataset) -> None:
+def test_in_the_shadow_mode_every_part_is_in_it_in_order_and_replays_as_its_recording(
+    store: Path, stream: Dataset
+) -> None:
     data = load_dataset(store)
     assert data.X.shape == stream.X.shape
     assert np.array_equal(data.X, stream.X)
     assert np.array_equal(data.y, stream.y)
-    assert (data.name, data.rate_hz, data.unit, data.part) == ("cell", stream.spec.rate_hz, stream.unit, None)
+    assert (data.name, data.rate_hz, data.unit, data.part) == (
+        "cell",
+        stream.spec.rate_hz,
+        stream.unit,
+        None,
+    )
     lower = [replay(item, RECIPE, seed=0).lower for item in (data, stream)]
     assert np.array_equal(*lower)
 
 
-def test_corrected_labels_count_and_forgotten_and_bad_traces_do_not(stream: Dataset, tmp_path: Path) -> None:
+def test_corrected_labels_count_and_forgotten_and_bad_traces_do_not(
+    stream: Dataset, tmp_path: Path
+) -> None:
     path = tmp_path / "cell.db"
     with DataEngine(recipe=RECIPE, store=path) as engine:
         ids = [engine.decide(x).id for x in stream.X[:12]]
@@ -59,9 +68,13 @@ def test_a_part_that_came_twice_is_one_part_there_too(stream: Dataset, tmp_path:
     assert (part[0] == part[2], part[0] == part[1]) == (True, False)
 
 
-def test_a_store_without_a_label_and_a_pattern_for_labels_are_refused(store: Path, tmp_path: Path) -> None:
+def test_a_store_without_a_label_and_a_pattern_for_labels_are_refused(
+    store: Path, tmp_path: Path
+) -> None:
     DataEngine(recipe=RECIPE, store=tmp_path / "new.db").close()
-    with pytest.raises(DataError, match=r"Expected a store with labelled traces, .* has none; record some first"):
+    with pytest.raises(
+        DataError, match=r"Expected a store with labelled traces, .* has none; record some first"
+    ):
         load_dataset(tmp_path / "new.db")
     with pytest.raises(DataError, match=r"Expected no label for .*cell\.db"):
         load_dataset(store, label="(OK)")

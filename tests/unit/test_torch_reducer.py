@@ -58,7 +58,9 @@ def own_reducer(network: Any = SmallNetwork) -> TorchReducer:
 
 
 @pytest.mark.parametrize("make", [quick, lambda: own_reducer()], ids=["conv", "own network"])
-def test_labels_of_fold_k_move_nothing_in_space_k_over_warm_starts_weights_averages_and_statistics(make: Any) -> None:
+def test_labels_of_fold_k_move_nothing_in_space_k_over_warm_starts_weights_averages_and_statistics(
+    make: Any,
+) -> None:
     X, y = toy_traces(120)
     reducer, other = make(), make()
     folds, rng = content_fold(X, reducer.folds), np.random.default_rng(1)
@@ -73,7 +75,9 @@ def test_labels_of_fold_k_move_nothing_in_space_k_over_warm_starts_weights_avera
         assert not np.array_equal(first, two)  # the other members did see these labels
 
 
-def test_a_member_that_is_trained_on_its_own_fold_is_caught_by_the_contract(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_member_that_is_trained_on_its_own_fold_is_caught_by_the_contract(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     labels_of_a_fold_move_nothing_in_its_space(quick(folds=2))
     honest = draw_batches
     leaking = lambda folds, *rest: honest(np.full_like(folds, -1), *rest)  # noqa: E731  # no row is left out
@@ -171,7 +175,9 @@ def test_grouped_members_compute_what_separate_networks_of_the_same_weights_comp
 
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("samples", [2, 3, 9, 64, 152, 5000])
-def test_traces_of_any_shape_are_embedded_finitely_and_alike_when_scripted(samples: int, channels: int) -> None:
+def test_traces_of_any_shape_are_embedded_finitely_and_alike_when_scripted(
+    samples: int, channels: int
+) -> None:
     rng = np.random.default_rng(0)
     X = rng.normal(size=(24, channels, samples)).cumsum(2).astype(np.float32)
     reducer = quick(steps=1)
@@ -202,7 +208,9 @@ def test_labels_of_one_class_are_learned_from() -> None:
 
 def test_batches_hold_each_row_outside_the_fold_as_often_as_any_other() -> None:
     folds = np.arange(50) % 5
-    batches = torch.stack(list(draw_batches(folds, 5, 8, 10, np.random.default_rng(0)))).numpy()  # (steps, B, K)
+    batches = torch.stack(
+        list(draw_batches(folds, 5, 8, 10, np.random.default_rng(0)))
+    ).numpy()  # (steps, B, K)
     for k in range(5):
         rows, times = np.unique(batches[:, :, k], return_counts=True)
         assert set(rows) == set(np.flatnonzero(folds != k))
@@ -222,7 +230,9 @@ def test_an_augmentation_of_nothing_changes_nothing_and_a_shift_moves_a_trace_in
 
 
 def test_mixed_traces_and_labels_lie_between_those_of_the_same_member() -> None:
-    x = torch.arange(4.0).repeat(2, 1)[..., None, None].expand(2, 4, 1, 5).contiguous()  # member k has traces of k
+    x = (
+        torch.arange(4.0).repeat(2, 1)[..., None, None].expand(2, 4, 1, 5).contiguous()
+    )  # member k has traces of k
     y = torch.tensor([[0.0] * 4, [1.0] * 4])
     mixed, labels = Augmentation(0, 0.0, 0.0, 0.5)(x, y, np.random.default_rng(0))
     assert torch.equal(mixed, x)  # nothing of another member comes in
@@ -241,7 +251,9 @@ def test_every_member_starts_from_the_weights_of_a_checkpoint(network: Any, tmp_
     torch.testing.assert_close(several.eval()(x.expand(-1, 3, -1, -1)), expected)
 
 
-def test_a_reducer_that_starts_from_a_checkpoint_learns_something_else_than_from_scratch(tmp_path: Any) -> None:
+def test_a_reducer_that_starts_from_a_checkpoint_learns_something_else_than_from_scratch(
+    tmp_path: Any,
+) -> None:
     save_checkpoint(Members(ConvNetwork, 2, 120, 1), tmp_path / "encoder.pt")
     X, y = toy_traces(60)
     from_checkpoint, from_scratch = quick(checkpoint=str(tmp_path / "encoder.pt")), quick()
@@ -252,9 +264,15 @@ def test_a_reducer_that_starts_from_a_checkpoint_learns_something_else_than_from
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(b"no checkpoint", "cannot be read"), (None, "cannot be read"), ("other", "of this network for traces")],
+    [
+        (b"no checkpoint", "cannot be read"),
+        (None, "cannot be read"),
+        ("other", "of this network for traces"),
+    ],
 )
-def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(tmp_path: Any, content: Any, message: str) -> None:
+def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(
+    tmp_path: Any, content: Any, message: str
+) -> None:
     path = tmp_path / "encoder.pt"
     if content == "other":
         save_checkpoint(Members(ConvNetwork, 6, 120, 1), path)
@@ -266,11 +284,16 @@ def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(tmp_path: Any, 
 
 def test_a_network_of_another_shape_is_refused_in_a_sentence() -> None:
     X, y = toy_traces(30)
-    with pytest.raises(SettingError, match=r"maps \(B, 2, 120\) to \(B, features\), got one that gives 3 dimensions"):
+    with pytest.raises(
+        SettingError,
+        match=r"maps \(B, 2, 120\) to \(B, features\), got one that gives 3 dimensions",
+    ):
         own_reducer(lambda channels, samples: nn.Conv1d(channels, 3, 5)).fit(X, y)
 
 
-def test_a_network_that_does_not_compile_answers_in_python_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_network_that_does_not_compile_answers_in_python_and_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     X, y = toy_traces(60)
     with caplog.at_level(logging.WARNING):
         reducer = own_reducer(PythonNetwork).fit(X, y)
@@ -308,9 +331,13 @@ def test_two_networks_of_one_name_in_one_process_answer_each_for_itself() -> Non
     assert not np.allclose(*embeddings)
 
 
-def test_an_engine_trains_on_after_an_import_a_retrain_per_cycle_until_its_steps_are_complete(tmp_path: Any) -> None:
+def test_an_engine_trains_on_after_an_import_a_retrain_per_cycle_until_its_steps_are_complete(
+    tmp_path: Any,
+) -> None:
     X, y = toy_traces(140, seed=3)
-    recipe = Recipe("conv", {"folds": 2, "steps": 4, "fit_steps": 20}, radius=0.07, retrain_every=1000)
+    recipe = Recipe(
+        "conv", {"folds": 2, "steps": 4, "fit_steps": 20}, radius=0.07, retrain_every=1000
+    )
     url = str(tmp_path / "cell.db")
     import_labelled(url, Dataset(X[:100, 0], y[:100].astype(np.int8)), recipe)
     left = []

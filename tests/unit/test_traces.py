@@ -55,7 +55,9 @@ def reason_of(x: np.ndarray, limit: float | None = None, compiled: bool = False)
         ("mixed units", 3, "mixed units", ("mixed units",) * 3),
     ],
 )
-def test_each_channel_has_a_unit(unit: Any, channels: int, stored: Any, units: tuple[str, ...]) -> None:
+def test_each_channel_has_a_unit(
+    unit: Any, channels: int, stored: Any, units: tuple[str, ...]
+) -> None:
     spec = TraceSpec(10, channels=channels, unit=unit)
     assert (spec.unit, spec.units) == (stored, units)
     assert stored_trace_spec({"trace": json.dumps(asdict(spec))}) == spec
@@ -67,7 +69,9 @@ def test_units_that_are_no_text_or_too_many_are_refused(unit: Any) -> None:
         TraceSpec(10, channels=2, unit=unit)
 
 
-@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4", ">f8", "i1", "i2", ">i2", "i4", "i8", "u2", "?"])
+@pytest.mark.parametrize(
+    "dtype", ["f2", "f4", "f8", ">f4", ">f8", "i1", "i2", ">i2", "i4", "i8", "u2", "?"]
+)
 def test_every_real_dtype_is_cast_to_float32(dtype: str) -> None:
     x = np.arange(100).astype(dtype)
     result = as_trace(x, None)
@@ -95,20 +99,35 @@ def test_a_contract_that_no_trace_can_keep_is_refused(message: str) -> None:
 @pytest.mark.parametrize(
     ("trace", "spec", "message"),
     [
-        *((bad, None, r"Expected one trace, \(samples,\) or \(channels, samples\), got shape") for bad in NO_TRACES),
-        *((np.array(bad), None, "Expected real numbers, got dtype") for bad in (["a", "b"], [1 + 2j], [None, 1], "force")),
+        *(
+            (bad, None, r"Expected one trace, \(samples,\) or \(channels, samples\), got shape")
+            for bad in NO_TRACES
+        ),
+        *(
+            (np.array(bad), None, "Expected real numbers, got dtype")
+            for bad in (["a", "b"], [1 + 2j], [None, 1], "force")
+        ),
         (
             np.ones(998),
             TraceSpec(1000),
             r"^Expected 1000 samples, got 998; resample the trace to 500 Hz x 2 s, or .*fit='pad'\)\.$",
         ),
         (np.ones(100), AGREED, r"Expected 6 channel\(s\), got 1; pass \(channels, samples\)"),
-        *((np.ones(shape), TraceSpec(100, fit="pad"), "Expected") for shape in ((1, 0), (2, 90), (90, 1))),
-        (np.ones((1000, 2)), None, r"got 1000 channels of 2 samples, which looks transposed; turn it, trace\.T"),
+        *(
+            (np.ones(shape), TraceSpec(100, fit="pad"), "Expected")
+            for shape in ((1, 0), (2, 90), (90, 1))
+        ),
+        (
+            np.ones((1000, 2)),
+            None,
+            r"got 1000 channels of 2 samples, which looks transposed; turn it, trace\.T",
+        ),
         (np.ones((1000, 2)), TraceSpec(1000, channels=2), r"looks transposed: turn it, trace\.T"),
     ],
 )
-def test_a_callers_mistake_says_what_was_expected_what_came_and_what_to_do(trace, spec, message: str) -> None:
+def test_a_callers_mistake_says_what_was_expected_what_came_and_what_to_do(
+    trace, spec, message: str
+) -> None:
     with pytest.raises(TraceError, match=message):
         as_trace(trace, spec)
 
@@ -129,14 +148,24 @@ QUIET = ramp(100, 2) * np.array([[1.0], [0.0]], dtype=np.float32)
 @pytest.mark.parametrize(
     ("x", "limit", "reason"),
     [
-        *((np.full((channels, 50), level), None, Reason.CONSTANT) for channels in (1, 2) for level in (0.0, -3.5, 25.0)),
-        (as_trace(np.where(np.arange(10) == 3, 1e300, np.arange(10.0)), None), None, Reason.NOT_FINITE),
+        *(
+            (np.full((channels, 50), level), None, Reason.CONSTANT)
+            for channels in (1, 2)
+            for level in (0.0, -3.5, 25.0)
+        ),
+        (
+            as_trace(np.where(np.arange(10) == 3, 1e300, np.arange(10.0)), None),
+            None,
+            Reason.NOT_FINITE,
+        ),
         *((sign * ramp(100), 20.0, Reason.SATURATED) for sign in (1.0, -1.0)),  # reaches 20
         *((x, 20.5, Reason.CERTAIN) for x in (ramp(100), -ramp(100), PLATEAU, QUIET)),
         *((x, None, Reason.CERTAIN) for x in (ramp(100), PLATEAU, QUIET)),
     ],
 )
-def test_dead_and_saturated_sensors_are_found_and_a_plateau_or_one_quiet_channel_is_no_fault(x, limit, reason) -> None:
+def test_dead_and_saturated_sensors_are_found_and_a_plateau_or_one_quiet_channel_is_no_fault(
+    x, limit, reason
+) -> None:
     assert reason_of(np.asarray(x, dtype=np.float32), limit) is reason
 
 
@@ -154,7 +183,9 @@ def test_cut_and_pad_keep_what_was_measured_at_its_own_time() -> None:
 
 @given(have=st.integers(50, 200), channels=st.integers(1, 3), seed=st.integers(0, 99))
 @settings(max_examples=60, deadline=None)
-def test_resample_is_linear_interpolation_over_the_whole(have: int, channels: int, seed: int) -> None:
+def test_resample_is_linear_interpolation_over_the_whole(
+    have: int, channels: int, seed: int
+) -> None:
     x = np.random.default_rng(seed).normal(size=(channels, have)).astype(np.float32)
     result = as_trace(x, TraceSpec(SAMPLES, channels=channels, fit="resample"))
     grid = np.linspace(0, have - 1, SAMPLES)
@@ -163,9 +194,16 @@ def test_resample_is_linear_interpolation_over_the_whole(have: int, channels: in
     np.testing.assert_array_equal(result[:, 0], x[:, 0])
 
 
-@given(have=st.integers(1, 500), samples=st.integers(1, 120), fit=st.integers(1, 3), seed=st.integers(0, 99))
+@given(
+    have=st.integers(1, 500),
+    samples=st.integers(1, 120),
+    fit=st.integers(1, 3),
+    seed=st.integers(0, 99),
+)
 @settings(max_examples=150, deadline=None)
-def test_what_cannot_honestly_be_fitted_is_not_finite_and_nothing_else_is(have, samples: int, fit: int, seed: int) -> None:
+def test_what_cannot_honestly_be_fitted_is_not_finite_and_nothing_else_is(
+    have, samples: int, fit: int, seed: int
+) -> None:
     x = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, have)).astype(np.float32))
     result = fit_length(x, samples, fit)
     assert result.shape == (2, samples)
@@ -191,7 +229,9 @@ def other_lengths(data: Dataset) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("fit", FITS[1:])
-def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(fit: str, make_data, tmp_path: Path) -> None:
+def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(
+    fit: str, make_data, tmp_path: Path
+) -> None:
     engine = DataEngine("pca", trace=TraceSpec(SAMPLES, fit=fit), retrain_every=10**6)
     learn(engine, make_data(300, samples=SAMPLES), range(300))
     engine.retrain()
@@ -201,12 +241,21 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(fit: s
     for x in other_lengths(make_data(130, samples=SAMPLES, seed=7)):
         ours = engine.decide(x)
         theirs = exported.decide(x)
-        raw = exported.module.decide(torch.from_numpy(x))  # the compiled fit, as a cell program calls it
+        raw = exported.module.decide(
+            torch.from_numpy(x)
+        )  # the compiled fit, as a cell program calls it
         for name in ("action", "reason", "lower", "upper", "n_success", "n_failure"):
             assert getattr(ours, name) == getattr(theirs, name)
-        assert (raw[2], raw[3], raw[4], raw[5]) == (ours.lower, ours.upper, ours.n_success, ours.n_failure)
+        assert (raw[2], raw[3], raw[4], raw[5]) == (
+            ours.lower,
+            ours.upper,
+            ours.n_success,
+            ours.n_failure,
+        )
         if ours.embedding is not None:
-            np.testing.assert_array_equal(np.array(ours.embedding, dtype=np.float32), theirs.embedding)
+            np.testing.assert_array_equal(
+                np.array(ours.embedding, dtype=np.float32), theirs.embedding
+            )
             np.testing.assert_array_equal(raw[6].numpy(), theirs.embedding)
         decided.append((x, ours))
     for x, decision in decided:
@@ -217,7 +266,11 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(fit: s
     labels = core_of(engine).new_labels
     engine.report(lost.id, True)
     kept = engine.store.get_decision(lost.id)  # and never learned from
-    assert (lost.reason, kept.quarantined, core_of(engine).new_labels) == (Reason.NOT_FINITE, True, labels)
+    assert (lost.reason, kept.quarantined, core_of(engine).new_labels) == (
+        Reason.NOT_FINITE,
+        True,
+        labels,
+    )
     np.testing.assert_array_equal(kept.trace[0, :30], np.linspace(0, 9, 30, dtype=np.float32))
 
 
@@ -237,10 +290,13 @@ def test_a_dataframe_has_samples_in_rows_and_channels_in_columns() -> None:
 
 def test_columns_that_do_not_match_are_named_and_time_is_no_channel() -> None:
     with pytest.raises(
-        TraceError, match=r"Expected a DataFrame with 2 channel\(s\).*got the columns Timestamp, FX, FY, FZ"
+        TraceError,
+        match=r"Expected a DataFrame with 2 channel\(s\).*got the columns Timestamp, FX, FY, FZ",
     ):
         as_trace(recording(), TraceSpec(60, channels=2))
-    dated = recording().rename(columns={"Timestamp": "When"}).assign(When=pd.Timestamp("2026-01-01"))
+    dated = (
+        recording().rename(columns={"Timestamp": "When"}).assign(When=pd.Timestamp("2026-01-01"))
+    )
     assert as_trace(dated, None).shape == (3, 60)
     with pytest.raises(TraceError, match="at least one channel"):
         as_trace(recording()[["Timestamp"]], None)
@@ -249,7 +305,9 @@ def test_columns_that_do_not_match_are_named_and_time_is_no_channel() -> None:
 def test_a_first_dataframe_with_a_row_a_trace_is_refused_and_not_taken_for_many_channels() -> None:
     wide = pd.DataFrame(np.random.default_rng(0).normal(size=(2, 1000)))
     with DataEngine("pca") as engine:
-        with pytest.raises(TraceError, match="got 2 rows of 1000 columns; pass one row, as a Series"):
+        with pytest.raises(
+            TraceError, match="got 2 rows of 1000 columns; pass one row, as a Series"
+        ):
             engine.decide(wide)
         assert engine.trace is None
         engine.decide(wide.iloc[0])

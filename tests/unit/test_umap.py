@@ -240,7 +240,9 @@ def test_places_repeat_exactly_with_a_random_state_and_differ_between_two(
     insertion: Traces,
 ) -> None:
     X, _ = insertion
-    first, same, other = (UmapReducer(random_state=seed).fit(X[:100]).embedding_ for seed in (1, 1, 2))
+    first, same, other = (
+        UmapReducer(random_state=seed).fit(X[:100]).embedding_ for seed in (1, 1, 2)
+    )
     assert torch.equal(first, same)
     assert not torch.equal(first, other)
 

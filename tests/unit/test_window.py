@@ -25,7 +25,9 @@ def seqs_of(labelled: LabelledTraces) -> list[int]:
 
 @settings(deadline=None)
 @given(capacity=st.integers(1, 200), steps=st.lists(st.integers(0, 90), max_size=6))
-def test_every_snapshot_is_of_the_newest_then_and_never_changes(capacity: int, steps: list[int]) -> None:
+def test_every_snapshot_is_of_the_newest_then_and_never_changes(
+    capacity: int, steps: list[int]
+) -> None:
     window, handed_out, last = TrainingWindow(capacity), [], 0
     for n in steps:
         if n % 7 == 1:

@@ -22,7 +22,9 @@ SAMPLES = 80
 
 
 def run(*command: object, **options: object) -> str:
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False, **options)
+    done = subprocess.run(
+        list(map(str, command)), capture_output=True, text=True, check=False, **options
+    )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout
 
@@ -32,7 +34,14 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
 ) -> None:
     prefix, build = tmp_path / "prefix", tmp_path / "build"
     run("cmake", "--install", programs, "--prefix", prefix)
-    run("cmake", "-S", repo / "tests" / "slow" / "cpp" / "consumer", "-B", build, f"-DCMAKE_PREFIX_PATH={prefix}")
+    run(
+        "cmake",
+        "-S",
+        repo / "tests" / "slow" / "cpp" / "consumer",
+        "-B",
+        build,
+        f"-DCMAKE_PREFIX_PATH={prefix}",
+    )
     run("cmake", "--build", build)
     store, key = tmp_path / "engine.db", tmp_path / "cell.key"
     assert command("export", "--make-key", key).exit_code == 0
@@ -43,20 +52,32 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
     X.tofile(tmp_path / "traces.f32")
     journal = tmp_path / "cell.csv"
     completed = run(
-        build / "consumer", file, tmp_path / "traces.f32", key, journal, env=os.environ | {"LC_ALL": "de_DE.UTF-8"}
+        build / "consumer",
+        file,
+        tmp_path / "traces.f32",
+        key,
+        journal,
+        env=os.environ | {"LC_ALL": "de_DE.UTF-8"},
     )
     *lines, last = completed.splitlines()
     expected = load_exported(file, key=key).decide_many(X)
     for line, decision in zip(lines, expected, strict=True):
         id_, *words = line.split()
         assert len(id_.split("-")[0]) == 12
-        reference = [ACTIONS.index(decision.action), decision.reason, decision.n_success, decision.n_failure]
+        reference = [
+            ACTIONS.index(decision.action),
+            decision.reason,
+            decision.n_success,
+            decision.n_failure,
+        ]
         assert words == list(map(str, reference))
     assert {d.action for d in expected} == set(Action)
     assert last == f"{dengine.__version__} 120 0"
     report = import_journal(store, journal)
     stops = sum(d.action is Action.ACCEPT for d in expected[::10])
-    assert report.imported + report.quarantined == stops + sum(d.action is Action.VERIFY for d in expected)
+    assert report.imported + report.quarantined == stops + sum(
+        d.action is Action.VERIFY for d in expected
+    )
     assert report.quarantined == 2
 
 
@@ -68,7 +89,15 @@ def test_libtorch_alone_decides_by_calling_the_module(
     X = make_data(60, SAMPLES, seed=9).X
     X.tofile(tmp_path / "traces.f32")
     build, where = tmp_path / "build", f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
-    run("cmake", "-S", repo / "tests" / "slow" / "cpp" / "plain", "-B", build, where, "-DCMAKE_BUILD_TYPE=Debug")
+    run(
+        "cmake",
+        "-S",
+        repo / "tests" / "slow" / "cpp" / "plain",
+        "-B",
+        build,
+        where,
+        "-DCMAKE_BUILD_TYPE=Debug",
+    )
     run("cmake", "--build", build)
     lines = run(build / "plain", file, SAMPLES, tmp_path / "traces.f32").splitlines()
     expected = [(d.action, d.reason) for d in load_exported(file).decide_many(X)]

@@ -42,7 +42,10 @@ def learned(request, make_data: Callable[..., Dataset], tmp_path_factory) -> Lea
     key = make_key(folder / "cell.key")
     with trained(data, folder / "engine.db", **settings) as engine:
         return Learned(
-            folder / "engine.db", export_torchscript(engine, folder / "model.ts", key=key), key, settings["guarantee"]
+            folder / "engine.db",
+            export_torchscript(engine, folder / "model.ts", key=key),
+            key,
+            settings["guarantee"],
         )
 
 
@@ -60,7 +63,9 @@ def X(make_data: Callable[..., Dataset]) -> np.ndarray:  # noqa: N802  # as ever
     return make_data(60, SAMPLES, seed=9, noise=1.5).X
 
 
-def stream(make_data: Callable[..., Dataset], n: int) -> tuple[np.ndarray, np.ndarray, list[str | None], list[list[int]]]:
+def stream(
+    make_data: Callable[..., Dataset], n: int
+) -> tuple[np.ndarray, np.ndarray, list[str | None], list[list[int]]]:
     """Traces, labels, parts, and after each trace the indices of the parts whose label comes then: late, or never."""
     rng, data = np.random.default_rng(8), make_data(n, SAMPLES, seed=2, noise=1.5)
     X = data.X.copy()
@@ -76,20 +81,30 @@ def stream(make_data: Callable[..., Dataset], n: int) -> tuple[np.ndarray, np.nd
 
 
 def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as_its_own(
-    start: Callable[..., Program], learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+    start: Callable[..., Program],
+    learned: Learned,
+    make_data: Callable[..., Dataset],
+    tmp_path: Path,
 ) -> None:
     X, y, parts, due = stream(make_data, 160)
     journal, ids, decisions, told_of = tmp_path / "cell.csv", [], [], 0
     for name in ("own", "imported"):
         shutil.copy(learned.store, tmp_path / f"{name}.db")
-    with DataEngine.open(tmp_path / "own.db", replaying=True) as engine, start("--key", learned.key) as cell:
-        stops_all = engine.policy.stops == "all"  # there the engine wants no late label of a confirmed part
+    with (
+        DataEngine.open(tmp_path / "own.db", replaying=True) as engine,
+        start("--key", learned.key) as cell,
+    ):
+        stops_all = (
+            engine.policy.stops == "all"
+        )  # there the engine wants no late label of a confirmed part
         for i, (x, part) in enumerate(zip(X, parts, strict=True)):
             decisions.append(engine.decide(x, part))
             must_agree([answer := cell.decide(x, part)], decisions[-1:])
             ids.append(answer[0])
             for k in due[i]:
-                if decisions[k].action is Action.REJECT or (stops_all and k != i and decisions[k].action is Action.ACCEPT):
+                if decisions[k].action is Action.REJECT or (
+                    stops_all and k != i and decisions[k].action is Action.ACCEPT
+                ):
                     continue
                 engine.report(decisions[k].id, bool(y[k]))
                 stop = decisions[k].action is Action.ACCEPT and not y[k]
@@ -107,18 +122,33 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
         with DataEngine.open(tmp_path / f"{name}.db") as engine:
             records, outcomes = engine.store.outcomes_since(400), engine.store.tally().outcomes
             rule = {key: value.tolist() for key, value in engine.model.rule.state_dict().items()}
-            evidence = [(item.lower, item.upper, item.success, item.novel, item.silent) for item in records]
-            certain = outcomes.false_accepts, outcomes.confirmed, outcomes.audited_accepts, outcomes.audited_accepts_bad
+            evidence = [
+                (item.lower, item.upper, item.success, item.novel, item.silent) for item in records
+            ]
+            certain = (
+                outcomes.false_accepts,
+                outcomes.confirmed,
+                outcomes.audited_accepts,
+                outcomes.audited_accepts_bad,
+            )
             hashes = engine.store.labelled().hashes.tolist()
             results.append([evidence, rule, engine.store.status()["sources"], hashes, certain])
     assert results[0] == results[1]
     with DataEngine.open(tmp_path / "imported.db") as engine:
-        labelled = next(k for k, d in enumerate(decisions) if k in due[k] and d.action is Action.VERIFY)
-        assert engine.store.get_decision(ids[labelled]).success is bool(y[labelled])  # by the id that the cell answered
+        labelled = next(
+            k for k, d in enumerate(decisions) if k in due[k] and d.action is Action.VERIFY
+        )
+        assert engine.store.get_decision(ids[labelled]).success is bool(
+            y[labelled]
+        )  # by the id that the cell answered
 
 
 def test_a_program_killed_at_any_moment_loses_no_label_that_it_acknowledged_and_decides_on_as_if_it_had_not_been(
-    programs: Path, start: Callable[..., Program], learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+    programs: Path,
+    start: Callable[..., Program],
+    learned: Learned,
+    make_data: Callable[..., Dataset],
+    tmp_path: Path,
 ) -> None:
     X, y, parts, due = stream(make_data, 100)
     rng = random.Random(4)
@@ -146,18 +176,25 @@ def test_a_program_killed_at_any_moment_loses_no_label_that_it_acknowledged_and_
         until = min(len(lines), done + rng.randrange(10, 60))
         with start() as cell:
             play(cell, done, until, decided)
-            if until < len(lines) and lines[until][0] == "label":  # not acknowledged: said again after the restart
+            if (
+                until < len(lines) and lines[until][0] == "label"
+            ):  # not acknowledged: said again after the restart
                 k = lines[until][1]
                 cell.process.stdin.write(f"label {ids[k]} {y[k]}\n")
         kills, done = kills + 1, until
     assert kills > 3
     assert decided == whole
     stored = read_journal(tmp_path / "cell.csv", TraceSpec(SAMPLES)).lines
-    assert acknowledged.items() <= {line.decision.id: line.label for line in stored if line.label is not None}.items()
+    assert (
+        acknowledged.items()
+        <= {line.decision.id: line.label for line in stored if line.label is not None}.items()
+    )
 
 
 @ONE
-def test_a_label_is_taken_once_and_never_changed(start: Callable[..., Program], X: np.ndarray, tmp_path: Path) -> None:
+def test_a_label_is_taken_once_and_never_changed(
+    start: Callable[..., Program], X: np.ndarray, tmp_path: Path
+) -> None:
     journal, ids = tmp_path / "cell.csv", {}
     with start() as cell:
         for x in X:
@@ -167,7 +204,11 @@ def test_a_label_is_taken_once_and_never_changed(start: Callable[..., Program], 
         assert cell.ask(f"label {ids['verify']} 1") == f"ok {ids['verify']}"
         assert cell.ask(f"stop {ids['accept']}") == f"ok {ids['accept']}"
         n = journal.read_text().count("\n")
-        for again in (f"label {ids['verify']} 1", f"stop {ids['accept']}", f"label {ids['accept']} 0"):
+        for again in (
+            f"label {ids['verify']} 1",
+            f"stop {ids['accept']}",
+            f"label {ids['accept']} 0",
+        ):
             assert cell.ask(again).startswith("ok ")  # an answer that was lost is asked for again
         wrong = {
             f"label {ids['verify']} 0": "has the other label already",
@@ -191,7 +232,9 @@ def test_a_label_is_taken_once_and_never_changed(start: Callable[..., Program], 
 
 
 @ONE
-def test_traces_come_from_files_too_and_one_that_cannot_be_read_is_verified(programs, learned, X, tmp_path: Path) -> None:
+def test_traces_come_from_files_too_and_one_that_cannot_be_read_is_verified(
+    programs, learned, X, tmp_path: Path
+) -> None:
     X[0].tofile(tmp_path / "trace.f32")
     (tmp_path / "column.txt").write_text("\n".join(map(str, X[0])))
     (tmp_path / "short.f32").write_bytes(X[0].tobytes()[:-3])
@@ -221,9 +264,13 @@ def test_traces_come_from_files_too_and_one_that_cannot_be_read_is_verified(prog
 
 
 @ONE
-def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(start, X: np.ndarray, tmp_path: Path) -> None:
+def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(
+    start, X: np.ndarray, tmp_path: Path
+) -> None:
     acknowledged, refused = [], 0
-    full = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (20_000, 20_000))  # bytes that the journal may have
+    full = partial(
+        resource.setrlimit, resource.RLIMIT_FSIZE, (20_000, 20_000)
+    )  # bytes that the journal may have
     with start(preexec_fn=full) as cell:
         for x in X:
             id_, action, reason = cell.decide(x)[:3]
@@ -244,14 +291,20 @@ def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(start,
 
 
 @ONE
-def test_with_a_key_only_what_was_signed_with_it_is_loaded(programs: Path, learned: Learned, tmp_path: Path) -> None:
+def test_with_a_key_only_what_was_signed_with_it_is_loaded(
+    programs: Path, learned: Learned, tmp_path: Path
+) -> None:
     for name in ("model.ts", "model.ts.sha256"):
         shutil.copy(learned.file.with_name(name), tmp_path / name)
     signed = learned.file.with_name("model.ts.sig").read_text()
     (short := tmp_path / "short.key").write_text("secret\n")
     for key, signature, expected in (
         (make_key(tmp_path / "other.key"), signed, "its signature is not one by this key"),
-        (learned.key, signed.replace(signed[12:76], "0" * 64), "its signature is not one by this key"),
+        (
+            learned.key,
+            signed.replace(signed[12:76], "0" * 64),
+            "its signature is not one by this key",
+        ),
         (short, signed, "is too short for a key"),
     ):
         (tmp_path / "model.ts.sig").write_text(signature)

@@ -39,23 +39,39 @@ def test_the_sum_is_that_of_the_standard(programs: Path) -> None:
     rng = np.random.default_rng(0)
     for size in (0, 1, 3, 55, 56, 63, 64, 65, 119, 120, 1000, 100_000):
         content = rng.bytes(size)
-        done = subprocess.run([programs / "sha256sum_check"], input=content, capture_output=True, check=True)
+        done = subprocess.run(
+            [programs / "sha256sum_check"], input=content, capture_output=True, check=True
+        )
         assert done.stdout.decode().strip() == hashlib.sha256(content).hexdigest()
         key = "k" * max(1, min(size, 130))  # shorter than a block, a block, longer
-        done = subprocess.run([programs / "sha256sum_check", key], input=content, capture_output=True, check=True)
-        assert done.stdout.decode().strip() == hmac.new(key.encode(), content, hashlib.sha256).hexdigest()
+        done = subprocess.run(
+            [programs / "sha256sum_check", key], input=content, capture_output=True, check=True
+        )
+        assert (
+            done.stdout.decode().strip()
+            == hmac.new(key.encode(), content, hashlib.sha256).hexdigest()
+        )
 
 
-def test_it_takes_the_engines_decisions(programs: Path, engine: DataEngine, file: Path, many: np.ndarray) -> None:
+def test_it_takes_the_engines_decisions(
+    programs: Path, engine: DataEngine, file: Path, many: np.ndarray
+) -> None:
     decisions = [engine.decide(x) for x in many]
     with Program(programs, file) as cell:
         must_agree([cell.decide(x) for x in many], decisions)
         assert cell.end() == (0, "")
     assert {d.action for d in decisions} == set(Action)
-    assert {d.reason for d in decisions} >= {Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
+    assert {d.reason for d in decisions} >= {
+        Reason.AUDIT,
+        Reason.NOT_FINITE,
+        Reason.CONSTANT,
+        Reason.SATURATED,
+    }
 
 
-def test_several_channels_come_one_after_the_other(programs: Path, make_data, tmp_path: Path) -> None:
+def test_several_channels_come_one_after_the_other(
+    programs: Path, make_data, tmp_path: Path
+) -> None:
     data = make_data(150, 40, 3)
     path = export_torchscript(fitted(data), tmp_path / "model.ts")
     with Program(programs, path) as cell:
@@ -88,7 +104,9 @@ def test_traces_of_other_lengths_are_fitted_as_python_does_and_come_back_from_th
 
 
 @pytest.fixture(scope="module")
-def written(programs: Path, file: Path, many: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> str:
+def written(
+    programs: Path, file: Path, many: np.ndarray, tmp_path_factory: pytest.TempPathFactory
+) -> str:
     """A journal of two parts."""
     journal = tmp_path_factory.mktemp("written") / "cell.csv"
     with Program(programs, file, "--journal", journal) as cell:
@@ -121,11 +139,15 @@ def test_a_journal_that_is_damaged_anywhere_but_at_its_end_is_refused_with_the_l
     for line in wrong.values():
         journal.write_text("\n".join([head, first, line, second, ""]))
         with Program(programs, file, "--journal", journal) as cell:
-            cell.must_refuse("is damaged in line 3, or a line before it is missing; take its earlier lines in")
+            cell.must_refuse(
+                "is damaged in line 3, or a line before it is missing; take its earlier lines in"
+            )
 
 
 @pytest.mark.parametrize(
-    ("order", "number"), [((0, 2), 2), ((0, 2, 1), 2), ((0, 1, 1, 2), 3)], ids=["missing", "swapped", "doubled"]
+    ("order", "number"),
+    [((0, 2), 2), ((0, 2, 1), 2), ((0, 1, 1, 2), 3)],
+    ids=["missing", "swapped", "doubled"],
 )
 def test_a_missing_swapped_or_doubled_line_is_refused_and_what_is_before_it_is_imported(
     programs: Path, file: Path, written: str, tmp_path: Path, order: tuple[int, ...], number: int
@@ -134,8 +156,15 @@ def test_a_missing_swapped_or_doubled_line_is_refused_and_what_is_before_it_is_i
     (journal := tmp_path / "cell.csv").write_text("\n".join([*(lines[i] for i in order), ""]))
     with Program(programs, file, "--journal", journal) as cell:
         cell.must_refuse(f"is damaged in line {number}, or a line before it is missing")
-    with pytest.raises(DataError, match=f"The checksum of line {number} of") if number == 2 else nullcontext():
-        assert f"The checksum of line {number} of" in read_journal(journal, TraceSpec(SAMPLES)).set_aside
+    with (
+        pytest.raises(DataError, match=f"The checksum of line {number} of")
+        if number == 2
+        else nullcontext()
+    ):
+        assert (
+            f"The checksum of line {number} of"
+            in read_journal(journal, TraceSpec(SAMPLES)).set_aside
+        )
 
 
 def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
@@ -143,7 +172,14 @@ def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
 ) -> None:
     journal = tmp_path / "cell.csv"
     first = written.rindex("\n", 0, -1) + 1
-    for end in (first + 1, first + 40, len(written) - 12, len(written) - 1, 5, 0):  # within the line, then within the head
+    for end in (
+        first + 1,
+        first + 40,
+        len(written) - 12,
+        len(written) - 1,
+        5,
+        0,
+    ):  # within the line, then within the head
         journal.write_text(written[:end])
         with Program(programs, file, "--journal", journal) as cell:
             cell.decide(many[0])
@@ -154,7 +190,9 @@ def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
         assert journal.read_text().count("\n") == kept.count("\n") + 1
 
 
-def test_a_file_that_is_no_journal_of_this_export_is_left_as_it_is(programs: Path, file: Path, tmp_path: Path) -> None:
+def test_a_file_that_is_no_journal_of_this_export_is_left_as_it_is(
+    programs: Path, file: Path, tmp_path: Path
+) -> None:
     other = tmp_path / "notes.txt"
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     for text in ("no line end", f"# dengine 3 {digest}\n", f"# dengine {digest}\n"):
@@ -167,14 +205,20 @@ def test_a_file_that_is_no_journal_of_this_export_is_left_as_it_is(programs: Pat
 @pytest.mark.parametrize(
     ("spoil", "summed", "message"),
     [
-        (lambda content: content[:5000] + bytes([content[5000] ^ 1]) + content[5001:], False, "is damaged or truncated"),
+        (
+            lambda content: content[:5000] + bytes([content[5000] ^ 1]) + content[5001:],
+            False,
+            "is damaged or truncated",
+        ),
         (lambda content: content[:5000], False, "is damaged or truncated"),
         (lambda content: b"garbage" * 1000, True, "no loadable TorchScript"),
         (lambda content: content, None, "holds no SHA-256 sum"),
     ],
     ids=["flip", "truncated", "garbage", "not a sum"],
 )
-def test_a_file_that_must_not_be_used_is_refused(programs, file: Path, tmp_path: Path, spoil, summed, message: str) -> None:
+def test_a_file_that_must_not_be_used_is_refused(
+    programs, file: Path, tmp_path: Path, spoil, summed, message: str
+) -> None:
     path, total = tmp_path / "model.ts", tmp_path / "model.ts.sha256"
     path.write_bytes(spoil(file.read_bytes()))
     of = path if summed else file

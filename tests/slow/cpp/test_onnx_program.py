@@ -12,7 +12,12 @@ pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-from dengine import ModelPrediction, TraceSpec, WilsonRadiusClassifier, load_dataset  # after the skips
+from dengine import (
+    ModelPrediction,
+    TraceSpec,
+    WilsonRadiusClassifier,
+    load_dataset,
+)  # after the skips
 from dengine.export import export_onnx, load_onnx, make_key
 from dengine.export.bundle import write_export
 from dengine.records import Action, Reason
@@ -34,7 +39,9 @@ def signed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     classifier = WilsonRadiusClassifier(alpha=0.1, lower_bound=0.9)
     model = ModelPrediction("pca", classifier).fit(data.X[:700], data.y[:700])
     key = make_key(folder / "cell.key")
-    return export_onnx(model, folder / "model.onnx", trace=TraceSpec(1000, limit=500.0), key=key), key
+    return export_onnx(
+        model, folder / "model.onnx", trace=TraceSpec(1000, limit=500.0), key=key
+    ), key
 
 
 def program(programs: Path, *arguments: Any, runtime: Any = None) -> Program:
@@ -42,7 +49,9 @@ def program(programs: Path, *arguments: Any, runtime: Any = None) -> Program:
     return Program(programs, *arguments, name="dengine-onnx", env=env)
 
 
-def test_it_decides_on_the_bundled_traces_as_python_does_and_verifies_the_bad_ones(programs: Path, signed) -> None:
+def test_it_decides_on_the_bundled_traces_as_python_does_and_verifies_the_bad_ones(
+    programs: Path, signed
+) -> None:
     file, key = signed
     X = load_dataset("insertion").X[700:1000].copy()
     X[0, 3], X[1, 5], X[2, 0], X[3], X[4] = np.nan, -np.inf, 1e30, 2.5, X[4] * 9.0
@@ -56,10 +65,16 @@ def test_it_decides_on_the_bundled_traces_as_python_does_and_verifies_the_bad_on
     assert bad <= {d.reason for d in expected}
 
 
-def test_it_learns_nothing_and_says_so(programs: Path, signed: tuple[Path, Path], tmp_path: Path) -> None:
+def test_it_learns_nothing_and_says_so(
+    programs: Path, signed: tuple[Path, Path], tmp_path: Path
+) -> None:
     learns_nothing = "a model in ONNX learns nothing"
     with program(programs, signed[0]) as cell:
-        assert cell.ask("label x-1 1") == f"error {learns_nothing}; export TorchScript" == cell.ask("stop x-1")
+        assert (
+            cell.ask("label x-1 1")
+            == f"error {learns_nothing}; export TorchScript"
+            == cell.ask("stop x-1")
+        )
         assert cell.decide(np.ones(2))[:3] == ["-", "verify", "malformed"]
         assert cell.end()[0] == 1
     with program(programs, signed[0], "--journal", tmp_path / "cell.csv") as cell:
@@ -85,7 +100,9 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("kind", SPOILT)
-def test_a_file_that_must_not_be_used_is_refused(programs: Path, signed, tmp_path: Path, kind: str) -> None:
+def test_a_file_that_must_not_be_used_is_refused(
+    programs: Path, signed, tmp_path: Path, kind: str
+) -> None:
     shutil.copytree(signed[0].parent, tmp_path, dirs_exist_ok=True)
     spoil, expected = SPOILT[kind]
     spoil(file := tmp_path / "model.onnx")
@@ -97,8 +114,11 @@ def test_a_file_that_must_not_be_used_is_refused(programs: Path, signed, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("runtime", "expected"), [("nothing.so", "name it in DENGINE_ONNXRUNTIME"), ("libm.so.6", "is no onnxruntime")]
+    ("runtime", "expected"),
+    [("nothing.so", "name it in DENGINE_ONNXRUNTIME"), ("libm.so.6", "is no onnxruntime")],
 )
-def test_without_onnxruntime_it_says_where_to_name_it(programs: Path, signed, runtime: str, expected: str) -> None:
+def test_without_onnxruntime_it_says_where_to_name_it(
+    programs: Path, signed, runtime: str, expected: str
+) -> None:
     with program(programs, signed[0], runtime=runtime) as cell:
         cell.must_refuse(expected)

@@ -49,14 +49,20 @@ def functions_in(path: Path, body: list[ast.stmt], class_name: str = "") -> Iter
 
 def main() -> None:
     """Parse, draw, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--functions", type=int, default=40)
     parser.add_argument("--modules", type=int, default=20)
     options = parser.parse_args()
     paths = sorted(PACKAGE.rglob("*.py"))
-    modules = {path.relative_to(PACKAGE.parent): ast.parse(path.read_text("utf-8")) for path in paths}
-    functions = [function for path, module in modules.items() for function in functions_in(path, module.body)]
+    modules = {
+        path.relative_to(PACKAGE.parent): ast.parse(path.read_text("utf-8")) for path in paths
+    }
+    functions = [
+        function for path, module in modules.items() for function in functions_in(path, module.body)
+    ]
     generator = random.Random(options.seed)
     print(f"{len(functions)} functions in {len(modules)} modules; seed {options.seed}")
     for number, function in enumerate(generator.sample(functions, options.functions), 1):

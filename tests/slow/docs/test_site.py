@@ -21,7 +21,9 @@ TO_BE_MADE = {f"dengine/{folder}/NAME.py" for folder in ("reducers", "cells", "c
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for package in ("mkdocs", "material", "mkdocstrings_handlers.python"):
-        pytest.importorskip(package, reason="the site needs the extra docs: pip install 'dengine[docs]'")
+        pytest.importorskip(
+            package, reason="the site needs the extra docs: pip install 'dengine[docs]'"
+        )
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
     done = subprocess.run(command, cwd=REPO, capture_output=True, text=True, timeout=300)
@@ -65,7 +67,9 @@ def test_every_file_and_heading_that_a_page_links_is_there(page: str) -> None:
         linked = REPO / (path or page)
         assert linked.exists(), path
         headings = re.findall(r"^#+ (.+)$", text_of([linked]), flags=re.M) if anchor else []
-        assert not anchor or anchor in {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", h).strip().lower()) for h in headings}
+        assert not anchor or anchor in {
+            re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", h).strip().lower()) for h in headings
+        }
 
 
 def test_every_script_and_module_that_the_documents_name_is_there() -> None:

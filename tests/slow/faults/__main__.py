@@ -75,9 +75,15 @@ def faults(
     killed = {
         "SIGKILL of the cell": partial(kills.kill_cells, times=kills_),
         "SIGKILL of the served cell": partial(kills.kill_cells, times=kills_, child=kills.serving),
-        "SIGKILL, mostly as a version is stored": partial(kills.kill_cells, times=others, child=kills.often),
-        "SIGKILL while the store is locked": partial(kills.kill_cells, times=others, child=kills.in_outage),
-        "SIGKILL, and the write-ahead log cut or removed": partial(kills.kill_cells, times=others, damage=kills.cut_wal),
+        "SIGKILL, mostly as a version is stored": partial(
+            kills.kill_cells, times=others, child=kills.often
+        ),
+        "SIGKILL while the store is locked": partial(
+            kills.kill_cells, times=others, child=kills.in_outage
+        ),
+        "SIGKILL, and the write-ahead log cut or removed": partial(
+            kills.kill_cells, times=others, damage=kills.cut_wal
+        ),
         "SIGKILL while the store is locked, and a bit of the journal flipped": partial(
             kills.kill_cells, times=others, child=kills.in_outage, damage=kills.flip_journal
         ),
@@ -85,20 +91,37 @@ def faults(
         "SIGKILL of an export": partial(kills.kill_exports, times=others),
     }
     if program is not None:
-        killed["SIGKILL of the C++ program"] = partial(kills.kill_programs, times=others, program=program)
+        killed["SIGKILL of the C++ program"] = partial(
+            kills.kill_programs, times=others, program=program
+        )
     results = [("SQLite", title(fault), fault, trials) for fault in (*ON_SQLITE, *ON_DISKS)]
-    results += [("SQLite", f"{title(asked_again)}: {ids:,} others in the store", partial(asked_again, stored=ids), 1)]
+    results += [
+        (
+            "SQLite",
+            f"{title(asked_again)}: {ids:,} others in the store",
+            partial(asked_again, stored=ids),
+            1,
+        )
+    ]
     results += [("SQLite", words, fault, 1) for words, fault in killed.items()]
     results += [("PostgreSQL", title(fault), fault, trials) for fault in ON_POSTGRES]
-    return [*results, *(("PostgreSQL", words, fault, 1) for words, fault in list(killed.items())[:2])]
+    return [
+        *results,
+        *(("PostgreSQL", words, fault, 1) for words, fault in list(killed.items())[:2]),
+    ]
 
 
 def between(program: list[str]) -> None:
     """Begin this program again with a library between it and its disk, which hangs or fails when a file says so."""
     folder = Path(tempfile.mkdtemp(prefix="dengine-faults-"))
     source = Path(__file__).with_name("sync.c")
-    subprocess.run(["gcc", "-shared", "-fPIC", "-o", folder / "sync.so", source, "-ldl"], check=True)
-    around = os.environ | {"LD_PRELOAD": str(folder / "sync.so"), "DENGINE_SYNC": str(folder / "sync")}
+    subprocess.run(
+        ["gcc", "-shared", "-fPIC", "-o", folder / "sync.so", source, "-ldl"], check=True
+    )
+    around = os.environ | {
+        "LD_PRELOAD": str(folder / "sync.so"),
+        "DENGINE_SYNC": str(folder / "sync"),
+    }
     os.execve(sys.executable, program, around)
 
 
@@ -108,7 +131,9 @@ def tried(fault: Fault, place: Callable[[], Place], trials: int, console: Consol
     for _ in range(trials):
         try:
             fault(outcome, place())
-        except Exception as error:  # the trial itself ended: that is counted, and the next fault is tried
+        except (
+            Exception
+        ) as error:  # the trial itself ended: that is counted, and the next fault is tried
             outcome.tell(error)
     for text in outcome.told[:3]:
         console.print(f"  {text}", style="red", highlight=False)
@@ -123,25 +148,58 @@ def mutated() -> bool:
             tree = copied(Path(folder))
             text = (tree / file).read_text(encoding="utf-8")
             (tree / file).write_text(text.replace(before, after), encoding="utf-8")
-            command = [sys.executable, "-m", "tests.slow.faults", "--trials", "1", "--others", "5", "--only", row]
+            command = [
+                sys.executable,
+                "-m",
+                "tests.slow.faults",
+                "--trials",
+                "1",
+                "--others",
+                "5",
+                "--only",
+                row,
+            ]
             around = os.environ | {"PYTHONPATH": folder}
-            done = subprocess.run(command, cwd=tree, env=around, capture_output=True, text=True, check=False)
+            done = subprocess.run(
+                command, cwd=tree, env=around, capture_output=True, text=True, check=False
+            )
         rows = [line for line in done.stdout.splitlines() if line.startswith(f"| SQLite | {row}")]
-        caught.append(text.count(before) == 1 and any(line.split(" | ")[4:7] != ["0", "0", "0"] for line in rows))
-        print("|", name, "|", *(rows or [done.stderr[-300:]]), "" if caught[-1] else "MISSED", flush=True)
+        caught.append(
+            text.count(before) == 1
+            and any(line.split(" | ")[4:7] != ["0", "0", "0"] for line in rows)
+        )
+        print(
+            "|",
+            name,
+            "|",
+            *(rows or [done.stderr[-300:]]),
+            "" if caught[-1] else "MISSED",
+            flush=True,
+        )
     return all(caught)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--trials", type=int, default=3, help="of each fault but the kills")
     parser.add_argument("--kills", type=int, default=20, help="of the cell")
     parser.add_argument(
-        "--others", type=int, default=10, help="of a version's commit, an outage, imports, exports, programs"
+        "--others",
+        type=int,
+        default=10,
+        help="of a version's commit, an outage, imports, exports, programs",
     )
-    parser.add_argument("--postgres", default="", metavar="URL", help="a server on which cells may be made")
-    parser.add_argument("--ids", type=int, default=2000, help="in a store that is away as others are asked for")
-    parser.add_argument("--mutations", action="store_true", help="show that rows can fail, and nothing else")
+    parser.add_argument(
+        "--postgres", default="", metavar="URL", help="a server on which cells may be made"
+    )
+    parser.add_argument(
+        "--ids", type=int, default=2000, help="in a store that is away as others are asked for"
+    )
+    parser.add_argument(
+        "--mutations", action="store_true", help="show that rows can fail, and nothing else"
+    )
     parser.add_argument("--program", type=Path, help="a built dengine-cell")
     parser.add_argument("--only", default="", help="faults whose words hold this")
     parser.add_argument("--out", type=Path, help="write the table there, as Markdown")
@@ -154,7 +212,9 @@ def main() -> None:
     console, folder = Console(), SYNC.parent
     columns = ("store", "fault", "times", "labels", "lost", "wrong", "raised", "longest wait")
     rows = []
-    os.environ["XDG_STATE_HOME"] = str(folder / "state")  # where PostgreSQL's cells have their journals
+    os.environ["XDG_STATE_HOME"] = str(
+        folder / "state"
+    )  # where PostgreSQL's cells have their journals
     how = arguments.trials, arguments.kills, arguments.others, arguments.program, arguments.ids
     for where, words, fault, trials in faults(*how):
         url = arguments.postgres if where == "PostgreSQL" else ""
@@ -171,7 +231,14 @@ def main() -> None:
             console.print(f"  {seen.versions} versions were swapped in", highlight=False)
         seen.must(seen.longest < 2 * WAIT, f"a call took {seen.longest:.1f} s")
         counts = (seen.injected, seen.labels, seen.lost, seen.wrong, seen.raised)
-        rows.append((where, words, *map(str, counts), f"{1000 * seen.longest:.0f} ms" if seen.longest else "-"))
+        rows.append(
+            (
+                where,
+                words,
+                *map(str, counts),
+                f"{1000 * seen.longest:.0f} ms" if seen.longest else "-",
+            )
+        )
         lines = ["| " + " | ".join(row) + " |" for row in (columns, ["---"] * len(columns), *rows)]
         print(lines[-1], flush=True)
         if arguments.out is not None:

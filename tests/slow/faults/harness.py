@@ -74,9 +74,13 @@ class Place:
 class Cell:
     """An engine that is driven by hand, so that what it raises and how long it takes is seen."""
 
-    def __init__(self, place: Place, outcome: Outcome, window: int = RECIPE.window, **options: Any) -> None:
+    def __init__(
+        self, place: Place, outcome: Outcome, window: int = RECIPE.window, **options: Any
+    ) -> None:
         self.place, self.outcome = place, outcome
-        self.engine = DataEngine(recipe=replace(RECIPE, window=window), store=place.store(), **options)
+        self.engine = DataEngine(
+            recipe=replace(RECIPE, window=window), store=place.store(), **options
+        )
         self.acknowledged: dict[str, bool] = {}
         self.next = 0
 
@@ -103,7 +107,9 @@ class Cell:
         try:
             result = work()
         finally:
-            if not isinstance(result, RetrainReport):  # a retrain takes its own time, which is no wait
+            if not isinstance(
+                result, RetrainReport
+            ):  # a retrain takes its own time, which is no wait
                 self.outcome.longest = max(self.outcome.longest, time.perf_counter() - begin)
         return result
 
@@ -124,16 +130,23 @@ class Cell:
             self.outcome.wrong += sum(a != b for a, b in zip(before, bounds(again), strict=True))
         if "://" not in self.place.url:
             (journal,) = Path(self.place.url).parent.glob(f"{Path(self.place.url).name}.*.journal")
-            self.outcome.must(journal.stat().st_size == HEADER, "the journal holds what the store has")
+            self.outcome.must(
+                journal.stat().st_size == HEADER, "the journal holds what the store has"
+            )
 
 
 def bounds(engine: DataEngine) -> list[tuple[Any, ...]]:
     """What an engine says of the probe."""
     seen = [engine.decide(x) for x in stream().X[-PROBE:]]
-    return [(d.action, d.lower, d.upper, d.n_success, d.n_failure, d.embedding, d.model_version) for d in seen]
+    return [
+        (d.action, d.lower, d.upper, d.n_success, d.n_failure, d.embedding, d.model_version)
+        for d in seen
+    ]
 
 
 def missing(store: SqlStore, acknowledged: dict[str, bool]) -> int:
     """How many labels a store does not hold as they were acknowledged."""
     result = {name: store.get_decision(name) for name in acknowledged}
-    return sum(item is None or item.success is not acknowledged[name] for name, item in result.items())
+    return sum(
+        item is None or item.success is not acknowledged[name] for name, item in result.items()
+    )

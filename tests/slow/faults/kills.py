@@ -67,13 +67,23 @@ def _acknowledge(path: str, *words: object) -> None:
         file.write(" ".join(map(str, words)) + "\n")
 
 
-def cell(place: Place, told: str, seed: int, recipe: Recipe = SOON, locked_after: int | None = None) -> None:
+def cell(
+    place: Place, told: str, seed: int, recipe: Recipe = SOON, locked_after: int | None = None
+) -> None:
     """Decide and report on and on, under ids of its own, and tell of each once it was answered and acknowledged.
 
     After each report it decides on a probe; or, `locked_after` so many parts, its store is locked.
     """
-    engine, data, rng = DataEngine.open_or_create(place.store(), recipe=recipe), stream(), np.random.default_rng(seed)
-    other = None if locked_after is None else sqlite3.connect(place.url, isolation_level=None, timeout=30)
+    engine, data, rng = (
+        DataEngine.open_or_create(place.store(), recipe=recipe),
+        stream(),
+        np.random.default_rng(seed),
+    )
+    other = (
+        None
+        if locked_after is None
+        else sqlite3.connect(place.url, isolation_level=None, timeout=30)
+    )
     _acknowledge(told, "began", engine.store.status()["labels"], engine.version)
     for n, _ in enumerate(_for_a_while()):
         if other is not None and n == locked_after:
@@ -88,7 +98,15 @@ def cell(place: Place, told: str, seed: int, recipe: Recipe = SOON, locked_after
             _acknowledge(told, "label", decision.id, int(data.y[i]))
         if other is None:
             probe = engine.decide(data.X[-1])
-            _acknowledge(told, "probe", engine.version, probe.lower, probe.upper, probe.n_success, probe.n_failure)
+            _acknowledge(
+                told,
+                "probe",
+                engine.version,
+                probe.lower,
+                probe.upper,
+                probe.n_success,
+                probe.n_failure,
+            )
 
 
 often = partial(cell, recipe=OFTEN)
@@ -99,9 +117,13 @@ def serving(place: Place, told: str, seed: int) -> None:
     """A served cell, with the process that retrains beside it."""
     with RetrainingProcess() as pool:
         pool.submit(int).result()  # it has begun
-        service = CellService(lambda: DataEngine.open_or_create(place.store(), recipe=SOON, executor=pool))
+        service = CellService(
+            lambda: DataEngine.open_or_create(place.store(), recipe=SOON, executor=pool)
+        )
         with closing(service), served(create_app(service, page=False)) as port:
-            _acknowledge(told, "began", service.engine.store.status()["labels"], service.engine.version, port)
+            _acknowledge(
+                told, "began", service.engine.store.status()["labels"], service.engine.version, port
+            )
             time.sleep(60)
 
 
@@ -119,13 +141,17 @@ def drive(told: str, seed: int) -> None:
                 raise ConnectionError(document)
             return document
 
-        with suppress(OSError, http.client.HTTPException, ValueError):  # it was killed, as it was to be
+        with suppress(
+            OSError, http.client.HTTPException, ValueError
+        ):  # it was killed, as it was to be
             for n, _ in enumerate(_for_a_while()):
                 i = int(rng.integers(len(data) - PROBE))
                 document = ask("/decide", trace=data.X[i].tolist(), request=f"{seed}-{n}")
                 if document["late"] or document["reason"] == Reason.NO_STORE:
                     continue
-                _acknowledge(told, "answer", document["id"], i, document["action"], document["lower"])
+                _acknowledge(
+                    told, "answer", document["id"], i, document["action"], document["lower"]
+                )
                 if document["action"] == Action.VERIFY:
                     ask("/report", id=document["id"], success=bool(data.y[i]))
                     _acknowledge(told, "label", document["id"], int(data.y[i]))
@@ -134,7 +160,12 @@ def drive(told: str, seed: int) -> None:
 def importing(place: Place, told: str, seed: int) -> None:
     """An import of recorded labels, chunk by chunk."""
     _acknowledge(told, "imported", 0)
-    import_labelled(place.store(), stream(), recipe=RECIPE, on_traces=lambda n: _acknowledge(told, "imported", n))
+    import_labelled(
+        place.store(),
+        stream(),
+        recipe=RECIPE,
+        on_traces=lambda n: _acknowledge(told, "imported", n),
+    )
     time.sleep(60)
 
 
@@ -152,7 +183,9 @@ def _at_home(surroundings: dict[str, str], child: Callable[..., None], *words: o
     child(*words)
 
 
-def killed(child: Callable[..., None], place: Place, seed: int, most: float = 0.5) -> list[list[str]]:
+def killed(
+    child: Callable[..., None], place: Place, seed: int, most: float = 0.5
+) -> list[list[str]]:
     """Run a child until a random moment after its first word, kill it, and return what it, and who asked it, told."""
     answer = f"{place.url if '://' not in place.url else f'/tmp/dengine-{os.getpid()}-{place.cell}'}.told"
     Path(answer).write_text("")
@@ -206,12 +239,23 @@ def check_cell(outcome: Outcome, place: Place, told: list[list[str]], excuse: st
         lost, n_stored = missing(engine.store, labels), engine.store.status()["labels"]
         probe = engine.decide(stream().X[-1])
         outcome.lost += 0 if text and lost == 1 else lost
-        now = [str(v) for v in (engine.version, probe.lower, probe.upper, probe.n_success, probe.n_failure)]
-        if told and told[-1][0] == "probe" and not text and [n_stored - len(labels)] == [int(n) for n, _ in began]:
+        now = [
+            str(v)
+            for v in (engine.version, probe.lower, probe.upper, probe.n_success, probe.n_failure)
+        ]
+        if (
+            told
+            and told[-1][0] == "probe"
+            and not text
+            and [n_stored - len(labels)] == [int(n) for n, _ in began]
+        ):
             outcome.must(now == told[-1][1:], f"decides otherwise: {now}, {told[-1]}")
         for id_, i, *answer in (words[1:] for words in told if words[0] == "answer" and not text):
             again = engine.decide(stream().X[int(i)], decision_id=id_)
-            outcome.must([again.action, str(again.lower)] == answer, f"{id_} is answered otherwise: {answer}, {again}")
+            outcome.must(
+                [again.action, str(again.lower)] == answer,
+                f"{id_} is answered otherwise: {answer}, {again}",
+            )
 
 
 def kill_cells(
@@ -239,7 +283,11 @@ def kill_cells(
 
 def next_place(place: Place, seed: int) -> Place:
     """Another file, or another cell of a server."""
-    return replace(place, cell=f"{place.cell}-{seed}") if "://" in place.url else replace(place, url=f"{place.url}.{seed}")
+    return (
+        replace(place, cell=f"{place.cell}-{seed}")
+        if "://" in place.url
+        else replace(place, url=f"{place.url}.{seed}")
+    )
 
 
 def kill_imports(outcome: Outcome, place: Place, times: int) -> None:
@@ -279,7 +327,9 @@ def kill_exports(outcome: Outcome, place: Place, times: int) -> None:
     for seed in range(times):
         killed(exporting, place, seed, most=0.3)
         outcome.injected += 1
-        with suppress(ExportError):  # killed between the file and its sum: exported again it is whole
+        with suppress(
+            ExportError
+        ):  # killed between the file and its sum: exported again it is whole
             result = load_exported(Path(place.url).with_suffix(".ts")).decide(stream().X[0])
             outcome.must(result.action is decision.action, "a killed export decides otherwise")
 
@@ -297,7 +347,10 @@ def kill_programs(outcome: Outcome, place: Place, times: int, program: Path) -> 
         with place.store() as store:
             outcome.lost += missing(store, acknowledged)
         journal.write_bytes(b"".join(journal.read_bytes().splitlines(keepends=True)[:-3]))
-        outcome.must("its head knows" in import_journal(place.store(), journal).set_aside, "the last lines can be removed")
+        outcome.must(
+            "its head knows" in import_journal(place.store(), journal).set_aside,
+            "the last lines can be removed",
+        )
     except DengineError as error:
         outcome.tell(error)
 

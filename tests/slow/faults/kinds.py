@@ -44,7 +44,9 @@ CHANGES = (
     "DELETE FROM label WHERE seq = 3",
     "UPDATE model_version SET accepted = 0",
 )
-SYNC = Path(os.environ.get("DENGINE_SYNC", os.devnull))  # what the library between this process and its disk is told by
+SYNC = Path(
+    os.environ.get("DENGINE_SYNC", os.devnull)
+)  # what the library between this process and its disk is told by
 
 
 def during(cell: Cell, fault: Any, away: bool = False) -> None:
@@ -56,8 +58,13 @@ def during(cell: Cell, fault: Any, away: bool = False) -> None:
         time.sleep(AWAY if away else OUTAGE)
         if away:
             decisions = [cell.engine.decide(x) for x in stream().X[:5]]
-            cell.outcome.must(Reason.NO_STORE not in {d.reason for d in decisions}, "verified, though the journal is well")
-            cell.outcome.must(bool(core_of(cell.engine).store_fault), "nobody was told that the store is away")
+            cell.outcome.must(
+                Reason.NO_STORE not in {d.reason for d in decisions},
+                "verified, though the journal is well",
+            )
+            cell.outcome.must(
+                bool(core_of(cell.engine).store_fault), "nobody was told that the store is away"
+            )
     cell.until_back()
     cell.play(AFTER)
     cell.finish()
@@ -101,7 +108,11 @@ def lost_journal(outcome: Outcome, place: Place) -> None:
     cell = Cell(place, outcome)
     cell.play(BEFORE)
     journal, remote = journal_path(cell.engine.store.database.url, place.cell), "://" in place.url
-    ways = [Path.unlink, lambda file: file.rename(f"{file}.away"), *[lambda file: shutil.rmtree(file.parent)] * remote]
+    ways = [
+        Path.unlink,
+        lambda file: file.rename(f"{file}.away"),
+        *[lambda file: shutil.rmtree(file.parent)] * remote,
+    ]
     with stopped(place) if remote else lock(place):
         for lose in ways:
             cell.play(10)
@@ -110,7 +121,9 @@ def lost_journal(outcome: Outcome, place: Place) -> None:
             cell.play(10)
             outcome.must(journal.exists(), "the journal was not made anew")
     cell.until_back()
-    outcome.must(any("made anew" in event.text for event in cell.engine.store.events()), "nobody was told")
+    outcome.must(
+        any("made anew" in event.text for event in cell.engine.store.events()), "nobody was told"
+    )
     cell.finish()
 
 
@@ -149,7 +162,10 @@ def lost_file(outcome: Outcome, place: Place) -> None:
         outcome.injected += 1
         cell.acknowledged.clear()  # they went with the file; what is acknowledged after must be in the journal
         cell.play(DURING)
-        outcome.must("deleted, moved or replaced" in core_of(cell.engine).store_fault, "a lost file was not noticed")
+        outcome.must(
+            "deleted, moved or replaced" in core_of(cell.engine).store_fault,
+            "a lost file was not noticed",
+        )
         cell.engine.close()
         copy.replace(file)
         cell.engine = DataEngine.open(cell.place.store())
@@ -194,7 +210,9 @@ def closed_while_away(outcome: Outcome, place: Place) -> None:
         outcome.must(not thread.is_alive(), f"{thread.name} goes on")
     end = time.monotonic() + 10.0
     while True:
-        with contextlib.suppress(StoreError):  # until the server has noticed that the session is over
+        with contextlib.suppress(
+            StoreError
+        ):  # until the server has noticed that the session is over
             cell.engine = DataEngine.open(place.store())
             break
         outcome.must(time.monotonic() < end, "the cell was not given free")
@@ -246,7 +264,10 @@ def _syncs(do: str) -> Iterator[None]:
 
 def _before_a_disk(outcome: Outcome, place: Place, full: bool = False) -> Cell:
     """A cell that waits as long as a robot's. full : its journal is to begin anew."""
-    cell, journal = Cell(replace(place, wait=0.4), outcome), Path(f"{place.url}.{place.cell}.journal")
+    cell, journal = (
+        Cell(replace(place, wait=0.4), outcome),
+        Path(f"{place.url}.{place.cell}.journal"),
+    )
     cell.play(60)
     cell.engine.flush()
     while full and journal.stat().st_size <= HEADER + RESERVE:
@@ -261,7 +282,9 @@ def _unsynced(cell: Cell, i: int) -> Decision:
     engine, outcome, x, good = cell.engine, cell.outcome, stream().X[i], bool(stream().y[i])
     cell.timed(lambda: engine.decide(x))
     earlier: Decision = cell.timed(lambda: engine.decide(x, decision_id=f"part-{i}"))
-    outcome.must(earlier.action is Action.VERIFY, f"{earlier.id} goes on unchecked, and is on no disk")
+    outcome.must(
+        earlier.action is Action.VERIFY, f"{earlier.id} goes on unchecked, and is on no disk"
+    )
     for success, error in ((good, StoreError), (not good, ReportError), (good, StoreError)):
         with contextlib.suppress(error):
             cell.timed(lambda success=success: engine.report(earlier.id, success))
@@ -284,7 +307,10 @@ def hung_disk(outcome: Outcome, place: Place, do: str = "hang") -> None:
     cell.finish()
     with DataEngine.open(place.store()) as again:
         for i, item in answer.items():
-            outcome.must(again.decide(data.X[i], decision_id=item.id) == item, f"{item.id} is answered otherwise")
+            outcome.must(
+                again.decide(data.X[i], decision_id=item.id) == item,
+                f"{item.id} is answered otherwise",
+            )
 
 
 def failing_disk(outcome: Outcome, place: Place) -> None:
@@ -298,7 +324,10 @@ def run_over_a_hung_disk(outcome: Outcome, place: Place) -> None:
     with _syncs("hang"):
         threading.Timer(2.0, SYNC.write_text, [""]).start()
         cycles = list(cell.engine.run(ReplayCell(stream(), np.arange(60, 90)), 30))
-    outcome.must(any(c.decision.reason is Reason.NO_STORE for c in cycles), "a part was decided on over a hung disk")
+    outcome.must(
+        any(c.decision.reason is Reason.NO_STORE for c in cycles),
+        "a part was decided on over a hung disk",
+    )
     cell.acknowledged |= {c.decision.id: c.success for c in cycles if c.success is not None}
     cell.play(60)
     cell.finish()
@@ -317,14 +346,22 @@ def end(url: str, hung: bool) -> None:
 
 def closed_while_hung(outcome: Outcome, place: Place, hung: bool = True) -> None:
     """A process that ends while a sync hangs."""
-    begin, code = time.monotonic(), f"from tests.slow.faults.kinds import end; end({place.url!r}, {hung})"
+    begin, code = (
+        time.monotonic(),
+        f"from tests.slow.faults.kinds import end; end({place.url!r}, {hung})",
+    )
     with _syncs("") if hung else contextlib.nullcontext():
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+        )
     outcome.must(time.monotonic() - begin < 60, "a hung disk kept the process from ending")
     outcome.must(hung or not done.stderr, f"it said at its end: {done.stderr}")
     acknowledged, seen = json.loads(done.stdout.splitlines()[-1])
     with DataEngine.open(place.store()) as again:
-        outcome.labels, outcome.lost = outcome.labels + len(acknowledged), outcome.lost + missing(again.store, acknowledged)
+        outcome.labels, outcome.lost = (
+            outcome.labels + len(acknowledged),
+            outcome.lost + missing(again.store, acknowledged),
+        )
     for name in ("injected", "wrong", "raised", "told"):
         setattr(outcome, name, getattr(outcome, name) + seen[name])
     outcome.longest = max(outcome.longest, seen["longest"])
@@ -346,11 +383,16 @@ def served_over_a_hung_disk(outcome: Outcome, place: Place) -> None:
         with _syncs("hang"):
             outcome.injected += 1
             answer = cell.timed(lambda: server.ask("/decide", {"trace": x[1], "request": "second"}))
-            outcome.must(answer["action"] == Action.VERIFY, "a part goes on unchecked over a hung disk")
+            outcome.must(
+                answer["action"] == Action.VERIFY, "a part goes on unchecked over a hung disk"
+            )
             with contextlib.suppress(OSError):
                 cell.timed(lambda: server.ask("/report", {"id": answer["id"], "success": good[1]}))
                 outcome.must(False, "a label was acknowledged on no disk")
-            outcome.must(server.ask("/healthz")["status"] == "degraded", "the server says that its disk is well")
+            outcome.must(
+                server.ask("/healthz")["status"] == "degraded",
+                "the server says that its disk is well",
+            )
             with contextlib.suppress(OSError):  # it may say that it does not know, but not wait
                 cell.timed(lambda: server.ask("/status"))
             begin = time.monotonic()
@@ -358,7 +400,10 @@ def served_over_a_hung_disk(outcome: Outcome, place: Place) -> None:
             outcome.must(time.monotonic() - begin < 60, "a hung disk kept the server from ending")
     cell.engine.close()
     with DataEngine.open(str(folder / "cell.db")) as again:
-        outcome.labels, outcome.lost = outcome.labels + 1, outcome.lost + missing(again.store, {first["id"]: bool(good[0])})
+        outcome.labels, outcome.lost = (
+            outcome.labels + 1,
+            outcome.lost + missing(again.store, {first["id"]: bool(good[0])}),
+        )
 
 
 def clock_set_back(outcome: Outcome, place: Place) -> None:
@@ -432,14 +477,21 @@ def changed(outcome: Outcome, place: Place) -> None:
             connection.row_factory = sqlite3.Row
             row = connection.execute("SELECT * FROM label WHERE seq = 3").fetchone()
             texts = {"success": 1 - row["success"]}
-            connection.create_function("sum_of", 0, lambda row=dict(row) | texts: row_sum("label", row))
+            connection.create_function(
+                "sum_of", 0, lambda row=dict(row) | texts: row_sum("label", row)
+            )
             connection.executescript(sql)
             outcome.injected += 1
         with DataEngine.open(other.store()) as again:
             texts = [again.decide(x) for x in stream().X[:20]]
-            outcome.must({(d.action, d.reason) for d in texts} == {(Action.VERIFY, Reason.NO_STORE)}, f"decided on: {sql}")
+            outcome.must(
+                {(d.action, d.reason) for d in texts} == {(Action.VERIFY, Reason.NO_STORE)},
+                f"decided on: {sql}",
+            )
             again.report(texts[0].id, True)
-            outcome.must("see `dengine verify`" in core_of(again).store_fault, f"nobody was told of: {sql}")
+            outcome.must(
+                "see `dengine verify`" in core_of(again).store_fault, f"nobody was told of: {sql}"
+            )
             outcome.lost += missing(again.store, {texts[0].id: True})
         outcome.must(not verify_history(other.url).ok, f"verified: {sql}")
         with contextlib.suppress(DataError):
@@ -458,7 +510,10 @@ def changed_long_ago(outcome: Outcome, place: Place) -> None:
     with DataEngine.open(place.store()) as again:
         name, good = cell.acknowledged.popitem()
         again.correct(name, not good)
-        outcome.must("see `dengine verify`" in core_of(again).store_fault, "the rule was told what was changed")
+        outcome.must(
+            "see `dengine verify`" in core_of(again).store_fault,
+            "the rule was told what was changed",
+        )
 
 
 def flipped(file: Path, rng: np.random.Generator, size: int | None = None) -> None:
@@ -479,9 +534,14 @@ def flipped_store(outcome: Outcome, place: Place) -> None:
         shutil.copy(place.url, other.url)
         flipped(Path(other.url), rng)
         outcome.injected += 1
-        with contextlib.suppress(StoreError), DataEngine.open(other.store()) as again:  # else it is refused, and said
+        with (
+            contextlib.suppress(StoreError),
+            DataEngine.open(other.store()) as again,
+        ):  # else it is refused, and said
             same = bounds(again) == before and not missing(again.store, cell.acknowledged)
-            answer = core_of(again).store_fault or any(event.kind == "damaged" for event in again.store.events())
+            answer = core_of(again).store_fault or any(
+                event.kind == "damaged" for event in again.store.events()
+            )
             outcome.must(same or bool(answer), f"flip {i}: nobody is told of it")
 
 
@@ -500,13 +560,22 @@ def put_back(outcome: Outcome, place: Place) -> None:
     Path(f"{place.url}.copy").replace(place.url)
     Path(f"{place.url}.{place.cell}.journal").unlink()  # its head is enough
     outcome.injected += 1
-    outcome.must([fault.table for fault in verify_history(place.url).faults] == ["ledger"], "verified, though cut off")
-    cell.engine, cell.acknowledged = DataEngine.open(place.store()), kept  # what was told since is lost, and that is said
+    outcome.must(
+        [fault.table for fault in verify_history(place.url).faults] == ["ledger"],
+        "verified, though cut off",
+    )
+    cell.engine, cell.acknowledged = (
+        DataEngine.open(place.store()),
+        kept,
+    )  # what was told since is lost, and that is said
     cell.play(AFTER)
     cell.finish()
     with DataEngine.open(place.store(), reading=True) as again:
         kinds = [event.kind for event in again.store.events()]
-        outcome.must(kinds.count("lost") == 1, f"it was told {kinds.count('lost')} times that the store was cut off")
+        outcome.must(
+            kinds.count("lost") == 1,
+            f"it was told {kinds.count('lost')} times that the store was cut off",
+        )
 
 
 def second(outcome: Outcome, place: Place) -> None:
@@ -522,9 +591,14 @@ def second(outcome: Outcome, place: Place) -> None:
     url = place.url
     if "://" not in url:
         Path(url := f"{url}.link").symlink_to(place.url)  # by another name, too
-    done = subprocess.run([*command, url, place.cell], capture_output=True, text=True, env=elsewhere, check=False)
+    done = subprocess.run(
+        [*command, url, place.cell], capture_output=True, text=True, env=elsewhere, check=False
+    )
     outcome.injected += 1
-    outcome.must(f"process {os.getpid()} on" in done.stderr and " owns " in done.stderr, "a second engine was let in")
+    outcome.must(
+        f"process {os.getpid()} on" in done.stderr and " owns " in done.stderr,
+        "a second engine was let in",
+    )
     cell.play(DURING)
     cell.finish()
 
@@ -539,8 +613,13 @@ def asked_again(outcome: Outcome, place: Place, stored: int = 0) -> None:
     nothing = cell.engine.decide(np.zeros(X.shape[1]))
     for start in range(0, stored, 5000):
         ids = (f"stored-{i}" for i in range(start, min(start + 5000, stored)))
-        cell.engine.store.apply_records([StoredDecision(replace(nothing, id=id_), X[:1], 1, True, 0.0) for id_ in ids])
-    earlier = [cell.timed(lambda i=i: cell.engine.decide(X[i], decision_id=f"part-{i}")) for i in range(IDS)]
+        cell.engine.store.apply_records(
+            [StoredDecision(replace(nothing, id=id_), X[:1], 1, True, 0.0) for id_ in ids]
+        )
+    earlier = [
+        cell.timed(lambda i=i: cell.engine.decide(X[i], decision_id=f"part-{i}"))
+        for i in range(IDS)
+    ]
     cell.engine.close()
     cell.engine = engine = DataEngine.open(place.store())  # which has none of them by heart
     core_of(engine).load_decision_ids()
@@ -548,25 +627,36 @@ def asked_again(outcome: Outcome, place: Place, stored: int = 0) -> None:
         outcome.injected += 1
         cell.play(1)
         time.sleep(AWAY)
-        decisions = [cell.timed(lambda i=i: engine.decide(X[IDS + i], decision_id=f"new-{i}")) for i in range(IDS)]
+        decisions = [
+            cell.timed(lambda i=i: engine.decide(X[IDS + i], decision_id=f"new-{i}"))
+            for i in range(IDS)
+        ]
         unknown = sum(decision.reason is Reason.NO_STORE for decision in decisions)
-        outcome.must(unknown <= 2, f"{unknown} of {IDS} new ids were taken for old ones")  # one in 500 at a million is
+        outcome.must(
+            unknown <= 2, f"{unknown} of {IDS} new ids were taken for old ones"
+        )  # one in 500 at a million is
         for i, decision in enumerate(earlier):
             for j in (i, i + 1):
                 answer = cell.timed(lambda i=i, j=j: engine.decide(X[j], decision_id=f"part-{i}"))
                 outcome.must(
-                    (answer.action, answer.reason) == (Action.VERIFY, Reason.NO_STORE), f"{decision.id} got an answer"
+                    (answer.action, answer.reason) == (Action.VERIFY, Reason.NO_STORE),
+                    f"{decision.id} got an answer",
                 )
             with contextlib.suppress(StoreError):
                 engine.report(decision.id, True)
-                outcome.must(False, f"a label was taken on {decision.id}, which nobody could look up")
+                outcome.must(
+                    False, f"a label was taken on {decision.id}, which nobody could look up"
+                )
         for decision in decisions:
             if decision.action is Action.VERIFY and decision.reason is not Reason.NO_STORE:
                 cell.timed(lambda decision=decision: engine.report(decision.id, True))
                 cell.acknowledged[decision.id] = True
     cell.until_back()
     for i, decision in enumerate(earlier):
-        outcome.must(engine.decide(X[i], decision_id=decision.id) == decision, f"{decision.id} is answered otherwise")
+        outcome.must(
+            engine.decide(X[i], decision_id=decision.id) == decision,
+            f"{decision.id} is answered otherwise",
+        )
         with contextlib.suppress(TraceError):
             engine.decide(X[i + 1], decision_id=decision.id)
             outcome.must(False, f"{decision.id} was taken for another part")
@@ -618,7 +708,9 @@ def interrupted(outcome: Outcome, place: Place) -> None:
             signal.raise_signal(signal.SIGINT)
 
     before = signal.signal(signal.SIGALRM, interrupt)
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+    handler = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a job in the background ignores it
     for _ in range(300):
         try:
             armed = True
@@ -652,8 +744,32 @@ def forked(outcome: Outcome, place: Place) -> None:
     cell.finish()
 
 
-ON_SQLITE = (locked, moved, lost_file, put_back, changed, changed_long_ago, flipped_store, unstorable)
-ON_SQLITE += (lost_journal, second, unclosed, closed_while_away, killed_executor, hung_executor, interrupted, forked)
-ON_DISKS = (hung_disk, failing_disk, closed_while_hung, run_over_a_hung_disk, served_over_a_hung_disk)
+ON_SQLITE = (
+    locked,
+    moved,
+    lost_file,
+    put_back,
+    changed,
+    changed_long_ago,
+    flipped_store,
+    unstorable,
+)
+ON_SQLITE += (
+    lost_journal,
+    second,
+    unclosed,
+    closed_while_away,
+    killed_executor,
+    hung_executor,
+    interrupted,
+    forked,
+)
+ON_DISKS = (
+    hung_disk,
+    failing_disk,
+    closed_while_hung,
+    run_over_a_hung_disk,
+    served_over_a_hung_disk,
+)
 ON_DISKS += (full_tmpfs, remade_on_a_full_disk, clock_set_back)
 ON_POSTGRES = (frozen, closed_while_away, killed_server, cut_off, lost_journal, second, asked_again)

@@ -48,7 +48,11 @@ def test_a_fault_costs_no_label_raises_nothing_keeps_nobody_waiting_and_changes_
     if where == "PostgreSQL" and not URL:
         pytest.skip("DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
     outcome = Outcome()
-    at = request.getfixturevalue("database") if where == "PostgreSQL" else str(tmp_path / "engine.db")
+    at = (
+        request.getfixturevalue("database")
+        if where == "PostgreSQL"
+        else str(tmp_path / "engine.db")
+    )
     FAULTS[where, words](outcome, Place(at))
     assert (outcome.lost, outcome.wrong, outcome.raised) == (0, 0, 0), outcome.told
     assert outcome.injected > 0
@@ -57,9 +61,15 @@ def test_a_fault_costs_no_label_raises_nothing_keeps_nobody_waiting_and_changes_
 
 
 @pytest.mark.merge
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="the library between this process and its disk needs gcc")
-def test_a_sync_that_hangs_or_fails_costs_nothing(repo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("DENGINE_STORE_WAIT", raising=False)  # as a cell waits for its store: the tests' own wait is long
+@pytest.mark.skipif(
+    shutil.which("gcc") is None, reason="the library between this process and its disk needs gcc"
+)
+def test_a_sync_that_hangs_or_fails_costs_nothing(
+    repo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(
+        "DENGINE_STORE_WAIT", raising=False
+    )  # as a cell waits for its store: the tests' own wait is long
     words = [sys.executable, "-m", "tests.slow.faults", "--trials", "1", "--only", "sync"]
     done = subprocess.run(words, cwd=repo, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -77,7 +87,9 @@ def cell(place: Place) -> Iterator[Cell]:
     created.engine.close()
 
 
-def test_a_version_that_took_too_long_to_store_is_not_stored_later(place: Place, cell: Cell) -> None:
+def test_a_version_that_took_too_long_to_store_is_not_stored_later(
+    place: Place, cell: Cell
+) -> None:
     cell.play(100)
     cell.engine.flush()
     before = cell.engine.version
@@ -87,7 +99,9 @@ def test_a_version_that_took_too_long_to_store_is_not_stored_later(place: Place,
     assert "not stored" in report.reason
     cell.until_back()
     cell.engine.flush()
-    assert cell.engine.version == max(kept.version for kept in cell.engine.store.retrains()) == before
+    assert (
+        cell.engine.version == max(kept.version for kept in cell.engine.store.retrains()) == before
+    )
     cell.finish()
     assert cell.outcome.wrong == 0, cell.outcome.told
 
@@ -98,7 +112,9 @@ def test_a_forgotten_engine_gives_its_cell_free(place: Place) -> None:
     DataEngine.open(place.url).close()
 
 
-def test_closing_does_not_wait_for_a_hung_retrain(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_does_not_wait_for_a_hung_retrain(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("dengine.engine.core.CLOSE_SECONDS", 0.1)
     cell = Cell(place, Outcome(), executor=Hung())
     cell.play(60)
@@ -119,7 +135,11 @@ def test_an_executor_that_was_shut_down_is_replaced_by_retrains_in_line(place: P
 def left(path: Path) -> tuple[list[bytes], int, bool]:
     """What a journal holds when it is opened again, how much of it is damaged, and whether its end was dropped."""
     with contextlib.closing(Journal(path)) as again:
-        return [record for _, _, record in again.undrained_records()], again.damaged, again.dropped > 0
+        return (
+            [record for _, _, record in again.undrained_records()],
+            again.damaged,
+            again.dropped > 0,
+        )
 
 
 @pytest.mark.parametrize(
@@ -145,7 +165,11 @@ def test_what_is_damaged_in_a_journal_is_noticed_and_costs_none_behind_it(
     for again in (False, True):  # and goes on behind what is there
         records, result, dropped = left(path)
         unfinished = kept == "ABCD" and not again
-        assert ("".join(chr(record[0]) for record in records), result, dropped) == (kept, damaged, unfinished)
+        assert ("".join(chr(record[0]) for record in records), result, dropped) == (
+            kept,
+            damaged,
+            unfinished,
+        )
     with contextlib.closing(Journal(path)) as again:
         again.append([b"F" * 50])
     assert [record[:1] for record in left(path)[0]][-1] == b"F"
@@ -179,9 +203,24 @@ def test_a_label_and_an_event_in_a_journal_return_bit_for_bit(tmp_path: Path) ->
     assert event_back == event
 
 
-def test_what_a_journal_holds_of_another_decision_of_an_id_is_set_aside_with_its_label(place: Place) -> None:
+def test_what_a_journal_holds_of_another_decision_of_an_id_is_set_aside_with_its_label(
+    place: Place,
+) -> None:
     def record(x: np.ndarray, time: float) -> StoredDecision:
-        created = Decision("part 7", Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0)
+        created = Decision(
+            "part 7",
+            Action.VERIFY,
+            Action.VERIFY,
+            0.0,
+            1.0,
+            0,
+            0,
+            None,
+            0,
+            Reason.NO_MODEL,
+            False,
+            1.0,
+        )
         return StoredDecision(created, x, 1, False, time)
 
     first, other = (record(np.full((1, 5), i, dtype=np.float32), float(i)) for i in range(2))
@@ -196,6 +235,10 @@ def test_what_a_journal_holds_of_another_decision_of_an_id_is_set_aside_with_its
         assert "data" in texts[0]
         assert "another decision" in texts[1]
         for _ in range(2):
-            assert store.apply_records([replace(label, time=6.0, decided=first.time)]) == [("part 7", 1)]
-        assert store.apply_records([replace(label, time=7.0, decided=first.time, success=True)]) == []
+            assert store.apply_records([replace(label, time=6.0, decided=first.time)]) == [
+                ("part 7", 1)
+            ]
+        assert (
+            store.apply_records([replace(label, time=7.0, decided=first.time, success=True)]) == []
+        )
         assert "a second label" in store.events()[-1].text

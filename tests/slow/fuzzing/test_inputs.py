@@ -24,18 +24,24 @@ from .damage import SAMPLES, anything, spoilt, traces, tries
 pytestmark = pytest.mark.filterwarnings("ignore")
 X, Y = toy_traces(70, SAMPLES)
 X = X[:, 0]
-SOUND = st.integers(0, len(X) - 1).flatmap(lambda i: st.floats(0.0, 1.0).map(lambda offset: X[i] + np.float32(offset)))
+SOUND = st.integers(0, len(X) - 1).flatmap(
+    lambda i: st.floats(0.0, 1.0).map(lambda offset: X[i] + np.float32(offset))
+)
 SPEC = TraceSpec(SAMPLES)
 RECIPES = [Recipe.load(name).to_toml() for name in ("conv", "pca", "rocket", "umap")]
 SETTINGS = '0 1 -1 true nan inf 1e400 "" "x" "none" [] [[1]] {} {a=1} 1979-05-27 07:32:00 "a:b" "\\u0000" 0.05 0.9'
 TOML = [*SETTINGS.split(), "9" * 5000, "[" * 300, "'''", "0x7fffffffffffffffffff", "\x80", "\0"]
 TABLE = [
     "FZ_0,FZ_1,FZ_2,label",
-    *(f"{','.join(map(str, x[:3]))},{'OK' if y else 'NOK'}" for x, y in zip(X[:4], Y, strict=False)),
+    *(
+        f"{','.join(map(str, x[:3]))},{'OK' if y else 'NOK'}"
+        for x, y in zip(X[:4], Y, strict=False)
+    ),
 ]
 RECORDING = ["timestamp,FZ_Base", *(f"{i / 500},{value}" for i, value in enumerate(X[0]))]
 PARTS = [
-    f"part,a-{i},{int(y)},7,verify,verify,uncertain,0.2,1.0,3,0,{','.join(map(str, X[i] + 1))}" for i, y in enumerate(Y[:3])
+    f"part,a-{i},{int(y)},7,verify,verify,uncertain,0.2,1.0,3,0,{','.join(map(str, X[i] + 1))}"
+    for i, y in enumerate(Y[:3])
 ]
 TYPED = "x -1 0 nan inf 1e400 1.5 - -- --out --json é , ,, a,b . / .. /dev/null missing/file %s {} a:b : http://x"
 WORDS = [*TYPED.split(), "", "\ud800", "a b", "x" * 300, "sqlite://", "none", "=", "*"]
@@ -74,7 +80,11 @@ def learned(store: Path | None = None) -> DataEngine:
 @pytest.fixture(scope="module")
 def engines() -> Iterator[list[DataEngine]]:
     """With a model, without one, and of an open contract; each works after all that was tried."""
-    items = [learned(), DataEngine("pca", trace=SPEC), DataEngine("pca", trace=TraceSpec(SAMPLES, fit="resample"))]
+    items = [
+        learned(),
+        DataEngine("pca", trace=SPEC),
+        DataEngine("pca", trace=TraceSpec(SAMPLES, fit="resample")),
+    ]
     yield items
     for engine in items:
         id_ = engine.decide(X[0] * -9.0).id
@@ -99,14 +109,21 @@ def journal(lines: bytes) -> bytes:
 
 @given(value=traces, which=st.integers(0, 2))
 @tries(3.0)
-def test_anything_in_the_place_of_a_trace_is_decided_on_or_refused(engines, value: Any, which: int) -> None:
+def test_anything_in_the_place_of_a_trace_is_decided_on_or_refused(
+    engines, value: Any, which: int
+) -> None:
     with suppress(DengineError):
         engines[which].decide(value)
 
 
-@given(value=anything | st.sampled_from([0, 1, True, 1.0, np.int8(1), np.bool_(True), np.array(1)]), x=SOUND)
+@given(
+    value=anything | st.sampled_from([0, 1, True, 1.0, np.int8(1), np.bool_(True), np.array(1)]),
+    x=SOUND,
+)
 @tries(3.0)
-def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(engines, value: Any, x: np.ndarray) -> None:
+def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(
+    engines, value: Any, x: np.ndarray
+) -> None:
     engine = engines[0]
     id_, before = engine.decide(x * -3.0).id, core_of(engine).new_labels
     try:
@@ -121,7 +138,9 @@ def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(engines, va
 
 @given(value=anything, trace=traces, x=SOUND, how=st.integers(0, 3), good=st.booleans())
 @tries(2.0)
-def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(engines, value, trace, x, how: int, good) -> None:
+def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(
+    engines, value, trace, x, how: int, good
+) -> None:
     calls: list[Callable[[], Any]] = [
         lambda: engines[0].report(value, good),
         lambda: engines[0].report(value, False, trace=x),
@@ -132,9 +151,13 @@ def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(engines, v
         calls[how]()
 
 
-@given(data=st.data(), value=st.sampled_from(TOML), lines=st.sampled_from(RECIPES).map(str.splitlines))
+@given(
+    data=st.data(), value=st.sampled_from(TOML), lines=st.sampled_from(RECIPES).map(str.splitlines)
+)
 @tries()
-def test_a_recipe_with_another_value_or_damaged_makes_an_engine_or_is_refused(folder: Path, data, value, lines) -> None:
+def test_a_recipe_with_another_value_or_damaged_makes_an_engine_or_is_refused(
+    folder: Path, data, value, lines
+) -> None:
     at = data.draw(st.sampled_from([i for i, line in enumerate(lines) if " = " in line]))
     lines[at] = lines[at].partition(" = ")[0] + " = " + value
     content = "\n".join(lines).encode("utf-8", "surrogatepass")
@@ -152,12 +175,18 @@ def test_a_damaged_file_of_data_is_read_or_refused(name: str, tmp_path_factory, 
     cell.mkdir()
     (cell / "1_OK.csv").write_bytes(FILES["cell/1_OK.csv"][0])
     (here / name).write_bytes(data.draw(st.sampled_from(FILES[name]).flatmap(spoilt)))
-    whole, labels = name in ("data.npz", "table.csv"), here / "labels.csv" if name == "labels.csv" else None
+    whole, labels = (
+        name in ("data.npz", "table.csv"),
+        here / "labels.csv" if name == "labels.csv" else None,
+    )
     with suppress(DengineError):
         load_dataset(here / name) if whole else load_dataset(cell, labels=labels)
 
 
-@given(content=spoilt("\n".join(PARTS).encode()).map(journal) | spoilt(journal("\n".join(PARTS).encode())))
+@given(
+    content=spoilt("\n".join(PARTS).encode()).map(journal)
+    | spoilt(journal("\n".join(PARTS).encode()))
+)
 @tries()
 def test_a_damaged_journal_is_read_or_refused(folder: Path, content: bytes) -> None:
     (folder / "damaged.csv").write_bytes(content)
@@ -165,7 +194,10 @@ def test_a_damaged_journal_is_read_or_refused(folder: Path, content: bytes) -> N
         read_journal(folder / "damaged.csv", SPEC)
 
 
-@given(labels=st.lists(st.sampled_from([0, 1]) | anything, min_size=3, max_size=3), X=st.just(X[:3]) | traces)
+@given(
+    labels=st.lists(st.sampled_from([0, 1]) | anything, min_size=3, max_size=3),
+    X=st.just(X[:3]) | traces,
+)
 @tries(0.3)
 def test_odd_arrays_and_labels_are_imported_or_refused(labels: list[Any], X: Any) -> None:
     with suppress(DengineError):
@@ -182,10 +214,14 @@ def must_be_one_line(words: list[str]) -> None:
 
 @given(data=st.data(), words=st.sampled_from(COMMANDS.splitlines()).map(str.split))
 @tries(0.1)
-def test_a_command_with_other_words_works_or_says_one_error(folder: Path, data, words: list[str]) -> None:
+def test_a_command_with_other_words_works_or_says_one_error(
+    folder: Path, data, words: list[str]
+) -> None:
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(1, len(words)))
-        words[at : at + data.draw(st.integers(0, 1))] = data.draw(st.lists(st.sampled_from(WORDS), max_size=1))
+        words[at : at + data.draw(st.integers(0, 1))] = data.draw(
+            st.lists(st.sampled_from(WORDS), max_size=1)
+        )
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         must_be_one_line(words)
@@ -193,7 +229,9 @@ def test_a_command_with_other_words_works_or_says_one_error(folder: Path, data, 
 
 @given(data=st.data(), shown=st.booleans())
 @tries(0.1)
-def test_a_damaged_store_is_opened_and_decides_or_is_refused(folder: Path, tmp_path_factory, data, shown: bool) -> None:
+def test_a_damaged_store_is_opened_and_decides_or_is_refused(
+    folder: Path, tmp_path_factory, data, shown: bool
+) -> None:
     path = tmp_path_factory.mktemp("damaged") / "cell.db"
     path.write_bytes(data.draw(spoilt((folder / "store.db").read_bytes())))
     if shown:

@@ -30,13 +30,31 @@ from tests.support.serving import served
 
 from .damage import SAMPLES, nested, spoilt, tries
 
-JSON, RAW, PACK, XML = "application/json", "application/octet-stream", "application/msgpack", "text/xml"
+JSON, RAW, PACK, XML = (
+    "application/json",
+    "application/octet-stream",
+    "application/msgpack",
+    "text/xml",
+)
 GOOD = [float(i % 7) for i in range(SAMPLES)]
 PATHS = """/decide /report /status /decisions /decisions/x /metrics /healthz /docs /RPC2 /RPC2/wrong /me / /explanations/
 /explanations/known-0 /course /embedding /versions /events?limit= /status?last= /correct /forget /rollback /policy /retrain
 /part?id= /map?id= /history?page= /page/static/ // /.env /%ff%fe /../../etc/passwd /decisions/..%2f..%2fetc%2fpasswd
 /decisions/%00 /decisions?limit= /decisions?open= /decisions?before= /decisions?since= /RPC2?token="""
-ODD = ["", "x", "%00", "-1", "1e999", "9" * 5000, "x" * 900, "%ff", "';--", "<script>", "%0d%0aSet-Cookie:a=b", "../../x"]
+ODD = [
+    "",
+    "x",
+    "%00",
+    "-1",
+    "1e999",
+    "9" * 5000,
+    "x" * 900,
+    "%ff",
+    "';--",
+    "<script>",
+    "%0d%0aSet-Cookie:a=b",
+    "../../x",
+]
 METHODS = ["GET", "POST", "POST", "PUT", "DELETE", "PATCH", "TRACE", "CONNECT", "BREW", "get"]
 HEADS = """Host:|Host: evil.example|Host: a/b@c|Origin: http://evil.example|Sec-Fetch-Site: cross-site|\
 Transfer-Encoding: chunked|Content-Length: -1|Content-Length: x|Content-Length: 99999999999999999999|\
@@ -55,9 +73,16 @@ ODD_XML = [
 ]
 
 
-def request(body: bytes, path: str = "/decide", content: str = JSON, method: str = "POST", *heads: str) -> bytes:
+def request(
+    body: bytes, path: str = "/decide", content: str = JSON, method: str = "POST", *heads: str
+) -> bytes:
     """A request whose frame is right, but for what heads say."""
-    lines = f"{method} {path} HTTP/1.1", "Host: localhost", f"Content-Type: {content}", f"Content-Length: {len(body)}"
+    lines = (
+        f"{method} {path} HTTP/1.1",
+        "Host: localhost",
+        f"Content-Type: {content}",
+        f"Content-Length: {len(body)}",
+    )
     return "\r\n".join([*lines, *heads, "", ""]).encode("utf-8", "replace") + body
 
 
@@ -65,18 +90,39 @@ def call(name: str, arguments: Any) -> bytes:
     return xmlrpc.client.dumps(tuple(arguments), name, allow_none=True).encode("utf-8", "replace")
 
 
-def only(body: st.SearchStrategy[bytes], content: str, path: str = "/decide") -> st.SearchStrategy[bytes]:
+def only(
+    body: st.SearchStrategy[bytes], content: str, path: str = "/decide"
+) -> st.SearchStrategy[bytes]:
     return body.map(lambda result: request(result, path, content))
 
 
-fields = st.dictionaries(st.sampled_from(["trace", "request", "part", "id", "success", "a"]), nested, max_size=3)
+fields = st.dictionaries(
+    st.sampled_from(["trace", "request", "part", "id", "success", "a"]), nested, max_size=3
+)
 asked = fields.map(lambda result: {"trace": GOOD} | result) | fields
 ids = st.uuids().map(str)  # of what is spoilt, and may yet be good
 sound = ids.map(lambda id_: {"trace": GOOD, "request": id_})
 paths = st.tuples(st.sampled_from(PATHS.split()), st.sampled_from(ODD)).map("".join)
-simple = st.none() | st.booleans() | st.integers(-(2**31), 2**31 - 1) | st.floats() | st.text(max_size=20)
+simple = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**31), 2**31 - 1)
+    | st.floats()
+    | st.text(max_size=20)
+)
 simple = st.recursive(simple | st.binary(max_size=20), st.lists, max_leaves=50)
-names = st.sampled_from(["decide", "report", "add", "begin", "system.listMethods", "__class__", "eval", "decide_recorded"])
+names = st.sampled_from(
+    [
+        "decide",
+        "report",
+        "add",
+        "begin",
+        "system.listMethods",
+        "__class__",
+        "eval",
+        "decide_recorded",
+    ]
+)
 framed = request(json.dumps({"trace": GOOD}).encode())
 KINDS = {
     "JSON": only(asked.map(json.dumps).map(str.encode), JSON)
@@ -84,30 +130,60 @@ KINDS = {
     "spoilt JSON": only(sound.map(json.dumps).map(str.encode).flatmap(spoilt), JSON),
     "raw": st.builds(
         lambda body, query: request(body, f"/decide?{query}", RAW),
-        st.binary(max_size=200) | st.sampled_from([2, 3, 100]).map(lambda n: struct.pack(f"<{SAMPLES}f", *GOOD) * n),
-        st.sampled_from(["", "channels=0", "channels=3", "channels=1&channels=1", "a=b", "request=%00", "part=%0a"]),
+        st.binary(max_size=200)
+        | st.sampled_from([2, 3, 100]).map(lambda n: struct.pack(f"<{SAMPLES}f", *GOOD) * n),
+        st.sampled_from(
+            [
+                "",
+                "channels=0",
+                "channels=3",
+                "channels=1&channels=1",
+                "a=b",
+                "request=%00",
+                "part=%0a",
+            ]
+        ),
     ),
-    "MessagePack": only(asked.map(lambda result: encode(json.loads(json.dumps(result), parse_int=float))), PACK)
+    "MessagePack": only(
+        asked.map(lambda result: encode(json.loads(json.dumps(result), parse_int=float))), PACK
+    )
     | only(sound.map(encode).flatmap(spoilt) | st.binary(max_size=50), PACK)
-    | only(st.sampled_from([b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 5000, b"\xc1"]), PACK),
+    | only(
+        st.sampled_from(
+            [b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 5000, b"\xc1"]
+        ),
+        PACK,
+    ),
     "XML-RPC": only(st.builds(call, names, st.lists(simple, max_size=4)), XML, "/RPC2")
     | only(st.sampled_from(ODD_XML).map(str.encode), XML, "/RPC2")
     | only(ids.map(lambda id_: call("decide", (GOOD, id_))).flatmap(spoilt), XML, "/RPC2"),
     "an action": st.builds(
         lambda path, body: request(body, path, JSON, "POST", "Origin: http://localhost"),
         st.sampled_from(["/correct", "/forget", "/rollback", "/policy", "/retrain", "/export"]),
-        st.dictionaries(st.sampled_from(["id", "ids", "success", "version", "alpha", "guarantee"]), nested, max_size=3)
+        st.dictionaries(
+            st.sampled_from(["id", "ids", "success", "version", "alpha", "guarantee"]),
+            nested,
+            max_size=3,
+        )
         .map(lambda result: result | {"author": " "})
         .map(json.dumps)
         .map(str.encode),
     ),
     "a head": st.builds(
-        request, st.just(b"{}"), paths, st.sampled_from([JSON, "", "a/b", "\x7f"]), st.sampled_from(METHODS)
+        request,
+        st.just(b"{}"),
+        paths,
+        st.sampled_from([JSON, "", "a/b", "\x7f"]),
+        st.sampled_from(METHODS),
     )
-    | st.sampled_from(HEADS.split("|")).map(lambda head: request(b"{}", "/decide", JSON, "POST", head)),
+    | st.sampled_from(HEADS.split("|")).map(
+        lambda head: request(b"{}", "/decide", JSON, "POST", head)
+    ),
     "no HTTP": st.binary(min_size=1, max_size=3000)
     | st.integers(1, len(framed) - 1).map(lambda n: framed[:n])
-    | st.sampled_from([b"GET / HTTX/1.1\r\n\r\n", b"\x16\x03\x01", b"GET / HTTP/1.1\r\nX: " + b"y" * 100_000]),
+    | st.sampled_from(
+        [b"GET / HTTX/1.1\r\n\r\n", b"\x16\x03\x01", b"GET / HTTP/1.1\r\nX: " + b"y" * 100_000]
+    ),
 }
 
 
@@ -134,14 +210,26 @@ class Cell:
 
     def decisions(self) -> dict[str, str]:
         store = self.service.submit(lambda engine: (engine.flush(), engine.store)[1]).result(60)
-        results = [store.get_decision(decision.decision.id) for decision in store.decisions(HistoryFilter(), 10**6)]
-        return {decision.decision.id: repr(decision) + decision.trace.tobytes().hex() for decision in results}
+        results = [
+            store.get_decision(decision.decision.id)
+            for decision in store.decisions(HistoryFilter(), 10**6)
+        ]
+        return {
+            decision.decision.id: repr(decision) + decision.trace.tobytes().hex()
+            for decision in results
+        }
 
     def probed(self, run: str) -> list[Any]:
         """What it decides on the same few traces."""
         X, _ = toy_traces(20, SAMPLES)
-        bodies = [{"trace": (x + np.float32(0.02)).tolist(), "request": f"{run}-{i}"} for i, x in enumerate(X[:, 0])]
-        texts = [json.loads(self.send(request(json.dumps(body).encode())).partition(b"\r\n\r\n")[2]) for body in bodies]
+        bodies = [
+            {"trace": (x + np.float32(0.02)).tolist(), "request": f"{run}-{i}"}
+            for i, x in enumerate(X[:, 0])
+        ]
+        texts = [
+            json.loads(self.send(request(json.dumps(body).encode())).partition(b"\r\n\r\n")[2])
+            for body in bodies
+        ]
         return [body | {"id": "", "time": 0, "seconds": 0} for body in texts]
 
 
@@ -178,7 +266,9 @@ def learned(file: Path) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @given(data=st.data())
 @tries(0.3)
-def test_a_malformed_request_is_answered_and_changes_nothing(cell: Cell, kind: str, data: st.DataObject) -> None:
+def test_a_malformed_request_is_answered_and_changes_nothing(
+    cell: Cell, kind: str, data: st.DataObject
+) -> None:
     sent = data.draw(KINDS[kind])
     text = cell.send(sent)
     status = re.match(rb"HTTP/1\.1 (\d{3}) ", text)

@@ -30,7 +30,10 @@ def pieces_of(part: str, repeats: int) -> list[Piece]:
         return [Piece(part, {"case": case}, seed) for case, n in cases for seed in range(n)]
     n, settings = {
         "null": (max(2, repeats // 20), [{"reducer": "conv", "data": "insertion"}]),
-        "certificate": (max(2, repeats // 10), _product(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))),
+        "certificate": (
+            max(2, repeats // 10),
+            _product(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,)),
+        ),
         "garbage": (max(1, repeats // 40), _product(reducer=QUICK)),
     }[part]
     pieces = [Piece(part, setting, seed) for setting in settings for seed in range(n)]
@@ -44,11 +47,24 @@ def _product(**axes: Iterable[Any]) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Parse, finish every piece, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("out/proof"), help="folder for the finished pieces")
-    parser.add_argument("--docs", type=Path, help="folder for proof.csv and proof.md; by default that of the pieces")
-    parser.add_argument("--repeats", type=int, default=200, help="replays of a main configuration; others have a share")
-    parser.add_argument("--only", default=",".join(PARTS), help=f"parts to do, of {', '.join(PARTS)}")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/proof"), help="folder for the finished pieces"
+    )
+    parser.add_argument(
+        "--docs", type=Path, help="folder for proof.csv and proof.md; by default that of the pieces"
+    )
+    parser.add_argument(
+        "--repeats",
+        type=int,
+        default=200,
+        help="replays of a main configuration; others have a share",
+    )
+    parser.add_argument(
+        "--only", default=",".join(PARTS), help=f"parts to do, of {', '.join(PARTS)}"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     args = parser.parse_args()
     pieces = [piece for part in args.only.split(",") for piece in pieces_of(part, args.repeats)]

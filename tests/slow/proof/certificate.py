@@ -12,7 +12,9 @@ from dengine.decision.certificate import log_evidence
 
 CLAIM = 0.05
 PROPENSITIES = (1.0, 0.1, 0.02)
-STREAMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {  # part's position in [0, 1) -> its true failure probability
+STREAMS: dict[
+    str, Callable[[np.ndarray], np.ndarray]
+] = {  # part's position in [0, 1) -> its true failure probability
     "at the claim": lambda t: np.full_like(t, CLAIM),
     "below it": lambda t: np.full_like(t, 0.4 * CLAIM),
     "far below it": lambda t: np.full_like(t, 0.1 * CLAIM),
@@ -36,7 +38,9 @@ def most_bad(mean: np.ndarray, alpha: float, propensity: float) -> np.ndarray:
     return allowed
 
 
-def ever_wrong(name: str, propensity: float, alpha: float, streams: int, parts: int, seed: int = 0) -> float:
+def ever_wrong(
+    name: str, propensity: float, alpha: float, streams: int, parts: int, seed: int = 0
+) -> float:
     """Share of streams in which the bound lies, after any part, below the running mean of the true probabilities."""
     rng, p = np.random.default_rng(seed), STREAMS[name](np.arange(parts) / parts)
     allowed = most_bad(np.cumsum(p) / np.arange(1, parts + 1), alpha, propensity)

@@ -32,7 +32,9 @@ RETRAINS = (100, 200, 400)  # labelled traces at each
 QUERIES = 100
 
 
-def squared_deviations(n_success: NDArray[np.int64], n: NDArray[np.int64], p: float) -> NDArray[np.float64]:
+def squared_deviations(
+    n_success: NDArray[np.int64], n: NDArray[np.int64], p: float
+) -> NDArray[np.float64]:
     """z^2 of each ball with at least `FEWEST` labels of noise, n_success of n, drawn at rate p."""
     enough = n >= FEWEST
     n, n_success = n[enough], n_success[enough]
@@ -55,7 +57,9 @@ def white_noise(n: int, p: float, seed: int, samples: int = 60) -> Noise:
     easy = rng.random(n) < 0.5
     X = rng.normal(20.0, 3.0, (n, samples))
     X[easy] -= 40.0
-    return Noise(X.astype(np.float32), np.where(easy, 0, rng.random(n) < p).astype(np.int8), easy, p)
+    return Noise(
+        X.astype(np.float32), np.where(easy, 0, rng.random(n) < p).astype(np.int8), easy, p
+    )
 
 
 def relabelled(X: NDArray[np.float32], n: int, p: float, seed: int) -> Noise:
@@ -77,12 +81,16 @@ def count_noise(recipe: Recipe, noise: Noise, seed: int) -> NDArray[np.float64]:
         model = model.successor().train(X, noise.y[:n], content_hash(X))
         n_success, n_failure = model.count(queries)
         results.append(
-            squared_deviations(n_success, n_success + n_failure - _easy(model, noise.easy[:n], queries), noise.p)
+            squared_deviations(
+                n_success, n_success + n_failure - _easy(model, noise.easy[:n], queries), noise.p
+            )
         )
     return np.concatenate(results)
 
 
-def _easy(model: ModelPrediction, easy: NDArray[np.bool_], queries: NDArray[np.float32]) -> NDArray[np.int64]:
+def _easy(
+    model: ModelPrediction, easy: NDArray[np.bool_], queries: NDArray[np.float32]
+) -> NDArray[np.int64]:
     """How many of each query's neighbours are easy: the same balls, counted with other labels."""
     labels = model.index.labels[1, : len(easy)]
     kept = labels.clone()
@@ -109,7 +117,9 @@ def weak_signal(n: int, strength: float, seed: int, samples: int = 40) -> Datase
 
 def places(recipe: Recipe, data: Dataset, seed: int) -> NDArray[np.float64]:
     """(n, K, d) where each trace lay in every space when it was decided; NaN before the first retrain."""
-    sure_of_nothing = replace(recipe.with_policy(alpha=1e-6, lower_bound=0.999), novelty=0.0)  # every label becomes known
+    sure_of_nothing = replace(
+        recipe.with_policy(alpha=1e-6, lower_bound=0.999), novelty=0.0
+    )  # every label becomes known
     engine = DataEngine(recipe=sure_of_nothing, seed=seed, replaying=True)
     results = [cycle.decision.embedding for cycle in engine.run(ReplayCell(data), len(data))]
     shape = np.shape(results[-1])

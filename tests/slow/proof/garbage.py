@@ -23,7 +23,9 @@ LEARNED, PER_KIND = 800, 100
 def _engine_noise(X: Traces, rng: np.random.Generator) -> NDArray[np.float64]:
     t, n = np.linspace(0.0, 1.0, X.shape[1]), len(X)
     beat = rng.uniform(20.0, 60.0, (n, 1)) * t + rng.uniform(0.0, 1.0, (n, 1))
-    return np.asarray(X.mean() + X.std() * (1.0 + 0.5 * np.sin(2 * np.pi * 3 * t)) * np.sin(2 * np.pi * beat))
+    return np.asarray(
+        X.mean() + X.std() * (1.0 + 0.5 * np.sin(2 * np.pi * 3 * t)) * np.sin(2 * np.pi * beat)
+    )
 
 
 def _spiked(X: Traces, rng: np.random.Generator) -> Traces:
@@ -34,7 +36,12 @@ def _spiked(X: Traces, rng: np.random.Generator) -> Traces:
 
 def _hum(X: Traces, rng: np.random.Generator) -> NDArray[np.float64]:
     return np.asarray(
-        X + 0.5 * X.std() * np.sin(2 * np.pi * 50 * np.linspace(0.0, 2.0, X.shape[1]) + rng.uniform(0, 6, (len(X), 1)))
+        X
+        + 0.5
+        * X.std()
+        * np.sin(
+            2 * np.pi * 50 * np.linspace(0.0, 2.0, X.shape[1]) + rng.uniform(0, 6, (len(X), 1))
+        )
     )
 
 
@@ -42,7 +49,8 @@ Kind = Callable[[Traces, Traces, np.random.Generator], NDArray[Any]]
 KINDS: dict[str, Kind] = {  # from good and bad traces (n, T)
     "white noise": lambda good, _bad, rng: rng.normal(good.mean(), good.std(), good.shape),
     "sine": lambda good, _bad, rng: (
-        good.mean() + good.std() * np.sin(np.linspace(0, 60, good.shape[1]) + rng.uniform(0, 6, (len(good), 1)))
+        good.mean()
+        + good.std() * np.sin(np.linspace(0, 60, good.shape[1]) + rng.uniform(0, 6, (len(good), 1)))
     ),
     "hum on good parts": lambda good, _bad, rng: _hum(good, rng),
     "hum on bad parts": lambda _good, bad, rng: _hum(bad, rng),
@@ -51,7 +59,9 @@ KINDS: dict[str, Kind] = {  # from good and bad traces (n, T)
     "shifted": lambda good, _bad, _rng: np.roll(good, good.shape[1] // 5, axis=1),
     "reversed": lambda good, _bad, _rng: good[:, ::-1],
     "upside down": lambda good, _bad, _rng: 2 * good.mean() - good,
-    "random walk": lambda good, _bad, rng: good.mean() + good.std() / 10 * np.cumsum(rng.normal(size=good.shape), axis=1),
+    "random walk": lambda good, _bad, rng: (
+        good.mean() + good.std() / 10 * np.cumsum(rng.normal(size=good.shape), axis=1)
+    ),
     "another machine": lambda good, _bad, rng: _engine_noise(good, rng),
     "half the gain": lambda good, _bad, _rng: 0.5 * good,
 }
@@ -73,7 +83,9 @@ def garbage(seed: int, reducer: str) -> list[dict[str, Any]]:
     order = rng.permutation(len(data))
     X, y, clean = data.X[order[:LEARNED]], data.y[order[:LEARNED]], data.X[order[LEARNED:]]
     good, bad = X[y == 1][:PER_KIND], X[y == 0][:PER_KIND]
-    kinds = {name: np.asarray(make(good, bad, rng), dtype=np.float32) for name, make in KINDS.items()}
+    kinds = {
+        name: np.asarray(make(good, bad, rng), dtype=np.float32) for name, make in KINDS.items()
+    }
     result = screws(X.shape[1], rng)
     if result is not None:
         kinds["screw driving"] = result
@@ -91,9 +103,17 @@ def _rows(
     recipe = RECIPES[reducer].with_policy(alpha=0.1, lower_bound=0.9)
     gated = ModelPrediction.from_recipe(recipe, seed).fit(X, y)
     open_ = ModelPrediction.from_recipe(replace(recipe, novelty=0.0), seed).fit(X, y)
-    share = [(name, *(_share(m, x, [Action.ACCEPT]) for m in (gated, open_))) for name, x in kinds.items()]
+    share = [
+        (name, *(_share(m, x, [Action.ACCEPT]) for m in (gated, open_)))
+        for name, x in kinds.items()
+    ]
     if clean is not None:
-        share.append(("clean, certain", *(_share(m, clean, [Action.ACCEPT, Action.REJECT]) for m in (gated, open_))))
+        share.append(
+            (
+                "clean, certain",
+                *(_share(m, clean, [Action.ACCEPT, Action.REJECT]) for m in (gated, open_)),
+            )
+        )
     return [{"kind": name, "gated": on, "open": off} for name, on, off in share]
 
 

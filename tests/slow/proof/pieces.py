@@ -29,9 +29,19 @@ STREAMS = 100  # of the certificate, a seed
 
 def null(seed: int, reducer: str, data: str) -> Row:
     """Labels that are independent of the trace, four in five good, through the whole loop: how many came out certain."""
-    X, recipe = dengine.load_dataset(data).X, dengine.Recipe.load(reducer).with_policy(alpha=0.1, lower_bound=0.9)
-    y = np.random.default_rng(100 + seed).permutation(np.arange(len(X)) < 0.8 * len(X)).astype(np.int8)
-    return {"cycles": len(X), "certain": int((dengine.replay((X, y), recipe, 100 + seed).action != "verify").sum())}
+    X, recipe = (
+        dengine.load_dataset(data).X,
+        dengine.Recipe.load(reducer).with_policy(alpha=0.1, lower_bound=0.9),
+    )
+    y = (
+        np.random.default_rng(100 + seed)
+        .permutation(np.arange(len(X)) < 0.8 * len(X))
+        .astype(np.int8)
+    )
+    return {
+        "cycles": len(X),
+        "certain": int((dengine.replay((X, y), recipe, 100 + seed).action != "verify").sum()),
+    }
 
 
 def certified(seed: int, stream: str, propensity: float, alpha: float) -> Row:
@@ -75,15 +85,25 @@ def sources_digest() -> str:
 def run_piece(piece: Piece, sources: str) -> list[Row]:
     """Every row of a piece, with its seed; sources : part of what it is kept under."""
     result = FUNCTIONS[piece.kind](seed=piece.seed, **piece.settings)
-    return [{"seed": piece.seed} | row for row in (result if isinstance(result, list) else [result])]
+    return [
+        {"seed": piece.seed} | row for row in (result if isinstance(result, list) else [result])
+    ]
 
 
-def finish(pieces: list[Piece], out: Path, jobs: int, tell: Callable[[str], None] = print) -> list[tuple[Piece, list[Row]]]:
+def finish(
+    pieces: list[Piece], out: Path, jobs: int, tell: Callable[[str], None] = print
+) -> list[tuple[Piece, list[Row]]]:
     """Every piece with its rows, in order; those missing on the disk are done, `jobs` at a time."""
-    run, sources, begin = Memory(out, verbose=0).cache(run_piece), sources_digest(), time.perf_counter()
+    run, sources, begin = (
+        Memory(out, verbose=0).cache(run_piece),
+        sources_digest(),
+        time.perf_counter(),
+    )
     there = sum(run.check_call_in_cache(piece, sources) for piece in pieces)
     tell(f"{there} of {len(pieces)} pieces are there already.")
-    every = Parallel(n_jobs=jobs, return_as="generator", batch_size=1)(delayed(run)(piece, sources) for piece in pieces)
+    every = Parallel(n_jobs=jobs, return_as="generator", batch_size=1)(
+        delayed(run)(piece, sources) for piece in pieces
+    )
     done: list[tuple[Piece, list[Row]]] = []
     for piece, rows in zip(pieces, every, strict=True):
         done.append((piece, rows))

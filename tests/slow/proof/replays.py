@@ -105,7 +105,9 @@ def judge(seed: int, case: Case) -> Row:
     wrong = stream.p if case.mirrored else 1.0 - stream.p
     rng, side, action = np.random.default_rng([seed, 13]), int(case.mirrored), SIDES[case.side]
     members, passed, certain = Mean(), Mean(FEW), 0
-    owed: deque[tuple[int, float]] = deque()  # checks that are never reported, and when they count as bad
+    owed: deque[tuple[int, float]] = (
+        deque()
+    )  # checks that are never reported, and when they count as bad
     stops: deque[tuple[int, Decision]] = deque()  # that come late
     numbers = [None] * case.cycles if stream.data.part is None else stream.data.part
     with DataEngine(recipe=case.recipe, seed=seed, replaying=True) as engine:
@@ -141,7 +143,10 @@ def spend(seed: int, case: Case) -> Row:
     saved : at the end what not checking the accepted saved less what they cost, by their true probabilities of failure.
     bound : what the certificate said of it then.  untrue : whether it ever said more.
     """
-    stream, policy = planted(case.truth, case.cycles, case.lower_bound, seed, case.rate, case.order), case.recipe.policy
+    stream, policy = (
+        planted(case.truth, case.cycles, case.lower_bound, seed, case.rate, case.order),
+        case.recipe.policy,
+    )
     (check, escape, _), accepted = policy.prices, Mean()
     account, most, bound, untrue = 0.0, float("nan"), 0.0, False
     with DataEngine(recipe=case.recipe, seed=seed, replaying=True) as engine:
@@ -157,7 +162,13 @@ def spend(seed: int, case: Case) -> Row:
                 bound = engine.certificate().saved or 0.0
                 untrue |= bound > check * accepted.n - escape * accepted.sum
     saved = check * accepted.n - escape * accepted.sum
-    return {"accepted": accepted.n, "account": most, "saved": saved, "bound": bound, "untrue": untrue}
+    return {
+        "accepted": accepted.n,
+        "account": most,
+        "saved": saved,
+        "bound": bound,
+        "untrue": untrue,
+    }
 
 
 def broken(rows: Iterable[Row], what: str, tolerance: float) -> int:
@@ -167,7 +178,9 @@ def broken(rows: Iterable[Row], what: str, tolerance: float) -> int:
 
 HELD, MOVING = ("sharp", "soft", "step", "mesa", "edge", "trap", "staircase", "just beyond", "bad few"), (
     "drifting", "jumping", "seasons")  # fmt: skip
-FACTORS: dict[str, Row] = {  # one at a time, beside the base: all stops known, as drawn, 1,503 parts at (0.1, 90 %)
+FACTORS: dict[
+    str, Row
+] = {  # one at a time, beside the base: all stops known, as drawn, 1,503 parts at (0.1, 90 %)
     "best first": {"order": "best first"},
     "worst first": {"order": "worst first"},
     "10 % audits, some stops": {"stops": "some", "audit_rate": 0.1},
@@ -186,7 +199,9 @@ FACTORS: dict[str, Row] = {  # one at a time, beside the base: all stops known, 
 def planted_cases() -> list[Case]:
     """Every truth at the base, and every factor by itself at two of them."""
     return [Case(truth, truth) for truth in (*HELD, *MOVING)] + [
-        Case(f"{truth}, {name}", truth, **factor) for name, factor in FACTORS.items() for truth in ("soft", "trap")
+        Case(f"{truth}, {name}", truth, **factor)
+        for name, factor in FACTORS.items()
+        for truth in ("soft", "trap")
     ]
 
 
@@ -200,7 +215,9 @@ def noise_cases() -> list[Case]:
     """Labels independent of the trace, or drawn once a part where parts repeat."""
     about: Row = {"share": 0.2, "cycles": 600}
     return [
-        Case(f"{truth} {rate:g}", truth, rate=rate, **about) for truth in ("noise", "parts") for rate in (0.5, 0.8, 0.88)
+        Case(f"{truth} {rate:g}", truth, rate=rate, **about)
+        for truth in ("noise", "parts")
+        for rate in (0.5, 0.8, 0.88)
     ]
 
 

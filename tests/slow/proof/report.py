@@ -30,9 +30,18 @@ HEADS = {
         "what the certificate said of it at the end. Broke: it ever said more.",
     ),
     "noise": ("Labels of noise", "As above. Certain: decisions per 1503 cycles."),
-    "null": ("The null test", "Labels independent of the trace, four in five good: certain decisions of a replay."),
-    "certificate": ("Certificate", "Streams of 2000 parts in which the bound, at any moment, was wrong; alpha 10 %."),
-    "garbage": ("Garbage accepted", "Share accepted with the novelty gate, and without it; last, certain of clean parts."),
+    "null": (
+        "The null test",
+        "Labels independent of the trace, four in five good: certain decisions of a replay.",
+    ),
+    "certificate": (
+        "Certificate",
+        "Streams of 2000 parts in which the bound, at any moment, was wrong; alpha 10 %.",
+    ),
+    "garbage": (
+        "Garbage accepted",
+        "Share accepted with the novelty gate, and without it; last, certain of clean parts.",
+    ),
 }
 
 
@@ -44,23 +53,38 @@ def share_row(k: int, n: int, alpha: float, claimed: bool = True) -> Row:
     """How often a promise was broken, and what its whole interval says; in brackets where nothing was promised."""
     ends = binomtest(k, n).proportion_ci(0.95)
     word = "BROKEN" if ends.low > alpha else "kept" if ends.high <= alpha + NEAR else "within error"
-    return {"broke": k / n, "low": ends.low, "high": ends.high, "verdict": word if claimed else f"({word.lower()})"}
+    return {
+        "broke": k / n,
+        "low": ends.low,
+        "high": ends.high,
+        "verdict": word if claimed else f"({word.lower()})",
+    }
 
 
 def replay_row(settings: Row, rows: list[Row]) -> Row:
     """One configuration of replays."""
     case, n = settings["case"], len(rows)
     certain = 1503 / case.cycles * _mean(row["certain"] for row in rows)
-    out: Row = {"alpha": case.alpha, "LB": case.lower_bound, "replays": n, "certain per 1503": certain}
+    out: Row = {
+        "alpha": case.alpha,
+        "LB": case.lower_bound,
+        "replays": n,
+        "certain per 1503": certain,
+    }
     out |= {case.side: _mean(row["passed"] for row in rows)}
-    shares = {name: broken(rows, name, case.tolerance) for name in (f"{who}, {when}" for who in WHO for when in WHEN)}
+    shares = {
+        name: broken(rows, name, case.tolerance)
+        for name in (f"{who}, {when}" for who in WHO for when in WHEN)
+    }
     out |= share_row(shares.pop("members, ever"), n, case.alpha, case.claims)
     return out | {name: f"({k / n:.0%})" for name, k in shares.items()}
 
 
 def cost_row(settings: Row, rows: list[Row]) -> Row:
     """One configuration under prices."""
-    out: Row = {"replays": len(rows)} | {name: _mean(row[name] for row in rows) for name in ("accepted", "saved", "bound")}
+    out: Row = {"replays": len(rows)} | {
+        name: _mean(row[name] for row in rows) for name in ("accepted", "saved", "bound")
+    }
     out["account"] = float(np.nanmax([row["account"] for row in rows]))
     return out | share_row(sum(row["untrue"] for row in rows), len(rows), settings["case"].alpha)
 
@@ -68,7 +92,12 @@ def cost_row(settings: Row, rows: list[Row]) -> Row:
 def null_row(settings: Row, rows: list[Row]) -> Row:
     """Each replay's, and their mean."""
     certain = [r["certain"] for r in rows]
-    return {"replays": len(rows), "cycles": rows[0]["cycles"], "certain": str(certain), "mean": _mean(certain)}
+    return {
+        "replays": len(rows),
+        "cycles": rows[0]["cycles"],
+        "certain": str(certain),
+        "mean": _mean(certain),
+    }
 
 
 def certificate_row(settings: Row, rows: list[Row]) -> Row:
@@ -80,7 +109,10 @@ def certificate_row(settings: Row, rows: list[Row]) -> Row:
 def garbage_rows(settings: Row, rows: list[Row]) -> list[Row]:
     """A row a kind."""
     means = pd.DataFrame(rows).groupby("kind", sort=False)[["gated", "open"]].mean()
-    return [{"kind": kind, "with the gate": gated, "without": open_} for kind, gated, open_ in means.itertuples()]
+    return [
+        {"kind": kind, "with the gate": gated, "without": open_}
+        for kind, gated, open_ in means.itertuples()
+    ]
 
 
 ROWS: dict[str, Callable[[Row, list[Row]], Any]] = {
@@ -101,7 +133,10 @@ def tables(done: Iterable[tuple[Piece, list[Row]]]) -> dict[str, pd.DataFrame]:
     result: dict[str, list[Row]] = {}
     for (kind, name), (settings, rows) in gathered.items():
         created = ROWS[kind](settings, rows)
-        named = [{"configuration": name} | row for row in (created if isinstance(created, list) else [created])]
+        named = [
+            {"configuration": name} | row
+            for row in (created if isinstance(created, list) else [created])
+        ]
         result.setdefault(kind, []).extend(named)
     return {kind: pd.DataFrame(rows) for kind, rows in result.items()}
 
@@ -110,7 +145,9 @@ def write_report(done: Iterable[tuple[Piece, list[Row]]], docs: Path) -> str:
     """Write both files; returns what became of everything that is called a guarantee, in a few lines."""
     docs.mkdir(parents=True, exist_ok=True)
     result = tables(done)
-    whole = pd.concat([frame.assign(part=kind) for kind, frame in result.items()], ignore_index=True)
+    whole = pd.concat(
+        [frame.assign(part=kind) for kind, frame in result.items()], ignore_index=True
+    )
     whole.to_csv(docs / "proof.csv", index=False, float_format="%.6g")
     blocks = ["# The proof", "`make proof` writes this page."]
     for kind in (kind for kind in HEADS if kind in result):

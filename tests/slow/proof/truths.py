@@ -74,11 +74,15 @@ def traces(u: Floats, rng: np.random.Generator) -> Floats:
     t = np.linspace(0.0, np.pi, SAMPLES)
     slope = rng.normal(0.0, 1.0, len(u))
     return np.asarray(
-        (20.0 + 10.0 * u)[:, None] * np.sin(t) + slope[:, None] * np.cos(t) + rng.normal(0, 0.3, (len(u), SAMPLES))
+        (20.0 + 10.0 * u)[:, None] * np.sin(t)
+        + slope[:, None] * np.cos(t)
+        + rng.normal(0, 0.3, (len(u), SAMPLES))
     )
 
 
-def planted(truth: str, n: int, lower_bound: float, seed: int, rate: float = 0.5, order: str = "drawn") -> Stream:
+def planted(
+    truth: str, n: int, lower_bound: float, seed: int, rate: float = 0.5, order: str = "drawn"
+) -> Stream:
     """A stream of n traces. truth : a name in `TRUTHS`; "noise" and "parts" have the success rate `rate` everywhere.
 
     order : "drawn", or by u, "best first" or "worst first".

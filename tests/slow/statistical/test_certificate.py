@@ -12,10 +12,14 @@ from tests.slow.proof.certificate import PROPENSITIES, STREAMS, ever_wrong, most
 
 @pytest.mark.parametrize("propensity", PROPENSITIES)
 @pytest.mark.parametrize("name", STREAMS)
-def test_the_bound_is_ever_wrong_in_at_most_alpha_of_the_streams(name: str, propensity: float, proof_repeats: int) -> None:
+def test_the_bound_is_ever_wrong_in_at_most_alpha_of_the_streams(
+    name: str, propensity: float, proof_repeats: int
+) -> None:
     streams, alpha = min(2000, 100 * proof_repeats), 0.1
     share = ever_wrong(name, propensity, alpha, streams, parts=2000)
-    assert stats.binomtest(round(share * streams), streams, alpha, alternative="greater").pvalue > 1e-4
+    assert (
+        stats.binomtest(round(share * streams), streams, alpha, alternative="greater").pvalue > 1e-4
+    )
 
 
 def test_an_adversary_who_reacts_to_every_outcome_gains_nothing(proof_repeats: int) -> None:

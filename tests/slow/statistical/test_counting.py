@@ -22,22 +22,38 @@ from dengine.model import neighbours as prediction
 from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
 from dengine.reducers import rocket, torch_reducer
-from tests.slow.proof.counts import count_noise, mean_square, moved, places, relabelled, weak_signal, white_noise
+from tests.slow.proof.counts import (
+    count_noise,
+    mean_square,
+    moved,
+    places,
+    relabelled,
+    weak_signal,
+    white_noise,
+)
 from tests.slow.proof.replays import Case, broken, judge
 
 HONEST = (0.8, 1.3)  # mean z^2; heads trained on all folds: 3 to 4.4
 SEEDS = 16
-JUST_BEYOND = Case("just beyond", "just beyond", reducer="pca", alpha=0.2, lower_bound=0.8, cycles=500)
+JUST_BEYOND = Case(
+    "just beyond", "just beyond", reducer="pca", alpha=0.2, lower_bound=0.8, cycles=500
+)
 WORSENS = replace(JUST_BEYOND, truth="jumping", cycles=1000)
 
 
 def z2(reducer: str = "conv", seeds: int = SEEDS) -> float:
-    return mean_square(count_noise(RECIPES[reducer], white_noise(500, 0.8, seed), seed) for seed in range(seeds))
+    return mean_square(
+        count_noise(RECIPES[reducer], white_noise(500, 0.8, seed), seed) for seed in range(seeds)
+    )
 
 
 def peeks(*strengths: float, folds: tuple[int, ...] = (3,), reducer: str = "conv") -> float:
     """Largest share of traces whose place in a fold's space was moved by the fold's labels."""
-    return max(moved(RECIPES[reducer], weak_signal(200, s, seed=1), fold, seed=0) for s in strengths for fold in folds)
+    return max(
+        moved(RECIPES[reducer], weak_signal(200, s, seed=1), fold, seed=0)
+        for s in strengths
+        for fold in folds
+    )
 
 
 def worse_than_allowed(replays: int, case: Case = JUST_BEYOND) -> float:
@@ -45,7 +61,9 @@ def worse_than_allowed(replays: int, case: Case = JUST_BEYOND) -> float:
     return broken([judge(seed, case) for seed in range(replays)], "passed, end", 0.2) / replays
 
 
-@pytest.mark.parametrize(("reducer", "seeds"), [("rocket", SEEDS), ("pca", 2 * SEEDS)])  # the plane of pca has fewer balls
+@pytest.mark.parametrize(
+    ("reducer", "seeds"), [("rocket", SEEDS), ("pca", 2 * SEEDS)]
+)  # the plane of pca has fewer balls
 def test_labels_of_noise_are_counted_as_chance_says(reducer: str, seeds: int) -> None:
     assert HONEST[0] <= z2(reducer, seeds) <= HONEST[1]
 
@@ -58,7 +76,9 @@ def test_labels_of_noise_are_counted_by_a_trained_network_as_chance_says() -> No
 def test_labels_of_noise_on_real_traces_are_counted_as_chance_says(proof_repeats: int) -> None:
     X = load_dataset("insertion").X[:, ::10]
     seeds = range(max(6, proof_repeats))
-    result = mean_square(count_noise(RECIPES["conv"], relabelled(X, 500, 0.5, seed), seed) for seed in seeds)
+    result = mean_square(
+        count_noise(RECIPES["conv"], relabelled(X, 500, 0.5, seed), seed) for seed in seeds
+    )
     assert HONEST[0] - 0.1 <= result <= HONEST[1]
 
 
@@ -75,7 +95,9 @@ def test_it_would_be_seen_in_the_other_spaces() -> None:
     assert np.nanmax(np.abs(first[:, 1] - other[:, 1])) > 0.05
 
 
-def test_where_every_part_is_just_beyond_the_tolerance_hardly_any_replay_accepts(proof_repeats: int) -> None:
+def test_where_every_part_is_just_beyond_the_tolerance_hardly_any_replay_accepts(
+    proof_repeats: int,
+) -> None:
     assert worse_than_allowed(max(5, proof_repeats)) <= 0.2
 
 
@@ -85,12 +107,16 @@ Mutation = Callable[[pytest.MonkeyPatch], None]
 def members_of_all_folds(patch: pytest.MonkeyPatch) -> None:
     """Member k of a network is trained on the labels of fold k as well."""
     honest = torch_reducer.draw_batches
-    patch.setattr(torch_reducer, "draw_batches", lambda folds, *rest: honest(np.full_like(folds, -1), *rest))
+    patch.setattr(
+        torch_reducer, "draw_batches", lambda folds, *rest: honest(np.full_like(folds, -1), *rest)
+    )
 
 
 def heads_of_all_folds(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(
-        rocket.RocketReducer, "training_masks", lambda self, folds: np.ones((self.folds, len(folds)), dtype=np.bool_)
+        rocket.RocketReducer,
+        "training_masks",
+        lambda self, folds: np.ones((self.folds, len(folds)), dtype=np.bool_),
     )
 
 
@@ -103,11 +129,15 @@ def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
         return train(self, *args, **options)
 
     patch.setattr(ModelPrediction, "train", train_anew)
-    patch.setattr(prediction, "fold_of", lambda hashes, folds: fold_of(hashes ^ np.int64(salt[0]), folds))
+    patch.setattr(
+        prediction, "fold_of", lambda hashes, folds: fold_of(hashes ^ np.int64(salt[0]), folds)
+    )
 
 
 def references_at_the_mean_of_heads(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(rocket, "points_in_fold_space", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
+    patch.setattr(
+        rocket, "points_in_fold_space", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1))
+    )
 
 
 def one_gate_for_all_heads(patch: pytest.MonkeyPatch) -> None:
@@ -127,7 +157,9 @@ def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
     fit_heads = rocket.fit_heads
 
     def screened(g: Tensor, y: Tensor, *rest: Any) -> Any:
-        relevance = ((g - g.mean(0)) * (y - y.double().mean())[:, None]).mean(0).abs() / (g.std(0) + 1e-9)
+        relevance = ((g - g.mean(0)) * (y - y.double().mean())[:, None]).mean(0).abs() / (
+            g.std(0) + 1e-9
+        )
         best = torch.zeros(g.size(1)).index_fill_(0, relevance.topk(10).indices, 1.0)
         w, *others = fit_heads(g * best, y, *rest)
         w[:, :-1] *= best
@@ -154,7 +186,10 @@ TAKEN_BACK = [
     (LiveModel, "rebuild_rule", lambda self: None),
 ]
 SAID: list[tuple[list[Any], Case]] = [
-    ([(Decision, "inclusion_probability", 1.0)], replace(WORSENS, stops="some", audit_rate=0.3, confirms=True)),
+    (
+        [(Decision, "inclusion_probability", 1.0)],
+        replace(WORSENS, stops="some", audit_rate=0.3, confirms=True),
+    ),
     (
         [(LiveModel, "count_overdue", lambda self, decision: None)],
         replace(WORSENS, truth="edge", missing=0.9, label_within=20),
@@ -186,7 +221,9 @@ def test_labels_counted_where_they_were_learned_are_caught(mutation: Mutation) -
         ("rocket", features_screened_by_labels),
     ],
 )
-def test_whatever_a_label_chose_in_its_own_space_is_caught(reducer: str, mutation: Mutation) -> None:
+def test_whatever_a_label_chose_in_its_own_space_is_caught(
+    reducer: str, mutation: Mutation
+) -> None:
     with mutated(mutation):
         assert peeks(2.0, reducer=reducer) > 0.1
 
@@ -197,7 +234,9 @@ def test_evidence_that_is_taken_after_its_label_is_caught() -> None:
 
 
 @pytest.mark.parametrize(("patches", "case"), SAID, ids=["unasked", "never", "taken back"])
-def test_outcomes_that_came_unasked_or_never_or_were_taken_back_are_no_evidence(patches, case, monkeypatch) -> None:
+def test_outcomes_that_came_unasked_or_never_or_were_taken_back_are_no_evidence(
+    patches, case, monkeypatch
+) -> None:
     assert worse_than_allowed(3, case) <= 0.34
     for patch in patches:
         monkeypatch.setattr(*patch)

@@ -41,7 +41,9 @@ def locking(descriptor: int, mode: int, n_bytes: int) -> None:
 def without(module: types.ModuleType, names: str) -> types.ModuleType:
     """A module that lacks names."""
     created, hidden = types.ModuleType(module.__name__), set(names.split())
-    created.__dict__.update({name: value for name, value in vars(module).items() if name not in hidden})
+    created.__dict__.update(
+        {name: value for name, value in vars(module).items() if name not in hidden}
+    )
     return created
 
 
@@ -51,7 +53,9 @@ if os.environ.get("DENGINE_TEST_MSVCRT") == "1":
     SEEN["msvcrt"].__dict__.update(LK_NBLCK=2, locking=locking)
 
 
-def import_hidden(name: str, globals_: Any = None, locals_: Any = None, fromlist: Any = (), level: int = 0) -> Any:
+def import_hidden(
+    name: str, globals_: Any = None, locals_: Any = None, fromlist: Any = (), level: int = 0
+) -> Any:
     ours = str((globals_ or {}).get("__name__", "")).split(".")[0] == "dengine"
     if ours and level == 0 and name in SEEN:
         return SEEN[name]
