@@ -1,1 +1,1 @@
-"""Decide, report, retrain, run: one engine, its versions, and what it does between two cycles."""
+"""The engine. This file holds no code; import `DataEngine` from `dengine`."""

@@ -1,7 +1,7 @@
-"""From a trace to a recorded decision: the model's decider, an id, a version, a time.
+"""From a trace to a `StoredDecision`: the model's decision, an id, a version, a time.
 
-`EngineCore` owns one `DecisionMaker`. The helpers below it check what a caller passes: a part's
-number, and an id that was decided before.
+`EngineCore` owns one `DecisionMaker` and hands its results to the outbox. The helpers below it
+check what a caller passes: a part's number, and an id that was decided before.
 """
 
 import logging

@@ -315,8 +315,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         wait, allow_import
             As for `open`; a class that the settings name is allowed.
         **settings
-            As `DataEngine` takes them. Those that are given must be the ones that a used store was
-            made with: the settings of a running cell do not change in silence.
+            As `DataEngine` takes them. The stored ones that are given must be those in force: the
+            settings of a running cell do not change in silence. `model`, `executor`, `clock`,
+            `replaying` and `on_safe_mode` are not stored and taken as they are. A new cell of a
+            product takes what is left open from its peers.
 
         Returns
         -------

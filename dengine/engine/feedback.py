@@ -148,26 +148,28 @@ class Feedback:
             self.store_pending()
 
     def take_in(self, stored: StoredDecision, success: bool) -> bool:
-        """Learn a reported label and hand it to the outbox; a report that is repeated does nothing.
+        """Learn a reported label and hand it to the outbox.
 
-        Returns whether the part counted as confirmed until now and was not. Raises ReportError
-        where another label was reported for it.
+        A report that is repeated before it is known to be on disk does nothing. Returns whether
+        silence had confirmed the part before this report. Raises ReportError if the store has a
+        label of the decision, except that a line stop may follow a confirmation.
         """
         id_ = stored.decision.id
-        confirmed_wrongly = False
+        was_confirmed = False
         if self._unsynced.get(id_) is not success:
-            confirmed_wrongly = self._take_in_new(stored, success)
+            was_confirmed = self._take_in_new(stored, success)
         self._unsynced[id_] = success
-        return confirmed_wrongly
+        return was_confirmed
 
     def note_synced(self, decision_id: str) -> None:
         """Note that the reported label of this decision is on disk."""
         del self._unsynced[decision_id]
 
     def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
-        """Learn a label and hand it to the outbox.
+        """Learn a label and hand it to the outbox; set `remedy` if the rule must be mended.
 
-        Returns whether the part counted as confirmed, and was not.
+        Returns whether silence had confirmed the part before, whatever the label is now. Raises
+        ReportError as `take_in`.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -181,18 +183,18 @@ class Feedback:
             label = NewLabel(decision.id, False, source, self._live.version, None)
             self._outbox.record_labels([(stored, label)])
             return True
-        confirmed_wrongly = self._pending.pop(decision.id, None) is not None
+        was_confirmed = self._pending.pop(decision.id, None) is not None
         self.store_pending()
-        if confirmed_wrongly:
+        if was_confirmed:
             self._live.unlearn(stored)
             self._labels.count_unlearned()
         label = self._learn(stored, success, source)
         self._outbox.record_labels([(stored, label)])
         self._unreported.pop(decision.id, None)
         self._awaiting_check.pop(decision.id, None)
-        if self._live.clear_overdue(decision.id) or confirmed_wrongly:
+        if self._live.clear_overdue(decision.id) or was_confirmed:
             self.remedy = self.remedy or Remedy.REBUILD_RULE
-        return confirmed_wrongly
+        return was_confirmed
 
     def _learn(self, stored: StoredDecision, success: bool, source: Source) -> NewLabel:
         """Update the rule and the references with the outcome of a part.

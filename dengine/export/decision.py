@@ -225,7 +225,10 @@ class DecisionModule(nn.Module):
     def restore(
         self, trace: Tensor, part: int, action: int, reason: int, lower: float, upper: float
     ) -> None:
-        """Make a decision that was made before, as a journal has it, the pending one again."""
+        """Make an earlier decision, as a journal has it, the pending one again.
+
+        The present pending decision is settled first. A faulty trace leaves none pending.
+        """
         x = self.as_trace(trace)
         self.settle()
         fault, content = self.decider.check(x)

@@ -889,7 +889,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         raise unknown_decision(decision_id)
     decision = item.decision
     recipe = Recipe.from_store(settings)
-    change = store.policy_change_after(decision_id)
+    change = store.policy_change_after(decision.id)
     if change is not None and change.data is not None:  # the policy that was in force then
         recipe = replace(recipe, policy=Policy.from_values(change.data["old"]))
     channels, samples = item.trace.shape

@@ -330,7 +330,8 @@ class CellService:
     async def changes(self, quiet: float | None = None) -> AsyncIterator[bool]:
         """Yield True at once, and then whenever something has changed since the last yield.
 
-        After `quiet` seconds without a change False is yielded; None: never.
+        After `quiet` seconds without a change False is yielded; None: never. The iteration ends
+        when `end_listening` is called.
         """
         event = asyncio.Event()
         listener = (asyncio.get_running_loop(), event)

@@ -198,7 +198,10 @@ class Journal:
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
     def save_newest_entry(self, newest: tuple[int, str] | None) -> None:
-        """Write the newest ledger entry and `drained_to` to header and head, without a sync.
+        """Write the newest ledger entry to the header and the head file, without a sync.
+
+        The head file lies beside the journal; a failure to write it is ignored. `drained_to` is
+        written to the header as well.
 
         An older header is harmless: the store ignores a record that it is given twice.
         """
@@ -244,9 +247,9 @@ class Journal:
             lost.close()
 
     def close(self) -> None:
-        """Cut off the reserved space and unlock the file.
+        """Cut off the reserved space, and the records if all are drained; unlock the file.
 
-        It stays, for the next engine to compare with the ledger.
+        The file stays with its header, for the next engine to compare with the ledger.
         """
         if self._owning and not self._file.closed:
             with _os_errors(self.path):

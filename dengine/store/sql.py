@@ -196,9 +196,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.database.write(lambda connection: self._replace_settings(connection, settings))
 
     def _replace_settings(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
-        """Replace the settings in a transaction.
+        """Replace the engine's settings of the cell in a transaction; the store's own stay.
 
-        SettingError if a peer of the product would embed traces differently.
+        StoreError for a setting that is the store's own (`RESERVED`). SettingError if a peer of
+        the product would embed traces differently.
 
         The product stays locked until the commit.
         """
@@ -621,7 +622,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return self._commit_version(*arguments)
 
     def _commit_version(self, *arguments: Any) -> int:
-        """Commit a version, the arguments of `_version_row`; return its number."""
+        """Commit the row of a retrain and delete stored states that are no longer kept.
+
+        The arguments are those of `_version_row`. Returns the version's number, which is higher
+        than the one given if a peer has taken that.
+        """
         row = self._version_row(*arguments)
         return self.database.write(
             lambda connection: self._insert_version(connection, row), flush_first=False
