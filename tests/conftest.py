@@ -33,12 +33,15 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
 LONG = (
     "test_docs",
+    "test_null",
     "test_notebooks",
     "test_page",
     "test_requests",
     "test_golden",
     "test_training",
     "test_cli",
+    "test_serve_process",
+    "test_without_posix",
 )
 # The C++ programs are built once, by one worker; each process that uses umap-learn compiles it anew, for 25 s.
 PROGRAMS = ("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program", "test_golden")

@@ -373,7 +373,7 @@ def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goe
             in shown
         )
         assert (
-            f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there."
+            f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 continues there."
             in shown
         )
         program.played.clear()  # somebody has filled it

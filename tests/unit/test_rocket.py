@@ -395,7 +395,7 @@ def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(
     monkeypatch.setattr(RocketEncoder, "raw_features", told)
     with DataEngine.open(url, replaying=True) as engine:
         assert engine.retrain().accepted
-    assert where == {"dengine-ahead_0"}  # neither in the opening nor in the retrain
+    assert where == {"dengine-precompute_0"}  # neither in the opening nor in the retrain
 
 
 def test_a_model_of_other_sizes_is_refused_in_a_sentence_that_says_how_to_go_on() -> None:
