@@ -62,7 +62,11 @@ def test_the_wheel_alone_runs_the_readmes_example(
     python: str, distributions: Path, repo: Path, tmp_path: Path
 ) -> None:
     interpreter = shutil.which(python)
-    if interpreter is None:
+    # A version manager may have put a name on the path without an interpreter behind it.
+    is_usable = (
+        interpreter is not None and subprocess.run([interpreter, "--version"]).returncode == 0
+    )
+    if not is_usable:
         pytest.skip(f"{python} is not on this machine")
     (wheel,) = distributions.glob("*.whl")
     run([interpreter, "-m", "venv", "clean"], tmp_path)
