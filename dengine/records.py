@@ -337,10 +337,9 @@ def as_success(value: Any, owner: str = "") -> bool:
 
 
 def as_outcome(value: Any, owner: str = "") -> Outcome:
-    """Convert what `Cell.proceed` returned to an `Outcome`.
+    """Convert an `Outcome`, or its text as in "stopped", to an `Outcome`.
 
-    Raises ReportError for any other value, which would otherwise be taken for UNKNOWN. `owner`
-    names the decision in the error.
+    Raises ReportError for any other value, True and None too. `owner` names the decision in it.
     """
     whose = f" of {owner}," if owner else ""
     message = f"Expected an Outcome, {', '.join(Outcome)},{whose} got {shortened(value)}"

@@ -99,7 +99,7 @@ class LiveModel:
     def resume(
         self, version: ModelVersion | None, newest_version: int, within: int, policy_since: int
     ) -> None:
-        """Go on from a stored version, bit for bit.
+        """Go on from a stored version, bit for bit, and learn the outcomes that came after it.
 
         Stored reference points are read, not computed again.
 
@@ -110,7 +110,7 @@ class LiveModel:
         newest_version : int
             Largest number that a version ever had.
         within : int
-            Number of later decisions after which a check is overdue.
+            After how many later decisions a verification without a report is overdue.
         policy_since : int
             First version under the policy in force.
         """

@@ -1,4 +1,4 @@
-"""Replays as tables: a row for each replay in the CSV, a pooled row for each recipe on the screen.
+"""Replays as tables: a row for each replay in the CSV, a pooled row for each recipe and policy.
 
 frame = frame_of(replays)
 Console().print(pooled_table(pool(frame, replays)))   # and promise_lines(rows)

@@ -203,7 +203,10 @@ def _parse_label(words: list[str], parts: Mapping[str, JournalLine], where: str)
 
 
 def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
-    """Return the part of a part's line; DataError for impossible values."""
+    """Return decision, trace and label of a part's line; DataError for impossible values.
+
+    A rejected part's trace is empty. Version 0 and propensity 1 stand for what the line lacks.
+    """
     padded = [*words[:N_DECISION_WORDS], *[""] * (N_DECISION_WORDS - len(words))]
     id_, label, part, *decided = padded
     with instead(DataError, f"The decision in {where} cannot be read", ValueError):

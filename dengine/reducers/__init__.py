@@ -82,7 +82,7 @@ def make_reducer(name: str, **params: Any) -> Any:
     Raises
     ------
     SettingError
-        If the name or a parameter is unknown, or a value is of another type than its default.
+        If the name or a parameter is unknown, or a value is of another type or out of range.
     """
     cls = reducer_class(name)
     allowed = signature(cls).parameters
@@ -92,12 +92,12 @@ def make_reducer(name: str, **params: Any) -> Any:
         raise SettingError(f"{problem}; it has {', '.join(allowed)}.")
     if name in _NAMED:
         for key, value in params.items():
-            _check_type(allowed[key].default, key, value)
+            _check_parameter(allowed[key].default, key, value)
     return cls(**params)
 
 
-def _check_type(default: Any, key: str, value: Any) -> None:
-    """Raise SettingError for a parameter of another type than its default.
+def _check_parameter(default: Any, key: str, value: Any) -> None:
+    """Raise SettingError for a parameter of another type than its default, or out of range.
 
     Otherwise every retrain would fail.
     """

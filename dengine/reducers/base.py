@@ -489,6 +489,7 @@ class LabelFree(_Wrapping):
     """
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
+        """Fit a clone of the transformer on traces X; labels are ignored."""
         traces = self.check_traces(X, reset=True)
         self.reducer_ = clone(self.reducer).fit(self.as_input(traces))
         self.dim_ = as_points(self.reducer_.transform(self.as_input(traces[:1]))).shape[1]

@@ -73,6 +73,7 @@ class PcaReducer(Reducer):
         return PcaEncoder(torch.from_numpy(self.mean_), torch.from_numpy(self.components_))
 
     def get_state(self) -> dict[str, NDArray[Any]]:
+        """Return arrays from which `set_state` restores the reducer bit for bit."""
         check_is_fitted(self, "components_")
         return {
             "mean": self.mean_,
@@ -81,6 +82,7 @@ class PcaReducer(Reducer):
         }
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        """Restore what `get_state` returned; the parameters must be the same."""
         self.mean_ = np.array(state["mean"])
         self.components_ = np.array(state["components"])
         self.n_features_in_ = len(self.mean_)

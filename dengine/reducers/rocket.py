@@ -564,6 +564,7 @@ class RocketReducer(Reducer):
         return FitReport(self.n_iter_, self.note_)
 
     def embed(self, X: ArrayLike) -> Floats:
+        """Embed traces (n, C, T) in every space; return float32 (n, K, d)."""
         traces = self.check_traces(X)
         with torch.inference_mode():
             points: Floats = apply_in_chunks(self.net_, torch.from_numpy(traces)).numpy()
@@ -578,6 +579,7 @@ class RocketReducer(Reducer):
         return self.net_
 
     def get_state(self) -> dict[str, NDArray[Any]]:
+        """Return arrays from which `set_state` restores the reducer bit for bit."""
         check_is_fitted(self, "net_")
         counts = [self.average_, self.n_fits_, self.n_component_traces_, self.n_iter_]
         state = {
@@ -592,6 +594,7 @@ class RocketReducer(Reducer):
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        """Restore what `get_state` returned; the parameters must be the same."""
         channels, samples = (int(value) for value in state["shape"])
         average, n_fits, n_component_traces, n_iter = (int(value) for value in state["counts"])
         self.trace_shape_ = (channels, samples)

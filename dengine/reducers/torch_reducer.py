@@ -399,6 +399,7 @@ class TorchReducer(Reducer):
 
     @torch.inference_mode()
     def embed(self, X: Floats) -> Floats:
+        """Embed traces (n, C, T) in every space; return float32 (n, K, d)."""
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
         chunks = torch.split(traces, CHUNK)
@@ -408,6 +409,7 @@ class TorchReducer(Reducer):
         warm_optimizer()
 
     def untrained_module(self, X: Floats) -> Encoder | None:
+        """Return the module that training on X (n, C, T) would change; see `Reducer`."""
         if "encoder_" in vars(self):
             return self.module()
         untrained: Self = clone(self)
@@ -421,6 +423,7 @@ class TorchReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
+        """Return the report of the last fit: its steps, and a note for the operator."""
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
         left = f"{self.n_steps_left_} steps to go" if self.n_steps_left_ else ""
@@ -428,6 +431,7 @@ class TorchReducer(Reducer):
         return FitReport(self.n_new_steps_, note, self.n_steps_left_)
 
     def get_state(self) -> dict[str, NDArray[Any]]:
+        """Return arrays from which `set_state` restores the reducer bit for bit."""
         check_is_fitted(self, "encoder_")
         counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
         counts += [self.n_steps_left_, self.n_new_steps_]
@@ -449,6 +453,7 @@ class TorchReducer(Reducer):
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        """Restore what `get_state` returned; the parameters must be the same."""
         channels, samples = (int(value) for value in state["shape"])
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
         self.trace_shape_ = (channels, samples)

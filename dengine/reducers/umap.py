@@ -222,9 +222,10 @@ class UmapReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
+        """Lay traces out, from the last layout if it can; return it, (n, d). See `Reducer.train`."""
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
-        if numbers is None or not self._has_trained_on_any(numbers):
+        if numbers is None or not self._has_searched_any(numbers):
             self._start(traces)
         self._train(traces, numbers, stop or StopRule())
         return as_points(self.embedding_.numpy())
@@ -255,8 +256,11 @@ class UmapReducer(Reducer):
     def _is_fitted(self) -> bool:
         return "encoder_" in vars(self)
 
-    def _has_trained_on_any(self, numbers: Ints) -> bool:
-        """Return whether the neighbours of any of these labels' traces were searched before."""
+    def _has_searched_any(self, numbers: Ints) -> bool:
+        """Return whether any of these labels' traces was in the last search of neighbours.
+
+        If none was, training starts anew.
+        """
         if "neighbors_" not in vars(self):
             return False
         neighbors = self.precomputed_neighbors_ or self.neighbors_
@@ -342,6 +346,7 @@ class UmapReducer(Reducer):
         return torch.cat([self.encoder_(chunk) for chunk in torch.split(traces, CHUNK)]).numpy()
 
     def untrained_module(self, X: Floats) -> UmapEncoder:
+        """Return the module that training on X (n, C, T) would change; see `Reducer`."""
         if self._is_fitted:
             return self.encoder_
         n = max(len(X), self.n_neighbors + 1)
@@ -364,12 +369,14 @@ class UmapReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
+        """Return the report of the last fit: its steps, and a note for the operator."""
         check_is_fitted(self, "encoder_")
         left = self.n_steps_left_
         note = f"{left} epochs of the first layout to go" if left else ""
         return FitReport(self.n_new_steps_, note, left)
 
     def get_state(self) -> dict[str, NDArray[Any]]:
+        """Return arrays from which `set_state` restores the reducer bit for bit."""
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]
         counts += [self.n_epochs_, self.n_steps_, self.n_new_steps_]
@@ -387,6 +394,7 @@ class UmapReducer(Reducer):
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        """Restore what `get_state` returned; the parameters must be the same."""
         channels, samples = (int(value) for value in state["shape"])
         self.trace_shape_ = (channels, samples)
         self.n_features_in_ = channels * samples

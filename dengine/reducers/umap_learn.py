@@ -93,6 +93,7 @@ class UmapLearnReducer(Reducer):
         return self._transform_batch(self.check_traces(X))
 
     def embed(self, X: Floats) -> Floats:
+        """Embed traces (n, C, T) in every space; return float32 (n, K, d)."""
         check_is_fitted(self, "umap_")
         traces = self.check_traces(X)
         points = [self._transform_batch(traces[i : i + 1]) for i in range(len(traces))]

@@ -154,7 +154,10 @@ class TokenUsers(UserManager):
         password: Any = None,
         certificate: Any = None,
     ) -> User | None:
-        """Return the user of a new session; None: it is refused."""
+        """Return the user of a new session, or None to refuse it.
+
+        None for a wrong user or token, and without a certificate where the server encrypts.
+        """
         if self._encrypted and not certificate:
             return None
         if self._tokens is None:

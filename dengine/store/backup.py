@@ -1,4 +1,4 @@
-"""Copies a store into one file, including what its journals hold, while the store may be in use.
+"""Copies an SQLite store into one file with what its journals hold, while it may be in use.
 
     report = backup_store("engine.db", "copy.db")
     report.decisions, report.labels, report.from_journals

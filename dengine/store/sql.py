@@ -290,7 +290,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     ) -> LabelledTraces:
         """Return labelled traces for training, with corrected labels.
 
-        A trace that is not as it was stored is left out, and an event names its decision.
+        Forgotten labels and quarantined traces are left out. So is a trace that is not as it was
+        stored, and an event names its decision.
 
         Parameters
         ----------
@@ -1120,14 +1121,15 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
         """Commit records of a journal in one transaction.
 
-        A record that is stored already and is the same counts as taken. Another decision with the
-        same id, a label on that, or a second label becomes an event, "dead letter": which one is
-        right is never guessed. A store in memory writes them when it is next read.
+        A record that is stored already and is the same counts as taken. A line stop of a part that
+        silence had confirmed corrects its label. Another decision with the same id, a label
+        without its decision, or any other second label becomes an event, "dead letter": which one
+        is right is never guessed. A store in memory writes them when it is next read.
 
         Returns
         -------
         list of (str, int)
-            Decision id and number of each label.
+            Decision id and number of each label, also of one stored before; none of a dead letter.
         """
         if self.wait is not None:
             return self.database.apply_records(records)
