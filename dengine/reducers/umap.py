@@ -222,7 +222,7 @@ class UmapReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Lay traces out, from the last layout if it can; return it, (n, d). See `Reducer.train`."""
+        """Lay traces out, from the last layout if it can; return it, (n, d)."""
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
         if numbers is None or not self._has_searched_any(numbers):
