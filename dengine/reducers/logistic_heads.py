@@ -105,8 +105,8 @@ def fit_heads(
     """Fit K ridge logistic regressions by Newton's method with a line search.
 
     Each minimises the sum of its log losses plus ``l2 / 2 * |w| ** 2``, the bias nearly free.
-    That is convex, so it ends at the same weights wherever it starts. A head whose leave-one-
-    out loss is above that of its base rate predicts the base rate. Each head decides this
+    That is convex, so it ends at the same weights wherever it starts. A head whose
+    leave-one-out loss is above that of its base rate predicts the base rate. Each head decides this
     alone: a common decision would let the labels of fold k choose head k.
 
     Parameters
