@@ -53,12 +53,18 @@ LETTER = r"[^\W\d_]"
 # Ends of a word in a name: partOK has the word OK, token does not.
 WORD_START = rf"(?:(?<!{LETTER})|(?<=[a-z])(?=[A-Z]))"
 WORD_END = rf"(?:(?!{LETTER})|(?<=[a-z])(?=[A-Z]))"
-WORD = (
-    r"(?P<not>(?i:not|non|no|nicht)[\W_]*)?"
-    rf"(?P<word>(?i:{'|'.join(word for word in MEANING if not word.isdecimal())}"
-    r"|(?:n[\W_]*)?i[\W_]?o|n[\W_]*o\.?k|o\.k))"  # i.O., n.i.O., n-ok
+NOT = r"(?P<not>(?i:not|non|no|nicht)[\W_]*)?"
+WORDS = "|".join(word for word in MEANING if not word.isdecimal())
+# i.O., o.k., and what n makes of them: n.i.O., nio, n-ok.
+IN_CELL = re.compile(
+    rf"{NOT}(?P<word>(?i:{WORDS}|(?:n[\W_]*)?i[\W_]?o|n[\W_]*o\.?k|o\.k))|(?P<digit>[01])"
 )
-IN_CELL = re.compile(rf"{WORD}|(?P<digit>[01])")
+# In a name N may be newtons or a lane, as in 50N_OK and mN.ok: apart from the word it is a not only
+# in n.ok, n.i.O. and n_i_O, and not after a letter, nor as a capital after a digit.
+APART = rf"(?<!{LETTER})(?:(?-i:n)|(?<!\d)n)"
+NOT_IO = rf"{APART}(?P<mark>[._-])i(?P=mark)o|(?<!{LETTER})(?-i:n)[\W_]*i[\W_]?o|nio"
+NOT_OK = rf"{APART}\.[\W_]*o\.?k|no\.?k"
+WORD = rf"{NOT}(?P<word>(?i:{WORDS}|{NOT_IO}|i[\W_]?o|{NOT_OK}|o\.k))"
 IN_NAME = re.compile(f"{WORD_START}{WORD}{WORD_END}")
 AT_END = re.compile(f"{WORD_START}{WORD}$")
 LABEL_COLUMNS = (
