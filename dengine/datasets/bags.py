@@ -5,6 +5,7 @@ headers, or else those of the log. Labels are a topic, of which the first messag
 has begun counts, or a file of labels by the insertions' numbers. `load_dataset` calls `read_bag`.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -276,6 +277,8 @@ def _labels_in_topic(
     """
     topic = str(options.label)
     words = dict[str, Any]()
+    notes = Counter[str]()
+    label_messages = labels.LabelColumn(topic, options.words, notes)
     begins = messages.logged[[cut.first for cut in cuts]]
     for logged, word in messages.others[topic]:
         n_begun = int(np.searchsorted(begins, logged, side="right"))
@@ -287,10 +290,10 @@ def _labels_in_topic(
         if name not in words:
             wanted = f"a message of {topic} before the next insertion begins"
             raise UnreadableError(f"Expected {wanted}, found none")
-        return labels.label_of(words[name], options.words), None
+        return label_messages.label_of(words[name]), None
 
     advice = f"give the topic that tells them, {topic} does not, or a file of labels"
-    return labels.LabelSource(find, advice)
+    return labels.LabelSource(find, advice, notes=notes)
 
 
 class RecordedInsertion(NamedTuple):

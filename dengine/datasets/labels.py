@@ -7,6 +7,7 @@ Label words, in any case: true ok okay pass passed good success successful gut i
 nok ng fail failed bad failure unsuccessful schlecht n.i.O. nio no 0; and a word of the first kind
 after a not, as in `run_7_not_ok.csv`. A file's name ends in the word, except for numbers:
 `part_7_NOK_1.csv` is bad. A number alone, 1 or 0, is a label of a name only if the user says so.
+A column whose name means the bad outcome, as `failed` or `Ausschuss`, says bad by true, yes or 1.
 """
 
 import os
@@ -71,6 +72,19 @@ LABEL_COLUMNS = (
     *("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome"),
     *("ergebnis", "bewertung", "urteil"),
 )
+# A column of this name, or whose name ends in such a word, says by true, yes or 1 that it is bad.
+BAD_COLUMNS = (
+    *("fail", "fails", "failed", "failure", "bad", "nok", "ng", "nio", "notok", "fault", "faulty"),
+    *("defect", "defects", "defective", "reject", "rejects", "rejected", "scrap", "scrapped"),
+    *("error", "errors", "anomaly", "anomalous", "ausschuss", "ausschuß", "fehler", "fehlerhaft"),
+    *("defekt", "schlecht", "rebut", "défaut", "defaut", "échec", "echec", "scarto", "rechazo"),
+)
+FLAG_ENDINGS = ("flag", "bit", "detected", "found")  # failed_flag, defect_detected
+NEGATIONS = ("not", "no", "non", "nicht", "kein", "keine", "without", "ohne", "free", "frei")
+FLAGS = {  # in any column, whether what its name says is so
+    **dict.fromkeys(("true", "yes", "1", "y", "ja", "j", "oui"), True),
+    **dict.fromkeys(("false", "no", "0", "n", "nein", "non"), False),
+}
 # In the columns of a recording these may be something else: a position, a robot's state.
 SIGNAL_COLUMNS = ("y", "class", "status", "ok")
 FILE_COLUMNS = (
@@ -83,6 +97,7 @@ FEW_NAMES = 5  # in fewer names each word may be a label
 LabelMap = Mapping[str, bool]
 NO_WORDS: LabelMap = {}
 LabelAndPart = tuple[int, str | None]
+NO_NOTES: Mapping[str, int] = {}
 
 
 class NoLabelError(UnreadableError):
@@ -107,6 +122,8 @@ class LabelSource(NamedTuple):
         What to do if most recordings have no label.
     faults : sequence of Fault
         What is wrong in the file of labels.
+    notes : mapping of str to int
+        What users should know, and how many times; `find` adds to it.
     without_label : callable
         Returns a name without the label in it, by which recordings are put in order.
     """
@@ -115,6 +132,7 @@ class LabelSource(NamedTuple):
     advice: str
     faults: Sequence[Fault] = ()
     without_label: Callable[[str], str] = str
+    notes: Mapping[str, int] = NO_NOTES
 
 
 def label_of(word: Any, words: LabelMap = NO_WORDS) -> int:
@@ -222,20 +240,65 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
     return LabelSource(find, advice, without_label=without_label)
 
 
-def label_of_cells(cells: Iterable[Any], column: str, words: LabelMap = NO_WORDS) -> int:
-    """Return the label that all cells of a column mean; empty ones do not count.
+def means_bad(column: str) -> bool:
+    """Return whether the name of a column means the bad outcome: `failed`, `is_defect`, `n.i.O.`.
 
-    Raises UnreadableError if they differ, and as `label_of`, whose `words` these are.
+    False for the opposite of it, as `not_failed` and `error_free`.
     """
-    texts = dict.fromkeys(map(str, cells))
-    stated = [text for text in texts if text.strip().lower() not in UNCHECKED]
-    if len(stated) < 2:
-        return label_of(stated[0] if stated else "", words)
-    with suppress(UnknownWordError):
-        labels = {label_of(text, words) for text in stated}
-        if len(labels) == 1:
-            return labels.pop()
-    raise UnreadableError(f"Expected one label in column {column}, got {listed(stated)}")
+    words = re.findall(rf"{LETTER}+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", column).lower())
+    while len(words) > 1 and words[-1] in FLAG_ENDINGS:
+        words.pop()
+    if "".join(words) in BAD_COLUMNS:
+        return True
+    return bool(words) and words[-1] in BAD_COLUMNS and set(NEGATIONS).isdisjoint(words)
+
+
+class LabelColumn:
+    """Reads the labels in the cells of a column.
+
+    If the name of the column means the bad outcome, true, yes and 1 in it are bad, and a note says
+    so. Words that are verdicts themselves, as OK and NOK, keep their meaning, and so do all if the
+    user states the meaning of one of true, yes, 1 and so on.
+
+    Parameters
+    ----------
+    name : str
+    words : mapping of str to bool
+        As in `label_of`.
+    notes : Counter
+        What users should know; it is added to.
+    """
+
+    def __init__(self, name: str, words: LabelMap, notes: Counter[str]) -> None:
+        self.name = name
+        self.words = words
+        self.notes = notes
+        self.is_inverted = means_bad(name) and FLAGS.keys().isdisjoint(words)
+
+    def label_of(self, cell: Any) -> int:
+        """Return the label that a cell means; raise as the function `label_of`."""
+        text = str(cell).strip().lower()
+        flag = FLAGS.get(text.removesuffix(".0").removesuffix("."))
+        if flag is None or text in self.words or not self.is_inverted:
+            return label_of(cell, self.words)
+        note = f"Column {self.name} tells what is bad, by its name: true, yes or 1 in it is bad"
+        self.notes[note] = 1
+        return int(not flag)
+
+    def label_of_cells(self, cells: Iterable[Any]) -> int:
+        """Return the label that all cells mean; empty ones do not count.
+
+        Raises UnreadableError if they differ, and as `label_of`.
+        """
+        texts = dict.fromkeys(map(str, cells))
+        stated = [text for text in texts if text.strip().lower() not in UNCHECKED]
+        if len(stated) < 2:
+            return self.label_of(stated[0] if stated else "")
+        with suppress(UnknownWordError):
+            labels = {self.label_of(text) for text in stated}
+            if len(labels) == 1:
+                return labels.pop()
+        raise UnreadableError(f"Expected one label in column {self.name}, got {listed(stated)}")
 
 
 def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOptions) -> LabelSource:
@@ -245,13 +308,16 @@ def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOption
     """
     # Without stated columns the label needs no number format.
     table_options = options if options.columns else None
+    notes = Counter[str]()
+    label_column = LabelColumn(column, options.words, notes)
 
     def find(name: str) -> LabelAndPart:
         frame = read_table(paths[name], table_options).frame
         cells = frame.iloc[:, column_place(column, list(frame.columns))]
-        return label_of_cells(cells, column, options.words), None
+        return label_column.label_of_cells(cells), None
 
-    return LabelSource(find, f"column {column} has none; name another column (label)")
+    advice = f"column {column} has none; name another column (label)"
+    return LabelSource(find, advice, notes=notes)
 
 
 class _FoundLabel(NamedTuple):
@@ -460,7 +526,9 @@ def labels_in_file(
         If the file cannot be read as one of labels.
     """
     source = Path(path).name
-    rows, faults = _read_label_rows(path, part, names)
+    rows, faults, column = _read_label_rows(path, part, names)
+    notes = Counter[str]()
+    label_column = LabelColumn(column, words, notes)
     rows_by_file = defaultdict[str, list[_LabelRow]](list)
     for row in rows:
         rows_by_file[row.words[0]].append(row)
@@ -490,36 +558,39 @@ def labels_in_file(
             message = f"Expected its folder in {where}, which names {n_names[row]} recordings"
             raise UnreadableError(message)
         try:
-            return label_of(row.label, words), row.part
+            return label_column.label_of(row.label), row.part
         except UnknownWordError as error:
             error.args = (f"{error} in {where}",)
             raise
 
     files = ", ".join(row.file for row in rows[:3]) or "no files"
     do = "call its columns file and label, and the files as they are"
-    return LabelSource(find, f"{source} names {files}: {do}", faults)
+    return LabelSource(find, f"{source} names {files}: {do}", faults, notes=notes)
 
 
-def read_ordered_labels(path: str | os.PathLike[str], part: str) -> list[str]:
+def read_ordered_labels(path: str | os.PathLike[str], part: str) -> tuple[list[str], str]:
     """Return the label words of a file that lists the traces of an array in their order.
+
+    The name of their column comes second.
 
     Raises DataError if the file cannot be read, or its rows are numbered in another order.
     """
-    rows, faults = _read_label_rows(path, part)
+    rows, faults, column = _read_label_rows(path, part)
     numbers = [int(row.file) for row in rows if row.file.isdecimal()]
     in_order = not numbers or numbers == list(range(numbers[0], numbers[0] + len(rows)))
     if faults or not in_order:
         actual = faults[0] if faults else numbers[:9]
         raise DataError(f"Expected a label of each trace in {path}, in their order, got {actual}.")
-    return [row.label for row in rows]
+    return [row.label for row in rows], column
 
 
 def _read_label_rows(
     path: str | os.PathLike[str], part: str, names: Sequence[str] = ()
-) -> tuple[list[_LabelRow], list[Fault]]:
+) -> tuple[list[_LabelRow], list[Fault], str]:
     """Return the rows of a file of labels, one for each file, and the faults of its other lines.
 
-    Parameters as in `labels_in_file`. Raises DataError if the file or a column cannot be found.
+    The name of the column of labels comes last. Parameters as in `labels_in_file`. Raises DataError
+    if the file or a column cannot be found.
     """
     try:
         table = read_table(Path(path))
@@ -549,7 +620,7 @@ def _read_label_rows(
         if rows.setdefault(row.words, row) is not row:
             message = f"Expected each file once, {row.file} came before"
             faults.append(Fault(Path(path).name, line, message))
-    return list(rows.values()), faults
+    return list(rows.values()), faults, header[of_label]
 
 
 def _path_words(path: str) -> tuple[str, ...]:
@@ -575,8 +646,9 @@ def _label_file_columns(
 ) -> tuple[int, int]:
     """Return the positions of the column of files and of the column of labels.
 
-    They are found by their names; of two columns that have other names, files come first. Raises
-    DataError if one is not found. with_names : the columns in which recordings are named.
+    They are found by their names; of two columns that have other names, files come first. The only
+    column whose name means the bad outcome has the labels if none is called so. Raises DataError if
+    one is not found. with_names : the columns in which recordings are named.
     """
     of_file = column_among(header, FILE_COLUMNS)
     of_label = column_among(header, LABEL_COLUMNS)
@@ -586,6 +658,9 @@ def _label_file_columns(
         if of_file is None:
             of_file = 0 if of_label is None else 1 - of_label
         of_label = 1 - of_file
+    bad_columns = [i for i, column in enumerate(header) if i != of_file and means_bad(column)]
+    if of_label is None and len(bad_columns) == 1:
+        of_label = bad_columns[0]
     if of_file is None or of_label is None:
         wanted = FILE_COLUMNS[0] if of_file is None else "label"
         actual = ", ".join(header)
@@ -633,6 +708,7 @@ def collect_recordings(
 
     for name, place in places.items():
         collector.add(name, partial(read_labelled, name, place))
+    collector.notes.update(source.notes)
     labelled = [recording.source for recording in collector.recordings]
     words = _likely_label_words(unlabelled.values(), labelled)
     collector.unknown_words.update(words)

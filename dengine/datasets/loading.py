@@ -38,7 +38,7 @@ from .dataset import (
     refit,
     split_names,
 )
-from .labels import label_of, parse_label_map, read_ordered_labels
+from .labels import LabelColumn, label_of, parse_label_map, read_ordered_labels
 from .tables import FORCE, find_recordings, from_frame, hold_many, read_folder, read_tables
 from .text import SUFFIXES as TEXTS
 from .triggers import Trigger
@@ -97,7 +97,8 @@ def load_dataset(
         the name of a column of the files. None: True/False, OK/NOK, pass/fail, good/bad,
         success/failure or i.O./n.i.O. at the end of the file's name except for numbers, or of a
         folder's; else a column with the name of a label. For a table the name of the column, for an
-        .npz file of the array.
+        .npz file of the array. If the name means the bad outcome, as `failed`, true, yes and 1 are
+        bad.
     labels : path, optional
         For a folder, a CSV file with a column of file names and one of labels; for a long table, of
         parts and labels; for an .npz file, of labels with a row for each trace.
@@ -279,10 +280,11 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
     or hold different arrays of one set. If only another axis is as long as the labels, it is the
     axis of the parts. Raises DataError if arrays are missing or do not fit together.
     """
-    label = options.label or "y"
+    label = label_column = options.label or "y"
     arrays, all_names = _read_archives(named, options)
     if options.labels is not None:
-        arrays[label] = np.array(read_ordered_labels(options.labels, options.part))
+        label_words, label_column = read_ordered_labels(options.labels, options.part)
+        arrays[label] = np.array(label_words)
     channels = () if "X" in arrays else options.channels
     traces = channels or ("X",)
     if not {label, *traces} <= set(arrays):
@@ -305,7 +307,7 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
             channels = ()
             options = replace(options, channels=())
         about["channels"] = channels or tuple(map(str, arrays.get("channels", ())))
-        data = _from_arrays(X, arrays[label], options, name, **about)
+        data = _from_arrays(X, arrays[label], options, name, label_column, **about)
         return refit(data, options, has_unit="unit" in arrays)
 
 
@@ -395,7 +397,7 @@ def _missing_arrays(named: Files, options: LoadOptions) -> str:
     elif traces:
         for path in sorted(next(iter(named.values())).parent.glob("*.csv")):
             with suppress(DataError):
-                if not label and len(read_ordered_labels(path, options.part)) in lengths:
+                if not label and len(read_ordered_labels(path, options.part)[0]) in lengths:
                     label = f"labels={str(path)!r}, in the order of the traces"
     shapes = ", ".join(f"{name} {arrays[name].shape}" for name in all_names) or "none"
     channel = "" if "X" in all_names or not traces else f"channel={traces[0]!r} and "
@@ -416,19 +418,23 @@ def _from_pair(X: Any, y: Any, options: LoadOptions) -> Dataset:
     return refit(_from_arrays(X, y, options), options, has_unit=False)
 
 
-def _from_arrays(X: Any, y: Any, options: LoadOptions, name: str = "data", **about: Any) -> Dataset:
+def _from_arrays(
+    X: Any, y: Any, options: LoadOptions, name: str = "data", label: str = "y", **about: Any
+) -> Dataset:
     """Make a data set of the traces that have a label; a note says how many have none.
 
     Words are converted to labels. Raises DataError if a label cannot be, or all are empty.
 
+    label : the array or column that the labels are from.
     about : further fields of the `Dataset`.
     """
     collector = RecordingCollector(name, ())
+    label_column = LabelColumn(label, options.words, collector.notes)
 
     def to_label(word: Any) -> float:
         """Return a label, NaN for an empty one, and 0 for an unknown word, which is counted."""
         try:
-            return label_of(word, options.words)
+            return label_column.label_of(word)
         except UnlabelledError:
             return np.nan
         except UnreadableError:
@@ -438,9 +444,10 @@ def _from_arrays(X: Any, y: Any, options: LoadOptions, name: str = "data", **abo
     wanted = "a label for each trace, 1 (success) or 0 (failure)"
     with instead(DataError, f"Expected {wanted}", ValueError, TypeError):
         labels = np.asarray(y)
-        if labels.dtype.kind in "OUS" or options.words:
+        if labels.dtype.kind in "OUS" or options.words or label_column.is_inverted:
             labels = np.array([to_label(word) for word in labels.tolist()])
     collector.check_label_words()
+    about["notes"] = tuple(f"{note}." for note in collector.notes)
     has_empty = labels.dtype.kind == "f" and labels.shape == np.shape(X)[:1]
     is_empty = np.isnan(labels) if has_empty else np.zeros(1, dtype=bool)
     if not is_empty.any():
@@ -452,7 +459,7 @@ def _from_arrays(X: Any, y: Any, options: LoadOptions, name: str = "data", **abo
         if about.get(key) is not None:
             about[key] = np.asarray(about[key])[~is_empty]
     note = f"{n} of {len(labels)} traces of {name} have no label yet: they are left out."
-    about |= {"notes": (note,), "unlabelled": n}
+    about |= {"notes": (*about["notes"], note), "unlabelled": n}
     return make_dataset(np.asarray(X)[~is_empty], labels[~is_empty], name=name, **about)
 
 

@@ -494,6 +494,7 @@ def _add_wide_rows(
     values, wrong = parse_numbers(frame[all_columns])
     traces = values.reshape(len(frame), len(columns), -1)
     collector.channels = tuple(filter(None, columns))
+    label_cells = labels.LabelColumn(label_column, options.words, collector.notes)
     parts = [""] * len(frame)
     if options.part in frame:
         parts = frame[options.part].astype(object).fillna("").tolist()
@@ -503,7 +504,7 @@ def _add_wide_rows(
         if line in wrong:
             raise UnreadableError(wrong[line])
         number = str(part).removesuffix(".0").strip() or None
-        label = labels.label_of(word, options.words)
+        label = label_cells.label_of(word)
         return Recording(_without_trailing_nan(trace), label, f"{source}, line {line}", number)
 
     for row in zip(frame.index, traces, frame[label_column].tolist(), parts, strict=True):
@@ -577,9 +578,10 @@ def _from_long(
         channel_units = (column_units.get(name) or units.split(name)[1] for name in channels)
         return timed._replace(units=tuple(channel_units))
 
+    label_cells = labels.LabelColumn(label or "", options.words, collector.notes)
+
     def find(part: str) -> labels.LabelAndPart:
-        cells = rows_of_part[part][label]
-        return labels.label_of_cells(cells, str(label), options.words), None
+        return label_cells.label_of_cells(rows_of_part[part][label]), None
 
     label_source = labels.LabelSource(find, "name the column of labels (label)")
     if options.labels is not None:

@@ -11,7 +11,7 @@ import pytest
 
 from dengine import DataEngine, Dataset, TraceSpec, load_dataset
 from dengine.datasets.importing import import_labelled
-from dengine.datasets.labels import labels_in_names
+from dengine.datasets.labels import labels_in_names, means_bad
 from dengine.errors import DataError, TraceError
 from tests.support.recording_forms import LABEL_FORMS
 
@@ -229,6 +229,100 @@ def test_a_number_or_a_part_of_another_word_is_no_label(name: str) -> None:
 def test_two_labels_in_a_name_that_contradict_each_other_are_an_error(name: str) -> None:
     with pytest.raises(DataError, match=r"Expected one label.*contradict each other.*\(label\)"):
         labels_in_names().find(name)
+
+
+def as_folder(cells: list[object], column: str, tmp: Path) -> tuple[Path, dict[str, str]]:
+    for i, cell in enumerate(cells):
+        path = write_csv(tmp / f"{i}.csv", np.arange(30.0))
+        pd.read_csv(path).assign(**{column: cell}).to_csv(path, index=False)
+    return tmp, {"label": column}
+
+
+def as_wide(cells: list[object], column: str) -> pd.DataFrame:
+    return pd.DataFrame(
+        {f"FZ_{i}": np.arange(30.0)[i] for i in range(30)}, range(len(cells))
+    ).assign(**{column: cells})
+
+
+def as_long(cells: list[object], column: str) -> pd.DataFrame:
+    rows = [(part, i / 100, 1.0 * i, cell) for part, cell in enumerate(cells) for i in range(30)]
+    return pd.DataFrame(rows, columns=["part", "time", "FZ", column])
+
+
+def as_listing(cells: list[object], column: str, tmp: Path) -> tuple[Path, dict[str, Any]]:
+    for i in range(len(cells)):
+        write_csv(tmp / "data" / f"{i}.csv", np.arange(30.0))
+    rows: dict[str, Any] = {"file": range(len(cells)), column: cells}
+    if means_bad(column):  # it is found among others
+        rows["operator"] = "Jim"
+    path = written(tmp / "l.csv", lambda path: pd.DataFrame(rows).to_csv(path, index=False))
+    return tmp / "data", {"labels": path}
+
+
+# A form of recordings -> writes them with a label in each cell, and returns the source and options.
+IN_COLUMN: dict[str, Callable[[list[object], str, Path], tuple[Any, dict[str, Any]]]] = {
+    "folder": as_folder,
+    "listing": as_listing,
+    "frame": lambda cells, column, tmp: (as_wide(cells, column), {"label": column}),
+    "wide": lambda cells, column, tmp: (
+        written(tmp / "a.csv", lambda path: as_wide(cells, column).to_csv(path, index=False)),
+        {"label": column},
+    ),
+    "parquet": lambda cells, column, tmp: (
+        written(tmp / "a.parquet", as_wide(cells, column).to_parquet),
+        {"label": column},
+    ),
+    "long": lambda cells, column, tmp: (
+        written(tmp / "a.csv", lambda path: as_long(cells, column).to_csv(path, index=False)),
+        {"label": column, "time": "time"},
+    ),
+    "npz": lambda cells, column, tmp: (
+        written(
+            tmp / "a.npz",
+            lambda path: np.savez(path, X=np.ones((len(cells), 30)), **{column: np.array(cells)}),
+        ),
+        {"label": column},
+    ),
+}
+# The name of a column -> cells of it that mean bad, good, good.
+FLAGS: dict[str, tuple[list[object], bool]] = {
+    "failed": ([True, False, False], True),
+    "Defect": ([1, 0, 0], True),
+    "reject": (["yes", "no", "no"], True),
+    "NG": (["y", "n", "n"], True),
+    "is_scrap": ([1.0, 0.0, 0.0], True),
+    "part fault": (["TRUE", "FALSE", "FALSE"], True),
+    "error": ([1, 0, 0], True),
+    "Ausschuss": (["ja", "nein", "nein"], True),
+    "n.i.O.": ([1, 0, 0], True),
+    "fehler": (["Ja", "Nein", "Nein"], True),
+    "rebut": (["oui", "non", "non"], True),
+    "Failed": (["NOK", "OK", "OK"], False),
+    "reject_flag": (["bad", "good", "good"], False),
+    "fault": (["fail", "pass", "pass"], False),
+    "passed": ([False, True, True], False),
+    "not_failed": ([0, 1, 1], False),
+    "error_free": (["no", "yes", "yes"], False),
+}
+
+
+@pytest.mark.parametrize("form", IN_COLUMN)
+@pytest.mark.parametrize("column", FLAGS)
+def test_true_is_bad_in_a_column_that_tells_what_is_bad(
+    form: str, column: str, tmp_path: Path
+) -> None:
+    cells, is_inverted = FLAGS[column]
+    source, options = IN_COLUMN[form](cells, column, tmp_path)
+    data = load_dataset(source, **options)
+    assert (data.y.tolist(), data.faults) == ([0, 1, 1], ())
+    assert any(f"Column {column} tells what is bad" in note for note in data.notes) == is_inverted
+
+
+def test_a_label_map_is_taken_as_typed_whatever_the_column_is_called(tmp_path: Path) -> None:
+    source, options = as_folder(["yes", "no"], "reject", tmp_path)
+    data = load_dataset(source, **options, label_map="yes=good,no=bad")
+    assert data.y.tolist() == [1, 0]
+    assert not any("tells what is bad" in note for note in data.notes)
 
 
 def test_a_number_is_a_label_of_a_name_where_somebody_says_so_and_never_against_a_word() -> None:
