@@ -290,8 +290,7 @@ class LabelColumn:
 
         Raises UnreadableError if they differ, and as `label_of`.
         """
-        texts = dict.fromkeys(map(str, cells))
-        stated = [text for text in texts if text.strip().lower() not in UNCHECKED]
+        stated = _stated(cells)
         if len(stated) < 2:
             return self.label_of(stated[0] if stated else "")
         with suppress(UnknownWordError):
@@ -301,23 +300,71 @@ class LabelColumn:
         raise UnreadableError(f"Expected one label in column {self.name}, got {listed(stated)}")
 
 
+def _stated(cells: Iterable[Any]) -> list[str]:
+    """Return the different texts of cells that are not empty."""
+    texts = dict.fromkeys(map(str, cells))
+    return [text for text in texts if text.strip().lower() not in UNCHECKED]
+
+
+def _read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
+    """Return the cells of a column of a file."""
+    # Without stated columns the label needs no number format.
+    frame = read_table(path, options if options.columns else None).frame
+    return list(map(str, frame.iloc[:, column_place(column, list(frame.columns))]))
+
+
 def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOptions) -> LabelSource:
     """Return a source of labels in a column of each recording's file, in one row or in all.
 
     paths : the files of the recordings, by name.
     """
-    # Without stated columns the label needs no number format.
-    table_options = options if options.columns else None
+    notes = Counter({f"The labels are those in column {column} of each file": 1})
+    label_column = LabelColumn(column, options.words, notes)
+
+    def find(name: str) -> LabelAndPart:
+        return label_column.label_of_cells(_read_cells(paths[name], column, options)), None
+
+    advice = f"column {column} has none; name another column (label)"
+    return LabelSource(find, advice, notes=notes)
+
+
+def labels_in_names_and_column(
+    paths: Mapping[str, Path], column: str, options: LoadOptions
+) -> LabelSource:
+    """Return a source of labels in paths, and in a column where a path tells none.
+
+    A recording whose path and column contradict each other is a fault. Parameters as in
+    `labels_in_column`.
+    """
+    in_names = labels_in_names(None, options.words)
     notes = Counter[str]()
     label_column = LabelColumn(column, options.words, notes)
 
     def find(name: str) -> LabelAndPart:
-        frame = read_table(paths[name], table_options).frame
-        cells = frame.iloc[:, column_place(column, list(frame.columns))]
-        return label_column.label_of_cells(cells), None
+        """Return the label of a path or of its column."""
+        try:
+            in_name = _find_word(name, options.words)
+        except NoLabelError:
+            label = label_column.label_of_cells(_read_cells(paths[name], column, options))
+            notes[f"Its name tells no label: that in column {column} is taken"] += 1
+            return label, None
+        label = in_name.label
+        cells: list[str] = []
+        with suppress(OSError, UnreadableError):
+            cells = _read_cells(paths[name], column, options)
+            label = label_column.label_of_cells(cells)
+        if label != in_name.label:
+            place = "folder" if in_name.start <= name.rfind("/") else "name"
+            meaning = ("bad", "good")
+            actual = (
+                f"its {place} says {meaning[in_name.label]} ({in_name.text}), its column {column}"
+                f" says {meaning[label]} ({listed(_stated(cells))})"
+            )
+            do = f"name the one to trust: label={column!r}, or a pattern of the path (label)"
+            raise UnreadableError(f"Expected one label, {actual}; {do}")
+        return label, None
 
-    advice = f"column {column} has none; name another column (label)"
-    return LabelSource(find, advice, notes=notes)
+    return in_names._replace(find=find, notes=notes)
 
 
 class _FoundLabel(NamedTuple):
@@ -343,7 +390,12 @@ class _FoundLabel(NamedTuple):
 
 
 def _find_label(name: str, words: LabelMap) -> LabelAndPart:
-    """Return the label in a path, and None for the part's number.
+    """Return the label in a path, and None for the part's number; raise as `_find_word`."""
+    return _find_word(name, words).label, None
+
+
+def _find_word(name: str, words: LabelMap) -> _FoundLabel:
+    """Return the word in a path that is its label.
 
     Raises NoLabelError if there is none, UnreadableError if several contradict each other.
     """
@@ -357,7 +409,7 @@ def _find_label(name: str, words: LabelMap) -> LabelAndPart:
             actual = f"{first.text} and {other.text} contradict each other in its name or folder"
             do = "say which it is by a pattern with a group for it (label)"
             raise UnreadableError(f"Expected one label, {actual}; {do}")
-    return first.label, None
+    return first
 
 
 def suggest_label_sources(

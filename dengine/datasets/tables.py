@@ -152,8 +152,6 @@ def read_folder(
     source, label_column = _label_source(named, options)
     channels = options.channels or _usual_channels(named.values(), options, label_column)
     collector = RecordingCollector(name, channels)
-    if label_column is not None:
-        collector.notes[f"The labels are those in column {label_column} of each file"] += 1
     in_order = sorted(named, key=lambda name: natural_key(source.without_label(name)))
     collector.ordered = sorted(named, key=natural_key) == in_order
     collector.notes.update(_unread_files_note(folder, named, options))
@@ -192,33 +190,41 @@ def _label_source(
 ) -> tuple[labels.LabelSource, str | None]:
     """Return the source of a folder's labels, and the column of its files that has them, or None.
 
-    A column is taken if the user names it, or if it has the name of a label and no file's name
-    states one.
+    A column is taken if the user names it, or if it has the name of a label and labels in it. If
+    files' names state labels too, the column tells those of the other files, and must not
+    contradict.
     """
     if options.labels is not None:
         names = list(named)
         source = labels.labels_in_file(options.labels, options.part, names, options.words)
         return source, None
     header = _first_rows(next(iter(named.values())), options)[0]
+    if options.label in header:
+        return labels.labels_in_column(named, options.label, options), options.label
+    in_names = labels.labels_in_names(options.label, options.words)
     if options.label is not None:
-        column = options.label if options.label in header else None
-    else:
-        usual = [name for name in labels.LABEL_COLUMNS if name not in labels.SIGNAL_COLUMNS]
-        place = labels.column_among(header, usual)
-        column = None if place is None else header[place]
-        in_names = labels.labels_in_names(None, options.words)
-        if column is not None and set(_count_labels(named, in_names)) != {None}:
-            column = None
-    if column is not None:
-        return labels.labels_in_column(named, column, options), column
-    return labels.labels_in_names(options.label, options.words), None
+        return in_names, None
+    usual = [name for name in labels.LABEL_COLUMNS if name not in labels.SIGNAL_COLUMNS]
+    place = labels.column_among(header, usual)
+    if place is None:
+        return in_names, None
+    column = header[place]
+    in_column = labels.labels_in_column(named, column, options)
+    if set(_count_labels(named, in_names)) == {None}:
+        return in_column, column
+    counts = _count_labels(list(named)[:: max(len(named) // TRIED, 1)], in_column)
+    if not counts[0] + counts[1]:
+        return in_names, None
+    return labels.labels_in_names_and_column(named, column, options), column
 
 
 def _has_label_column(named: Mapping[str, Path], options: LoadOptions) -> bool:
     """Return whether a column of the files has labels, and the first file one label in it."""
     with suppress(DataError):
-        source, column = _label_source(named, options)
-        return column is not None and _count_labels([next(iter(named))], source)[None] == 0
+        _, column = _label_source(named, options)
+        if column is not None:
+            source = labels.labels_in_column(named, column, options)
+            return _count_labels([next(iter(named))], source)[None] == 0
     return False
 
 

@@ -325,6 +325,71 @@ def test_a_label_map_is_taken_as_typed_whatever_the_column_is_called(tmp_path: P
     assert not any("tells what is bad" in note for note in data.notes)
 
 
+# File -> what its column `verdict` says, its label, and what the fault says if both contradict.
+NAMES_AND_COLUMNS: dict[str, tuple[str, int | None, str]] = {
+    "joint00_pass1.csv": (
+        "NOK",
+        None,
+        "its name says good (pass), its column verdict says bad (NOK)",
+    ),
+    "03_first_pass.csv": (
+        "nok",
+        None,
+        "its name says good (pass), its column verdict says bad (nok)",
+    ),
+    "IO_007.csv": ("n.i.O.", None, "its name says good (IO), its column verdict says bad (n.i.O.)"),
+    "007_OK.csv": ("NOK", None, "its name says good (OK), its column verdict says bad (NOK)"),
+    "007_NOK.csv": ("OK", None, "its name says bad (NOK), its column verdict says good (OK)"),
+    "good/007.csv": ("NOK", None, "its folder says good (good), its column verdict says bad (NOK)"),
+    "1_OK.csv": ("OK", 1, ""),
+    "2_NOK.csv": ("nok", 0, ""),
+    "3_OK.csv": ("pending", 1, ""),
+    "4_OK.csv": ("rework", 1, ""),
+    "5.csv": ("OK", 1, ""),
+    "6.csv": ("NOK", 0, ""),
+    "8_OK.csv": ("OK", 1, ""),
+    "9_OK.csv": ("OK", 1, ""),
+}
+
+
+def write_verdicts(folder: Path) -> None:
+    for name, (verdict, *_) in NAMES_AND_COLUMNS.items():
+        path = write_csv(folder / name, np.arange(30.0))
+        pd.read_csv(path).assign(verdict=verdict).to_csv(path, index=False)
+
+
+def test_a_name_and_a_column_that_contradict_each_other_are_a_fault_that_names_both(
+    tmp_path: Path,
+) -> None:
+    write_verdicts(tmp_path)
+    data = load_dataset(tmp_path)
+    faults = {fault.source: fault.message for fault in data.faults}
+    labels = dict(zip(map(str, data.source), data.y.tolist(), strict=True))
+    for name, (_, label, message) in NAMES_AND_COLUMNS.items():
+        assert labels.get(name) == label, name
+        assert message in faults.get(name, ""), name
+        assert (label is None) == ("to trust: label='verdict'" in faults.get(name, "")), name
+    assert "Its name tells no label: that in column verdict is taken (2 times)." in data.notes
+
+
+@pytest.mark.parametrize(
+    ("label", "expected"), [("verdict", (5, 7)), (r"(NOK|OK|pass|IO|good)[\d_]*(?:[.]|/)", (10, 2))]
+)
+def test_the_user_says_whether_a_name_or_its_column_is_to_be_trusted(
+    label: str, expected: tuple[int, int], tmp_path: Path
+) -> None:
+    write_verdicts(tmp_path)
+    data = load_dataset(tmp_path, label=label, channel="FZ_Base")
+    assert (data.y.sum(), (data.y == 0).sum()) == expected
+
+
+def test_a_column_without_labels_is_a_channel_beside_names_that_state_them(tmp_path: Path) -> None:
+    for name in ("1_OK.csv", "2_NOK.csv"):
+        write_csv(tmp_path / name, np.arange(30.0), ("result",))
+    data = load_dataset(tmp_path)
+    assert (data.channels, data.y.tolist()) == (("result",), [1, 0])
+
+
 def test_a_number_is_a_label_of_a_name_where_somebody_says_so_and_never_against_a_word() -> None:
     source_of_labels = labels_in_names(None, {"1": True, "0": False})
     assert [
