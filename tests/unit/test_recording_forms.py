@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from dengine import Dataset, load_dataset
+from dengine.datasets.clocks import seconds_of
 from dengine.errors import DataError
 from tests.support import recording_forms
 from tests.support.command_line import dengine, document
@@ -356,6 +357,23 @@ def test_a_clock_that_names_no_unit_is_read_by_its_size_and_that_is_said(tmp_pat
     ):
         write(tmp_path / "a_OK.csv", ["Time", "FZ"], [TIMES[form](i) for i in range(N)], texts())
         assert f"is read as {unit}" in " ".join(dengine("data", tmp_path).stdout.split()), form
+
+
+def test_counts_that_float64_would_round_are_subtracted_exactly() -> None:
+    counts = [639079416000000001 + 7 * i for i in range(N)]
+    for column in (pd.Series(counts), pd.Series(list(map(str, counts)))):
+        seconds, wrong, note = seconds_of(column, "Ticks")
+        np.testing.assert_allclose(seconds, 7e-7 * np.arange(N), rtol=1e-12)
+        assert (wrong, note) == ([], "")
+
+
+def test_a_count_that_no_epoch_makes_a_date_of_is_refused(tmp_path: Path) -> None:
+    cells = [str(50_000_000_000_000_000 + 40_000 * i) for i in range(N)]
+    write(tmp_path / "bare" / "a_OK.csv", ["Time", "FZ"], cells, texts())
+    with pytest.raises(DataError, match=r"dates from 2000 to 2100 .* 5e\+16 is none"):
+        load_dataset(tmp_path / "bare")
+    write(tmp_path / "stated" / "a_OK.csv", ["Time (0.1 us)", "FZ"], cells, texts())
+    assert load_dataset(tmp_path / "stated").rate_hz == 250.0
 
 
 def test_a_clock_of_whole_milliseconds_tells_the_rate_that_it_has_on_average(
