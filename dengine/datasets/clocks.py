@@ -183,7 +183,8 @@ def _elapsed(column: pd.Series, times: NDArray[np.float64]) -> NDArray[np.float6
             return elapsed
         except InvalidOperation:  # what Python's float reads and Decimal does not
             pass
-    return times - times[first]
+    since_first: NDArray[np.float64] = times - times[first]
+    return since_first
 
 
 def clock_of(
@@ -287,6 +288,20 @@ def seconds_of(
             return _elapsed(column, times) * scale, wrong, note
     seconds, missing = _parse_timestamps(column)
     return seconds, column.index[missing].tolist(), ""
+
+
+def holds_dates(column: pd.Series) -> bool:
+    """Return whether a column of times states dates, so that times of several parts compare."""
+    import pandas as pd
+
+    if pd.api.types.is_datetime64_any_dtype(column):
+        return True
+    times, wrong = floats(column)
+    if 2 * len(wrong) < max(len(times), 1):
+        times = times[~np.isnan(times)]
+        return bool(len(times)) and _epoch_unit(times) is not None
+    text = column.astype(str).str.strip()
+    return bool(text.str.match(DATE_FORM).mean() > 0.5)
 
 
 def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
