@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from dengine import Dataset, load_dataset
+from dengine.datasets import units
 from dengine.datasets.clocks import seconds_of
 from dengine.errors import DataError
 from tests.support import recording_forms
@@ -442,6 +443,31 @@ def test_a_row_of_units_is_of_the_clock_too_and_of_a_long_table(
     path.write_text("\n".join([head, row, *rows]))
     data = load_dataset(path, time="Zeit")
     assert (data.rate_hz, data.unit, data.notes) == (250.0, "kN", ())
+
+
+@pytest.mark.parametrize("form", ["hh:mm:ss", "HH:MM:SS.fff", "hh:mm:ss,000", "[hh:mm:ss]", "ms"])
+def test_the_form_of_a_time_may_stand_in_a_row_of_units(form: str, tmp_path: Path) -> None:
+    cells = times(step=4, form="{:.0f}")
+    if form != "ms":
+        cells = [TIMES["06:00:00,008"](i) for i in range(N)]
+    path = write(tmp_path / "a_OK.csv", ["hora", "fuerza"], cells, texts(), delimiter=";")
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, f"{form};kgf", *rows]))
+    data = load_dataset(tmp_path)
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    assert (data.channels, data.rate_hz, data.unit) == (("fuerza",), 250.0, "kgf")
+
+
+def test_a_unit_in_another_case_is_the_one_that_it_can_be(tmp_path: Path) -> None:
+    for unit, usual in {"KN": "kN", "kn": "kN", "LBF": "lbf", "Mpa": "Mpa", "mn": "mn"}.items():
+        assert units.spelling(unit) == usual
+    assert units.split("FZ [KN]") == ("FZ", "kN")
+    for name, unit, scale in (("a_OK", "N", 1.0), ("b_OK", "N", 1.0), ("c_OK", "KN", 1e-3)):
+        cells = texts(VALUES * scale, "{:.6f}")
+        write(tmp_path / f"{name}.csv", ["time", f"FZ [{unit}]"], times(), cells)
+    data = load_dataset(tmp_path)
+    assert (data.unit, data.faults) == ("N", ())
+    np.testing.assert_allclose(data.X, np.stack([VALUES] * 3), rtol=1e-6)
 
 
 def test_the_unit_of_frames_is_that_of_their_columns() -> None:
