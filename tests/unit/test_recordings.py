@@ -687,3 +687,13 @@ def test_parts_with_dates_are_in_the_order_of_their_times(small: Dataset) -> Non
         data = load_dataset(other, time="time")
         np.testing.assert_array_equal(data.X, expected.X[::-1])
         assert any("order of the rows, which is not that" in note for note in data.notes)
+
+
+def test_a_word_of_an_undecided_part_is_not_proposed_as_a_label(small: Dataset) -> None:
+    verdicts = np.where(small.y == 1, "conforme", "no conforme").astype(object)
+    verdicts[[2, 7]] = "pendiente"
+    with pytest.raises(DataError, match="label_map='conforme=good,no conforme=bad' or"):
+        load_dataset((list(small.X), list(verdicts)))
+    label_map = "conforme=good,no conforme=bad"
+    data = load_dataset((list(small.X), list(verdicts)), label_map=label_map)
+    assert (len(data.y), len(data.faults)) == (22, 2)
