@@ -1,14 +1,15 @@
 """The clock of a recording: which column it is, its times in seconds, and the sampling rate.
 
 A column is the clock by its name (`traces.is_time_column`), or by its values: times of day, or
-seconds since 1970. Any other column that rises steadily may be a clock or a path; users are told of
-it, and name it themselves. Text files, tables and DataFrames all ask `clock_of` and `rate_of`.
+counts since an epoch. Any other column that rises steadily may be a clock or a path; users are told
+of it, and name it themselves. Text files, tables and DataFrames all ask `clock_of` and `rate_of`.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -31,9 +32,15 @@ RATES = (1.0, 1e6)  # hertz that are plausible
 SPANS = (1e-3, 3600.0)  # plausible durations of a recording, in seconds
 DAY = units.SECONDS["d"]
 EXCEL_DAYS = (2e4, 8e4)  # since 1900: the years 1954 to 2119
-# Times since 1970: from which number on, and the seconds in one.
-EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e9, 1.0))
-LATEST = 5e9  # seconds since 1970: the year 2128
+# Counts since an epoch: the seconds in one, and the seconds from the epoch to 1970. Those of 100 ns
+# are Windows' FILETIME, since 1601, and .NET's ticks, since year 1.
+EPOCHS = (
+    *((1.0, 0.0), (1e-3, 0.0), (1e-6, 0.0), (1e-9, 0.0)),
+    *((1e-7, 11_644_473_600.0), (1e-7, 62_135_596_800.0)),
+)
+PLAUSIBLE_DATES = (946_684_800.0, 4_102_444_800.0)  # since 1970: the years 2000 to 2100
+LEAST_DATE = 1e16  # a larger count since a start would be of months, even in nanoseconds
+LARGEST_EXACT = 2.0**53  # float64 rounds larger whole numbers
 HEAD = 200  # rows by which it is found whether a column rises
 STEADY = 0.9  # of the steps of a steady column are within half of their median
 STATED_UNIT = re.compile(
@@ -128,7 +135,7 @@ def is_rising(times: NDArray[np.float64]) -> bool:
 def _is_clock(cells: pd.Series, name: str) -> bool:
     """Return whether a column is a clock by its values.
 
-    It is if it holds times as text that rise, times since 1970, or if it has no name and rises
+    It is if it holds times as text that rise, times since an epoch, or if it has no name and rises
     steadily by steps other than 1.
     """
     times, wrong = floats(cells)
@@ -145,11 +152,39 @@ def _is_clock(cells: pd.Series, name: str) -> bool:
 
 
 def _epoch_unit(times: NDArray[np.float64]) -> float | None:
-    """Return the seconds in one of numbers that are times since 1970; None if they are not."""
-    for least, unit in EPOCHS:
-        if least <= np.abs(times[0]) and np.abs(times[0]) * unit < LATEST:
+    """Return the seconds in one of numbers that count since an epoch; None if they do not.
+
+    They do if they then are dates from 2000 to 2100, which at most one epoch makes of a number.
+    """
+    earliest, latest = PLAUSIBLE_DATES
+    for unit, before_1970 in EPOCHS:
+        if earliest <= times[0] * unit - before_1970 < latest:
             return unit
     return None
+
+
+def _elapsed(column: pd.Series, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the counts of a clock since its first, shape (n,); NaN where there is none.
+
+    Counts that float64 would round are subtracted as they are written.
+
+    times : the column as float64.
+    """
+    rows = np.flatnonzero(~np.isnan(times))
+    if not len(rows):
+        return times
+    first = int(rows[0])
+    if abs(times[first]) > LARGEST_EXACT and column.dtype.kind not in "fc":
+        cells = column.to_numpy(dtype=object)
+        elapsed = np.full(len(times), np.nan)
+        try:
+            start = Decimal(str(cells[first]))
+            elapsed[rows] = [float(Decimal(str(cells[i])) - start) for i in rows]
+            return elapsed
+        except InvalidOperation:  # what Python's float reads and Decimal does not
+            pass
+    since_first: NDArray[np.float64] = times - times[first]
+    return since_first
 
 
 def clock_of(
@@ -250,11 +285,23 @@ def seconds_of(
         times, wrong = floats(column)
         if 2 * len(wrong) < max(len(times), 1):
             scale, note = _seconds_per_count(times, name, unit)
-            rows = np.flatnonzero(~np.isnan(times))
-            start = times[rows[0]] if len(rows) else 0.0
-            return (times - start) * scale, wrong, note
+            return _elapsed(column, times) * scale, wrong, note
     seconds, missing = _parse_timestamps(column)
     return seconds, column.index[missing].tolist(), ""
+
+
+def holds_dates(column: pd.Series) -> bool:
+    """Return whether a column of times states dates, so that times of several parts compare."""
+    import pandas as pd
+
+    if pd.api.types.is_datetime64_any_dtype(column):
+        return True
+    times, wrong = floats(column)
+    if 2 * len(wrong) < max(len(times), 1):
+        times = times[~np.isnan(times)]
+        return bool(len(times)) and _epoch_unit(times) is not None
+    text = column.astype(str).str.strip()
+    return bool(text.str.match(DATE_FORM).mean() > 0.5)
 
 
 def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -310,6 +357,11 @@ def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tupl
     epoch_unit = _epoch_unit(times)
     if epoch_unit is not None:
         return epoch_unit, ""
+    if abs(times[0]) >= LEAST_DATE:
+        wanted = f"dates from 2000 to 2100 in the clock {name}"
+        epochs = "since 1970, as a FILETIME or as .NET ticks"
+        do = "write its unit into the header, as in time [ns]"
+        raise UnreadableError(f"Expected {wanted}, {times[0]:.4g} is none {epochs}; {do}")
     step = float(np.median(np.abs(np.diff(times))))
     low, high = EXCEL_DAYS
     if low < times[0] < high and 0 < step * DAY < 1.0:

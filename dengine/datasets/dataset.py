@@ -33,6 +33,8 @@ UNKNOWN_RATE = (
     " rate_hz=..."
 )
 MAX_LABEL_WORDS = 12  # more different words are no labels
+# Words of parts that nobody has decided on: a proposal does not call them good or bad.
+UNDECIDED = ("pending", "pendiente", "en attente", "offen", "open", "todo", "tbd", "in progress")
 expect_data = partial(expect, error=DataError)
 
 
@@ -396,6 +398,7 @@ class RecordingCollector:
         if sum(self.unknown_words.values()) <= (n_known / 9 if is_one_sided else n_known):
             return
         words = [word for word, _ in self.unknown_words.most_common()]
+        words = [word for word in words if word.lower() not in UNDECIDED] or words
         if is_one_sided:
             bad = set(words) if 1 in labels else set()
         else:

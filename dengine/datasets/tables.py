@@ -8,6 +8,7 @@ and a column of parts. `load_dataset` calls `read_folder`, `read_tables` and `fr
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,7 +25,7 @@ from ..errors import DataError, listed
 from ..files import read_errors
 from ..traces import is_time_column
 from . import labels, units
-from .clocks import floats, place_of_clock, seconds_of
+from .clocks import MAX_GAP, floats, holds_dates, is_rising, place_of_clock, seconds_of
 from .dataset import (
     MAX_LABEL_WORDS,
     Dataset,
@@ -62,6 +63,13 @@ SECONDS_COLUMN = "\0seconds"  # added to a long table; no file has this name
 MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered ones
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 TRIED = 20  # recordings, on which advice about a column is tried
+MAX_STATIONS = 12  # more different values in the rows of a part are no stations
+# What a column is called that tells where a part was made.
+STATION = re.compile(
+    r"(work_?)?station|machine|maschine|anlage|cell|zelle|line|linie|press|presse|robot|roboter"
+    r"|spindle|spindel|nest|cavity|tool|head|lane",
+    re.IGNORECASE,
+)
 SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
 
 
@@ -572,6 +580,10 @@ def _from_long(
     with_seconds = frame.assign(**{SECONDS_COLUMN: seconds})
     groups = with_seconds.groupby(options.part, sort=False)
     rows_of_part = {str(part): rows for part, rows in groups}
+    no_stations = {options.part, time, label, *collector.channels}
+    _check_single_station(rows_of_part, [name for name in others if name not in no_stations])
+    rows_of_part, order_note = _order_by_time(rows_of_part, holds_dates(frame[time]))
+    collector.notes.update(order_note)
     places = [frame.columns.get_loc(name) for name in collector.channels]
     read_options = replace(options, time=time)
 
@@ -595,6 +607,72 @@ def _from_long(
         label_source = labels.labels_in_file(options.labels, "part", parts, options.words)
     labels.collect_recordings(rows_of_part, read, label_source, collector)
     return as_dataset(collector, options)
+
+
+def _check_single_station(rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str]) -> None:
+    """Raise DataError if the rows of a part are those of several, which were made elsewhere.
+
+    Such rows would be merged to one zigzag trace. A column tells them apart if the times of its
+    values overlap, and each value by itself has times without gaps.
+
+    columns : that may tell where a part was made.
+    """
+    for part, rows in rows_of_part.items():
+        for name in columns:
+            if 2 <= rows[name].nunique() <= MAX_STATIONS and _are_stations(rows, name):
+                values = listed(sorted(map(str, rows[name].dropna().unique())))
+                wanted = f"one recording for each part, part {part} has several values of {name}"
+                do = f"make the parts' numbers unique, as {name} and number in one column"
+                raise DataError(f"Expected {wanted} ({values}) at the same time; {do}.")
+
+
+def _are_stations(rows: pd.DataFrame, name: str) -> bool:
+    """Return whether the values of a column stand for recordings that overlap in time."""
+    times = rows[SECONDS_COLUMN].to_numpy()
+    runs = [run for _, run in rows.groupby(name)[SECONDS_COLUMN]]
+    all_steps = [np.diff(run.to_numpy()) for run in runs]
+    if not all(len(steps) and ((steps > 0).all() or (steps < 0).all()) for steps in all_steps):
+        return False
+    if len(np.unique(times)) < len(times):
+        return True
+    # From here on each time occurs once, as in one recording with a state in a column.
+    if any(np.abs(steps).max() > MAX_GAP * np.median(np.abs(steps)) for steps in all_steps):
+        return False
+    latest_start = max(run.min() for run in runs)
+    earliest_end = min(run.max() for run in runs)
+    if latest_start >= earliest_end:
+        return False
+    overlap_is_long = 2 * (earliest_end - latest_start) >= times.max() - times.min()
+    if not overlap_is_long and is_rising(np.sort(times)):
+        return False
+    # In a file in the order of time, numbers may be a signal that changes from row to row.
+    steps = np.diff(times)
+    is_in_order = bool((steps > 0).all() or (steps < 0).all())
+    is_number = not floats(rows[name])[1]
+    return not (is_in_order and is_number and STATION.fullmatch(name) is None)
+
+
+def _order_by_time(
+    rows_of_part: dict[str, pd.DataFrame], has_dates: bool
+) -> tuple[dict[str, pd.DataFrame], list[str]]:
+    """Return the parts in the order of their first times, and a note if that is not the file's.
+
+    They keep the order of the file if their times are no dates or overlap.
+    """
+    starts = {part: rows[SECONDS_COLUMN].min() for part, rows in rows_of_part.items()}
+    ends = {part: rows[SECONDS_COLUMN].max() for part, rows in rows_of_part.items()}
+    by_time = sorted(starts, key=starts.__getitem__)
+    if by_time == list(starts) or not np.isfinite([*starts.values(), *ends.values()]).all():
+        return rows_of_part, []
+    overlap = any(starts[b] <= ends[a] for a, b in itertools.pairwise(by_time))
+    if has_dates and not overlap:
+        note = "Parts are in the order of their times, which is not that of the rows"
+        return {part: rows_of_part[part] for part in by_time}, [note]
+    if has_dates or not overlap:
+        return rows_of_part, [
+            "Parts are in the order of the rows, which is not that of their times"
+        ]
+    return rows_of_part, []
 
 
 def _time_column(frame: pd.DataFrame, options: LoadOptions) -> str:
@@ -622,7 +700,11 @@ def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -
         return frame
     others = [name for name in frame if name not in keys]
     texts = [name for name in others if floats(frame[name])[1]]
-    tags = [name for name in texts if not frame.duplicated([*keys[:2], name]).any()]
+    tags = [
+        name
+        for name in texts
+        if not STATION.fullmatch(name) and not frame.duplicated([*keys[:2], name]).any()
+    ]
     values = [name for name in others if name not in texts]
     if not tags or len(values) != 1:
         return frame

@@ -49,6 +49,8 @@ COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 # A cell of a row of units, beside the units that `units.parse` knows.
 UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")
+# How a row of units states times of day: hh:mm:ss, HH:MM:SS.fff or mm:ss,0.
+TIME_FORMAT = re.compile(r"(h{1,2}:)?m{1,2}:s{1,2}([.,:](f+|s+|m+|z+|x+|0+))?", re.IGNORECASE)
 
 
 class TimedTrace(NamedTuple):
@@ -191,7 +193,8 @@ def _without_trailing_empty(row: list[str]) -> list[str]:
 
 def _is_unit(cell: str) -> bool:
     """Return whether a cell may stand in a row of units; empty ones may."""
-    return UNIT_CELL.fullmatch(cell) is not None or units.parse(cell) is not None
+    is_form = UNIT_CELL.fullmatch(cell) is not None or TIME_FORMAT.fullmatch(cell) is not None
+    return is_form or units.parse(units.spelling(cell)) is not None
 
 
 def _find_header(
@@ -250,7 +253,8 @@ def _without_comment_mark(row: list[str], delimiter: str) -> list[str]:
 
 def _pad_units(units_row: list[str], n: int) -> list[str]:
     """Return a row of units without brackets, as n units, "" for each that is missing."""
-    return [cell.strip("[](){} ") for cell in units_row][:n] + [""] * (n - len(units_row))
+    plain = [units.spelling(cell.strip("[](){} ")) for cell in units_row[:n]]
+    return plain + [""] * (n - len(plain))
 
 
 def _columns_advice(rows: list[list[str]]) -> str:

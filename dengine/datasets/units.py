@@ -23,6 +23,7 @@ PREFIXES = {
     "n": 1e-9,
     "": 1.0,
 }
+USUAL_PREFIXES = ("", "k", "m", "M")  # by which a unit is known that is spelled in another case
 # Units that may have a prefix, with their dimension and factor.
 BASES = {
     **dict.fromkeys(("N", "Newton", "newton", "Newtons"), ("N", 1.0)),
@@ -104,6 +105,18 @@ def parse(unit: str) -> tuple[str, float] | None:
     return None
 
 
+def spelling(unit: str) -> str:
+    """Return a unit as it is usually spelled: kN for KN; the same text if it is none.
+
+    A unit of one letter, and one that two units could be, as mn of mN and MN, is not changed.
+    """
+    if len(unit) < 2 or parse(unit) is not None:
+        return unit
+    known = [f"{prefix}{base}" for base in BASES for prefix in USUAL_PREFIXES]
+    alike = [name for name in (*known, "daN", *ALONE) if name.lower() == unit.lower()]
+    return alike[0] if len({parse(name) for name in alike}) == 1 else unit
+
+
 def factor(unit: str, other: str) -> float | None:
     """Return the factor that converts numbers in one unit to another; None if there is none."""
     if unit == other:
@@ -124,10 +137,11 @@ def split(name: str) -> tuple[str, str]:
     """Return the name of a column without its unit, and the unit; "" if it states none."""
     plain = COMMENT_MARK.sub("", name.strip())
     if match := BRACKETED.fullmatch(plain):
-        return (match["name"], match["unit"]) if parse(match["unit"]) else (plain, "")
+        unit = spelling(match["unit"])
+        return (match["name"], unit) if parse(unit) else (plain, "")
     if match := SLASHED.fullmatch(plain):
         before = match["name"] or match["other"]
-        unit = match["unit"] or match["such"]
+        unit = spelling(match["unit"] or match["such"])
         return (before, unit) if parse(unit) else (plain, "")
     match = ENDING.fullmatch(plain)
     if match is None:

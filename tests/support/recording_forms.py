@@ -159,6 +159,12 @@ TIMES: Mapping[str, Callable[[int], str]] = {
     "1772344800008.00 (ms)": lambda i: f"{_at(i).timestamp() * 1e3:.2f}",
     "1772344800008000 (µs)": lambda i: str(round(_at(i).timestamp() * 1e6)),
     "1772344800008000000 (ns)": lambda i: f"{1772344800000 + 4 * i}000000",
+    "134168184000080000 (FILETIME: 100 ns since 1601)": lambda i: str(
+        134168184000000000 + 40000 * i
+    ),
+    "639079416000080000 (.NET ticks: 100 ns since year 1)": lambda i: str(
+        639079416000000000 + 40000 * i
+    ),
     "2026-03-01T06:00:00.008Z": lambda i: f"{_trimmed(i)}Z",
     "2026-03-01T06:00:00.008+01:00": lambda i: f"{_at(i):%Y-%m-%dT%H:%M:%S.%f}+01:00",
     "2026-03-01T06:00:00.008+01": lambda i: f"{_trimmed(i)}+01",

@@ -9,6 +9,8 @@ import pandas as pd
 import pytest
 
 from dengine import Dataset, load_dataset
+from dengine.datasets import units
+from dengine.datasets.clocks import seconds_of
 from dengine.errors import DataError
 from tests.support import recording_forms
 from tests.support.command_line import dengine, document
@@ -358,6 +360,23 @@ def test_a_clock_that_names_no_unit_is_read_by_its_size_and_that_is_said(tmp_pat
         assert f"is read as {unit}" in " ".join(dengine("data", tmp_path).stdout.split()), form
 
 
+def test_counts_that_float64_would_round_are_subtracted_exactly() -> None:
+    counts = [639079416000000001 + 7 * i for i in range(N)]
+    for column in (pd.Series(counts), pd.Series(list(map(str, counts)))):
+        seconds, wrong, note = seconds_of(column, "Ticks")
+        np.testing.assert_allclose(seconds, 7e-7 * np.arange(N), rtol=1e-12)
+        assert (wrong, note) == ([], "")
+
+
+def test_a_count_that_no_epoch_makes_a_date_of_is_refused(tmp_path: Path) -> None:
+    cells = [str(50_000_000_000_000_000 + 40_000 * i) for i in range(N)]
+    write(tmp_path / "bare" / "a_OK.csv", ["Time", "FZ"], cells, texts())
+    with pytest.raises(DataError, match=r"dates from 2000 to 2100 .* 5e\+16 is none"):
+        load_dataset(tmp_path / "bare")
+    write(tmp_path / "stated" / "a_OK.csv", ["Time (0.1 us)", "FZ"], cells, texts())
+    assert load_dataset(tmp_path / "stated").rate_hz == 250.0
+
+
 def test_a_clock_of_whole_milliseconds_tells_the_rate_that_it_has_on_average(
     tmp_path: Path,
 ) -> None:
@@ -424,6 +443,31 @@ def test_a_row_of_units_is_of_the_clock_too_and_of_a_long_table(
     path.write_text("\n".join([head, row, *rows]))
     data = load_dataset(path, time="Zeit")
     assert (data.rate_hz, data.unit, data.notes) == (250.0, "kN", ())
+
+
+@pytest.mark.parametrize("form", ["hh:mm:ss", "HH:MM:SS.fff", "hh:mm:ss,000", "[hh:mm:ss]", "ms"])
+def test_the_form_of_a_time_may_stand_in_a_row_of_units(form: str, tmp_path: Path) -> None:
+    cells = times(step=4, form="{:.0f}")
+    if form != "ms":
+        cells = [TIMES["06:00:00,008"](i) for i in range(N)]
+    path = write(tmp_path / "a_OK.csv", ["hora", "fuerza"], cells, texts(), delimiter=";")
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, f"{form};kgf", *rows]))
+    data = load_dataset(tmp_path)
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    assert (data.channels, data.rate_hz, data.unit) == (("fuerza",), 250.0, "kgf")
+
+
+def test_a_unit_in_another_case_is_the_one_that_it_can_be(tmp_path: Path) -> None:
+    for unit, usual in {"KN": "kN", "kn": "kN", "LBF": "lbf", "Mpa": "Mpa", "mn": "mn"}.items():
+        assert units.spelling(unit) == usual
+    assert units.split("FZ [KN]") == ("FZ", "kN")
+    for name, unit, scale in (("a_OK", "N", 1.0), ("b_OK", "N", 1.0), ("c_OK", "KN", 1e-3)):
+        cells = texts(VALUES * scale, "{:.6f}")
+        write(tmp_path / f"{name}.csv", ["time", f"FZ [{unit}]"], times(), cells)
+    data = load_dataset(tmp_path)
+    assert (data.unit, data.faults) == ("N", ())
+    np.testing.assert_allclose(data.X, np.stack([VALUES] * 3), rtol=1e-6)
 
 
 def test_the_unit_of_frames_is_that_of_their_columns() -> None:

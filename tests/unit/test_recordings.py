@@ -780,3 +780,79 @@ def test_recordings_that_are_added_do_not_make_those_before_count_again(tmp_path
         import_labelled(store, load_dataset(tmp_path / "cell"))
     with pytest.raises(TraceError, match="was to 104 by resample"):
         import_labelled(store, load_dataset(tmp_path / "cell", samples=104, fit="resample"))
+
+
+def long_table(small: Dataset, start: Callable[[int], Any], step: Any = 0.004) -> pd.DataFrame:
+    """Return a table with a row for each sample, of parts 1 to 24."""
+    return pd.DataFrame(
+        {"part": i + 1, "time": start(i) + step * j, "FZ": float(x[j]), "label": label}
+        for i, (x, label) in enumerate(zip(small.X, words(small), strict=True))
+        for j in range(len(x))
+    )
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.002, 0.0013])
+@pytest.mark.parametrize("order", ["blocks", "interleaved"])
+def test_two_stations_with_the_same_parts_are_refused(
+    offset: float, order: str, small: Dataset
+) -> None:
+    stations = [
+        long_table(small, lambda i, late=late: late).assign(station=number)
+        for number, late in enumerate((0.0, offset), start=1)
+    ]
+    table = pd.concat(stations)
+    if order == "interleaved":
+        table = table.sort_values(["part", "time"], kind="stable")
+    for rate_hz in (None, 250.0):
+        with pytest.raises(DataError, match=r"part 1 has several values of station \(1, 2\)"):
+            load_dataset(table, time="time", channel="FZ", rate_hz=rate_hz)
+    table["part"] = table["station"].astype(str) + "-" + table["part"].astype(str)
+    assert len(load_dataset(table, time="time", channel="FZ").y) == 48
+
+
+def test_a_table_in_another_order_or_with_a_state_in_a_column_is_read(small: Dataset) -> None:
+    table = long_table(small, lambda i: 10.0 * i)
+    expected = load_dataset(table, time="time").X
+    half = np.arange(len(table)) % 50 // 25
+    tables = {
+        "newest first": table[::-1],
+        "by value": table.sort_values("FZ"),
+        "by phase": table.assign(phase=np.where(half, "a", "b")).sort_values("phase"),
+        "a heartbeat": table.assign(beat=np.arange(len(table)) % 2),
+        "few that are uncertain": table.assign(
+            quality=np.where(np.arange(len(table)) % 50 // 3 == 7, "uncertain", "good")
+        ).sort_values("quality"),
+    }
+    for name, other in tables.items():
+        data = load_dataset(other, time="time", channel="FZ")
+        order = [int(part) - 1 for part in other["part"].unique()]
+        np.testing.assert_array_equal(data.X, expected[order], err_msg=name)
+
+
+def test_parts_with_dates_are_in_the_order_of_their_times(small: Dataset) -> None:
+    stamp = pd.Timestamp("2026-03-01 06:00")
+    minute, step = pd.Timedelta(minutes=1), pd.Timedelta(milliseconds=4)
+    table = long_table(small, lambda i: stamp + i * minute, step)
+    expected = load_dataset(table, time="time")
+    newest_first = load_dataset(table[::-1], time="time")
+    np.testing.assert_array_equal(newest_first.X, expected.X)
+    np.testing.assert_array_equal(newest_first.y, expected.y)
+    assert not any("order of their times" in note for note in expected.notes)
+    assert any("in the order of their times" in note for note in newest_first.notes)
+    # Parts that overlap, and times that are no dates, leave the order of the file.
+    overlapping = long_table(small, lambda i: stamp + i * 10 * step, step)[::-1]
+    no_dates = long_table(small, lambda i: 60.0 * i)[::-1]
+    for other in (overlapping, no_dates):
+        data = load_dataset(other, time="time")
+        np.testing.assert_array_equal(data.X, expected.X[::-1])
+        assert any("order of the rows, which is not that" in note for note in data.notes)
+
+
+def test_a_word_of_an_undecided_part_is_not_proposed_as_a_label(small: Dataset) -> None:
+    verdicts = np.where(small.y == 1, "conforme", "no conforme").astype(object)
+    verdicts[[2, 7]] = "pendiente"
+    with pytest.raises(DataError, match="label_map='conforme=good,no conforme=bad' or"):
+        load_dataset((list(small.X), list(verdicts)))
+    label_map = "conforme=good,no conforme=bad"
+    data = load_dataset((list(small.X), list(verdicts)), label_map=label_map)
+    assert (len(data.y), len(data.faults)) == (22, 2)
