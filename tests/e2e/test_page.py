@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import pytest
 
 from dengine import Action, DataEngine, Dataset, Decision, Policy, TraceSpec, load_exported
 from dengine.recipe import Recipe
+from dengine.store.records import KEEP
 from dengine.store.sql import SqlStore
 from dengine.store.views import HistoryFilter
 from tests.support.driving import RECIPE
@@ -229,7 +230,13 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(
 def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell, tmp_path: Path) -> None:
     with_a_model(page, demo)
     opened(page, demo, "actions")
-    confirmed(page, "Retrain now", "Robin")
+    begun = "The retrain has begun."
+    for _ in range(60):  # the demonstration's own retrains are under way at times
+        confirmed(page, "Retrain now", "Robin")
+        if page.locator("#result").text_content() == begun:
+            break
+        page.wait_for_timeout(500)
+    expect(page.locator("#result")).to_have_text(begun)
     confirmed(page, "Roll back")
     page.get_by_role("button", name="Export").click()
     with page.expect_download() as download:
@@ -258,6 +265,38 @@ def test_the_rules_of_axe_pass_and_a_phone_need_not_scroll_sideways(
         opened(page, demo, "actions")
         page.get_by_role("button", name="Change the policy").click()
         must_suit_a_phone(page, "the policy")
+
+
+def test_a_dialog_offers_what_there_is_now_and_not_when_the_page_was_opened(
+    browser: Browser, tmp_path: Path, stream: Dataset
+) -> None:
+    file = tmp_path / "cell.db"
+    with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
+        played(service, stream, 40)
+        service.submit(DataEngine.retrain).result()
+        opened(page, DemoCell(f"http://127.0.0.1:{port}", file), "actions")
+        expect(page.get_by_role("button", name="Roll back")).to_be_enabled()
+        for _ in range(2 * KEEP):  # those that were there at first are kept no longer
+            service.submit(DataEngine.retrain).result()
+        policy = replace(service.engine.policy, audit_rate=0.25)
+        service.submit(lambda engine: engine.set_policy(policy, "Kim")).result()
+        versions = service.submit(lambda engine: engine.store.versions()).result()
+        offered = [str(version.report.version) for version in versions if version.kept][-2::-1]
+        rate = page.get_by_label("Share of certain parts")
+        for _ in range(60):  # the page follows within a moment
+            page.get_by_role("button", name="Change the policy").click()
+            is_new = rate.input_value() == "0.25"
+            page.get_by_role("button", name="Cancel").click()
+            if is_new:
+                break
+            page.wait_for_timeout(100)
+        assert is_new
+        page.get_by_role("button", name="Roll back").click()
+        choices = page.get_by_label("Version").locator("option")
+        assert [choice.get_attribute("value") for choice in choices.all()] == offered
+        page.get_by_role("button", name="Cancel").click()
+        confirmed(page, "Roll back", "Robin")
+        expect(page.locator("#result")).to_contain_text(f"Version {offered[0]} answers again")
 
 
 TOKEN = "correct-horse-battery-staple"

@@ -4,6 +4,7 @@ import { el } from "./dom.js";
 import { post } from "./server.js";
 
 const at = (id) => document.getElementById(id);
+const newest = new Map(); // by id of a button: its action as of the last refresh, for an unchanged button stays in the page
 let current = null; // the action that the dialog asks about
 let openedBy = null; // id of its button
 let refresh = () => {};
@@ -13,7 +14,8 @@ export const setOwner = (me) => { owner = me; }; // the owner of the page's toke
 
 export function button(id, title, action, off = false, ...marks) {
   // action : title and explanation of the dialog; path and body of the request; fields to fill in; resultText(response).
-  return el("button", { type: "button", id, class: action.quiet ? null : "main", disabled: off || !owner.operates, "data-asks": JSON.stringify(action.body ?? {}), onclick: () => open(id, action) }, ...marks, title);
+  newest.set(id, action);
+  return el("button", { type: "button", id, class: action.quiet ? null : "main", disabled: off || !owner.operates, "data-asks": JSON.stringify(action.body ?? {}), onclick: () => open(id, newest.get(id)) }, ...marks, title);
 }
 
 function field({ name, label, options, ...attributes }) {
