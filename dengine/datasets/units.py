@@ -112,8 +112,8 @@ def spelling(unit: str) -> str:
     """
     if len(unit) < 2 or parse(unit) is not None:
         return unit
-    known = [f"{prefix}{base}" for base in BASES for prefix in USUAL_PREFIXES]
-    alike = [name for name in (*known, "daN", *ALONE) if name.lower() == unit.lower()]
+    prefixed = [f"{prefix}{base}" for base in BASES for prefix in USUAL_PREFIXES]
+    alike = [name for name in (*prefixed, "daN", *ALONE) if name.lower() == unit.lower()]
     return alike[0] if len({parse(name) for name in alike}) == 1 else unit
 
 

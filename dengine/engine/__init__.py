@@ -1,1 +1,4 @@
-"""The engine. This file holds no code; import `DataEngine` from `dengine`."""
+"""`DataEngine`, and the objects that it decides, learns and retrains with.
+
+This file holds no code; import `DataEngine` from `dengine`.
+"""

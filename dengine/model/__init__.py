@@ -1,4 +1,4 @@
-"""What the engine drives: two contracts, dengine's own model, and the adapter of baselines."""
+"""Models that decide on a trace: their contracts, dengine's own, the adapter of baselines."""
 
 import lazy_loader
 

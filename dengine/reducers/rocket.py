@@ -210,7 +210,8 @@ def weigh_towers(
     losses : Tensor of float64, shape (K,)
         Leave-one-out log loss of each head with these shares.
     """
-    n_heads, n_rows = len(outside), outside.sum(1)
+    n_heads = len(outside)
+    n_rows = outside.sum(1)
     mask = outside.double()
     candidates = torch.linspace(0.0, 1.0, N_SHARES).double()  # share of the towers before
     mixed = left_out[0]
