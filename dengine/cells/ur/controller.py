@@ -110,7 +110,7 @@ class RobotProgram:
             yield
 
     def _carry_out(self, number: int, verb: int) -> Any:
-        """Carry out an order, yielding once per control cycle; return its result code."""
+        """Simulate one order, a yield per control cycle; return its result code (`yield from`)."""
         if verb == Verb.INSERT:
             return (yield from self._insert(number))
         if verb not in tuple(Verb) or not self.played:
