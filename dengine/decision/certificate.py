@@ -223,6 +223,8 @@ class OutcomeBound:
         Parts among them whose outcome is known.
     n_bad : int
         Parts that are known to be decided wrongly.
+    n_unchecked : int
+        Parts among them that were decided without a check; the others were audited.
     propensity : float
         Probability with which the outcome of each was asked for; 0 if none was, so that nothing is
         known.
@@ -237,6 +239,7 @@ class OutcomeBound:
     n: int
     n_with_outcome: int
     n_bad: int
+    n_unchecked: int
     propensity: float
     alpha: float
     upper: float
@@ -271,12 +274,15 @@ class Certificate:
     def saved(self) -> float | None:
         """Lower bound on what was saved by not checking accepted parts, in the unit of the prices.
 
-        It is n check - escape n upper, an expectation as the bound is. None without prices.
+        It is n_unchecked check - escape min(n_unchecked, n upper), an expectation as the bound is:
+        an audited part saves no check, and it cannot escape. None without prices.
         """
         if self.prices is None:
             return None
         check, escape, _ = self.prices
-        return self.accepted.n * (check - escape * self.accepted.upper)
+        n_unchecked = self.accepted.n_unchecked
+        n_escaped = min(n_unchecked, self.accepted.n * self.accepted.upper)
+        return n_unchecked * check - escape * n_escaped
 
     @property
     def kept(self) -> bool:
@@ -292,12 +298,14 @@ class Certificate:
         )
         which = "that went on without a check"
         claim = self._claim(self.accepted, which, "accept", "bad", unknown)
-        if self.saved is None or self.accepted.upper >= 1.0:
+        n_unchecked = self.accepted.n_unchecked
+        if self.saved is None or self.accepted.upper >= 1.0 or n_unchecked == 0:
             return claim
         saved = "nothing for certain"
         if self.saved > 0.0:
             saved = f"at least {math.floor(self.saved):,}"
-        return f"{claim} By the prices not checking them saved {saved}."
+        which = "them" if n_unchecked == self.accepted.n else f"{n_unchecked:,} of them"
+        return f"{claim} By the prices not checking {which} saved {saved}."
 
     @property
     def sentence_on_rejects(self) -> str:
@@ -390,20 +398,22 @@ def certify(
     # Share of alpha for known outcomes: audits see less and need more.
     share = 1.0 if stops == "all" or audit_rate == 0.0 else 0.1
     if stops == "all" or 0 < o.accepted == o.false_accepts + o.confirmed:
-        accepted = _bound_outcomes(o.accepted, o.accepted, o.false_accepts, 1.0, share * alpha)
+        accepted = _bound_outcomes(
+            o.accepted, o.accepted, o.false_accepts, o.accepted, 1.0, share * alpha
+        )
     elif audit_rate == 0.0:
-        accepted = _bound_outcomes(o.accepted, 0, 0, 0.0, alpha)
+        accepted = _bound_outcomes(o.accepted, 0, 0, o.accepted, 0.0, alpha)
     else:
         n = o.accepted + o.audited_accepts
         n_bad = o.audited_accepts_bad
         audit_alpha = (1.0 - share) * alpha
-        accepted = _bound_outcomes(n, o.audited_accepts, n_bad, audit_rate, audit_alpha)
+        accepted = _bound_outcomes(n, o.audited_accepts, n_bad, o.accepted, audit_rate, audit_alpha)
         upper = max(accepted.upper, (n_bad + o.false_accepts) / max(1, n))
         shadowed = audit_rate == 1.0 and o.accepted == 0
         accepted = replace(accepted, upper=upper, shadowed=shadowed)
     n = o.rejected + o.audited_rejects
     n_good = o.audited_rejects_good
-    rejected = _bound_outcomes(n, o.audited_rejects, n_good, audit_rate, alpha)
+    rejected = _bound_outcomes(n, o.audited_rejects, n_good, o.rejected, audit_rate, alpha)
     upper = max(rejected.upper, (n_good + o.false_rejects) / max(1, n))
     shadowed = audit_rate == 1.0 and o.rejected == 0
     rejected = replace(rejected, upper=upper, shadowed=shadowed)
@@ -411,8 +421,8 @@ def certify(
 
 
 def _bound_outcomes(
-    n: int, n_with_outcome: int, n_bad: int, propensity: float, alpha: float
+    n: int, n_with_outcome: int, n_bad: int, n_unchecked: int, propensity: float, alpha: float
 ) -> OutcomeBound:
     """Return the group of these counts with its `failure_bound`."""
     upper = failure_bound(n, n_bad, alpha, propensity)
-    return OutcomeBound(n, n_with_outcome, n_bad, propensity, alpha, upper)
+    return OutcomeBound(n, n_with_outcome, n_bad, n_unchecked, propensity, alpha, upper)

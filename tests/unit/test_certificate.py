@@ -166,6 +166,24 @@ def test_by_prices_it_says_what_was_saved_at_least_and_nothing_where_that_is_not
     assert certificate("all", accepted=1203, false_accepts=24).saved is None
 
 
+def test_a_part_that_was_audited_saves_no_check() -> None:
+    shadow = Policy(0.05, guarantee="cost", prices=(5, 120, 47.5), shadow=True)
+    result = shadow.certificate(Outcomes(audited_accepts=5000))
+    assert (result.accepted.n, result.accepted.n_unchecked, result.saved) == (5000, 0, 0.0)
+    assert result.sentence.endswith("the tolerance is 4.16667 %.")
+    audited = Policy(0.05, guarantee="cost", prices=(5, 120, 47.5), audit_rate=0.4)
+    result = audited.certificate(Outcomes(accepted=3000, audited_accepts=2000))
+    n_escaped = 5000 * result.accepted.upper
+    assert (result.accepted.n, result.saved) == (
+        5000,
+        pytest.approx(3000 * 5 - 120 * n_escaped),
+    )
+    assert "By the prices not checking 3,000 of them saved at least " in result.sentence
+    # What is saved is never less than if every unchecked part had escaped.
+    lost = audited.certificate(Outcomes(accepted=10, audited_accepts=900, audited_accepts_bad=450))
+    assert lost.saved == pytest.approx(10 * 5 - 10 * 120)
+
+
 def test_one_sentence_says_what_was_kept_or_what_audits_tell_which_alone_know_of_rejected_parts() -> (
     None
 ):
