@@ -1,7 +1,9 @@
-"""A trained version that does not answer yet: it catches up on labels and is stored first.
+"""`Candidate`: a newly trained version of the model, from the end of its training until it answers.
 
-`learner.Learner` takes a candidate through these steps, either to the end or one short step between
-two cycles.
+Until then the previous version goes on answering. The candidate takes in the labels that came since
+its training began, is stored, and then replaces the previous version; or it is dropped.
+`learner.Learner` takes it through these steps, either all at once or one short step between two
+cycles.
 """
 
 from __future__ import annotations
@@ -67,9 +69,11 @@ class Candidate:
         self._seconds = clock() - trained.begin
 
     def catch_up(self, window: TrainingWindow, seconds: float = np.inf) -> bool:
-        """Make labels that came since the training references, for at most so many seconds.
+        """Make references of the window's labels that came since the training, oldest first.
 
-        Returns whether the candidate has all labels of the window now.
+        It stops between two labels once `seconds` have passed by the clock; the time is added to
+        the report. A label that the model cannot take is logged and skipped. Returns True when no
+        label is left, and always where there is no model.
         """
         if self.model is None:
             return True
@@ -87,15 +91,17 @@ class Candidate:
         return not missing
 
     def lose_patience(self) -> bool:
-        """Count a step of waiting for the labels' numbers; returns whether there were too many."""
+        """Count a step of waiting for label numbers; return True from the `PATIENCE`-th step on."""
         self._patience -= 1
         return self._patience <= 0
 
     def accept(self, version: int, corrected_to: int) -> RetrainReport:
-        """Complete the report, and where there is a model, accept it as the version of this number.
+        """Complete the report, and mark the version as accepted if the training gave a model.
 
-        `corrected_to` is the newest correction that its labels had. Returns the report, which the
-        store keeps.
+        The report gets the seconds of work so far. With a model it also gets `version` as its
+        number, and `trained_on` is set, with `corrected_to` as the number of the newest correction
+        that the labels had. Without one the report stays that of a dropped retrain. Returns the
+        report, which the caller stores.
         """
         self.report = replace(self.report, seconds=self._seconds)  # storing it comes on top
         if self.model is not None:
@@ -104,19 +110,23 @@ class Candidate:
         return self.report
 
     def begin_storing(self, storing: Future[int], seconds: float) -> None:
-        """Note that the version's commit has begun, and how many seconds it may take to begin."""
+        """Keep the future of the version's commit, and give it `seconds` from now to begin."""
         self.storing = storing
         self._store_until = time.monotonic() + seconds
 
     def may_go_on_storing(self) -> bool:
-        """Return whether the commit is under way, or has time left to begin."""
+        """Return whether the commit may be waited for.
+
+        True while it runs, and while it is queued and its seconds to begin have not passed. False
+        before `begin_storing` and once the commit is done.
+        """
         storing = self.storing
         if storing is None or storing.done():
             return False
         return storing.running() or time.monotonic() < self._store_until
 
     def number(self, version: int) -> None:
-        """Take the number that the store gave the version; 0 keeps the number that it has.
+        """Set the report's version to the number that the store gave; 0 changes nothing.
 
         The two differ where a peer's version was stored first.
         """

@@ -1,4 +1,5 @@
-"""The inside of `DataEngine`: composes its objects, and takes decisions and reports through them.
+"""`EngineCore`, the inside of `DataEngine`: it makes the engine's objects, and calls them in order
+for each decision, each report and each retrain.
 
 `DataEngine` is the public face of `EngineCore`. `dengine serve` uses the core itself, by
 `engine.core_of`, for what only a server needs: a decision that must not wait, one that came too
@@ -46,10 +47,10 @@ log = logging.getLogger("dengine")
 
 
 class ExclusiveUse:
-    """A block that one thread enters at a time, and that SIGINT does not interrupt.
+    """A reentrant block that one thread enters at a time, and that SIGINT does not interrupt.
 
-    Another thread gets a StoreError. A SIGINT that comes meanwhile is handled when the block ends,
-    so that a label is stored and counted, or neither.
+    Entering it while another thread is inside raises StoreError at once. A SIGINT that comes
+    meanwhile is handled when the block ends, so that a label is stored and counted, or neither.
     """
 
     def __init__(self) -> None:
@@ -76,7 +77,9 @@ class ExclusiveUse:
         self._handlers.append(handler)
 
     def _delay(self, number: int, frame: FrameType | None) -> None:
-        """Keep a signal for the end of the block."""
+        """Remember a SIGINT; `__exit__` passes the first to the handler that was set before the
+        block.
+        """
         self._delayed.append((number, frame))
 
     def __exit__(self, *exception: object) -> None:
@@ -163,7 +166,11 @@ class EngineCore:
             threading.Thread(target=template.warm_up, name="dengine-warm-up").start()
 
     def resume(self) -> None:
-        """Go on from the store, with the same version and the same decisions, bit for bit."""
+        """Restore what a used store holds: version, references, rule, labels and pending checks.
+
+        The engine then decides bit for bit as before it was closed. It is called once, before the
+        first decision, and waits for the store without a time limit.
+        """
         settings = self.settings.now
         self.learner.resume(settings.recipe.policy.label_within, settings.policy_since)
         self.feedback.resume()
@@ -177,10 +184,15 @@ class EngineCore:
         decision_id: str | None = None,
         timed_out: bool = False,
     ) -> Decision:
-        """Decide on one trace and record the decision.
+        """Decide on one trace, record the decision and return it.
 
         Arguments, result and errors are those of `DataEngine.decide`. With `timed_out` the caller
-        waits no more and verifies, so the decision is VERIFY, `Reason.LATE`.
+        has given up waiting and verifies the part, so the decision is VERIFY, `Reason.LATE`; a
+        fault of the trace, or of the store, is the reason instead. Before it decides, the call
+        takes a short step with a version that the executor has trained, and counts an earlier
+        accepted part without a report as confirmed or unobserved. Afterwards it announces a safe
+        mode that began or ended. An id that has a decision already gets it back, and nothing else
+        happens.
         """
         self.outbox.check_usable()
         with self.exclusive:
@@ -202,11 +214,15 @@ class EngineCore:
         return stored.decision
 
     def try_decide(self, trace: ArrayLike, part: str | int | None = None) -> Decision | None:
-        """Decide as `decide` does where that waits for nothing; else do nothing and return None.
+        """Decide as `decide` without an id, but only where nothing has to be waited for; else
+        return None.
 
-        It may be called in any thread while no other uses the engine. It waits for neither store
-        nor disk, and runs no code of the user's, nor umap-learn's. `process_retrains` later swaps
-        versions and announces safe mode.
+        None changes nothing. It is returned where the outbox is locked, before the first trace,
+        while settings are unsaved or the rule must be rebuilt, and where the model is a baseline,
+        uses classes of the user's, or is not compiled. The decision is recorded in memory and goes
+        to the disk later. Any thread may call it while no other uses the engine; else it raises
+        StoreError. It leaves swapping versions and announcing safe mode to `process_retrains`.
+        Other errors as of `decide`.
         """
         self.outbox.check_usable()
         with self.outbox.try_lock() as is_free, self.exclusive:
@@ -226,11 +242,14 @@ class EngineCore:
     def record_timeout(
         self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str
     ) -> Decision:
-        """Record VERIFY, `Reason.LATE`, for a caller that timed out, without asking the model.
+        """Record VERIFY, `Reason.LATE`, for a caller that gave up waiting, without asking the
+        model.
 
-        It may be called in any thread. The decision is on disk when this returns, and an id that
-        has a decision keeps it. With a store in memory, and before the first trace, it is returned
-        unrecorded: `decide` must record it, with `timed_out`. Errors as of `DataEngine.decide`.
+        Returns the recorded decision, after waiting for the disk within the store's time limit; an
+        id that has a decision already gets that one. It may be called in any thread, also during
+        another call. With a store in memory, before the first trace, and where the id cannot be
+        looked up, a VERIFY is returned that is not recorded; in the first two cases `decide` must
+        record it, with `timed_out`. Errors as of `DataEngine.decide`.
         """
         self.outbox.check_usable()
         id_ = as_id(decision_id)
@@ -258,9 +277,14 @@ class EngineCore:
         timed_out: bool = False,
         decision_id: str | None = None,
     ) -> StoredDecision:
-        """Decide on a trace and hand the decision to the outbox, without waiting.
+        """Decide on a trace and hand the decision to the outbox, without waiting until it is on
+        disk.
 
-        Returns it with its number.
+        Before that, labels that the store has numbered enter the training window, and accepted
+        parts without a report count as confirmed or unobserved. The decision is VERIFY where
+        `timed_out` (`Reason.LATE`) and where the store is damaged or cannot be written
+        (`Reason.NO_STORE`). Returns the record with its number, 0 where it could not be recorded.
+        Raises TraceError for a wrong shape.
         """
         x = self._check_trace(trace)
         self.learner.catch_up()
@@ -273,9 +297,10 @@ class EngineCore:
         return self.outbox.record_decision(item)
 
     def _sync_decision(self, stored: StoredDecision) -> StoredDecision:
-        """Wait until a decision is on disk; one that cannot be written becomes VERIFY.
+        """Wait until a decision is on disk, and return the record that counts.
 
-        Returns the one that counts.
+        Where the disk does not answer in time, an ACCEPT or REJECT is replaced in the outbox by
+        VERIFY, `Reason.NO_STORE`, unless it has reached the disk by then. A VERIFY stays as it is.
         """
         try:
             self.outbox.sync()
@@ -296,9 +321,10 @@ class EngineCore:
         return stored
 
     def _verify_unrecorded(self, decision_id: str, part: str | None, error: StoreError) -> Decision:
-        """Return VERIFY for an id that may have a decision which cannot be looked up.
+        """Return VERIFY, `Reason.NO_STORE`, for an id that cannot be looked up, and log a warning.
 
-        Nothing is recorded.
+        The id may have a decision already, so nothing is recorded. `error` says why the look-up
+        failed.
         """
         log.warning(
             "whether %r was decided before cannot be looked up; it is verified: %s",
@@ -310,10 +336,12 @@ class EngineCore:
     # The contract of traces
 
     def set_trace_spec(self, spec: TraceSpec, inferred: bool = False) -> TraceSpec:
-        """Set the trace contract, in the store as well, where none is set; return the one in force.
+        """Set the trace contract (shape, rate and unit of all traces) and return the one in force.
 
-        A contract that peers of the product have set comes before `spec`. `inferred` says that
-        `spec` comes from a first trace.
+        One that is set already stays and is returned. Where the cell shares a product with others,
+        a contract that these have set is taken in place of `spec`. `inferred` says that `spec`
+        comes from a first trace. The settings are saved in the store; where that fails, they are
+        saved with a later trace.
         """
         if self.settings.now.trace is not None:
             return self.settings.now.trace
@@ -328,9 +356,13 @@ class EngineCore:
         return spec
 
     def _check_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
-        """Return a trace as float32, shape (channels, samples), held to the contract.
+        """Return a trace as float32, shape (channels, samples), converted as the trace contract
+        demands.
 
-        A first sound trace sets the contract. Raises TraceError where the shape is wrong.
+        Where none is set, the first trace without a fault sets it. That trace also starts what an
+        untrained model can compute in advance. Settings that could not be saved before are saved.
+        Raises TraceError for a wrong shape; a trace with NaN, or another fault, is returned like
+        any other.
         """
         settings = self.settings.now
         has_learned = self.live.version + self.learner.labels.new_labels > 0
@@ -352,9 +384,12 @@ class EngineCore:
     def report(
         self, decision_id: str, success: bool, trace: ArrayLike | None, part: str | int | None
     ) -> RetrainReport | None:
-        """Learn the outcome of a decision.
+        """Learn the outcome of a decision; return the report of a retrain that it set off here, or
+        None.
 
-        Arguments, result and errors are those of `DataEngine.report`.
+        Arguments, result and errors are those of `DataEngine.report`. It returns when the label is
+        on disk, and after a retrain in this thread, if one was due. The label of a trace with a
+        fault is stored, and sets off no retrain.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)
@@ -372,9 +407,10 @@ class EngineCore:
     def _record_lost_accept(
         self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any
     ) -> StoredDecision:
-        """Record the accept behind a line stop whose decision was lost.
+        """Record an ACCEPT under this id for a line stop whose decision was lost, and return the
+        record.
 
-        Raises UnknownDecisionError without its trace.
+        Raises UnknownDecisionError, and records nothing, without the trace and for a success.
         """
         if trace is None or success:
             raise UnknownDecisionError(
@@ -389,24 +425,26 @@ class EngineCore:
         return stored
 
     def retrain(self) -> RetrainReport:
-        """Retrain in line, as `DataEngine.retrain`."""
+        """Retrain in this thread and return the report, as `DataEngine.retrain`."""
         self.outbox.check_usable()
         with self.exclusive:
             return self.learner.retrain()
 
     def start_retrain(self) -> RetrainReport | None:
-        """Begin to retrain in the executor and return None; without one, retrain in line.
+        """Begin to retrain in the executor and return None, also while a retrain is under way.
 
-        Returns the report of a retrain in line.
+        Without an executor that takes work, retrain in this thread and return the report. Raises
+        StoreError where the labels before it cannot be stored.
         """
         return self.learner.start_retrain()
 
     def process_retrains(self, brief: bool = False) -> RetrainReport | None:
         """Do between two parts what is due: swap in a trained version, retrain, announce safe mode.
 
-        With `brief` a version that an executor has trained comes one step further, a few
-        milliseconds, and not to the end. Returns the report of the newest retrain, once; None
-        without one.
+        A version that the executor has trained is brought to its end, so that it answers or is
+        dropped; with `brief` it comes only one step further, a few milliseconds. A retrain that is
+        due begins in the executor, or without one runs here. Returns the report of the newest
+        finished retrain, once; None if there is none that was not returned before.
         """
         with self.exclusive:
             self.learner.collect(to_the_end=not brief)
@@ -417,26 +455,30 @@ class EngineCore:
     # The store
 
     def load_decision_ids(self) -> None:
-        """Load the ids of all decisions, so that `decide` need not look up a new id in the store.
+        """Flush, then load the ids of all decisions, so that `decide` need not look up a new id in
+        the store.
 
-        It takes a second for a million decisions.
+        It takes a second for a million decisions. Raises NotTakenError as `flush`.
         """
         self.flush()
         self.outbox.load_ids()
 
     def flush(self, wait: float | None = None) -> None:
-        """Return when everything is on disk.
+        """Wait until everything recorded is on disk, and in the store if that answers in time.
 
-        Raises NotTakenError after `wait` seconds, None: the store's own limit.
+        Labels of silently confirmed parts, which wait in memory, are recorded first. Afterwards
+        labels that the store has numbered are in the training window. Raises NotTakenError after
+        `wait` seconds; None: the store's own limit.
         """
         self.feedback.store_pending()
         self.outbox.flush(wait)
         self.learner.catch_up()
 
     def close(self) -> None:
-        """Bring in a retrain under way, write everything, and close the store.
+        """Finish or give up a retrain under way within `CLOSE_SECONDS`, write everything, close the
+        store.
 
-        A second call does nothing.
+        A second call does nothing. Errors as of `DataEngine.close`.
         """
         with self.exclusive:
             if self.outbox.is_usable:
@@ -445,10 +487,10 @@ class EngineCore:
             self.outbox.close()
 
     def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """Return the decision as an exporter takes it; `trace` is another contract of traces.
+        """Return the newest model with its settings, as an exporter takes it.
 
-        Raises ExportError before the first retrain, for a baseline, and where the store was changed
-        from outside.
+        `trace` replaces the trace contract in force. Raises ExportError before the first retrain,
+        for a baseline, and where the store was changed from outside.
         """
         if self.outbox.integrity_error:
             error = self.outbox.integrity_error
@@ -499,7 +541,11 @@ class EngineCore:
         return retrain_fault(self.learner.dropped, self.live.version)
 
     def complete_status(self, status: Status) -> Status:
-        """Return a status read from the store, completed with what only the engine knows."""
+        """Return a copy of a status read from the store, with what only the engine knows put in.
+
+        That is version, shadow and safe mode, new labels, fault and lag of the store, and whether a
+        retrain is under way.
+        """
         return replace(
             status,
             version=self.live.version,

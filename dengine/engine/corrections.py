@@ -1,4 +1,5 @@
-"""What people put right: a wrong label, labels to forget, a version to go back to, another policy.
+"""`Corrections`: with it people correct a label, forget labels, go back to an earlier version, or
+set another policy.
 
     engine.correct(decision.id, success=False, author="kim")
     engine.rollback(3)
@@ -43,7 +44,7 @@ LABEL_TEXTS = {True: "success", False: "failure"}
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """What a verb that puts something right did.
+    """What `correct`, `forget`, `rollback` or `set_policy` did.
 
     Attributes
     ----------
@@ -64,7 +65,10 @@ class Changed:
 
 
 class Corrections:
-    """Puts things right in a store, and in what an engine has learned.
+    """Carries out corrections in the store and in what the engine has learned.
+
+    Every verb first finishes what is under way: a retrain, labels on their way to the store, news
+    of peers. So it blocks, and raises StoreError where the store does not answer.
 
     Parameters
     ----------
@@ -79,14 +83,14 @@ class Corrections:
         """Correct a wrong label, or let a forgotten one count again, from the next decision on.
 
         References, the next retrain, the rule and the certificate take the label as corrected; the
-        fold of its trace stays. A baseline, which cannot take a label back, is trained anew at
-        once. The label as it was reported stays in the store.
+        fold of its trace stays. A baseline, which cannot take a label back, is retrained before
+        this returns. The label as it was reported stays in the store.
 
         Parameters
         ----------
         decision_id : str
         success : bool
-            The right label. The label that counts already changes nothing.
+            The right label. If it counts so already, nothing changes.
         author : str
             Who says so, for the record.
 
@@ -98,6 +102,8 @@ class Corrections:
         ------
         ReportError
             For an unknown decision, and for one without a label.
+        StoreError
+            Where the store does not answer.
         """
         label = as_success(success)
         (stored,) = self._find_labelled([decision_id])
@@ -111,17 +117,17 @@ class Corrections:
         return self._change_labels(Change("correct", text, data, author, (id_,), label))
 
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
-        """Leave labels out of all that is learned and counted, from the next decision on; `correct`
-        brings one back.
+        """Leave labels out of all that is learned and counted, from the next decision on.
 
-        Traces, and labels as they were reported, stay in the store; the version that was trained
-        with them goes on until the next retrain. A guarantee assumes that the choice of what is
-        forgotten does not depend on the label. The certificate counts a forgotten outcome of a
-        certain decision as wrong, so that forgetting earns nothing.
+        `correct` brings one back. Traces, and labels as they were reported, stay in the store; the
+        version that was trained with them goes on until the next retrain. A guarantee assumes that
+        the choice of what is forgotten does not depend on the label. The certificate counts a
+        forgotten outcome of a certain decision as wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
         *decision_ids : str
+            Labels among them that are forgotten already are left as they are.
         author, reason : str
             For the record.
 
@@ -132,7 +138,10 @@ class Corrections:
         Raises
         ------
         ReportError
-            For an unknown decision, and for one without a label; then none is forgotten.
+            For an unknown decision, for one without a label, and for no id at all; then none is
+            forgotten.
+        StoreError
+            Where the store does not answer.
         """
         if not decision_ids:
             raise ReportError(
@@ -151,8 +160,7 @@ class Corrections:
         return self._change_labels(Change("forget", text, data, author, tuple(labels), None))
 
     def rollback(self, version: int, author: str = "") -> Changed:
-        """Let an earlier version answer again, as a new version, so that the history goes on in one
-        line.
+        """Let an earlier version answer again, stored as a new version with a new number.
 
         Labels that came since are among its references, corrections count, and the rule in force
         goes on. The next retrain starts from this version. A reducer that is stored by its traces
@@ -162,6 +170,7 @@ class Corrections:
         Parameters
         ----------
         version : int
+            The version that answers now changes nothing.
         author : str
             For the record.
 
@@ -171,8 +180,11 @@ class Corrections:
 
         Raises
         ------
+        SettingError
+            For what is no whole number.
         StoreError
-            For a version that is not kept; it names those that are.
+            For a version that is not kept (it names those that are), for damaged traces, and where
+            the store does not answer.
         """
         if isinstance(version, bool) or not isinstance(version, int | np.integer):
             raise SettingError(
@@ -192,13 +204,15 @@ class Corrections:
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on.
 
-        Every earlier one keeps the bounds that it was decided by.
+        The policy is stored, and the model goes on under it as a new version. Every earlier version
+        keeps the bounds that it decided by.
 
-        Where anything but the audit rate changes, and under "pooled" and "cost" where that does
-        too, the rule starts anew, and is updated with decisions from now on only: alpha was not
-        spent on a tolerance that was chosen after the data was seen, and the old bounds are of
-        another scale. `certificate` speaks of decisions since this change; whoever may choose among
-        the certificates of m policies errs with probability up to m alpha.
+        Where alpha, lower_bound, interval, guarantee, stops or prices change, and under "pooled"
+        and "cost" with stops="some" where the audit rate does too, the rule starts anew. It is then
+        updated with decisions from now on only: alpha was not spent on a tolerance that was chosen
+        after the data was seen, and the old bounds are of another scale. `certificate` speaks of
+        decisions since any change of the policy; whoever may choose among the certificates of m
+        policies errs with probability up to m alpha.
 
         A safe mode goes on, where the new rule has one, until fresh evidence ends it. A part that
         was accepted before, and was not reported, stays unobserved. In the shadow mode,
@@ -209,6 +223,7 @@ class Corrections:
         Parameters
         ----------
         policy : Policy
+            The whole policy; one equal to that in force changes nothing.
         author : str
             For the record.
 
@@ -222,6 +237,8 @@ class Corrections:
             For what is no policy, for force limits that the traces cannot hold, and, of a model
             that was handed in, for anything but audit_rate, stops, label_within, windows and
             shadow.
+        StoreError
+            Where the store does not answer.
         """
         example = "for example Policy(alpha=0.05, lower_bound=0.95)"
         expect(isinstance(policy, Policy), "a Policy", policy, example)
@@ -263,16 +280,19 @@ class Corrections:
         return self._done(event, "the rule of the new policy has no safe mode")
 
     def _make_ready(self) -> None:
-        """Bring in all that is under way, because a correction comes after everything that was
-        known before it.
+        """Finish what is under way: a retrain, labels on their way to the store, news of peers.
+
+        A correction comes after everything that was known before it. Raises StoreError where the
+        engine is closed or the store does not answer.
         """
         self._core.outbox.check_usable()
         self._core.learner.make_ready()
 
     def _find_labelled(self, decision_ids: Sequence[Any]) -> list[StoredDecision]:
-        """Return decisions that have labels.
+        """Finish what is under way, then return the decisions of these ids, in their order.
 
-        Raises ReportError for an unknown id, and for a decision without a label.
+        A decision whose label was forgotten has `success` None. Raises ReportError for an unknown
+        id, and for a decision that never had a label.
         """
         self._make_ready()
         decisions = []
@@ -286,7 +306,10 @@ class Corrections:
         return decisions
 
     def _change_labels(self, change: Change) -> Changed:
-        """Store a change of labels, learn it, and return what was done."""
+        """Store a change of labels, and apply it to references, training window and rule.
+
+        A model that cannot change its references is retrained. Returns what was done.
+        """
         self._store.apply_change(change)
         for id_ in change.decisions:
             self._core.outbox.evict_decision(id_)
@@ -296,15 +319,17 @@ class Corrections:
     def _done(
         self, change: Change, reason_ended: str = "the corrected outcomes keep the tolerance"
     ) -> Changed:
-        """Announce a safe mode that the change began or ended, for this reason, and return what was
-        done.
+        """Announce a safe mode that the change began or ended, and return what the change did.
+
+        `reason_ended` is recorded as the reason if a safe mode ended. The result names the newest
+        event of the store as the event of the change.
         """
         number = self._store.events(1)[0].number
         self._core.feedback.announce_safe_mode(reason_ended)
         return Changed(change.kind, _sentence(f"{change.text}."), number, self._core.live.version)
 
     def _unchanged(self, kind: str, text: str) -> Changed:
-        """Return that everything was as asked for already, so that no event was recorded."""
+        """Return a `Changed` for a request that was fulfilled already; no event is recorded."""
         return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._core.live.version)
 
 

@@ -1,7 +1,9 @@
-"""From a trace to a `StoredDecision`: the model's decision, an id, a version, a time.
+"""`DecisionMaker` turns a trace into a `StoredDecision`: the model's decision, an id, a version and
+a time.
 
-`EngineCore` owns one `DecisionMaker` and hands its results to the outbox. The helpers below it
-check what a caller passes: a part's number, and an id that was decided before.
+`EngineCore` owns one `DecisionMaker` and hands its results to the outbox. The functions below it
+check what a caller passes, a part's number and an id that was decided before, and make a VERIFY
+without a trace.
 """
 
 import logging
@@ -46,7 +48,7 @@ class DecisionMaker:
         self._count = count(1)
 
     def infer_trace_spec(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
-        """Infer the trace contract from a first trace.
+        """Infer the trace contract from a first trace, and decide by it while no contract is set.
 
         Parameters
         ----------
@@ -58,8 +60,13 @@ class DecisionMaker:
         Returns
         -------
         TraceSpec or None
-            None if the trace is faulty: then it is verified by a contract of its own, and the next
-            trace sets the contract.
+            None if the trace has a fault: then only this trace is decided by it, and the next one
+            sets the contract.
+
+        Raises
+        ------
+        TraceError
+            For a trace of fewer samples than a first trace must have.
         """
         spec, is_sound = infer_trace_spec(x, trace)
         self._first_conditions = DecisionConditions(spec)
@@ -74,7 +81,8 @@ class DecisionMaker:
         verify_reason: Reason | None = None,
         decision_id: str | None = None,
     ) -> StoredDecision:
-        """Decide on one trace; any thread may call it.
+        """Decide on one trace and return the record of it, which is not recorded yet; any thread
+        may call it.
 
         Parameters
         ----------
@@ -83,19 +91,22 @@ class DecisionMaker:
         part : str or None
             Number of the part.
         model : EngineModel or None
-            The model that answers; None before the first training.
+            The model that answers; None before the first training: then the decision is VERIFY,
+            `Reason.NO_MODEL`, unless a force limit rejects.
         version : int
-            Its number.
+            Number of the model's version.
         verify_reason : Reason, optional
-            Why the part is verified without asking the model.
+            Verify for this reason, without asking the model and without force limits; a fault of
+            the trace comes before it.
         decision_id : str, optional
             An id of the caller's; None: a new one.
 
         Returns
         -------
         StoredDecision
-            The record for the store. A model that raises, or returns impossible bounds, is logged,
-            and the decision is VERIFY with `Reason.MODEL_ERROR`.
+            The record for the store, with number 0. It is quarantined if the trace has a fault. A
+            model that raises, or returns impossible bounds, is logged, and the decision is VERIFY
+            with `Reason.MODEL_ERROR`.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         conditions = self._settings.conditions or self._first_conditions
@@ -141,9 +152,11 @@ class DecisionMaker:
     def lost_accept(
         self, x: NDArray[np.float32], part: str | None, version: int, decision_id: str
     ) -> StoredDecision:
-        """Make the record of a line stop whose decision was lost.
+        """Return the record of the ACCEPT behind a line stop whose decision was lost; nothing is
+        recorded.
 
-        Returns an accept without a check, with this id, and with no evidence: the bound is (0, 1).
+        The decision has this id, `Reason.CERTAIN`, and no evidence: no labels and the bound (0, 1).
+        Its propensity is the present audit rate.
         """
         stored = self.decide(x, part, None, version, None, decision_id)
         decision = replace(
@@ -157,18 +170,20 @@ class DecisionMaker:
 
 
 def _verify(x: NDArray[np.float32], conditions: DecisionConditions, reason: Reason) -> Verdict:
-    """Decide without a model: faults and force limits count, else the part is verified."""
+    """Decide without a model: VERIFY for `reason`, unless a fault or a force limit decides."""
     verdict: Verdict = decider_without_model(conditions, reason)(torch.from_numpy(x))
     return verdict
 
 
 def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
-    """Return the decision that an id has already.
+    """Return the decision of a record, if `trace` is the trace that it was made on.
 
     Raises
     ------
     TraceConflictError
-        If it was made on another trace.
+        For another trace.
+    TraceError
+        For a trace that the contract `spec` does not allow.
     """
     x = convert_trace(trace, spec, False)
     if not np.array_equal(x, stored.trace, equal_nan=True):
@@ -178,7 +193,10 @@ def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None)
 
 
 def verify_decision(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
-    """Return a VERIFY decision for which neither model nor trace was looked at."""
+    """Return a VERIFY decision for which neither model nor trace was looked at.
+
+    It has no labels, the bound (0, 1), no embedding and propensity 1; nothing is recorded.
+    """
     return Decision(
         id=decision_id,
         action=Action.VERIFY,
@@ -202,7 +220,7 @@ def as_part(part: Any) -> str | None:
     Raises
     ------
     TraceError
-        If it is neither a text that prints nor a whole number, or too long.
+        For anything but a whole number or a text of 1 to `LONGEST` printable characters.
     """
     if part is None:
         return None

@@ -89,7 +89,9 @@ def frozen_objects() -> Iterator[None]:
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Switch Python's garbage collector off until the block ends."""
+    """Switch Python's garbage collector off until the block ends, then on again if it was on
+    before.
+    """
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -108,7 +110,10 @@ def core_of(engine: DataEngine) -> EngineCore:
 
 
 def _close_forgotten(outbox: Outbox) -> None:
-    """Write what a program left behind that did not close its engine; an error is logged."""
+    """Close the outbox of an engine that a program did not close; an error is logged.
+
+    It writes what was left, when the engine is garbage-collected or the program ends.
+    """
     try:
         outbox.close()
     except StoreError as error:
@@ -226,7 +231,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _start(
         self, settings: EngineSettings, template: EngineModel, store: SqlStore, **options: Any
     ) -> None:
-        """Compose the engine on an opened store; options as of `EngineCore`."""
+        """Compose the engine's objects on an opened store; options as of `EngineCore`.
+
+        It sets `store`, `seed` and `resumed`, and closes the engine when it is garbage-collected.
+        """
         self.store = store
         self.seed = settings.seed
         self.resumed = False
@@ -236,7 +244,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
-        """Close the store where the block raises."""
+        """Close the engine's store where the block raises, and raise the error again."""
         try:
             yield
         except BaseException:
@@ -278,9 +286,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         StoreError
-            Where the store is not used, or another engine owns the cell.
+            Where the store does not exist or is not used, or another engine owns the cell.
         SettingError
-            Where an object is missing.
+            Where an object is missing, not needed, or another than before.
         ImportRefusedError
             A SettingError, where a class would have to be imported that is not allowed.
         """
@@ -315,19 +323,22 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         wait, allow_import
             As for `open`; a class that the settings name is allowed.
         **settings
-            As `DataEngine` takes them. The stored ones that are given must be those in force: the
-            settings of a running cell do not change in silence. `model`, `executor`, `clock`,
-            `replaying` and `on_safe_mode` are not stored and taken as they are. A new cell of a
-            product takes what is left open from its peers.
+            As `DataEngine` takes them. For a used store those that are given must be those in
+            force: the settings of a running cell do not change in silence. `model`, `executor`,
+            `clock`, `replaying` and `on_safe_mode` are not stored and taken as they are. A new cell
+            of a product takes what is left open from its peers.
 
         Returns
         -------
         DataEngine
+            Its `resumed` says whether the store was used.
 
         Raises
         ------
         SettingError
             Where a given setting is not the used store's.
+        StoreError, ImportRefusedError
+            As `open`.
         """
         with opening(store, wait=wait) as opened:
             allowed = allow_import or named_classes(**settings)
@@ -349,13 +360,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A second call does nothing. Raises StoreError where the journal did not take everything;
-        close again when the disk is well.
+        A retrain that takes longer is dropped. A second call does nothing. Raises StoreError where
+        the journal did not take everything; close again when the disk is well.
         """
         self._core.close()
 
     def flush(self, wait: float | None = None) -> None:
-        """Return when everything known so far is on disk.
+        """Wait until everything known so far is on disk, and in the store if that answers in time.
 
         Raises NotTakenError after `wait` seconds; None: the store's own limit.
         """
@@ -366,7 +377,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def decide(
         self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str | None = None
     ) -> Decision:
-        """Decide on one trace.
+        """Decide on one trace, and record the decision.
 
         Parameters
         ----------
@@ -387,10 +398,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         TraceError
-            For a wrong shape, a first trace of less than 10 samples, and an id that belongs to
-            another trace.
+            For a wrong shape, a first trace of less than 10 samples, an id that belongs to another
+            trace, and a part's number that is none.
         ReportError
             For an id that is no id.
+        StoreError
+            For an engine that is closed, was opened for reading, or is in use by another thread.
         """
         return self._core.decide(trace, part, decision_id)
 
@@ -431,17 +444,22 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Drive a cell, and yield a record of each cycle as it happens.
 
-        Python's garbage collector works between decisions, and after a hundred cycles only on newer
-        objects (`gc.freeze`). What the cell raises propagates, after everything known is written.
+        In each cycle the cell inserts a part, the engine decides, and the cell verifies it, lets it
+        go on or rejects it; a known outcome is reported, and retrains happen between cycles. When
+        the iteration ends, also by an error of the cell, everything known is written. Python's
+        garbage collector works between decisions, and after a hundred cycles only on newer objects
+        (`gc.freeze`).
 
         Parameters
         ----------
         cell : Cell
         cycles : int
+            Number of parts.
 
         Returns
         -------
         iterator of Cycle
+            The first part is inserted with its first `next`.
 
         Raises
         ------
@@ -452,7 +470,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._run(cell, cycles)
 
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
-        """Yield a record of each cycle, and flush at the end, however it comes."""
+        """Yield a record of each cycle; at the end, also after an error, write everything to disk.
+
+        After `WARM_UP` cycles the garbage collector ignores the objects that exist then.
+        """
         with ExitStack() as ending:
             ending.callback(self.flush, LONG_WAIT if self.store.wait is not None else None)
             for index in range(cycles):
@@ -461,9 +482,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 yield self._cycle(cell, index)
 
     def _cycle(self, cell: Cell, index: int) -> Cycle:
-        """Insert one part, decide, do what the decision says, and report its outcome.
+        """Have the cell insert one part, decide, do what the decision says, and report its outcome.
 
-        Returns the record of it.
+        An ACCEPT of which the cell learns nothing is not reported, nor is a REJECT. A label that
+        cannot be written is logged and waits. A retrain that is due is begun or done. Returns the
+        record of the cycle; `seconds` is the duration of the decision alone.
         """
         trace = cell.insert()
         with uncollected():
@@ -495,9 +518,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     # Learning
 
     def retrain(self) -> RetrainReport:
-        """Retrain now, in line.
+        """Retrain now, in this thread, and return the report.
 
-        A version that fails, or cannot be stored, is dropped and recorded.
+        A version that fails, or cannot be stored, is dropped and recorded; the report has
+        `accepted` False then. Raises StoreError where the labels before it cannot be stored.
         """
         return self._core.retrain()
 
@@ -532,9 +556,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self.set_policy(replace(self.policy, shadow=on), author)
 
     def certificate(self) -> Certificate:
-        """Return bounds, at confidence 1 - alpha, on the errors of unchecked decisions.
+        """Flush, and return bounds, at confidence 1 - alpha, on the errors of unchecked decisions.
 
-        Decisions since the last change of policy count.
+        Decisions since the last change of policy count. Raises NotTakenError as `flush`.
         """
         self.flush()
         policy = self.policy
@@ -556,9 +580,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def model(self) -> Any:
-        """The model that answers, a baseline as its author knows it.
-
-        Returns None before the first retrain.
+        """The model that answers (of a baseline, the user's own object); None before a first
+        retrain.
         """
         answering = self._core.live.answering
         return None if answering is None else answering.user_model
@@ -574,14 +597,17 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._core.live.newest.safe_mode
 
     def find(self, decision_id: str) -> StoredDecision | None:
-        """Return a decision with its trace, and with its label where it has one.
+        """Return a decision with its trace, and with its label where it has one; None for an
+        unknown id.
 
-        Returns None for an unknown id.
+        Raises StoreError where the id cannot be looked up, and ReportError for what is no id.
         """
         return self._core.outbox.find_decision(as_id(decision_id))
 
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Return how the engine is doing; arguments and errors as of `history.status.status`."""
+        """Flush, and return how the engine is doing; arguments and errors as of
+        `history.status.status`.
+        """
         self.flush()
         return self._core.complete_status(status(self.store, last, watching))
 

@@ -1,4 +1,5 @@
-"""Collects the outcomes of decided parts and turns them into stored labels.
+"""`Feedback` collects the outcomes of decided parts: it updates the decision rule and the
+references with them, and turns them into stored labels.
 
 With `Policy(stops="all")` a bad part stops the system before the next decision, so the next
 decision confirms an accepted part: the rule is updated, the trace becomes a reference, and its
@@ -99,7 +100,12 @@ class Feedback:
         return self._settings.now.recipe.policy.stops == "all"
 
     def resume(self) -> None:
-        """Read from the store which checks are pending, and which accepts have no outcome."""
+        """Restore from the store which checks are pending, and which accepted parts have no
+        outcome.
+
+        With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
+        "some" they are only counted, as unobserved since the last label.
+        """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
         for stored in store.pending_decisions(self._settings.now.evidence.since):
@@ -116,7 +122,11 @@ class Feedback:
                 self._unreported[id_] = accepted
 
     def record_decision(self, stored: StoredDecision) -> None:
-        """Note a decision with a pending outcome; record an event if nearly all are novel."""
+        """Note a new decision: VERIFY as a pending check, ACCEPT as a part without an outcome.
+
+        The rule is updated with checks that have become overdue. When nearly all recent decisions
+        are `Reason.NOVEL`, an event is recorded, once until their share has fallen to one half.
+        """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
             self._awaiting_check[decision.id] = stored
@@ -132,9 +142,12 @@ class Feedback:
         self._novelty_reported = self._novel_share > limit
 
     def confirm_silent(self) -> None:
-        """Count accepted parts without an outcome as confirmed, or as unobserved.
+        """Count accepted parts without an outcome as confirmed, or as unobserved; the next trace
+        has come.
 
-        It is called when the next trace has come.
+        With `stops="all"` each is a success: rule and references learn it, and its label,
+        CONFIRMED, waits in memory; `MOST_CONFIRMED` of them are handed to the outbox. With "some"
+        the parts are only counted, and nothing is learned.
         """
         if not self._unreported:
             return
@@ -148,11 +161,12 @@ class Feedback:
             self.store_pending()
 
     def take_in(self, stored: StoredDecision, success: bool) -> bool:
-        """Learn a reported label and hand it to the outbox.
+        """Learn a reported label and hand it to the outbox, without waiting for the disk.
 
-        A report that is repeated before it is known to be on disk does nothing. Returns whether
-        silence had confirmed the part before this report. Raises ReportError if the store has a
-        label of the decision, except that a line stop may follow a confirmation.
+        The same report once more, before `note_synced`, does nothing and returns False. Returns
+        whether silence had confirmed the part before this report, whatever its label is now. Raises
+        ReportError if the store has a label of the decision, except that a line stop may follow a
+        confirmation.
         """
         id_ = stored.decision.id
         was_confirmed = False
@@ -162,14 +176,19 @@ class Feedback:
         return was_confirmed
 
     def note_synced(self, decision_id: str) -> None:
-        """Note that the reported label of this decision is on disk."""
+        """Note that the reported label of this decision is on disk; the same report is no
+        repetition now.
+        """
         del self._unsynced[decision_id]
 
     def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
-        """Learn a label and hand it to the outbox; set `remedy` if the rule must be mended.
+        """Learn a label that is no repetition and hand it to the outbox, after labels that wait.
 
-        Returns whether silence had confirmed the part before, whatever the label is now. Raises
-        ReportError as `take_in`.
+        A confirmation by silence is taken back first. If its label went to the outbox before, only
+        the new label goes there too, and `remedy` is set to CORRECT. Otherwise its reference is
+        removed, and `remedy` is set to REBUILD_RULE, as for a check that was counted as overdue.
+        Returns whether there was such a confirmation, whatever the label is now. Raises ReportError
+        as `take_in`.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -197,12 +216,12 @@ class Feedback:
         return was_confirmed
 
     def _learn(self, stored: StoredDecision, success: bool, source: Source) -> NewLabel:
-        """Update the rule and the references with the outcome of a part.
+        """Update the rule and the references with the outcome of a part; return its label for the
+        store.
 
-        Returns its label for the store.
-
-        The rule is not updated with a rejected part: which of them come back is somebody's choice,
-        and no sample.
+        A trace with a fault teaches neither. A rejected part that was inspected does not update the
+        rule: which of them are inspected is somebody's choice, and no sample. Any other outcome
+        sets the count of unobserved parts back to zero.
         """
         decision = stored.decision
         version = self._live.version
@@ -222,7 +241,11 @@ class Feedback:
         return NewLabel(decision.id, success, source, version, point, silent, overdue_to=overdue_to)
 
     def _was_unobserved(self, stored: StoredDecision) -> bool:
-        """Return whether a part was counted among the unobserved before its label came."""
+        """Return whether this part is one of those counted as unobserved.
+
+        It is, if it was accepted under the present policy with stops="some", and went on without an
+        outcome until now.
+        """
         decision = stored.decision
         if decision.action is not Action.ACCEPT or self._stops_all:
             return False
@@ -230,9 +253,10 @@ class Feedback:
         return decision.id not in self._unreported and is_of_policy
 
     def store_pending(self) -> bool:
-        """Hand the labels of confirmed parts to the outbox, without waiting.
+        """Hand the labels of silently confirmed parts to the outbox, without waiting.
 
-        Returns whether there were any.
+        Returns False if there were none. Labels that the store has numbered by now enter the
+        window.
         """
         if not self._pending:
             return False
@@ -242,7 +266,11 @@ class Feedback:
         return True
 
     def number_labels(self) -> None:
-        """Add labels that the store has numbered to the window, and count overdue checks."""
+        """Add labels that the store has newly numbered to the training window.
+
+        Their references get the same numbers. The rule is updated with checks that have become
+        overdue.
+        """
         self._count_overdue()
         for id_, seq in self._outbox.pop_label_numbers():
             learned = self._live.assign_number(id_, seq)
@@ -251,7 +279,9 @@ class Feedback:
                 self._labels.add(stored.trace, int(success), stored.content_hash, seq)
 
     def _count_overdue(self) -> None:
-        """Update the rule as if decisions whose check was not reported in time were wrong."""
+        """Update the rule with checks that were not reported within `label_within` decisions, as
+        errors.
+        """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within
         pending = self._awaiting_check
@@ -276,10 +306,11 @@ class Feedback:
         self._unobserved = 0
 
     def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
-        """Record that a safe mode began or ended since the last call, and call `on_safe_mode`.
+        """Record an event and call `on_safe_mode` if a safe mode began or ended since the last
+        call.
 
-        It comes last in every cycle, because either may fail and must cost no label; a failure is
-        logged.
+        `reason_ended` is recorded when one ended. It comes last in every cycle, because either step
+        may fail and must cost no label; a failure is logged and not tried again.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

@@ -1,7 +1,9 @@
-"""What a cell takes in of its product: the labels of the other cells, and their newest version.
+"""`Peers`: reads from the store what the other cells of a product have learned: labels, and the
+newest version of the model.
 
-News is asked for between two cycles, never by `decide`. A cell whose connection is lost goes on
-with what it has. `learner.Learner` asks for news in the order that `Learner.take_in_news` shows.
+The cells of a product share one store. News is asked for between two cycles, never by `decide`. A
+cell whose connection is lost goes on with what it has. `learner.Learner` asks for news in the order
+that `Learner._take_in_news` shows.
 """
 
 from __future__ import annotations
@@ -72,9 +74,12 @@ class Peers:
         return self._clock() - self._asked >= NEWS_SECONDS
 
     def fetch_news(self) -> tuple[ProductNews, bool]:
-        """Return new labels of the product, at most `MOST`, and whether a peer's version is newer.
+        """Ask the store for what is new in the product.
 
-        Raises StoreError where the store gives no answer in time.
+        Returns the news, with at most `MOST` labels of all cells, this one included, and whether it
+        names a newer version than the one that answers; one that could not be taken over does not
+        count. Where there is something new, the store's integrity is checked. Raises StoreError
+        where the store gives no answer in time.
         """
         store = self._outbox.store
         newest = self._window.newest_seq
@@ -85,14 +90,17 @@ class Peers:
         return news, has_newer_version
 
     def fetch_version(self) -> ModelVersion | None:
-        """Return the newest version of the product.
+        """Return the newest version of the product with its state; None before the first.
 
         Raises StoreError where the store gives no answer in time.
         """
         return self._outbox.call_store(self._outbox.store.last_version)
 
     def note_loss(self, error: StoreError) -> None:
-        """Note that news cannot be had; it is logged once, and asked for again later."""
+        """Note that news cannot be had: set `is_lost`, and ask again after `NEWS_SECONDS`.
+
+        Only the first of several losses is logged.
+        """
         if not self.is_lost:
             product = self._outbox.store.product
             log.warning(
@@ -102,13 +110,15 @@ class Peers:
         self._asked = self._clock()
 
     def note_connection(self) -> None:
-        """Note that news was had; that it comes again is logged once."""
+        """Note that news was had: clear `is_lost`, and log it if it was set."""
         if self.is_lost:
             log.warning("news of product %s comes again", self._outbox.store.product)
         self.is_lost = False
 
     def take_in(self, news: ProductNews) -> None:
-        """Add the labels of the news to the window and the references, in their order."""
+        """Add the labels of the news to the window, in their order, and make peers' labels
+        references.
+        """
         labelled = news.labelled
         rows = zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True)
         for trace, label, hash_, seq in rows:
@@ -124,8 +134,8 @@ class Peers:
     def take_over(self, version: ModelVersion) -> None:
         """Let a peer's version answer, with every label since and this cell's own rule.
 
-        A version that cannot be restored is logged and left alone, and the version before goes on
-        answering.
+        Where it cannot be restored, that is logged and the present version goes on answering. It is
+        tried again with later news only if the store was the reason.
         """
         store = self._outbox.store
         trained_on = TrainedOn.from_state(version.state)

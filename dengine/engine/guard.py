@@ -1,4 +1,5 @@
-"""Guards an engine's calls of its model: an exception is logged and never reaches the cell.
+"""`GuardedModel`: calls of the engine's model in which an exception is logged and never reaches the
+cell.
 
 `live_model.LiveModel`, `resume` and the training make these calls. A prediction that fails is
 guarded where decisions are made, because its reason is recorded with the decision.
@@ -38,12 +39,15 @@ class GuardedModel:
         self.model = model
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute in advance what a training on traces (n, channels, samples) begins with."""
+        """Compute in advance, and keep in the model, what a training on traces begins with.
+
+        X has shape (n, channels, samples); `numbers` are their labels' sequence numbers.
+        """
         with logged_failure("computing in advance of a retrain failed"):
             self.model.precompute(X, numbers)
 
     def prepare(self, previous: EngineModel) -> None:
-        """Make the model ready to predict in place of the previous one.
+        """Give the model the previous one's rule, and make it ready to predict in its place.
 
         Where it fails, every prediction will fail.
         """
@@ -51,7 +55,7 @@ class GuardedModel:
             self.model.prepare(previous)
 
     def update_rule(self, *outcome: Any) -> None:
-        """Update the rule, arguments as of `EngineModel.update_rule`.
+        """Update the model's rule with an outcome, arguments as of `EngineModel.update_rule`.
 
         Where it fails, the model refuses to predict.
         """
@@ -69,9 +73,10 @@ class GuardedModel:
         embedding: Embedding | None = None,
         point: NDArray[Any] | None = None,
     ) -> Floats | None:
-        """Make a labelled trace a reference and return its point (d,).
+        """Make a labelled trace a reference and return its point, float32 of shape (d,).
 
-        Returns None, and adds no reference, where it fails.
+        Arguments as of `EngineModel.add_reference`. Where it fails, no reference is added, and None
+        is returned.
         """
         with logged_failure(
             "the model cannot take a labelled trace; the next version learns it from the store"

@@ -1,4 +1,5 @@
-"""Adds labels to the training window, and counts those since the last retrain began.
+"""`CellLabels` and `ProductLabels`: each adds labels to the training window, and counts those since
+the last retrain began.
 
 `CellLabels` is for a cell that learns alone. `ProductLabels` is for a cell that shares a product
 with others, whose labels have one sequence in the store. `feedback.Feedback` adds labels;
@@ -42,7 +43,7 @@ class CellLabels:
         self.new_labels = 0
 
     def resume(self, counts_from: int) -> None:
-        """Count the labels of the window after this number, as when the engine was closed."""
+        """Set the count to the number of the window's labels after this number."""
         self.new_labels = len(self._window.newer(counts_from))
 
     def recount(self, counts_from: int) -> None:
@@ -70,7 +71,9 @@ class CellLabels:
         self.new_labels = 0
 
     def give_back(self, n_labels: int) -> None:
-        """Count the labels of a retrain that was dropped again, so that the next one comes soon."""
+        """Count the labels of a retrain that was dropped as new again, so that the next one comes
+        soon.
+        """
         self.new_labels += n_labels
 
     def complete(self, model: EngineModel) -> None:
@@ -128,7 +131,10 @@ class ProductLabels:
         return bool(self._waiting)
 
     def resume(self, counts_from: int) -> None:
-        """Count the labels of the window after this number, as when the engine was closed."""
+        """Count the window's labels after this number as new, when an engine goes on from a store.
+
+        They count as labels of peers, so that they alone do not make a retrain this cell's turn.
+        """
         n_new = len(self._window.newer(counts_from))
         numbers = self._window.newer(0)
         self._since = [(number, False) for number in numbers[len(numbers) - n_new :]]
@@ -136,7 +142,7 @@ class ProductLabels:
         self._updated_to = self._window.newest_seq
 
     def recount(self, counts_from: int) -> None:
-        """Count again after the window was filled anew, without labels that were forgotten."""
+        """Count the new labels again, after the window was filled anew without forgotten labels."""
         own_numbers = {number for number, is_own in self._since if is_own}
         newer = self._window.newer(self._trained_to)
         self._since = [(number, number in own_numbers) for number in newer]
@@ -148,9 +154,11 @@ class ProductLabels:
         """Do nothing: a label counts when it enters the window."""
 
     def add(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
-        """Take a label of this cell that the store has numbered.
+        """Keep a label of this cell, which is a reference already, with the number that the store
+        gave it.
 
-        It enters the window when none before it is missing.
+        It enters the window at once if its number is the next one, else when the peers' labels
+        before it have come.
         """
         self._waiting[seq] = trace, label, hash_
         self._updated_to = max(seq, self._updated_to)
@@ -158,7 +166,10 @@ class ProductLabels:
             self.admit(trace, label, hash_, seq)
 
     def admit(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
-        """Add the next label of the product to the window; a peer's label becomes a reference."""
+        """Add the product's next label to the window and count it as new.
+
+        A peer's label also becomes a reference of the answering model, unless that has it already.
+        """
         is_own = self._waiting.pop(seq, None) is not None
         self._window.add(trace, label, hash_, seq)
         if seq > self._trained_to:
@@ -168,10 +179,10 @@ class ProductLabels:
             GuardedModel(model).add_reference(trace, label, hash_, seq)
 
     def is_due(self, retrain_every: int) -> bool:
-        """Return whether a retrain is this cell's turn.
+        """Return whether a retrain is due and this cell is the one to do it.
 
-        It is where the label that makes it due is this cell's own, or where a peer missed its turn
-        and twice as many labels have come.
+        That is so where the label that completes `retrain_every` is this cell's own, or where a
+        peer missed its turn and twice as many labels have come.
         """
         due = self._since[retrain_every - 1 : retrain_every]
         missed = self._since[2 * retrain_every - 1 :]
@@ -186,14 +197,17 @@ class ProductLabels:
         """Do nothing after a dropped retrain: the next one is the turn of whichever cell is due."""
 
     def complete(self, model: EngineModel) -> None:
-        """Make this cell's waiting labels references of a version that it trained."""
+        """Add this cell's labels that wait for peers' labels to a version that it trained, as
+        references.
+        """
         self._references_to = 0
         self._add_waiting(model)
 
     def take_over(self, model: EngineModel, references_to: int, counts_from: int) -> None:
-        """Make waiting labels references of a peer's version, and count from `counts_from`.
+        """Prepare a peer's version to answer: add this cell's waiting labels to it as references.
 
-        The version's references hold every label up to `references_to` already.
+        Its references hold every label up to the number `references_to` already; later labels of
+        peers are added when they come. Labels after `counts_from` go on counting as new.
         """
         self._references_to = references_to
         self._add_waiting(model)
@@ -201,7 +215,9 @@ class ProductLabels:
         self._since = [(number, is_own) for number, is_own in self._since if number > counts_from]
 
     def _add_waiting(self, model: EngineModel) -> None:
-        """Make waiting labels references of a version, except those up to `_references_to`."""
+        """Add this cell's waiting labels to a version as references, except those that it has
+        already.
+        """
         guarded = GuardedModel(model)
         for seq, (trace, label, hash_) in self._waiting.items():
             if seq > self._references_to:

@@ -1,9 +1,10 @@
-"""The order in which an engine learns: store labels, update the rule, train, swap, take in news.
+"""`Learner` calls, in the right order, all that an engine learns with: store labels, update the
+rule, train, swap, take in peers' news.
 
-`Learner` is the only object that calls the others in this order. `Feedback` turns outcomes into
-labels, `LiveModel` learns them, `Retrainer` trains a candidate, and `Peers` reads what other cells
-of the product made; none of them knows the learner. `core.EngineCore` calls it once per decision,
-report and cycle.
+It is the only object that calls the others in this order. `Feedback` turns outcomes into labels,
+`LiveModel` learns them, `Retrainer` trains a candidate, and `Peers` reads what other cells of the
+product made; none of them knows the learner. `core.EngineCore` calls it once per decision, report
+and cycle.
 """
 
 from __future__ import annotations
@@ -88,8 +89,14 @@ class Learner:
         self._was_accepted = True  # the last retrain
         self._precomputed: Future[None] | None = None  # what the next retrain begins with
 
-    def resume(self, within: int, policy_since: int) -> None:
-        """Go on from the store, bit for bit; arguments as of `LiveModel.resume`."""
+    def resume(self, label_within: int, policy_since: int) -> None:
+        """Restore window, version, rule and counts from the store, bit for bit, when an engine
+        opens it.
+
+        `label_within` and `policy_since` are as of `LiveModel.resume`. With a version, or with an
+        import of `IMPORTED` labels, it also begins in a thread to compute what the next retrain
+        starts with.
+        """
         version = self._store.last_version()  # before the labels: a peer may store both meanwhile
         labelled = self._store.labelled(self._window.capacity)
         self._window.refill(labelled)
@@ -97,7 +104,7 @@ class Learner:
         for report in reports:
             self._note_outcome(report)
         newest_version = max((report.version for report in reports), default=0)
-        self.live.resume(version, newest_version, within, policy_since)
+        self.live.resume(version, newest_version, label_within, policy_since)
         if self.live.answering is not None or len(labelled.seq) >= IMPORTED:
             self._precompute(labelled)
         self.labels.resume(self._counts_from)
@@ -114,7 +121,9 @@ class Learner:
         return 0 if trained_on is None else trained_on.counts_from
 
     def _precompute(self, labelled: LabelledTraces) -> None:
-        """Begin to compute, in a thread, what the next retrain starts with."""
+        """Start a thread that computes what the next retrain begins with; `_begin_retrain` waits
+        for it.
+        """
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
         model = GuardedModel(self.live.newest)
         self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)
@@ -123,7 +132,13 @@ class Learner:
     # One outcome
 
     def report(self, stored: StoredDecision, success: bool) -> None:
-        """Learn a reported label, and return once it is on disk; NotTakenError where it is not."""
+        """Learn a reported label, and return once it is on disk.
+
+        If silence had confirmed the part before, it also waits for the store, so that the rule is
+        put right now; where the store does not answer, that happens later. A safe mode that began
+        or ended is announced. Raises NotTakenError where the label is not known to be on disk, and
+        ReportError as `Feedback.take_in`.
+        """
         self.catch_up()
         confirmed_wrongly = self._feedback.take_in(stored, success)
         self._outbox.sync()
@@ -135,7 +150,13 @@ class Learner:
         self._feedback.announce_safe_mode()
 
     def catch_up(self) -> None:
-        """Add labels that the store has taken to the window, and do a remedy that waited for it."""
+        """Add labels that the store has numbered to the window, and do what `Feedback.remedy` asks
+        for.
+
+        The remedy, a rebuild of the rule and perhaps a correction, waits until the store has every
+        label; until then this returns at once. A correction first finishes a retrain under way.
+        Where the store fails meanwhile, that is logged, and a later call tries again.
+        """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
@@ -156,12 +177,15 @@ class Learner:
             log.exception("the rule is rebuilt when the store is back")
 
     def store_labels(self) -> None:
-        """Have every label in the store, with its number; StoreError where the store is away."""
+        """Wait until every label is in the store and has its number.
+
+        That includes labels of silently confirmed parts. Raises StoreError where the store is away.
+        """
         self._feedback.store_pending()
         self._drain_labels()
 
     def _drain_labels(self) -> None:
-        """Wait until the store has the labels that are in the journal.
+        """Wait until the store has the labels that are in the journal, then catch up.
 
         Raises StoreError where it is away.
         """
@@ -172,9 +196,11 @@ class Learner:
     # A retrain
 
     def retrain(self) -> RetrainReport:
-        """Train a version and let it answer, in line.
+        """Train a version in this thread, let it answer, and return the report.
 
-        One that cannot be stored is dropped and recorded.
+        A retrain under way in the executor is finished first, or given up after `HUNG` seconds. A
+        version that fails or cannot be stored is dropped and recorded, and the report says so.
+        Raises StoreError where the labels before it cannot be stored.
         """
         self.collect(HUNG)
         self.store_labels()
@@ -189,9 +215,10 @@ class Learner:
         return self._report or candidate.report
 
     def start_retrain(self) -> RetrainReport | None:
-        """Begin to train in the executor, unless it trains already, and return None.
+        """Begin to train in the executor, unless a training is under way, and return None.
 
-        Without an executor, retrain in line and return the report.
+        Without an executor that takes work, retrain in this thread and return the report. Raises
+        StoreError where the labels before it cannot be stored.
         """
         self.collect()
         if self.is_busy:
@@ -204,10 +231,11 @@ class Learner:
         return self.retrain()
 
     def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
-        """Retrain, or begin to, if the recipe says so and the store is available.
+        """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
-        `once` leaves a training that lacks steps as it is until the report of the last one was
-        taken. Returns the report of a retrain in line; None without one.
+        With `once` a version that lacks steps is not trained on until the report of its last
+        retrain was taken. Nothing happens, and None is returned, where the store is away. Returns
+        the report of a retrain in this thread; None where none was due or it runs in the executor.
         """
         is_due = self._is_due(recipe.retrain_every)
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
@@ -246,10 +274,13 @@ class Learner:
         return self._retrainer.future is not None or self.is_swapping
 
     def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
-        """Bring a version that the executor trained a step further, or to the end.
+        """Take a training's outcome from the executor, and bring its version closer to answering.
 
-        `wait` is how many seconds to wait for a training that is not done; then the version is
-        brought to the end.
+        Each call does one short step: take the outcome, catch up on labels, store the version, swap
+        it in. With `to_the_end`, and always where cells share a product, it does all steps and
+        blocks until the version answers or is dropped. With `wait` above 0 it also waits so many
+        seconds for a training that is not done; then that is given up. Without a training it does
+        nothing.
         """
         if self._retrainer.future is None and self._candidate is None:
             return
@@ -262,11 +293,15 @@ class Learner:
             self._advance(to_the_end)
 
     def _as_candidate_of(self, trained: Trained) -> Candidate:
-        """Return the outcome of a training as a candidate, ready to predict."""
+        """Return the outcome of a training as a candidate that takes over the answering model's
+        rule.
+        """
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
 
     def _begin_retrain(self) -> None:
-        """Take in all news before a training, and count new labels from zero."""
+        """Prepare for a training: wait for what is computed in advance, take in all news of peers,
+        and count new labels from zero.
+        """
         if self._precomputed is not None:
             self._precomputed.result()
             self._precomputed = None
@@ -274,9 +309,10 @@ class Learner:
         self.labels.begin_retrain()
 
     def _advance(self, to_the_end: bool) -> None:
-        """Bring the candidate a step further: catch up on labels, store it, swap it in.
+        """Bring the candidate further: catch up on labels, store it, catch up again, swap it in.
 
-        One not stored is dropped.
+        It takes one step, or all steps with `to_the_end`. A candidate that cannot be stored is
+        dropped. One that is stored waits for a later call where the newest labels cannot be stored.
         """
         candidate = self._candidate
         if candidate is None:
@@ -301,9 +337,10 @@ class Learner:
         self._swap(candidate)
 
     def _store_candidate(self, candidate: Candidate, to_the_end: bool) -> bool:
-        """Return whether the candidate is in the store; False where another step is needed.
+        """Store the candidate, and return True once the store has it.
 
-        Raises StoreError where it cannot be stored.
+        False means that another step is needed: labels are missing, or the commit is under way.
+        With `to_the_end` it blocks instead. Raises StoreError where it cannot be stored.
         """
         if candidate.storing is None:
             if not candidate.catch_up(self._window, np.inf if to_the_end else STEP):
@@ -319,9 +356,10 @@ class Learner:
         return True
 
     def _begin_storing(self, candidate: Candidate) -> Future[int]:
-        """Begin to store a candidate, with its model where it has one.
+        """Complete the candidate's report, and submit report and model to the thread that stores
+        them.
 
-        The future returns its number.
+        Returns a future of the version's number. Without a model only the report is stored.
         """
         report = candidate.accept(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
@@ -331,16 +369,23 @@ class Learner:
         return self._outbox.submit(lambda: self._store.put_version(report, newest_seq, state))
 
     def _state_of(self, model: EngineModel, trained_on: TrainedOn) -> dict[str, Any]:
-        """Return the arrays of a version of this model, for the store."""
+        """Return the arrays of this model as a version, by name, for the store."""
         return self.live.get_state(model, trained_on) | self.labels.get_state()
 
     def _waits_for_labels(self, candidate: Candidate, to_the_end: bool) -> bool:
-        """Return whether the candidate should wait another step for labels to be stored."""
+        """Return whether the candidate should wait another step for labels to be stored.
+
+        It asks the outbox to store them at once. False with `to_the_end`, and when the candidate
+        has waited for `PATIENCE` steps.
+        """
         has_lost_patience = candidate.lose_patience()
         return not to_the_end and not has_lost_patience and self._outbox.request_label_drain()
 
     def _swap(self, candidate: Candidate) -> None:
-        """Let a stored candidate answer: one reference is swapped."""
+        """Let a stored candidate answer, and keep its report for `take_report`.
+
+        Without a model, when the training was dropped, the old version goes on answering.
+        """
         self._report = candidate.report
         self._was_accepted = candidate.model is not None
         self._note_outcome(candidate.report)
@@ -351,9 +396,9 @@ class Learner:
             self.labels.complete(candidate.model)
 
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
-        """Drop a candidate that could not be stored.
+        """Drop a candidate that could not be stored, and keep a report that says so.
 
-        Its labels count as new, so that the next retrain is soon.
+        Its labels count as new again, so that the next retrain is soon.
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
@@ -368,7 +413,7 @@ class Learner:
         self._note_outcome(self._report)
 
     def _note_outcome(self, report: RetrainReport) -> None:
-        """Keep the reasons of the retrains that were dropped since the last accepted one."""
+        """Add the reason of a dropped retrain to `dropped`; an accepted one empties the list."""
         self.dropped = [] if report.accepted else [*self.dropped, report.reason]
 
     def take_report(self) -> RetrainReport | None:
@@ -380,7 +425,11 @@ class Learner:
     # News of a product
 
     def _is_due(self, retrain_every: int) -> bool:
-        """Return whether a retrain is due, after the news of the product, if any, was taken in."""
+        """Return whether a retrain is due by the number of new labels.
+
+        Where cells share a product, their news is taken in first, and a peer's version that came
+        makes it due no more.
+        """
         if self._peers is not None and self._peers.is_news_due:
             self._take_in_news(self._peers)
         if not self.labels.is_due(retrain_every):
@@ -389,7 +438,9 @@ class Learner:
         return self.labels.is_due(retrain_every)
 
     def _take_in_all_news(self) -> None:
-        """Take in the peers' news until there is no more, in a few rounds, if there are peers."""
+        """Take in the peers' news until there is no more, at most `ROUNDS` times; without peers do
+        nothing.
+        """
         peers = self._peers
         if peers is None:
             return
@@ -398,9 +449,10 @@ class Learner:
                 return
 
     def _take_in_news(self, peers: Peers) -> int:
-        """Take in the peers' newest version, labels and corrections.
+        """Take in the peers' newest version, at most `MOST` labels, and corrections.
 
-        Returns how many labels, 0 where the store is away.
+        Returns the number of labels, 0 where the store is away, which is logged once. Corrections
+        that cannot be read come with the next news.
         """
         version = None
         try:
@@ -429,7 +481,7 @@ class Learner:
     # What people put right
 
     def make_ready(self) -> None:
-        """Bring in every version, label and news that is under way, before a person's change.
+        """Finish every retrain, label and news that is under way, before a person's change.
 
         Raises StoreError where that cannot be.
         """
@@ -447,10 +499,10 @@ class Learner:
         return isinstance(self.labels, ProductLabels) and self.labels.has_gaps
 
     def apply_corrections(self, may_retrain: bool = True) -> None:
-        """Learn the store's newest corrections: window, references and rule.
+        """Apply the store's newest corrections to window, references and rule.
 
-        A model that cannot change a reference is trained anew, where `may_retrain`: by the cell
-        that corrected.
+        A model that cannot change a reference is retrained, if `may_retrain`: only the cell that
+        corrected does so. Raises StoreError where the store is away.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         last = self.labels.last_to_read
@@ -462,10 +514,12 @@ class Learner:
             self.retrain()
 
     def roll_back(self, number: int, event: Change) -> None:
-        """Let an earlier version answer again, as a new one, with all later labels as references.
+        """Let the earlier version `number` answer again, as a new version, and store it with
+        `event`.
 
-        Raises StoreError for a version that is not kept, and where a trace that it was trained on
-        is damaged.
+        All later labels become its references, and the present rule goes on. New labels count from
+        zero. Raises StoreError for a version that is not kept, and where a trace that it was
+        trained on is damaged.
         """
         self._outbox.check_integrity()
         begin = self._clock()
@@ -487,13 +541,16 @@ class Learner:
         add_labels_since(model, self._store, version, self._window)
         trained_on = replace(trained_on, counts_from=self._window.newest_seq)
         reason = f"rolled back to version {number}"
-        self._record(event, model, trained_on, reason, self._clock() - begin)
+        self._store_and_swap_in(event, model, trained_on, reason, self._clock() - begin)
         self._begin_retrain()
 
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
-        """Go on under another policy, as a new version of the same model.
+        """Go on under another policy, as a new version of the same model, and store it with
+        `event`.
 
-        With `policy` None only settings outside the model have changed, and its rule goes on.
+        With `policy` the rule starts anew and counts the decisions of `evidence`. With None only
+        settings outside the model have changed, and its rule goes on. Before the first retrain only
+        the event is stored.
         """
         live = self.live
         template = live.template
@@ -503,13 +560,20 @@ class Learner:
         if model is None or live.trained_on is None:
             self._store.apply_change(event)
         else:
-            self._record(event, model, live.trained_on, "another policy, the same model", 0.0)
+            self._store_and_swap_in(
+                event, model, live.trained_on, "another policy, the same model", 0.0
+            )
         live.change_evidence(template, evidence)
 
-    def _record(
+    def _store_and_swap_in(
         self, event: Change, model: EngineModel, trained_on: TrainedOn, reason: str, seconds: float
     ) -> None:
-        """Store a version together with the event of the person who made it; then it answers."""
+        """Store a model as the next version, together with the event of a person, and let it
+        answer.
+
+        Its report, accepted after `seconds` for this reason, becomes the newest. StoreError where
+        it cannot be stored: then nothing changes.
+        """
         n_traces = len(trained_on.seq)
         report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)
         state = self._state_of(model, trained_on)

@@ -1,4 +1,4 @@
-"""The model that answers, and how its references and its rule learn from outcomes.
+"""`LiveModel`: the model that answers, and how its references and its rule learn from outcomes.
 
 `LiveModel` knows the store and the training window below it. Which version answers, and when, is up
 to `learner.Learner`; outcomes come from `feedback.Feedback`.
@@ -97,11 +97,16 @@ class LiveModel:
         return self.newest_version + 1
 
     def resume(
-        self, version: ModelVersion | None, newest_version: int, within: int, policy_since: int
+        self,
+        version: ModelVersion | None,
+        newest_version: int,
+        label_within: int,
+        policy_since: int,
     ) -> None:
-        """Go on from a stored version, bit for bit, and learn the outcomes that came after it.
+        """Restore a stored version, bit for bit, and learn the outcomes that came after it.
 
-        Stored reference points are read, not computed again.
+        Without a version, or where its model cannot be restored, the template stays, and its rule
+        is updated with every stored outcome. Stored reference points are read, not computed again.
 
         Parameters
         ----------
@@ -109,10 +114,15 @@ class LiveModel:
             None before the first retrain.
         newest_version : int
             Largest number that a version ever had.
-        within : int
+        label_within : int
             After how many later decisions a verification without a report is overdue.
         policy_since : int
             First version under the policy in force.
+
+        Raises
+        ------
+        StoreError
+            Where the store cannot be read.
         """
         store = self.outbox.store
         since = self.evidence.since
@@ -124,7 +134,7 @@ class LiveModel:
             state = version.state if version.version >= since else without_rule(version.state)
             model = restore_model(self.outbox, self.template, state)
         past = read_rule_progress(
-            store, None if model is None else version, since, within, policy_since
+            store, None if model is None else version, since, label_within, policy_since
         )
         self.overdue = set(past.overdue_ids)
         self.overdue_to = past.overdue_to
@@ -142,18 +152,20 @@ class LiveModel:
             self._rebuild_rule_of(model, self._read_outcomes)
 
     def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn | None) -> None:
-        """Let a model answer from now on, as the version of this number."""
+        """Let a model answer from now on, as the version of this number; nothing is stored."""
         self.answering = model
         self.version = version
         self.newest_version = max(version, self.newest_version)
         self.trained_on = trained_on
 
     def learn(self, stored: StoredDecision, success: bool, unobserved: int | None) -> Point | None:
-        """Update the rule with an outcome and make the trace a reference.
+        """Update the rule with an outcome, and make the trace a reference of the answering model.
 
         `unobserved` is the number of accepted parts without an outcome since the previous update;
-        None leaves the rule as it is. Returns the reference point (d,) to be stored with the label;
-        None where there is none.
+        with None, or for a decision before the present rule began, the rule is not updated. The
+        reference has a provisional number until `assign_number`. Returns the reference point,
+        float32 of shape (d,), to be stored with the label; None where there is none: no model yet,
+        a failure, or a baseline.
         """
         decision = stored.decision
         if unobserved is not None and decision.model_version >= self.evidence.since:
@@ -179,7 +191,11 @@ class LiveModel:
         return point if model.keeps_references else None
 
     def unlearn(self, stored: StoredDecision) -> None:
-        """Remove the reference of a part that was confirmed wrongly, before the store has it."""
+        """Remove the reference of a part that was confirmed wrongly, before the store has its
+        label.
+
+        The rule keeps the outcome: it must be rebuilt.
+        """
         *_, number = self._unnumbered.pop(stored.decision.id)
         if number:
             self.newest.change_reference(number, stored.content_hash, None)
@@ -187,7 +203,7 @@ class LiveModel:
     def assign_number(self, decision_id: str, seq: int) -> tuple[StoredDecision, bool] | None:
         """Give the reference of a learned label the sequence number that the store assigned.
 
-        Returns the decision and its label, for the training window; None where the decision taught
+        Returns the decision and its label, for the training window; None for a label that taught
         nothing.
         """
         if decision_id not in self._unnumbered:
@@ -198,7 +214,10 @@ class LiveModel:
         return stored, success
 
     def count_overdue(self, decision: Decision) -> None:
-        """Update the rule as if a decision was wrong: its check was not reported in time."""
+        """Update the rule as if a decision was wrong, because its check was not reported in time.
+
+        A decision without evidence, or from before the present rule began, changes nothing.
+        """
         if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
         for outcome in overdue_outcomes(decision):
@@ -212,7 +231,7 @@ class LiveModel:
     def clear_overdue(self, decision_id: str) -> bool:
         """Count a decision as overdue no more, because its check was reported.
 
-        Returns whether it was counted so; then the rule must be rebuilt.
+        Returns whether it was counted so. If True, the rule must be rebuilt; this does not do it.
         """
         if decision_id not in self.overdue:
             return False
@@ -220,9 +239,9 @@ class LiveModel:
         return True
 
     def rebuild_rule(self) -> None:
-        """Reset the rule and update it with every stored outcome.
+        """Reset the newest model's rule and update it with every stored outcome since it began.
 
-        Raises StoreError where the store is away.
+        Raises StoreError, and changes nothing, where the store is away.
         """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
@@ -238,14 +257,18 @@ class LiveModel:
         _update_rule(model, read_outcomes)
 
     def _read_outcomes(self, after: int = 0) -> list[OutcomeRecord]:
-        """Return the stored outcomes of labels after this number, checked against the ledger."""
+        """Return the stored outcomes of labels after this number, checked against the ledger.
+
+        A failed check sets the outbox's `integrity_error`.
+        """
         self.outbox.check_integrity(after)
         return self.outbox.store.outcomes_since(after, self.evidence.since, self.overdue_to)
 
     def apply_corrections(self) -> bool:
-        """Apply the store's newest corrections to the references.
+        """Apply the store's newest corrections to the references of the answering model.
 
-        Returns False where the model must be trained again.
+        Returns False where the model cannot take one and must be trained again; True before the
+        first retrain. The rule is left to `rebuild_rule`.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
@@ -258,7 +281,10 @@ class LiveModel:
     def with_policy(
         self, policy: Policy, evidence: EvidenceWindow
     ) -> tuple[EngineModel, EngineModel | None]:
-        """Return template and answering model under another policy, with a new rule."""
+        """Return copies of template and answering model under another policy, with a new rule.
+
+        The second is None before the first retrain. Neither is in force yet.
+        """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)
         if self.answering is None:
@@ -268,12 +294,17 @@ class LiveModel:
         return template, model
 
     def change_evidence(self, template: EngineModel, evidence: EvidenceWindow) -> None:
-        """Go on with another template, and with other decisions that the rule is updated with."""
+        """Go on with another template, and with other decisions that a rebuilt rule is updated
+        with.
+        """
         self.template = template
         self.evidence = evidence
 
     def get_state(self, model: EngineModel, trained_on: TrainedOn) -> State:
-        """Return the arrays of a version of this model, for the store."""
+        """Return the arrays by name with which the store can restore a model as a version.
+
+        They hold the model, what it was trained on, and which corrections and overdue checks count.
+        """
         state = model.get_state() | trained_on.to_state()
         state["corrected_to"] = np.array(self.corrected_to)
         state["overdue_to"] = np.array(self.overdue_to)
@@ -287,7 +318,7 @@ class LiveModel:
 def _update_rule(model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]) -> None:
     """Update a model's rule with outcomes in the order of their labels.
 
-    They are not read for a rule that never learns.
+    For a rule that never learns, `read_outcomes` is not called.
     """
     if not model.rule_learns:
         return

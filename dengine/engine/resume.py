@@ -1,4 +1,4 @@
-"""Restores a stored version bit for bit: its model, later labels and corrections.
+"""Functions that restore a stored version bit for bit: its model, later labels and corrections.
 
 `live_model.LiveModel` uses these functions when a store is opened, `learner.Learner` for a
 rollback, and `fleet.Peers` when another cell's version is taken over.
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 def restore_model(
     outbox: Outbox, template: EngineModel, state: Mapping[str, NDArray[Any]]
 ) -> EngineModel | None:
-    """Return the model of a stored state.
+    """Return a new model, made from the template, in the state of a stored version.
 
-    Returns None where it must be trained again and one of its traces is damaged.
+    A model that is stored by its traces is trained on them again. Returns None where one of these
+    traces is damaged.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -39,7 +40,8 @@ def restore_model(
 def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on the traces of a stored version, with the labels that these had then.
 
-    Returns False, with the model untrained, where one of these traces is damaged.
+    The traces are checked against the ledger. Returns False, with the model untrained, where one is
+    damaged or missing; a label that was forgotten then is none of them.
     """
     store = outbox.store
     first = int(trained_on.seq[0])
@@ -72,16 +74,18 @@ def newest_reference(version: ModelVersion) -> int:
 
 
 def newest_correction(version: ModelVersion) -> int:
-    """Return the number of the newest correction that a stored version has."""
+    """Return the number of the newest correction that a stored version has; 0 if none."""
     return int(version.state.get("corrected_to", 0))
 
 
 def add_labels_since(
     model: EngineModel, store: SqlStore, version: ModelVersion, window: TrainingWindow
 ) -> int:
-    """Add the labels and corrections that came after a version was stored to its model.
+    """Add to a version's model, as references, the labels that came after it was stored.
 
-    Returns the number of the newest correction.
+    They are at most as many as `window` holds, and end with the window's newest label. Corrections
+    that came meanwhile are applied in the same order as then, so that the model is the same bit for
+    bit. Returns the number of the newest correction in the store.
     """
     corrected_to = newest_correction(version)
     # A baseline cannot be corrected afterwards, so it gets each label as it was when the version
@@ -114,9 +118,11 @@ def add_labels_since(
 
 
 def apply_correction(model: EngineModel, store: SqlStore, correction: Correction) -> bool:
-    """Relabel, remove or add again the reference of a corrected label.
+    """Change the reference of a corrected label: relabel it, remove it or add it again.
 
     Returns False where the model cannot change that reference, so that it must be trained again.
+    True where there is nothing to change: a baseline, a quarantined part, or a trace that is
+    damaged.
     """
     if not model.keeps_references:
         return True

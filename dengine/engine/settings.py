@@ -1,8 +1,8 @@
-"""The settings of an engine: what it was made with, what its store keeps of that, and what is in
-force now.
+"""`EngineSettings`, what an engine was made with and its store keeps; `SettingsInForce`, the
+present ones while it runs; and functions that check and complete the settings a program gives.
 
-`DataEngine` makes or reads `EngineSettings` before it opens a cell. `SettingsInForce` holds the
-present ones while it runs. What the engine has learned is not among them.
+`DataEngine` makes or reads `EngineSettings` before it opens a cell. What the engine has learned is
+not among them.
 """
 
 import json
@@ -105,7 +105,11 @@ class EngineSettings:
             ForceLimitsGate(self.recipe.policy.windows, self.trace)  # raises before it is in force
 
     def to_store(self) -> dict[str, str]:
-        """Return the settings as texts by name, as `SqlStore.save_settings` takes them."""
+        """Return the settings as texts by name, as `SqlStore.save_settings` takes them.
+
+        Settings at their defaults are left out, except the recipe and the seed; dengine's own
+        version is added.
+        """
         texts = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
         if self.model is not None:
             texts["model"] = self.model
@@ -144,12 +148,18 @@ class EngineSettings:
         allow_import : bool or collection of str
             As of `check_imports`; a class that `reducer` names is allowed.
 
+        Returns
+        -------
+        EngineSettings
+
         Raises
         ------
         StoreError
-            For an unused store.
+            For an unused store, and for a seed that is damaged.
         SettingError
-            Where an object is missing, or is another than the engine was made with.
+            Where an object is missing, not needed, or another than the engine was made with.
+        ImportRefusedError
+            Where the recipe names a class that may not be imported.
         """
         if "recipe" not in texts:
             raise StoreError(
@@ -179,8 +189,12 @@ class EngineSettings:
         )
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
-        """Return the settings in force and the untrained model: the recipe's, or the one that was
-        handed in.
+        """Return the settings in force and an untrained model: the recipe's, or `model` if handed
+        in.
+
+        The settings are a copy that describes the object that was handed in, and whose recipe has
+        that model's own numbers in place of those without effect. Raises SettingError for an object
+        that lacks a method of `Model`.
         """
         if model is None:
             reducer = self.recipe.reducer
@@ -201,7 +215,9 @@ class EngineSettings:
         """Raise SettingError where settings that a program gives are not the ones that are set.
 
         `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. The
-        shadow mode and force limits are set by an operator, so that the program need not give them.
+        shadow mode is not compared, nor are force limits that the program leaves out, because an
+        operator sets both. Beside a baseline only `LOOP_SETTINGS` are compared. An unknown name is
+        an error, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -242,7 +258,7 @@ class EngineSettings:
 def _with_objects(
     recipe: Recipe, texts: Mapping[str, str], name: str, reducer: Any, model: Model | None
 ) -> Recipe:
-    """Return a stored recipe with the reducer object that was handed in, if any.
+    """Return a stored recipe, with the reducer object that was handed in put into it, if any.
 
     Raises SettingError where an object is missing, not needed, or another than the store was made
     with.
@@ -278,8 +294,9 @@ def _with_objects(
 
 
 def _check_description(texts: Mapping[str, str], name: str, description: str) -> None:
-    """Raise SettingError where an object that is handed in again has other settings than the store
-    was made with.
+    """Raise SettingError where an object that is handed in again has other settings than before.
+
+    `texts` are the settings of the store, whose "described" is compared, if there is one.
     """
     made_with = texts.get("described")
     if made_with is not None and description != made_with:
@@ -290,10 +307,11 @@ def _check_description(texts: Mapping[str, str], name: str, description: str) ->
 
 
 def choose_recipe(reducer: Any, recipe: Any, given: Mapping[str, Any]) -> Recipe:
-    """Return the recipe that is asked for, or else the reducer's own, with the given settings in
-    place of its own.
+    """Return the recipe that is asked for, with the settings of `given` in place of its own.
 
-    Raises SettingError where `recipe` names another reducer than `reducer`.
+    `recipe` is a Recipe, a name or a TOML file; without one it is the default recipe of `reducer`,
+    or of conv. A setting of None keeps the recipe's own. Raises SettingError where `recipe` names
+    another reducer than `reducer`, and for a setting out of range.
     """
     source = recipe
     if source is None:
@@ -310,7 +328,10 @@ def choose_recipe(reducer: Any, recipe: Any, given: Mapping[str, Any]) -> Recipe
 def named_classes(
     reducer: Any = None, recipe: Any = None, policy: Policy | None = None, **others: Any
 ) -> list[str]:
-    """Return each `module:Class` that a caller names in settings, as `DataEngine` takes them."""
+    """Return each `module:Class` that a caller names in settings, as `DataEngine` takes them.
+
+    A name may stand in reducer, recipe or policy; other settings are ignored.
+    """
     recipes = [Recipe.load(source) for source in (reducer, recipe) if source is not None]
     recipes.append(Recipe(policy=policy or Policy()))
     return [name for named in recipes for name in named.user_classes]
@@ -319,8 +340,9 @@ def named_classes(
 def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
     """Raise ImportRefusedError where a stored recipe names a class that may not be imported.
 
-    Whoever writes to the store could otherwise run code here. `allow_import` True allows any class;
-    else it holds the names of those that are allowed.
+    Whoever writes to the store could otherwise run code here. With `allow_import` True any class is
+    allowed, with False none; else it holds the names of those that are. `store` is the store's name
+    in the message.
     """
     if allow_import is True:
         return
@@ -333,9 +355,8 @@ def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[st
 
 
 def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
-    """Return the trace contract of a product's other cells.
-
-    Returns None where there is none, or no product.
+    """Return the trace contract of a product's other cells; None where there is none, or no
+    product.
     """
     specs = map(stored_trace_spec, store.peers_settings().values())
     return next(filter(None, specs), None)
@@ -344,10 +365,11 @@ def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
 def fill_from_peers(
     request: Mapping[str, Any], store: "SqlStore", allow_import: bool | Collection[str]
 ) -> dict[str, Any]:
-    """Return settings for a new engine, with seed and recipe from another cell of its product where
-    these are open.
+    """Return a copy of the settings for a new engine, with what is open taken from a peer.
 
-    Raises ImportRefusedError where the peer's recipe names a class that may not be imported.
+    A peer is another cell of the store's product. Taken are its seed (0 without a peer), and its
+    recipe if `request` names neither reducer, recipe nor model. Raises ImportRefusedError where
+    that recipe names a class that may not be imported.
     """
     peer = next(iter(store.peers_settings().values()), {})
     filled = dict(request)
@@ -362,8 +384,9 @@ def fill_from_peers(
 
 
 def check_model_settings(reducer: Any, given: Mapping[str, Any]) -> None:
-    """Raise SettingError for settings beside a baseline, or another model, on which they would have
-    no effect.
+    """Raise SettingError for settings that have no effect beside a model that is handed in.
+
+    These are radius, folds, reducer, and of a policy all but audit_rate, stops, shadow and windows.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:
@@ -382,7 +405,7 @@ def check_model_settings(reducer: Any, given: Mapping[str, Any]) -> None:
 
 
 def flat_settings(recipe: Recipe) -> dict[str, Any]:
-    """Return every setting of a recipe by its name, those of its policy included."""
+    """Return every setting of a recipe by its name, those of its policy among them."""
     settings = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     del settings["policy"]
     return settings | recipe.policy.to_values()
@@ -413,7 +436,9 @@ class SettingsInForce:
         self._outbox = outbox
 
     def change(self, settings: EngineSettings) -> None:
-        """Use other settings from now on; the store is not changed."""
+        """Use other settings from now on, and compute what follows from them; the store is not
+        changed.
+        """
         policy = settings.recipe.policy
         self.now = settings
         self.audited_share = policy.audited_share
@@ -424,7 +449,10 @@ class SettingsInForce:
             )
 
     def save(self) -> None:
-        """Store the settings; where the store is away, note that they are unsaved."""
+        """Write the settings to the store, within its time limit.
+
+        Where that fails, the error is logged and `is_unsaved` is set; nothing is raised.
+        """
         texts = self.now.to_store()
         try:
             self._outbox.call_store(lambda: self._outbox.store.save_settings(texts))

@@ -1,9 +1,9 @@
-"""Training of a new version within its time budget, in line or in an executor.
+"""`TrainingWindow` holds the newest labelled traces in memory; `Retrainer` trains a new version on
+them within a time budget, in the calling thread or in an executor.
 
-No failure of either stops the cell.
-
-`TrainingWindow` holds the newest labelled traces in memory. `Retrainer` trains a successor of the
-present model on a snapshot of it; `learner.Learner` decides when, and what becomes of the result.
+It trains a successor of the present model, on a snapshot of the window. No failure of a training or
+of the executor stops the cell. `learner.Learner` decides when to train, and what becomes of the
+result.
 """
 
 import logging
@@ -65,7 +65,11 @@ class TrainingWindow:
         return int(self._block[0][self._end - 1]) if self._end else 0
 
     def add(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
-        """Add one labelled trace (channels, samples); the oldest one leaves a full window."""
+        """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
+
+        `label` is 1 or 0, `hash_` the hash of part or content, `seq` the label's number, larger
+        than any before.
+        """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)
         row = (seq, trace, label, hash_)
@@ -75,8 +79,11 @@ class TrainingWindow:
         self._first = max(self._first, self._end - self.capacity)
 
     def _enlarge(self, trace_shape: tuple[int, ...]) -> None:
-        """Copy the window to the front of a new block, half as long again, for traces of this
-        shape.
+        """Copy the window to the front of a new block that is half as long again, at least 64 rows
+        longer.
+
+        `trace_shape` is the shape of one trace, which an empty window does not know. The old block
+        is not changed.
         """
         n = len(self)
         columns = [column[self._first :] for column in self._block]
@@ -92,8 +99,10 @@ class TrainingWindow:
         self._end = n
 
     def refill(self, labelled: LabelledTraces) -> None:
-        """Hold the newest of these labelled traces, which are ordered by number, in place of all
-        others.
+        """Replace the whole window by the newest of these labelled traces, which are ordered by
+        number.
+
+        Their arrays become the window's block and are not copied.
         """
         self._block = [labelled.seq, labelled.traces, labelled.labels, labelled.hashes]
         self._end = len(labelled.seq)
@@ -195,14 +204,15 @@ class Trained:
 
 
 class Retrainer:
-    """Trains successors of a model on the window, in line or in an executor.
+    """Trains successors of a model on the window, in the calling thread or in an executor.
 
     Parameters
     ----------
     window : TrainingWindow
     limits : Limits
     executor : concurrent.futures.Executor or None
-        Set to None when it died, hangs or takes no more work: then retrains are in line.
+        Set to None when it died, hangs or takes no more work: then retrains are in the calling
+        thread.
     clock : callable
         Seconds, of any origin; it must pickle for a process executor.
 
@@ -228,17 +238,21 @@ class Retrainer:
         self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
 
     def train(self, current: EngineModel, begin: float) -> Trained:
-        """Train a successor of the current model in line; `begin` is when work on the retrain
-        began.
+        """Train a successor of the current model in this thread, and return the outcome.
+
+        `begin` is when work on the retrain began, by the clock. The current model is not changed; a
+        failure is an outcome without a model.
         """
         data = self.window.snapshot()
         trained = train_candidate(current.successor(), data, self.limits, self.clock)
         return replace(trained, begin=begin)
 
     def start(self, current: EngineModel) -> bool:
-        """Begin to train a successor in the executor.
+        """Begin to train a successor of the current model in the executor, on the window as it is
+        now.
 
-        Returns False without an executor that takes work.
+        `collect` returns the outcome. Returns False, and begins nothing, without an executor; one
+        that takes no more work is given up.
         """
         if self.executor is None:
             return False
@@ -262,10 +276,10 @@ class Retrainer:
     def collect(self, wait: float = 0.0) -> Trained | None:
         """Return the outcome of the training in the executor, once.
 
-        Returns None where there is none or it is not done.
-
-        With `wait` above 0 a training that is not done after so many seconds is given up, and its
-        outcome is dropped. So is one that takes longer than `HUNG`.
+        Returns None where there is none or it is not done. With `wait` above 0 it blocks for at
+        most so many seconds; a training that is not done then is given up, and so is one that takes
+        longer than `HUNG`: the outcome has no model and says why. After that, and after the
+        executor died, the executor is used no more.
         """
         future = self.future
         left = self._began + HUNG - time.monotonic()
@@ -279,7 +293,10 @@ class Retrainer:
         return replace(trained, begin=self.clock() - trained.seconds)
 
     def _give_up(self, future: Future[Trained], error: Exception) -> str:
-        """Return why a training is dropped, and stop using an executor that died or hangs."""
+        """Log why a training failed, and return it as the reason of a dropped retrain.
+
+        An executor that died or did not finish in time is used no more.
+        """
         training_raised = future.done() and not isinstance(error, BrokenExecutor)
         log.error("a retrain in the executor failed: %s", error, exc_info=training_raised)
         if training_raised:
@@ -296,10 +313,12 @@ class Retrainer:
 def train_candidate(
     successor: EngineModel, data: LabelledTraces, limits: Limits, clock: Clock
 ) -> Trained:
-    """Train a successor on labelled traces; any exception becomes a dropped outcome.
+    """Train a successor, which this changes, on labelled traces and return the outcome.
 
-    A plain function, so that any executor can run it. Whether the model is accepted depends on no
-    label: with a gate on held-out loss, the labels of fold k would choose encoder k.
+    Any exception, no trace at all, and a defect of the trained model give an outcome without a
+    model, whose reason begins with "dropped: ". A training that reaches a limit ends early and is
+    accepted. Sets the present thread to one torch thread. It is a plain function, so that any
+    executor can run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
     begin = clock()
@@ -327,6 +346,8 @@ def train_candidate(
 
 
 def _dropped(error: Exception) -> str:
-    """Return the reason of a training that raised: the error's type and its first line."""
+    """Return the reason of a training that raised: "dropped: ", the error's type and its first
+    line.
+    """
     lines = str(error).splitlines() or [""]
     return f"dropped: {type(error).__name__}: {lines[0]}"
