@@ -1,10 +1,12 @@
-"""Copies an SQLite store into one file with what its journals hold, while it may be in use.
+"""Copies an SQLite store into a new file, together with the records still in the cells' journals.
+`backup_store` does that, while engines may use the store, and returns a `BackupReport` with the
+numbers of decisions and labels. `dengine backup` uses it; PostgreSQL stores are refused.
 
     report = backup_store("engine.db", "copy.db")
     report.decisions, report.labels, report.from_journals
 
 A plain copy of the file would lack what is beside it: the newest transactions, in its `-wal` file,
-and the newest labels, in the journal of each cell. `dengine backup` uses this.
+and the newest decisions, labels and events, in the journal of each cell.
 """
 
 import os
@@ -34,10 +36,10 @@ class BackupReport:
     decisions, labels : int
         Numbers in the copy, of all cells.
     from_journals : int
-        Number of records that were copied from journals, since the store did not have them yet.
+        Number of records (decisions, labels, events) that were added from journals, since the store
+        had not taken them yet.
     without_journal : tuple of str
-        Cells without a journal.
-
+        Cells that have no journal beside the store, sorted.
     """
 
     decisions: int
@@ -47,10 +49,10 @@ class BackupReport:
 
 
 def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> BackupReport:
-    """Copy a store in a file, and add to the copy what the journals hold.
+    """Copy an SQLite store into a new file, and add to the copy what the cells' journals hold.
 
     Engines may run meanwhile: everything that they had acknowledged when this was called is in the
-    copy. The copy is written in full or not at all.
+    copy. The copy is written in full or not at all. The store and the journals are only read.
 
     Parameters
     ----------
@@ -66,9 +68,10 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
     Raises
     ------
     StoreError
-        If `url` is no store in a file, and if a journal cannot be read.
+        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), and if a journal
+        cannot be read.
     OutputError
-        If the copy cannot be written.
+        If `out` exists, or cannot be written.
     """
     with reading(os.fspath(url)) as connection:
         if connection.dialect.name != "sqlite":
@@ -101,14 +104,21 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
 
 
 def _copy(url: str, target: Path) -> None:
-    """Copy a store's file by SQLite's own backup."""
+    """Copy an SQLite store into the file `target` by SQLite's own online backup.
+
+    The copy replaces what `target` held.
+    """
     with reading(url) as connection, closing(sqlite3.connect(target)) as copy:
         source: Any = connection.connection.driver_connection
         source.backup(copy)
 
 
 def _add_records(file: Path, cell: str, records: list[Record]) -> None:
-    """Add a cell's records to the copy; those that it has already change nothing."""
+    """Commit a cell's journal records to the copy.
+
+    Records that the copy already has change nothing. A record that contradicts the copy is stored
+    there as an event of kind "dead letter".
+    """
     if not records:
         return
     with SqlStore(str(file), cell) as store:
@@ -117,9 +127,9 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
 
 
 def _fold_wal_and_count(file: Path) -> tuple[int, int]:
-    """Turn off write-ahead logging, so that everything is in one file.
+    """Turn off write-ahead logging in a store's file, so that everything is in this one file.
 
-    Returns its numbers of decisions and labels.
+    Return the numbers of its decisions and labels, over all cells.
     """
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")

@@ -1,9 +1,9 @@
 """Connections to a store's database, and the class `Database` through which one cell writes to it.
-
-`make_engine` makes the SQLAlchemy engine for SQLite or PostgreSQL; `reading` connects for reading
-only. `Database` adds transactions that end with a ledger entry, the lease on the cell, and the
-insertion of journal records. It also handles a deleted file, a forked process, and rows that the
-database refuses. `SqlStore` is built on it.
+`make_engine` makes the SQLAlchemy engine for SQLite or PostgreSQL; `reading` opens a store for one
+block of reading. `Database` has the transactions, each of which ends with a ledger entry, the lock
+by which one engine owns a cell on a PostgreSQL server, and the insertion of journal records. It
+also notices a deleted file and a forked process, and leaves out rows that the database refuses.
+`SqlStore` is built on it.
 """
 
 import hashlib
@@ -69,17 +69,24 @@ BUSY_SECONDS = 10.0  # wait for another process that writes to the same SQLite f
 
 
 def make_engine(url: str | None) -> sa.Engine:
-    """Make an SQLAlchemy engine; it does not connect yet.
+    """Return a new SQLAlchemy engine for a store's database; it does not connect yet.
+
+    SQLite connections are in WAL mode with synchronous=FULL. PostgreSQL ones use psycopg.
 
     Parameters
     ----------
     url : str or None
         A file (SQLite), or a URL of SQLite or PostgreSQL. None: SQLite in memory.
 
+    Returns
+    -------
+    sqlalchemy.Engine
+
     Raises
     ------
     StoreError
-        For any other database, and for a URL that cannot be read.
+        For any other database, for a URL that cannot be read, for an SQLite URL in memory, and if
+        the driver of PostgreSQL is not installed. The message has no password.
     """
     if url is None:
         options = {"poolclass": sa.pool.StaticPool, "connect_args": {"check_same_thread": False}}
@@ -117,7 +124,10 @@ def make_engine(url: str | None) -> sa.Engine:
 
 
 def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
-    """Have an engine use `_connect`, `_set_pragmas` and `_begin` below; return the engine."""
+    """Have an engine call `_connect`, `_set_pragmas` and `_begin` below, and return this engine.
+
+    They open its SQLite connections, set them up, and begin their transactions.
+    """
     sa.event.listen(engine, "do_connect", _connect)
     sa.event.listen(engine, "connect", _set_pragmas)
     sa.event.listen(engine, "begin", _begin)
@@ -125,23 +135,27 @@ def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
 
 
 def _unusable_url(url: str, reason: str) -> StoreError:
-    """Return the error for a URL that cannot be used; it names the part behind the password."""
+    """Return the StoreError for a URL that cannot be used, with the reason.
+
+    The message quotes only the part of the URL behind the last @, so that no password is in it.
+    """
     actual = f"{url.split('@')[-1]!r}: {reason}. For PostgreSQL: pip install 'dengine[postgres]'"
     return StoreError(f"Expected a file or a database URL that can be used here, got {actual}.")
 
 
 class CopyConnection(sqlite3.Connection):
-    """A connection to a copy of a file; the copy is deleted with it."""
+    """An SQLite connection to a temporary copy of a file; the copy is deleted with it."""
 
 
 def _connect(
     dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]
 ) -> Any:
-    """Return a new SQLite connection, also to a file that cannot be written.
+    """Return a new SQLite connection, for a file that cannot be written one that only reads.
 
-    If neither the file nor its folder can be written, the file is opened as immutable. If in
-    addition a `-wal` is beside it without a `-shm`, both files are copied to a temporary folder and
-    the copy is opened, since SQLite must create the `-shm` to read them.
+    SQLAlchemy calls it with the dialect and the driver's arguments. If neither the file nor its
+    folder can be written, the file is opened as immutable. If in addition a `-wal` is beside it
+    without a `-shm`, both files are copied to a temporary folder and the copy is opened, since
+    SQLite must create the `-shm` to read them.
     """
     name = str(arguments[0])
     file = Path(name)
@@ -170,14 +184,19 @@ def _connect(
 
 
 def _is_unwritable(error: Exception) -> bool:
-    """Return whether an SQLite error says that a file cannot be written, or created beside it."""
+    """Return whether an SQLite error says that a file is read-only, or cannot be opened."""
     # An extended code has more in its higher bits
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     return code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN)
 
 
 def _set_pragmas(connection: Any, record: Any) -> None:
-    """Set a new SQLite connection to synced commits, and a store's or an empty file to WAL mode."""
+    """Set a new SQLite connection to synchronous=FULL, so that a commit survives a power failure.
+
+    The file of a store, or an empty one, is set to WAL mode; another program's file is not changed,
+    and a file that cannot be written keeps its mode. The driver then begins no transactions by
+    itself.
+    """
     connection.isolation_level = None  # `_begin` starts transactions, not the driver
     try:
         tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
@@ -194,9 +213,9 @@ def _set_pragmas(connection: Any, record: Any) -> None:
 
 
 def _begin(connection: sa.Connection) -> None:
-    """Begin a transaction; one that will write takes SQLite's write lock at once.
+    """Begin an SQLite transaction; with the option `dengine_write` it takes the write lock at once.
 
-    The busy timeout does not apply to a read transaction that becomes a write.
+    It then waits for other writers, which a read transaction that becomes a write would not do.
     """
     write = connection.get_execution_options().get("dengine_write", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
@@ -218,7 +237,11 @@ ROW_ERRORS = (sa.exc.IntegrityError, sa.exc.DataError, OverflowError, ValueError
 
 @contextmanager
 def _store_errors(verb: str, name: str) -> Iterator[None]:
-    """Turn a database error of the block into a StoreError that says what to do."""
+    """Context manager that raises StoreError for an error of the database, a file or a value.
+
+    Its message is "Could not `verb` `name`", the error, and what to do. Errors of dengine pass
+    unchanged.
+    """
     try:
         yield
     except DengineError:
@@ -232,7 +255,10 @@ def _store_errors(verb: str, name: str) -> Iterator[None]:
 
 @contextmanager
 def reading(url: str) -> Iterator[sa.Connection]:
-    """Connect to a store for reading; the block sees one snapshot of it, and writes nothing.
+    """Context manager that opens a store for reading; the block sees one snapshot of the database.
+
+    Nothing is created or written, and the connection is closed after the block. In SQLite, text
+    with damaged bytes is read with escapes instead of an error.
 
     Parameters
     ----------
@@ -246,7 +272,7 @@ def reading(url: str) -> Iterator[sa.Connection]:
     Raises
     ------
     StoreError
-        Where there is no store of the present schema.
+        If there is no file, if it is no store of the present schema, and if the database fails.
     """
     engine = make_engine(url)
     name = engine.url.render_as_string(hide_password=True)
@@ -272,9 +298,10 @@ def reading(url: str) -> Iterator[sa.Connection]:
 
 
 def run_integrity_check(connection: sa.Connection, table: str = "") -> list[str]:
-    """Run SQLite's integrity check on the file, or on one table.
+    """Run SQLite's integrity check on the whole file, or on one table.
 
-    Return its findings, [] if all is well.
+    Return its findings as texts, [] if all is well. A database error is a finding, too, and not
+    raised.
     """
     try:
         lines = connection.execute(
@@ -295,7 +322,7 @@ class Database:
     cell_id : str
         The cell; it is entered if it is new. Tables are created in an empty database.
     clock : callable
-        Returns the time, in seconds, for the ledger's entries.
+        Returns the time, in seconds since 1970, for the ledger's entries.
     product : str or None
         What a new cell makes; None: as the store says.
     before_use : callable
@@ -317,7 +344,8 @@ class Database:
     Raises
     ------
     StoreError
-        For another program's database, another schema, or a ledger with another key.
+        For another program's database, another schema, a ledger with another key, or another
+        product than the cell's.
     """
 
     def __init__(
@@ -349,7 +377,11 @@ class Database:
         self._opened = None if self._file is None else self._file.stat()
 
     def _open(self, product: str | None) -> Scope:
-        """Create or check the tables, enter the cell, and set `newest_entry`; return the scope."""
+        """Create the tables or check them, enter the cell if it is new, and set `newest_entry`.
+
+        Return the cell with its product. Raise StoreError, and disconnect, if the database is no
+        store of this schema, or if the cell has another ledger key or another product.
+        """
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
                 connection = plain.execution_options(dengine_write=True)
@@ -365,9 +397,10 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """Open a transaction for reading, after waiting records were written.
+        """Context manager that opens a read transaction and gives its connection.
 
-        Yield its connection.
+        `before_use` is called first, so that waiting records are seen. Raise StoreError if the
+        database fails or is closed.
         """
         self.check_open()
         self._before_use()
@@ -376,9 +409,12 @@ class Database:
 
     @contextmanager
     def _transaction(self) -> Iterator[sa.Connection]:
-        """Open a write transaction that locks the cell.
+        """Context manager that opens a write transaction, locks the cell and gives the connection.
 
-        Commit it with a ledger entry, or roll it back on an error.
+        After the block a ledger entry for the rows that it added is inserted, and both are
+        committed; then `newest_entry` is set and `on_entry` called. Without such rows there is no
+        entry. On an error everything is rolled back, and StoreError is raised: also if the file was
+        replaced, or if `commit_if` no longer wants the commit.
         """
         with _store_errors("write to", self.name), self._writer.connect() as connection:
             connection.execution_options(dengine_write=True)
@@ -399,7 +435,10 @@ class Database:
                 self.on_entry()
 
     def _check_file(self) -> None:
-        """Raise an OSError if another file, or none, is at the path of the one that was opened."""
+        """Raise FileNotFoundError if the opened SQLite file is no longer the one at its path.
+
+        PostgreSQL and a store in memory are not checked.
+        """
         if self._file is None or self._opened is None:
             return
         with suppress(OSError):
@@ -409,9 +448,10 @@ class Database:
 
     @contextmanager
     def commit_if(self, is_wanted: Callable[[], bool]) -> Iterator[None]:
-        """Commit this thread's transactions in the block only if `is_wanted()` is true by then.
+        """Context manager in which this thread commits a transaction only if `is_wanted()`.
 
-        Otherwise they are rolled back, and StoreError is raised.
+        `is_wanted` is called just before each commit. If it is false, the transaction is rolled
+        back, and `write` raises StoreError.
         """
         self._commits.is_wanted = is_wanted
         try:
@@ -427,9 +467,10 @@ class Database:
         ] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:
-        """Compare what an engine reads of this cell and its product with their ledgers.
+        """Compare what an engine reads of this cell, and its product's others, with their ledgers.
 
-        Settings, corrections and versions are checked in full.
+        These are settings, corrections, labels and model versions. Of the labels only the newest
+        are checked, everything else in full.
 
         Parameters
         ----------
@@ -451,9 +492,10 @@ class Database:
         return ""
 
     def check_pages(self) -> str:
-        """Run SQLite's integrity check on the tables that engines read.
+        """Run SQLite's integrity check on the tables that engines read, all but traces and events.
 
-        Return its first finding, "" if all is well.
+        Return its first finding, or the error if that fails; "" if all is well, and for PostgreSQL
+        and a store in memory, which are not checked.
         """
         for name in CHECKED_TABLES if self._file is not None else ():
             try:
@@ -465,7 +507,7 @@ class Database:
         return ""
 
     def check_writable(self) -> None:
-        """Raise a StoreError if SQLite cannot write to its file, found by an update of no row."""
+        """Raise a StoreError if the database cannot be written, found by an update of no row."""
         self.write(
             lambda connection: connection.exec_driver_sql(
                 "UPDATE setting SET value = value WHERE 0"
@@ -475,7 +517,8 @@ class Database:
     def acquire_lease(self) -> None:
         """Lock the cell on a PostgreSQL server, and write from now on through that one connection.
 
-        The lock lasts as long as the connection. Raises StoreError if another engine has it.
+        The lock lasts as long as the connection; a new connection locks again. Raise StoreError if
+        another engine has the lock; this `Database` can then still be used, without it.
         """
         # The name is shown to an engine that finds the cell locked.
         options = TIMEOUTS | {"application_name": f"dengine {describe_process()}"[:63]}
@@ -492,9 +535,10 @@ class Database:
             raise
 
     def _take_lease(self, connection: Any, record: Any) -> None:
-        """Lock the cell for a new PostgreSQL connection, until that is closed.
+        """Lock the cell for a new PostgreSQL connection, until that connection is closed.
 
-        If another engine has the lock, the connection is closed and StoreError is raised.
+        SQLAlchemy calls it for each connection. If another engine has the lock, the connection is
+        closed, and the StoreError that is raised names that engine.
         """
         digest = hashlib.sha256(b"dengine " + self.cell_id.encode()).digest()
         key = int.from_bytes(digest[:8], "big", signed=True)
@@ -513,7 +557,7 @@ class Database:
             )
 
     def check_open(self) -> None:
-        """Raise a StoreError after `close`, and in a forked process."""
+        """Raise a StoreError after `close`, and in a process forked after the opening."""
         if self._closed:
             raise StoreError(
                 f"Expected an open store, got {self.name} after close(); open it again."
@@ -522,19 +566,22 @@ class Database:
             raise forked_error(self._pid, self.name)
 
     def write(self, add_rows: Callable[[sa.Connection], T], flush_first: bool = True) -> T:
-        """Call `add_rows` in a write transaction, commit it, and return what it returned.
+        """Call `add_rows` in a write transaction, commit it, and return what `add_rows` returned.
+
+        This waits until another thread's transaction has ended. The commit includes a ledger entry
+        for the rows that were added.
 
         Parameters
         ----------
         add_rows : callable
             Takes the connection, and adds rows.
         flush_first : bool, default True
-            Write waiting records before.
+            Call `before_use` first, so that waiting records are written before these rows.
 
         Raises
         ------
         StoreError
-            Where the database fails; then nothing is written.
+            If the database fails or is closed; then nothing is written.
         """
         self.check_open()
         if flush_first:
@@ -548,14 +595,15 @@ class Database:
                     self._disconnect()
 
     def read(self, query: sa.Select[Any]) -> Sequence[Any]:
-        """Return the rows of a query."""
+        """Run a query in a read transaction of its own, and return all its rows."""
         with self.reading() as connection:
             return connection.execute(query).all()
 
     def close(self, waiting: bool = True) -> None:
-        """Disconnect.
+        """Disconnect from the database; later calls raise StoreError.
 
-        Wait for a write of another thread first if `waiting`, else let that write disconnect.
+        If another thread is writing: with `waiting` this waits until it has finished; without, it
+        returns at once, and that thread disconnects when it has finished.
         """
         self._closed = True
         if self._writing.acquire(blocking=waiting):
@@ -563,6 +611,7 @@ class Database:
             self._writing.release()
 
     def _disconnect(self) -> None:
+        """Close all connections."""
         self._writer.dispose()
         self._engine.dispose()
 
@@ -571,20 +620,22 @@ class Database:
     def insert(
         self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]
     ) -> range:
-        """Insert rows of this cell into a table, and number them.
+        """Insert rows of this cell into a table, each with the next number; return these numbers.
 
         Parameters
         ----------
         connection : sqlalchemy.Connection
             In a write transaction.
         column : sqlalchemy.Column
-            The table's column that takes the numbers; they continue those of its rows.
+            The table's column that takes the numbers. They continue those of the cell; or those of
+            its product, if it has one and the table is shared.
         rows : sequence of mapping
+            Without `cell_id` and the number. They are not changed.
 
         Returns
         -------
         range
-            The numbers.
+            The numbers, in the order of the rows; empty without rows.
         """
         if not rows:
             return range(0)
@@ -598,17 +649,18 @@ class Database:
     def insert_corrections(
         self, connection: sa.Connection, rows: Sequence[Mapping[str, Any]]
     ) -> None:
-        """Insert corrections, each with the number of the newest label so far."""
+        """Insert rows of corrections, each with the number of the newest label as `newest_seq`."""
         newest = self.scope.next_number(connection, LABEL.c.seq) - 1
         self.insert(
             connection, CORRECTION.c.number, [{**row, "newest_seq": newest} for row in rows]
         )
 
     def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
-        """Return a row for each of these decisions that is stored, by id.
+        """Return, by id, a row for each of these decisions of the cell that is stored.
 
-        It has content_hash, quarantined and time, and of the label success, source, seq and the
-        corrected label, which are NULL if there is no label.
+        It has content_hash, quarantined and time of the decision, and of its label success, source,
+        seq and `corrected`: the label after corrections, 0, 1 or FORGOTTEN. These four are None
+        without a label. Ids that are not stored are left out.
         """
         label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
         query = sa.select(
@@ -619,9 +671,9 @@ class Database:
     def _rows_by_id(
         self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]
     ) -> dict[str, Any]:
-        """Run a query over decisions for these ids of the cell, in chunks.
+        """Run a query over this cell's decisions for the given ids, at most CHUNK ids at a time.
 
-        Return the rows by id.
+        Return the rows by id; ids without a row are left out.
         """
         query = query.where(DECISION.c.cell_id == self.cell_id)
         return {
@@ -631,9 +683,11 @@ class Database:
         }
 
     def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
-        """Commit records of a journal, as `SqlStore.apply_records`.
+        """Commit records of a journal; return (decision id, label number) of their labels.
 
-        A record that the database refuses is left out, and an event says so.
+        All are committed in one transaction, as `SqlStore.apply_records` describes. If the database
+        refuses a value, the records are halved until the refused one is alone: it is left out, and
+        an event of kind "dead letter" is stored instead. Any other failure raises StoreError.
         """
         try:
             return self.write(lambda connection: self._insert_records(connection, records))
@@ -651,10 +705,11 @@ class Database:
     def _insert_records(
         self, connection: sa.Connection, records: Sequence[Record]
     ) -> list[tuple[str, int]]:
-        """Insert the records that are not stored yet; return (decision id, number) of the labels.
+        """Insert the decisions, labels and events that are not stored yet.
 
-        A record that contradicts a stored one becomes an event, a dead letter. A late stop corrects
-        the label of a part that silence had confirmed.
+        Return (decision id, number) of each label, new or stored before with the same value. A
+        record that contradicts a stored one becomes an event of kind "dead letter". A line stop of
+        a part whose label was "confirmed" by silence corrects that label to failure.
         """
         events = self._new_events(
             connection, [record for record in records if isinstance(record, Event)]
@@ -701,9 +756,10 @@ class Database:
         return [(id_, numbers[id_]) for id_ in dict.fromkeys(labelled)]
 
     def _insert_late_stops(self, connection: sa.Connection, ids: Sequence[str]) -> None:
-        """Correct to failure the labels of parts that silence had confirmed and that later stopped.
+        """Correct to failure the labels of parts that silence had confirmed and that stopped later.
 
-        Each gets an event.
+        Such a label was "confirmed" since no line stop had been reported in time. Insert a
+        correction and an event of kind "late stop" for each.
         """
         now = float(self._clock())
         text = "counts as a failure, was a success: its stop came after its confirmation"
@@ -721,9 +777,10 @@ class Database:
     def _insert_decisions(
         self, connection: sa.Connection, decisions: Sequence[StoredDecision]
     ) -> list[Event]:
-        """Insert the decisions that are not stored yet.
+        """Insert the decisions that are not stored yet, with their traces.
 
-        Return a dead letter for each whose id has another decision.
+        Return an event of kind "dead letter", not inserted yet, for each whose id is stored with
+        other values.
         """
         trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
@@ -747,7 +804,7 @@ class Database:
         return events
 
     def _new_events(self, connection: sa.Connection, events: Sequence[Event]) -> list[Event]:
-        """Return the events that are not stored yet, by time, kind and text."""
+        """Return the events that the cell has not stored yet, compared by time, kind and text."""
         if not events:
             return []
         query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text)
@@ -757,13 +814,16 @@ class Database:
         return [event for event in events if (event.time, event.kind, event.text) not in stored]
 
     def _dead_letter(self, text: str) -> Event:
-        """Log a record that cannot be stored, and return the event that tells of it."""
+        """Log an error for a record that cannot be stored; return an event of kind "dead letter".
+
+        The event is not inserted here.
+        """
         log.error("dead letter: %s", text)
         return Event(0, self._clock(), "dead letter", as_text(text))
 
 
 def _describe(record: Record) -> str:
-    """Return a record in words, for a dead letter."""
+    """Return a record (event, decision or label) in a few words, for the text of a dead letter."""
     if isinstance(record, Event):
         return f"an event, {record.text!r}"
     if isinstance(record, StoredDecision):

@@ -1,13 +1,16 @@
-"""A cell's journal: the write-ahead log on the local disk, from which the store is filled.
+"""A cell's journal: the write-ahead log on the local disk, from which the store is filled. The
+class `Journal` is one locked file: a header, then the records (decisions, labels, events) in the
+order in which they were written. `encode_record` and `decode_record` convert a record to bytes and
+back; other functions return a journal's path, read the records that its store has not taken, and
+describe the process that owns a cell. `Outbox` writes the journal while a cell runs; backup and
+verification read it.
 
-The journal is one locked file: a header, then the records (decisions, labels, events) in the order
-in which they were written. Each record has its length, its CRC-32, and a digest over itself and the
-record before, so that a changed record and a missing one are both noticed. The header names the
-process that owns the cell, the offset up to which the store holds the records, and the newest entry
-of the cell's ledger that the store held: a store that was cut off or restored from an older copy
-lacks that entry. A small file beside the journal, its head, repeats the entry, for the case that
-the journal was lost together with the store. `Outbox` writes the journal while a cell runs; backup
-and verification read it.
+Each record has its length, its CRC-32, and a digest over itself and the record before, so that a
+changed record and a missing one are both noticed. The header names the process that owns the cell,
+the offset up to which the store holds the records, and the newest entry of the cell's ledger that
+the store held: a store that was cut off or restored from an older copy lacks that entry. A small
+file beside the journal, its head, repeats the entry, for the case that the journal was lost
+together with the store.
 """
 
 import hashlib
@@ -45,7 +48,11 @@ Record = StoredDecision | NewLabel | Event
 
 
 def encode_record(record: Record) -> bytes:
-    """Return a record in bytes: its row in JSON, then the samples of its trace or point."""
+    """Return a record (decision, label or event) as bytes, without the journal's frame.
+
+    They are the length of a JSON text, this text with the record's kind and fields, and the float32
+    samples of a decision's trace or a label's point.
+    """
     if isinstance(record, StoredDecision):
         row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
         samples = pack(record.trace)
@@ -57,7 +64,7 @@ def encode_record(record: Record) -> bytes:
 
 
 def decode_record(blob: bytes) -> Record:
-    """Return the record that `encode_record` wrote; StoreError for anything else."""
+    """Return the record that `encode_record` wrote; raise StoreError for other bytes."""
     do = "open the store with the dengine that wrote it"
     errors = (struct.error, ValueError, KeyError, TypeError, AttributeError)
     with instead(
@@ -77,6 +84,9 @@ def decode_record(blob: bytes) -> Record:
 class Journal:
     """An open journal file. One thread appends; any thread may read.
 
+    Opening reads all records that the store does not hold yet, and checks them. If `owning`, an
+    unfinished record at the end is cut off, the header is written and disk space is reserved.
+
     Parameters
     ----------
     path : Path
@@ -87,7 +97,7 @@ class Journal:
     Attributes
     ----------
     end : int
-        Offset behind the last record.
+        Offset behind the last record, in bytes.
     drained_to : int
         Offset up to which the store holds the records; set by the outbox.
     newest_entry : (int, str) or None
@@ -103,7 +113,8 @@ class Journal:
     Raises
     ------
     StoreError
-        Where another process, or another engine of this one, owns the file.
+        If another process, or another engine of this one, owns the file, and if the file is no
+        journal or cannot be used.
     """
 
     def __init__(self, path: Path, owning: bool = True) -> None:
@@ -133,19 +144,27 @@ class Journal:
         return self.drained_to >= self.end
 
     def append(self, records: Sequence[bytes]) -> list[int]:
-        """Append encoded records and sync them to the disk.
+        """Append encoded records behind the last one, and return when they are synced to the disk.
+
+        If it fails, the journal's end stays where it was, and the same records can be appended
+        again.
+
+        Parameters
+        ----------
+        records : sequence of bytes
+            As `encode_record` returns them.
 
         Returns
         -------
         list of int
-            The offset of each record, for `read`.
+            The offset of each record in bytes, for `read`.
 
         Raises
         ------
         LostJournalError
-            Where the open file is no longer the one at its path, so that nobody would read it.
+            If the open file is no longer the one at its path, so that nobody would read it.
         StoreError
-            Where the disk fails.
+            If the disk fails.
         """
         offsets = []
         framed = bytearray()
@@ -167,9 +186,9 @@ class Journal:
         return offsets
 
     def read(self, offset: int) -> bytes:
-        """Return the encoded record at an offset that `append` gave.
+        """Return the encoded record at an offset that `append` returned.
 
-        StoreError if it was changed.
+        Raise StoreError if no intact record begins there.
         """
         if (record := self._read_record(offset)) is None:
             raise StoreError(
@@ -179,9 +198,9 @@ class Journal:
         return record
 
     def undrained_records(self) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (offset, end, encoded record) of each intact record behind `drained_to`.
+        """Yield (offset, end, encoded record) of the records that the store lacks, oldest first.
 
-        Damaged ones are skipped.
+        Damaged records are skipped: the search goes on at the next one.
         """
         begin = self.drained_to
         while begin < self.end:
@@ -198,12 +217,11 @@ class Journal:
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
     def save_newest_entry(self, newest: tuple[int, str] | None) -> None:
-        """Write the newest ledger entry to the header and the head file, without a sync.
+        """Write the newest ledger entry and `drained_to` to the header, the entry also to the head.
 
-        The head file lies beside the journal; a failure to write it is ignored. `drained_to` is
-        written to the header as well.
-
-        An older header is harmless: the store ignores a record that it is given twice.
+        Nothing is synced: an older header is harmless, since the store ignores a record that it is
+        given twice. Raise StoreError if the header cannot be written; a failure of the head is
+        ignored. None leaves the head as it is.
         """
         self.newest_entry = newest
         with _os_errors(self.path):
@@ -216,7 +234,11 @@ class Journal:
             head.write(json.dumps(newest).ljust(HEADER).encode())
 
     def clear(self) -> None:
-        """Remove all records, which the store holds now. Call `reserve` afterwards."""
+        """Remove all records, drained or not; the caller has made sure that the store holds them.
+
+        The file is cut off behind its header, which frees the reserved space: call `reserve`
+        afterwards.
+        """
         with _os_errors(self.path):
             self._file.truncate(HEADER)
             self.drained_to = HEADER
@@ -226,12 +248,19 @@ class Journal:
             self._file.write(self._header(), 0)
 
     def reserve(self) -> None:
-        """Reserve disk space for about RESERVE bytes of records, and sync that."""
+        """Reserve disk space for at least RESERVE bytes of records, and sync that.
+
+        On a full disk nothing is reserved, and no error raised.
+        """
         with _os_errors(self.path):
             self._file.reserve(HEADER + RESERVE)
 
     def recreate(self) -> None:
-        """Create the lost file again, with the undrained records at their old offsets."""
+        """Create a new file at the path of a journal that was deleted, moved or replaced.
+
+        The records that are not drained are copied from the lost file to the same offsets. Raise
+        StoreError if the new file cannot be written; the journal then still uses the lost one.
+        """
         lost = self._file
         self._file = _open_file(self.path)
         try:
@@ -247,9 +276,10 @@ class Journal:
             lost.close()
 
     def close(self) -> None:
-        """Cut off the reserved space, and the records if all are drained; unlock the file.
+        """Cut off the reserved space, and the records if all are drained; close, unlock the file.
 
-        The file stays with its header, for the next engine to compare with the ledger.
+        The file stays with its header, for the next engine to compare with the ledger. A journal
+        that was opened for reading is only closed.
         """
         if self._owning and not self._file.closed:
             with _os_errors(self.path):
@@ -257,7 +287,7 @@ class Journal:
         self._file.close()
 
     def _header(self) -> bytes:
-        """Return the header: MAGIC, and in JSON owner, drained offset and newest ledger entry."""
+        """Return the header in bytes: MAGIC, and in JSON owner, drained offset, newest entry."""
         fields = {
             "owner": describe_process()[:80],
             "drained": self.drained_to,
@@ -266,13 +296,16 @@ class Journal:
         return (MAGIC + json.dumps(fields).encode()).ljust(HEADER, b"\0")
 
     def _write_header_and_reserve(self) -> None:
+        """Write the header, and reserve disk space for records."""
         self._file.write(self._header(), 0)
         self.reserve()
 
     def _scan(self) -> None:
-        """Read the header and all undrained records.
+        """Read the header and all undrained records, and set the attributes that describe them.
 
-        Set `drained_to`, `end`, `dropped`, `damaged` and the digest.
+        These are `drained_to`, `newest_entry`, `end`, `dropped`, `damaged` and the digest of the
+        last record. With a damaged header all records count as undrained. Nothing is written. Raise
+        StoreError if the file is no journal.
         """
         size = self._file.size
         if size == 0:
@@ -303,7 +336,10 @@ class Journal:
         self._digest = previous or bytes(16)
 
     def _read_record(self, offset: int) -> bytes | None:
-        """Return the encoded record at an offset; None if it is not as it was written."""
+        """Return the encoded record at an offset, without its frame.
+
+        None if no record begins there, or if it is cut off or its CRC-32 differs.
+        """
         frame = self._file.read(FRAME.size, offset)
         if len(frame) < FRAME.size or not frame.startswith(MARK):
             return None
@@ -319,21 +355,21 @@ class LostJournalError(StoreError):
 
 
 def _chain_digest(previous: bytes, record: bytes) -> bytes:
-    """Return the digest of a record, 16 bytes, over the digest of the one before and the record."""
+    """Return the digest (BLAKE2b, 16 bytes) over the digest of the record before and a record."""
     return blake2b(previous + record, digest_size=16).digest()
 
 
 def _os_errors(path: Path, owning: bool = True) -> AbstractContextManager[None]:
-    """Turn an OSError of the block into a StoreError that names the journal and says what to do."""
+    """Context manager that raises StoreError, with the journal's path, for an OSError."""
     do = "free some space there, or make its folder writable"
     do = do if owning else "read it as the user that its cell runs as"
     return instead(StoreError, f"Could not use the journal {path}", OSError, do=do)
 
 
 def _open_file(path: Path, owning: bool = True) -> OwnedFile:
-    """Open a journal's file, locked if `owning`.
+    """Open a journal's file, and lock it if `owning`; it is then created if need be.
 
-    StoreError that names the owner if another engine has it.
+    Raise StoreError if the system refuses, or if another engine has locked it; that is then named.
     """
     with _os_errors(path, owning):
         try:
@@ -348,18 +384,20 @@ def _open_file(path: Path, owning: bool = True) -> OwnedFile:
 
 
 def journal_path(url: Any, cell_id: str) -> Path:
-    """Return the path of a cell's journal.
+    """Return the path of a cell's journal, whether the file exists or not.
 
     Parameters
     ----------
     url : sqlalchemy.URL
         The store.
     cell_id : str
+        Characters that a file name cannot have are escaped.
 
     Returns
     -------
     Path
-        Beside an SQLite file; for a server in the user's state folder (`XDG_STATE_HOME`).
+        Beside an SQLite file, STORE.CELL.journal; for a server in the folder dengine of the user's
+        state folder (`XDG_STATE_HOME`, or ~/.local/state).
     """
     name = urllib.parse.quote(cell_id, safe="")
     if IGNORES_CASE:  # or cell A and cell a would have one journal
@@ -374,9 +412,9 @@ def journal_path(url: Any, cell_id: str) -> Path:
 
 
 def sqlite_file(url: Any) -> Path:
-    """Return the real file of an SQLite URL, links resolved, also of a `file:` URI.
+    """Return the path of the file of an SQLite URL or `file:` URI, absolute, links resolved.
 
-    One file has one owner.
+    So one file has one path, and one owner, whatever name it was opened by.
     """
     database = str(url.database)
     is_uri = database.startswith("file:")
@@ -391,7 +429,10 @@ def head_path(journal: Path) -> Path:
 
 
 def read_newest_entries(path: Path) -> set[tuple[int, str]]:
-    """Return the ledger entries (number, digest), at most two, that a journal and its head name."""
+    """Return the ledger entries (number, digest) that a journal's header and its head name.
+
+    They are none, one or two; a file that is missing or damaged names none.
+    """
     entries = {_read_head(path)}
     with suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as file:
         entries.add(_parse_header(file.read(HEADER))[1])
@@ -399,9 +440,10 @@ def read_newest_entries(path: Path) -> set[tuple[int, str]]:
 
 
 def read_undrained(path: Path) -> list[Record]:
-    """Return the records of a journal that its store has not taken, whoever owns it.
+    """Return the records of a journal that its store has not taken, oldest first, whoever owns it.
 
-    If several decisions share an id, only the last is returned.
+    If several decisions share an id, only the last is returned. Damaged records are left out.
+    Nothing is locked or changed. Raise StoreError if the file cannot be read or is no journal.
     """
     journal = Journal(path, owning=False)
     try:
@@ -417,9 +459,9 @@ def read_undrained(path: Path) -> list[Record]:
 
 
 def _read_head(journal: Path) -> tuple[int, str] | None:
-    """Return number and digest of the ledger entry in the head beside a journal.
+    """Return number and digest of the ledger entry in the head, the small file beside a journal.
 
-    None if there is none.
+    None if the head is missing or damaged, or names no entry.
     """
     with suppress(OSError, ValueError, TypeError):
         number, digest = json.loads(head_path(journal).read_bytes())
@@ -428,7 +470,10 @@ def _read_head(journal: Path) -> tuple[int, str] | None:
 
 
 def _parse_header(header: bytes) -> tuple[int, tuple[int, str] | None, str]:
-    """Return the fields of a header: drained offset, newest ledger entry, owner."""
+    """Return the fields of a header: drained offset, newest ledger entry or None, owner.
+
+    Raise ValueError, KeyError or TypeError for a damaged header.
+    """
     fields = json.loads(header[len(MAGIC) :].rstrip(b"\0"))
     newest = fields["newest"]
     entry = None if newest is None else (int(newest[0]), str(newest[1]))
@@ -436,19 +481,22 @@ def _parse_header(header: bytes) -> tuple[int, tuple[int, str] | None, str]:
 
 
 def forked_error(pid: int, name: str) -> StoreError:
-    """Return the error for a forked process that uses what its parent opened."""
+    """Return the StoreError for a forked process that uses what its parent `pid` opened."""
     actual = f"its fork {os.getpid()}"
     do = "open it after the fork, in the process that uses it"
     return StoreError(f"Expected the process that opened {name}, {pid}, got {actual}; {do}.")
 
 
 def describe_process() -> str:
-    """Return this process and host in words, for another process that finds the cell owned."""
+    """Return this process's number and host in words, "process N on HOST".
+
+    It is stored, so that another process that finds the cell owned can name its owner.
+    """
     return f"process {os.getpid()} on {socket.gethostname()}"
 
 
 def owned_error(owner: str, name: str) -> StoreError:
-    """Return the error for a second engine on a cell."""
+    """Return the StoreError for an engine whose cell another engine owns; it names that owner."""
     do = (
         "close that engine first, ask its page or its HTTP where it is served, or give this "
         "one a cell_id of its own"

@@ -1,4 +1,8 @@
-"""The ledger of a cell: a hash chain by which a changed or missing row of the store is noticed.
+"""The ledger of a cell: a hash chain by which a changed or missing row of the store is noticed. The
+file has the sum of a row (`row_sum`), the class `LedgerEntry` that ends a transaction with an
+entry, the hook that gives every inserted row its sum (`chain_writes`), the check of the ledger's
+key, and `find_integrity_error`, which compares rows with the ledger. `Database` uses it for every
+write and when an engine starts; `verify_history` checks the whole chain.
 
 Every transaction that adds rows or changes settings ends with a ledger entry. The entry has a
 digest over the entry before, over the sums (SHA-256) of the rows that the transaction added, and,
@@ -47,17 +51,26 @@ NOT_SUMMED = {"sum", "state"}
 
 
 def row_sum(table: str, row: Mapping[str, Any]) -> bytes:
-    """Return the sum of a row.
-
-    The SHA-256 of the table's name and every value's name, type and bytes.
+    """Return the sum of a row: SHA-256 over the table's name and each value's name, type and bytes.
 
     It is the same on SQLite and PostgreSQL, as written and as read: true is 1 (SQLite has no
-    booleans), NaN is left out and -0.0 is 0.0 (SQLite keeps neither).
+    booleans), None and NaN are left out and -0.0 is 0.0 (SQLite keeps neither). The order of the
+    columns does not matter, and the columns `sum` and `state` are left out.
+
+    Parameters
+    ----------
+    table : str
+    row : mapping of str to int, bool, float, str, bytes or None
 
     Returns
     -------
     bytes
         32 bytes.
+
+    Raises
+    ------
+    TypeError
+        For a value of another type.
     """
     pieces = [table.encode(), b"\n"]
     for name, begin in _columns(tuple(row)):  # inline, since a thousand rows a second pass here
@@ -92,7 +105,7 @@ _DOUBLE = struct.Struct(">d").pack
 
 
 def is_intact(table: str, row: Mapping[str, Any]) -> bool:
-    """Return whether a row, which includes its sum, is as it was stored."""
+    """Return whether a row's stored sum is the one that its values have now."""
     return bool(row_sum(table, row) == row["sum"])
 
 
@@ -102,9 +115,9 @@ def state_sum(state: bytes | None) -> bytes | None:
 
 
 def ledger_key() -> bytes:
-    """Return the key from the file that DENGINE_LEDGER_KEY names, b"" if it names none.
+    """Return the key from the file that DENGINE_LEDGER_KEY names; b"" if the variable is not set.
 
-    StoreError for a file without a key.
+    Raise StoreError if the file cannot be read or holds no key.
     """
     file = os.environ.get(KEY_VARIABLE)
     return read_key(file, StoreError) if file else b""
@@ -120,7 +133,8 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
     key : bytes
         b"" for a ledger without a key.
     begin : bool, default False
-        If the cell has no ledger yet, record that it is begun with this key.
+        If the cell has no ledger entry yet, store a setting by which the key is recognized later (a
+        keyed digest, not the key).
 
     Raises
     ------
@@ -151,14 +165,14 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
     """Return a row (number, digest, chains) of a cell's newest ledger entry.
 
-    None if there is none.
+    The digest is 32 bytes, the chains are JSON. None if the cell has no entry.
     """
     query = sa.select(*LEDGER.c["number", "digest", "chains"]).where(LEDGER.c.cell_id == cell_id)
     return connection.execute(query.order_by(LEDGER.c.number.desc()).limit(1)).first()
 
 
 def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
-    """Return the SHA-256 over the sums of rows, given by table; their order does not matter."""
+    """Return the SHA-256, 32 bytes, over the sums of rows, given by table; in whatever order."""
     digest = hashlib.sha256()
     for table in sorted(sums):
         ordered = sorted(sums[table])
@@ -167,7 +181,7 @@ def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
 
 
 def entry_digest(previous: bytes, head: Mapping[str, Any], key: bytes = b"") -> bytes:
-    """Return the digest of a ledger entry.
+    """Return the digest of a ledger entry over all its columns and the digest of the entry before.
 
     Parameters
     ----------
@@ -188,19 +202,22 @@ def entry_digest(previous: bytes, head: Mapping[str, Any], key: bytes = b"") -> 
 
 
 def _extend_chain(chained: str, sums: Iterable[bytes]) -> str:
-    """Return a table's chain, hexadecimal, extended by the sums of the next entry's rows."""
+    """Return a table's chain extended by the sums of the next entry's rows: SHA-256, hexadecimal.
+
+    The order of the sums does not matter; the first entry of a table extends "".
+    """
     return hashlib.sha256(chained.encode() + b"".join(sorted(sums))).hexdigest()
 
 
 def _settings_chain(settings: Mapping[str, str]) -> str:
-    """Return the chain value of a cell's settings, hexadecimal."""
+    """Return the chain value of a cell's settings, SHA-256 in hexadecimal; in whatever order."""
     return _extend_chain("", [json.dumps(settings, sort_keys=True).encode()])
 
 
 def _parse_chains(text: str) -> dict[str, str]:
-    """Return the chain of each table from an entry's column `chains`.
+    """Return the chain of each table, hexadecimal, by name, from an entry's column `chains`.
 
-    {} if it is damaged, which then fits no rows.
+    {} if that is damaged; no rows fit it then.
     """
     with suppress(ValueError, TypeError):
         return dict(json.loads(text))
@@ -213,7 +230,7 @@ class LedgerEntry:
     Parameters
     ----------
     connection : sqlalchemy.Connection
-        Of the transaction.
+        Of the transaction. The cell's newest entry is read from it.
     cell_id : str
     key : bytes, default b""
         Key of a keyed ledger.
@@ -236,9 +253,10 @@ class LedgerEntry:
         self.settings = False
 
     def add_rows(self, table: str, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Add rows that are about to be inserted into a table.
+        """Add the sums of rows that are about to be inserted into a table.
 
-        Return them with the entry's number and their sums.
+        Return copies of the rows with two more columns: `entry`, the number of this entry, and
+        `sum`.
         """
         chained = [{**row, "entry": self._number} for row in rows]
         for row in chained:
@@ -247,17 +265,18 @@ class LedgerEntry:
         return chained
 
     def append(self, clock: Callable[[], float]) -> tuple[int, str] | None:
-        """Insert the entry, as the last step of the transaction.
+        """Insert the entry into the ledger, as the transaction's last step; this does not commit.
 
         Parameters
         ----------
         clock : callable
-            Returns the entry's time, in seconds.
+            Returns the entry's time, in seconds since 1970.
 
         Returns
         -------
         (int, str) or None
-            Number and hexadecimal digest of the entry; None if nothing was added or changed.
+            Number and hexadecimal digest of the entry. None if no rows were added and no settings
+            changed; then no entry is inserted.
         """
         if not (self._sums or self.settings):
             return None
@@ -284,16 +303,19 @@ class LedgerEntry:
 
 
 def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
-    """Return a cell's settings, without those that the store itself keeps (`RESERVED`)."""
+    """Return a cell's settings, by key, without those that the store itself keeps (`RESERVED`).
+
+    {} for an unknown cell.
+    """
     query = sa.select(SETTING.c.key, SETTING.c.value)
     query = query.where(SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED))
     return {row.key: row.value for row in connection.execute(query)}
 
 
 def find_settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, str]:
-    """Compare a cell's settings with the ledger's newest copy.
+    """Compare a cell's settings with the newest copy of them in the ledger.
 
-    Return by key what is wrong, in words.
+    Return, by key, "is not chained", "is missing" or "was changed"; {} if they are equal.
     """
     stored = read_settings(connection, cell_id)
     chained: dict[str, str] = {}
@@ -315,15 +337,18 @@ def find_settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, s
 def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, first: int) -> str:
     """Compare what an engine reads of a cell with the cell's ledger.
 
+    These are the settings, corrections, versions and newest labels. Of the ledger only the newest
+    entry is checked.
+
     Parameters
     ----------
     connection : sqlalchemy.Connection
     cell_id : str
     key : bytes
-        Key of the ledger, b"" without one.
+        Key of the ledger, b"" without one. Another key than the ledger's is a difference.
     first : int
         Number of the oldest label that is checked. Settings, corrections and versions are checked
-        in full.
+        in full, but for the versions' stored states.
 
     Returns
     -------
@@ -360,6 +385,7 @@ def _find_table_error(
 ) -> str:
     """Compare a table's rows with the chain over them; return the first difference in words, or "".
 
+    A difference is a row that its sum does not fit, or rows that were removed, added or replaced.
     Rows from number `first` on are read, or from the first of its entry, up to those of the entry
     `last_entry`: others may write meanwhile. `chained` is the chain that `last_entry` has.
     """
@@ -388,7 +414,7 @@ def _find_table_error(
 
 
 def chain_writes(engine: sa.Engine) -> None:
-    """Have every statement of an engine pass `_chain_statement`, which chains inserted rows."""
+    """Have an engine call `_chain_statement` before every statement, to chain inserted rows."""
     sa.event.listen(engine, "before_execute", _chain_statement, retval=True)
 
 
@@ -398,9 +424,10 @@ def _chain_statement(
     """Add rows that are about to be inserted to the transaction's ledger entry.
 
     SQLAlchemy calls it before it executes a statement, with its rows as `many` or as a `single`
-    one. It returns the statement and its parameters; inserted rows then have the entry's number and
-    a sum. If settings are written, that is noted in the entry. Raises StoreError for an insert into
-    a chained table whose rows are not beside the statement.
+    one. It returns the statement and its parameters. Rows inserted into a chained table then have
+    the entry's number and a sum; other statements, and those outside a write transaction of
+    `Database`, pass unchanged. If settings are written, that is noted in the entry. Raise
+    StoreError for an insert into a chained table whose rows are not beside the statement.
     """
     entry: LedgerEntry | None = connection.get_execution_options().get("dengine_entry")
     if entry is None or not isinstance(statement, sa.Insert | sa.Update | sa.Delete):

@@ -1,4 +1,6 @@
-"""Opens what a user names as a store: None, a file, a URL, or a store that is open already.
+"""Opens what a user names as a store: None (in memory), a file, a URL, or a store that is open
+already. `open_store` returns it as an `SqlStore`; `opening` does so for a block, and closes it if
+that raises. The engine, the data sets and the command line use them.
 
     store = open_store("engine.db")      # an SqlStore; open_store(None) is one in memory
 
@@ -26,17 +28,19 @@ LONG_WAIT = 10.0  # seconds to wait for a store while no cell runs: the paramete
 def open_store(
     store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None
 ) -> SqlStore:
-    """Open the store that a user named.
+    """Open the store that a user named, and create it if need be.
 
     Parameters
     ----------
     store : None, str, path or SqlStore
         None: a store in memory. A file or URL: a database; a `CellAddress` (see `address`) also
-        names the cell and its product. A store is returned as it is.
+        names the cell and its product, otherwise the cell is "cell". A store is returned as it is.
     must_exist : bool, default False
         Raise a StoreError for a file or cell that does not exist, instead of creating it.
     wait : float or None
-        As `SqlStore` takes it; `LONG_WAIT` if no cell waits for it.
+        Seconds that an engine on this store waits for the disk or database at most, as `SqlStore`
+        takes it; pass `LONG_WAIT` where no cell waits for it. Not used for a store in memory or an
+        open one.
 
     Returns
     -------
@@ -45,7 +49,7 @@ def open_store(
     Raises
     ------
     StoreError
-        For anything else, and as of `SqlStore`.
+        For an argument of another type, and as of `SqlStore`.
     """
     from .peers import check_cell_exists  # SQLAlchemy is imported where it is used
     from .sql import SqlStore
@@ -70,9 +74,10 @@ def open_store(
 def opening(
     store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None
 ) -> Iterator[SqlStore]:
-    """Open a store for the block, as `open_store`; yield it.
+    """Context manager that opens a store as `open_store` does, and gives it.
 
-    If the block raises, a store that was opened here is closed; otherwise it stays open.
+    The store stays open after the block. Only if the block raises is a store that was opened here
+    closed; one that was passed open is never closed.
     """
     opened = open_store(store, must_exist=must_exist, wait=wait)
     try:

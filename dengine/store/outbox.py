@@ -1,11 +1,12 @@
-"""The engine's only way to its store while a cell runs: writes go to the local journal first.
+"""The engine's only way to its store while a cell runs: the class `Outbox`, with a journal in
+between. Decisions, labels and events are appended to the local journal, and from there copied
+("drained") into the store's database. One thread writes and syncs the journal; another drains it
+and runs the calls that the engine makes to the store; a third reads the ids of all decisions once,
+into a `BloomFilter`, by which a new id is recognized.
 
-Decisions, labels and events are appended to the journal, and from there copied ("drained") into
-the store's database. Two threads do that: one writes and syncs the journal, the other drains it and
-runs the calls that the engine makes to the store. So no call of the engine waits longer than the
-store's time limit (`SqlStore.wait`), even where the disk or the database does not answer.
-`Outbox.lag` is how far the store is behind. A store without a journal (in memory, or opened for
-reading) is called directly.
+So no call of the engine waits longer than the store's time limit (`SqlStore.wait`), even where the
+disk or the database does not answer. `Outbox.lag` is how far the store is behind. A store without a
+journal (in memory, or opened for reading) is called directly.
 """
 
 from __future__ import annotations
@@ -96,7 +97,10 @@ class BloomFilter:
         return bool((self._bytes[byte] & bit).all())
 
     def _positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the four bits of each id, each as a byte's index and a byte with one bit set."""
+        """Return the four bits of each id, each as an index of a byte and a byte with one bit set.
+
+        Both arrays have four entries per id; the second has dtype uint8.
+        """
         digests = (
             blake2b(id_.encode("utf-8", "surrogatepass"), digest_size=16).digest() for id_ in ids
         )
@@ -108,11 +112,13 @@ class Outbox:
     """Records what the engine decides, and asks the store for it, within a time limit.
 
     Every `record_*` method returns at once; `sync` waits for the disk, `drain` for the store.
+    Opening copies what an earlier process left in the journal into the store, checks the store's
+    integrity, and starts three threads, which `close` ends.
 
     Parameters
     ----------
     store : SqlStore
-        Where the records end.
+        Where the records end. `close` closes it.
     window : int
         Number of newest labels that the engine reads, and whose integrity is therefore checked.
     owning : bool, default True
@@ -179,7 +185,9 @@ class Outbox:
     def _start(self, journal: Journal) -> None:
         """Drain what an earlier process left in the journal, check the store, start the threads.
 
-        If that fails, the journal is closed.
+        Damage in the journal is stored as an event. The journal is emptied, and space reserved in
+        it. The check by SQLite is waited for only CHECK_SECONDS and goes on in a thread. On an
+        error the journal is closed, and the error raised.
         """
         try:
             self._compare_with_ledger(journal)  # before anything is drained
@@ -231,10 +239,11 @@ class Outbox:
             thread.start()
 
     def _compare_with_ledger(self, journal: Journal) -> None:
-        """Record an event where the store's ledger lacks an entry that the journal or its head has.
+        """Check that the store's ledger has the entries that the journal and its head name.
 
-        Then the store was cut off or restored from an older copy, and the whole journal is drained
-        again.
+        If one is missing, the store was cut off or restored from an older copy: an event is stored,
+        and the journal is set to be drained from its beginning. An event is also stored if the
+        journal or its head is new though the store is not.
         """
         entries = [
             entry for entry in (journal.newest_entry, journal.head_entry) if entry is not None
@@ -260,6 +269,8 @@ class Outbox:
     def check_integrity(self, since: int | None = None) -> None:
         """Compare what the engine reads from the store with the ledger; set `integrity_error`.
 
+        The first error stays; nothing is returned. A store in memory is not checked.
+
         Parameters
         ----------
         since : int or None
@@ -269,7 +280,7 @@ class Outbox:
             self._set_integrity_error(self.store.database.check_integrity(self._window, since))
 
     def _set_integrity_error(self, error: str) -> None:
-        """Keep and log the first integrity error; "" changes nothing."""
+        """Keep and log an integrity error, if it is the first; "" changes nothing."""
         if error and not self.integrity_error:
             self.integrity_error = (
                 f"{error}; see `dengine verify`, and restore the store from a copy."
@@ -277,14 +288,14 @@ class Outbox:
             log.error("every part is verified: %s", self.integrity_error)
 
     def _log_event(self, kind: str, text: str) -> None:
-        """Log an error and commit it to the store as an event."""
+        """Log an error, and commit it to the store as an event, directly and not by the journal."""
         log.error("%s: %s", kind, text)
         self.store.put_event(kind, text)
 
     def _save_newest_entry(self) -> None:
-        """Write the ledger's newest entry to the journal's header.
+        """Write the ledger's newest entry to the journal's header and its head; errors are ignored.
 
-        By it a store that was cut off is recognized.
+        By it a store that was cut off is recognized at the next start.
         """
         with self._changed, suppress(StoreError):  # a broken journal is reported by its next record
             if self._journal is not None:
@@ -302,7 +313,7 @@ class Outbox:
 
     @property
     def _journal_fault(self) -> str:
-        """Why the journal cannot be written: its last error, or a sync that takes too long.
+        """Why the journal cannot be written: its last error, or a sync that exceeds `limit`.
 
         "" if it can.
         """
@@ -323,7 +334,11 @@ class Outbox:
 
     @property
     def _unavailable_reason(self) -> str:
-        """Why the store cannot be written or read at present; "" if it can."""
+        """Why the store cannot be written or read at present; "" if it can.
+
+        This is a fault of the journal, the last error of the store, or a lag above both `limit` and
+        LAG_SECONDS.
+        """
         lag = self.lag
         late = (
             f"no answer from the store for {lag:.1f} s."
@@ -351,9 +366,10 @@ class Outbox:
 
     @contextmanager
     def try_lock(self) -> Iterator[bool]:
-        """Try to take the lock for the block, without waiting; yield whether that succeeded.
+        """Context manager that tries to take the outbox's lock, and gives whether that succeeded.
 
-        While the block holds the lock, the threads of the outbox wait.
+        It waits at most a millisecond. While the block holds the lock, the threads of the outbox
+        wait, and so do calls from other threads. The lock is released after the block.
         """
         locked = self._changed.acquire(
             timeout=LOCK_SECONDS
@@ -367,7 +383,7 @@ class Outbox:
     # What the engine records
 
     def record_decision(self, item: StoredDecision) -> StoredDecision:
-        """Record a new decision without waiting; callable from any thread.
+        """Record a new decision without waiting for disk or store; callable from any thread.
 
         Parameters
         ----------
@@ -377,8 +393,9 @@ class Outbox:
         Returns
         -------
         StoredDecision
-            The same with its number; number 0 if it could not be recorded, since the disk hangs. If
-            the id already has a decision in memory, that one, and nothing is recorded.
+            The same with its number; unchanged, with number 0, if it could not be recorded, since
+            the disk hangs and MAX_UNWRITTEN records wait. If the id already has a decision in
+            memory, that one, and nothing is recorded.
         """
         id_ = item.decision.id
         with self._changed:
@@ -396,10 +413,17 @@ class Outbox:
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
         """Replace a recorded decision that was not returned to the caller yet, under the same id.
 
+        Time, trace and number stay those of the first decision.
+
         Returns
         -------
         StoredDecision
-            The new decision; or the first one, unchanged, if that is on disk by now.
+            The new decision; or the first one, unchanged, if that is in the journal by now.
+
+        Raises
+        ------
+        KeyError
+            If no decision with this id is in memory.
         """
         with self._changed:
             first = self._recent[item.decision.id]
@@ -410,9 +434,14 @@ class Outbox:
         return item
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
-        """Record labels of decisions without waiting.
+        """Record labels of decisions without waiting; each gets the present time.
 
-        `pop_label_numbers` later returns the numbers that they get.
+        `pop_label_numbers` later returns the numbers that they get in the store.
+
+        Parameters
+        ----------
+        labels : iterable of (StoredDecision, NewLabel)
+            Each label with its decision.
         """
         now = self.store.clock
         with self._changed:
@@ -424,14 +453,23 @@ class Outbox:
             )
 
     def record_event(self, kind: str, text: str) -> None:
-        """Record an event, a kind in one word and a text for people, without waiting."""
+        """Record an event with the present time, without waiting.
+
+        Parameters
+        ----------
+        kind : str
+            In a word.
+        text : str
+            For people.
+        """
         with self._changed:
             self._append([Event(0, self.store.clock(), as_text(kind), as_text(text))])
 
     def _append(self, records: Sequence[Record]) -> None:
-        """Add records in memory and wake the journal's thread.
+        """Add records in memory, in their order, and wake the thread that writes the journal.
 
-        Without a journal the store takes them at once.
+        The caller holds the lock. Without a journal the store takes the records here, before this
+        returns.
         """
         numbers = self.store.apply_records(records) if self._journal is None else []
         for record in records:
@@ -457,7 +495,10 @@ class Outbox:
     def _remove_drained(
         self, records: Sequence[Record], numbers: Sequence[tuple[str, int]]
     ) -> None:
-        """Drop stored records from memory; keep the numbers that their labels were given."""
+        """Drop stored records from memory; keep the numbers that their labels were given.
+
+        Decisions among the newest N_RECENT stay in memory, now with their labels.
+        """
         self._label_numbers += numbers
         for record in records:
             if isinstance(record, StoredDecision):
@@ -469,7 +510,7 @@ class Outbox:
                     self._recent[record.decision_id] = item
 
     def sync(self, seconds: float | None = None) -> None:
-        """Wait until everything that was recorded is on disk.
+        """Wait until everything that was recorded so far is in the journal and synced to the disk.
 
         Parameters
         ----------
@@ -479,7 +520,7 @@ class Outbox:
         Raises
         ------
         NotTakenError
-            Where that takes too long, or fails. Recording the same again is harmless.
+            If that takes too long, or fails. Recording the same again is harmless.
         """
         limit = self.limit if seconds is None else seconds
         with self._changed:
@@ -502,6 +543,8 @@ class Outbox:
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
         """Return a decision with its label, from memory, the journal or the store.
 
+        The store is asked only if the id may be there, and only for `limit` seconds.
+
         Parameters
         ----------
         decision_id : str
@@ -516,7 +559,8 @@ class Outbox:
         Raises
         ------
         StoreError
-            Where the id cannot be looked up, since the store is unavailable.
+            If the store is needed and unavailable, and if the id was answered without recording a
+            decision.
         """
         with self._changed:
             if decision_id in self._unrecorded:
@@ -538,12 +582,13 @@ class Outbox:
         return item
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
-        """Return the decision that an id already has; None if the id is new.
+        """Return the decision that an id already has, with its label; None if the id is new.
 
         Raises
         ------
         StoreError
-            Where that cannot be looked up; the id is then remembered as answered but unrecorded.
+            If that cannot be looked up. The id is then remembered as answered but unrecorded: until
+            a decision is recorded for it, `find_decision` raises StoreError.
         """
         with self._changed:
             self._unrecorded.discard(decision_id)
@@ -554,7 +599,10 @@ class Outbox:
             raise
 
     def _load_ids_loop(self, journal: Journal) -> None:
-        """Run `load_ids` until it succeeds; until then every new id is looked up in the store."""
+        """Run `load_ids` until it succeeds or the outbox is closed; pause after each failure.
+
+        Until then every new id is looked up in the store.
+        """
         while not self._closed:
             try:
                 self.load_ids()
@@ -564,9 +612,10 @@ class Outbox:
                     self._changed.wait_for(lambda: self._closed, RETRY_SECONDS)
 
     def load_ids(self) -> None:
-        """Read the ids of all decisions into memory, to recognize a new id without the store.
+        """Read the ids of all decisions from the store into a Bloom filter in memory.
 
-        Takes about a second for a million.
+        Afterwards a new id is recognized without the store. A second call does nothing. It takes
+        about a second for a million ids. Raise StoreError if the store cannot be read.
         """
         with self._changed:
             if self._known_ids is None:
@@ -578,7 +627,10 @@ class Outbox:
         known_ids.complete = True
 
     def _is_new(self, decision_id: str) -> bool:
-        """Return whether an id certainly has no decision; False also if that is not known."""
+        """Return whether an id certainly has no decision; False if it may have one.
+
+        Until all ids are loaded, False for every id.
+        """
         known_ids = self._known_ids
         return (
             known_ids is not None and known_ids.complete and not known_ids.may_contain(decision_id)
@@ -587,14 +639,14 @@ class Outbox:
     def evict_decision(self, decision_id: str) -> None:
         """Drop a decision from memory, since it was corrected in the store.
 
-        The next search reads it there.
+        The next `find_decision` reads it there.
         """
         self._recent.pop(decision_id, None)
 
     def pop_label_numbers(self) -> list[tuple[str, int]]:
-        """Return (decision id, label number) of the labels stored since the last call.
+        """Return (decision id, label number) of the labels that were stored since the last call.
 
-        Each is returned once.
+        They are in the order in which they were stored. Each is returned once.
         """
         with self._changed:
             numbers = self._label_numbers
@@ -607,7 +659,7 @@ class Outbox:
         return self._drained == self._appended
 
     def request_label_drain(self) -> bool:
-        """Ask the threads to drain labels at once, without waiting for it.
+        """If any label is not drained, ask the threads to drain everything now; do not wait.
 
         Return whether any label is not drained.
         """
@@ -618,12 +670,13 @@ class Outbox:
             return bool(self._labels)
 
     def drain(self) -> None:
-        """Wait until the store has taken everything recorded so far.
+        """Wait until the store has taken everything recorded so far, at most `limit` seconds.
 
         Raises
         ------
         StoreError
-            Where the store is unavailable, or takes too long.
+            If the store is unavailable, or takes too long. The records stay in the journal, and are
+            drained later.
         """
         with self._changed:
             if self.is_drained:
@@ -639,25 +692,36 @@ class Outbox:
                 raise self._unavailable()
 
     def _unavailable(self) -> StoreError:
-        """Return the error for a store that cannot be reached now."""
+        """Return the StoreError for a store that cannot be reached now, with the reason."""
         return StoreError(
             f"The store is unavailable: {self._unavailable_reason} Labels wait in its journal; "
             "try this again when it is back."
         )
 
     def flush(self, seconds: float | None = None) -> None:
-        """Wait until every record is in the store, or on disk if the store is unavailable.
+        """Wait until every record is on disk, and then in the store unless that is unavailable.
 
-        Parameters and errors are those of `sync`.
+        Each of the two waits is limited.
+
+        Parameters
+        ----------
+        seconds : float or None
+            The longest to wait for the disk; None: `limit`. The store is waited for `limit`
+            seconds.
+
+        Raises
+        ------
+        NotTakenError
+            As of `sync`. That the store is unavailable is no error.
         """
         self.sync(seconds)
         with suppress(StoreError):
             self.drain()
 
     def call_store(self, call: Callable[[], T]) -> T:
-        """Call the store and return the result, within the time limit.
+        """Have the store's thread run `call`, and return its result within `limit` seconds.
 
-        StoreError where the store is unavailable.
+        Raise StoreError if the store is unavailable or takes too long, and whatever `call` raises.
         """
         return self.wait_for_result(self.submit(call))
 
@@ -667,7 +731,8 @@ class Outbox:
         Raises
         ------
         StoreError
-            Where it takes longer than `limit`. The call is then cancelled, unless it is committing.
+            If it takes longer than `limit`. The call is then cancelled, so that it commits nothing.
+            A call that is committing is waited for COMMIT_SECONDS more; then it may still succeed.
         """
         if not wait([future], self.limit).done and not future.cancel():
             wait([future], COMMIT_SECONDS)
@@ -676,15 +741,22 @@ class Outbox:
         return future.result()
 
     def submit(self, call: Callable[[], T]) -> Future[T]:
-        """Have the store's thread run a call; `wait_for_result` waits for it.
+        """Have the store's thread run a call, and return without waiting for it.
+
+        Records that are on disk by then are drained before, if the store takes them.
 
         Without a journal there is no such thread: the call runs here, before this returns, and what
         it raises is raised here.
 
+        Returns
+        -------
+        Future
+            Of the call's result, for `wait_for_result`.
+
         Raises
         ------
         StoreError
-            Where the store is unavailable.
+            If the store is unavailable.
         """
         future: Future[T] = Future()
         if self._journal is None:
@@ -698,17 +770,25 @@ class Outbox:
         return future
 
     def _drain_before_use(self) -> None:
-        """Drain before the store is used directly, so that its user sees every record."""
+        """Drain before the store is used directly, so that its user sees every record.
+
+        It waits at most `limit` seconds. If the store is unavailable, nothing is raised here. In
+        the thread that drains, and after `close`, it does nothing.
+        """
         if not self._closed and threading.current_thread() is not self._threads[1]:
             with suppress(StoreError):
                 self.drain()
 
     def close(self) -> None:
-        """Drain, stop the threads and close store and journal, within seconds.
+        """Drain, stop the threads, close store and journal; it takes seconds at most.
 
-        A second call does nothing.
+        What the store does not take stays in the journal, and the next engine drains it. The
+        journal, too, is closed. A second call does nothing, nor does one in a forked process.
 
-        What the store does not take stays in the journal, and the next engine drains it.
+        Raises
+        ------
+        NotTakenError
+            If the journal cannot be written; then nothing is closed.
         """
         if not self.is_usable:
             return
@@ -737,9 +817,10 @@ class Outbox:
     # The thread that writes the journal
 
     def _write_loop(self, journal: Journal) -> None:
-        """Write and sync new records in batches until closed.
+        """Write and sync new records in batches until closed: the journal's thread runs it.
 
-        After an error, try the same batch again.
+        After an error it wakes those who wait in `sync`, and tries the same records again a second
+        later.
         """
         while True:
             with self._changed:
@@ -763,9 +844,10 @@ class Outbox:
                     self._changed.wait(RETRY_SECONDS)
 
     def _write_batch(self, journal: Journal, batch: Sequence[Record]) -> None:
-        """Append records to the journal and sync it.
+        """Append records to the journal, sync it, and mark them as synced.
 
-        A large journal is cleared first, a lost one created again.
+        A journal above 8 MB is cleared first if the store takes its records within BATCH_SECONDS. A
+        journal whose file was lost is created again, and an event is recorded.
         """
         if journal.end > 8 << 20:
             with self._changed:  # a cell that never pauses would fill the disk
@@ -802,9 +884,10 @@ class Outbox:
     # The thread that drains the journal into the store
 
     def _drain_loop(self, journal: Journal) -> None:
-        """Drain synced records and run submitted calls until closed.
+        """Drain synced records and run submitted calls until closed: the store's thread runs it.
 
-        After an error, try again later.
+        Before a call everything synced is drained. After an error of the store it is logged once,
+        kept for `fault`, and tried again a second later.
         """
         while True:
             with self._changed:
@@ -839,7 +922,11 @@ class Outbox:
                     self._changed.wait_for(lambda: self._calls or self._closed, RETRY_SECONDS)
 
     def _drain_chunk(self, journal: Journal) -> None:
-        """Have the store take the oldest synced records in one call, at most DRAIN_CHUNK."""
+        """Have the store commit the oldest synced records, at most DRAIN_CHUNK, in one transaction.
+
+        Decisions that were replaced are left out. Journal, counters and memory are updated. Raise
+        StoreError if the store refuses; nothing is updated then.
+        """
         with self._changed:
             n = min(DRAIN_CHUNK, self._synced - self._drained)
         entries = [
@@ -864,9 +951,13 @@ class Outbox:
             self._changed.notify_all()
 
     def _run_call(self, future: Future[Any], call: Callable[[], Any]) -> None:
-        """Run a submitted call, unless it was cancelled; set the future's result or exception."""
+        """Run a submitted call; set the future's result or exception. Nothing is raised here.
+
+        A call that was cancelled is not run, or if it runs, its transactions are rolled back.
+        """
 
         def is_wanted() -> bool:
+            """Return whether the future was not cancelled; from then on it cannot be."""
             return future.running() or (
                 not future.cancelled() and future.set_running_or_notify_cancel()
             )

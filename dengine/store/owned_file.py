@@ -1,9 +1,10 @@
-"""`OwnedFile`, a file that one process locks and reads and writes at offsets.
+"""`OwnedFile`, a file that one process locks and reads and writes at offsets; the journal is such a
+file. `open_plain` opens a file without following a symbolic link. In a child process, after a fork,
+all owned files are closed.
 
-The journal is such a file. POSIX locks the file (`flock`) and reads and writes at an offset in one
-call. Windows locks one byte far behind all content, so that others can read the rest, and sets the
-offset first. Either lock ends with the process, however that ends, and a child process does not
-inherit it.
+POSIX locks the file (`flock`) and reads and writes at an offset in one call. Windows locks one byte
+far behind all content, so that others can read the rest, and sets the offset first. Either lock
+ends with the process, however that ends.
 """
 
 import ctypes
@@ -20,7 +21,10 @@ LOCKED_BYTE = 2**31 - 2  # the last that the C library of Windows can lock
 
 
 def _lock_of_system() -> Callable[[int], object]:
-    """Return this system's function that locks a descriptor, or raises BlockingIOError."""
+    """Return a function that locks a file's descriptor for this process, in this system's way.
+
+    It does not wait: it raises BlockingIOError if another descriptor has the lock.
+    """
     exclusive_now = 2 | 4  # LOCK_EX and LOCK_NB, of every system that has flock
     with suppress(ImportError):
         from fcntl import flock
@@ -43,11 +47,11 @@ def _lock_of_system() -> Callable[[int], object]:
 def _lock_of_windows(msvcrt: Any) -> Callable[[int], object]:
     """Return the function that locks a descriptor on Windows, and raises as `flock` does.
 
-    Locking moves the descriptor's offset.
+    It locks one byte far behind the content, and moves the descriptor's offset there.
     """
 
     def lock(descriptor: int) -> None:
-        """Lock one byte of the file; BlockingIOError if it is locked."""
+        """Lock one byte of the file without waiting; BlockingIOError if it is locked."""
         os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
         try:
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
@@ -61,9 +65,10 @@ LOCK = _lock_of_system()
 
 
 def open_plain(path: Path, flags: int) -> int:
-    """Open a file and return its descriptor; a new one is readable by its owner alone.
+    """Open a file with the flags of `os.open` in binary mode, and return its descriptor.
 
-    OSError for a symbolic link.
+    A new file is readable and writable by its owner alone. Raise OSError for a symbolic link, and
+    if the system refuses.
     """
     no_follow = getattr(os, "O_NOFOLLOW", 0)
     binary = getattr(os, "O_BINARY", 0)  # or Windows writes \r\n for \n
@@ -73,14 +78,14 @@ def open_plain(path: Path, flags: int) -> int:
 
 
 class OwnedFile:
-    """An open file; it is created if need be.
+    """An open file that one process owns; it is created, with its folder, if need be.
 
     Parameters
     ----------
     path : Path
         A symbolic link is refused.
     owning : bool, default True
-        Lock the file. False: only read it, whoever owns it.
+        Lock the file, and open it for writing. False: only read it, whoever owns it; it must exist.
 
     Raises
     ------
@@ -97,9 +102,10 @@ class OwnedFile:
         _OPEN.add(self)
 
     def _open_and_lock(self) -> int:
-        """Open and lock the file, and again if another file is at its path by then.
+        """Create the file and its folder if need be, open and lock it; return the descriptor.
 
-        Return the descriptor.
+        If the file was deleted or replaced before it was locked, this starts again. Raise
+        BlockingIOError if it is locked already.
         """
         while True:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -124,7 +130,7 @@ class OwnedFile:
         return os.fstat(self._fd).st_size
 
     def in_place(self) -> bool:
-        """Return whether this open file is still the one at its path."""
+        """Return whether this open file is still the one at its path; on Windows always True."""
         if os.name == "nt":  # there an open file cannot be deleted, moved or replaced
             return True
         try:
@@ -133,7 +139,10 @@ class OwnedFile:
             return False
 
     def read(self, size: int, offset: int) -> bytes:
-        """Return `size` bytes from an offset, or fewer at the end of the file."""
+        """Return `size` bytes from an offset in bytes, or fewer at the end of the file.
+
+        Threads may call this at the same time.
+        """
         if hasattr(os, "pread"):
             return os.pread(self._fd, size, offset)
         with self._seeking:
@@ -141,7 +150,10 @@ class OwnedFile:
             return os.read(self._fd, size)
 
     def write(self, content: bytes | bytearray, offset: int) -> None:
-        """Write all of the content at an offset, or raise an OSError."""
+        """Write all of the content at an offset in bytes; nothing is synced.
+
+        Raise OSError if the system refuses, or a full disk takes only a part.
+        """
         if hasattr(os, "pwrite"):
             written = os.pwrite(self._fd, content, offset)
         else:
@@ -160,9 +172,10 @@ class OwnedFile:
         os.ftruncate(self._fd, size)
 
     def reserve(self, size: int) -> None:
-        """Reserve disk space for `size` bytes in total, and sync.
+        """Reserve disk space for `size` bytes in total, and sync the file.
 
-        Without space the file stays as it is.
+        It becomes at least `size` bytes long, with zeros at its end. If the disk has no space, the
+        file stays as it is, and nothing is raised.
         """
         before = self.size
         try:
@@ -185,8 +198,7 @@ _OPEN: weakref.WeakSet[OwnedFile] = weakref.WeakSet()
 
 
 def _close_all() -> None:
-    """Close every open file, in a child process after a fork."""
-    """Close every open file, in a child process after a fork."""
+    """Close every open `OwnedFile`; it is called in a child process after a fork."""
     for file in list(_OPEN):
         file.close()
 

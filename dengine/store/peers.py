@@ -1,4 +1,8 @@
-"""Lists the cells of a database; checks that cells of one product have matching settings."""
+"""Lists the cells of a database, and checks that cells of one product have matching settings.
+`list_cells` returns a `CellSummary` per cell, `check_cell_exists` refuses an unknown cell, and
+`check_peer_settings` refuses settings that would embed traces differently than another cell of the
+product does. The command line and `SqlStore` use them.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,12 +27,13 @@ class CellSummary:
     ----------
     cell_id : str
     product : str or None
+        What the cell makes; None if it shares nothing with other cells.
     decisions, labels : int
         Their numbers.
     version : int or None
         Number of the newest accepted version, its product's or its own; None before the first.
     last_seen : float or None
-        Time of its newest decision or label, in seconds since 1970.
+        Time of its newest decision or label, in seconds since 1970; None before the first decision.
     """
 
     cell_id: str
@@ -44,7 +49,10 @@ def check_peer_settings(
 ) -> None:
     """Check that two cells of a product would embed a trace in the same way.
 
-    A policy, a radius, a schedule or a budget may differ: a version's arrays do not depend on them.
+    Compared are the reducer with its parameters, folds, training window, novelty, seed, trace spec
+    and model. A policy, a radius, a schedule or a budget may differ: a version's arrays do not
+    depend on them. A cell without a recipe yet, and a trace spec that one of them has not set yet,
+    fit everything.
 
     Parameters
     ----------
@@ -53,6 +61,7 @@ def check_peer_settings(
     name : str
         Of the peer, for the error.
     product : str
+        For the error.
 
     Raises
     ------
@@ -84,7 +93,10 @@ def check_peer_settings(
 
 
 def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
-    """Return the settings on which an embedding depends, by name."""
+    """Return the settings on which an embedding depends, by name, of a cell's stored settings.
+
+    Those that are not stored are None.
+    """
     recipe = Recipe.from_toml(settings["recipe"])
     of_recipe = {key: getattr(recipe, key) for key in EMBEDDING}
     return of_recipe | {key: settings.get(key) for key in ("seed", "trace", "model", "described")}
@@ -103,9 +115,9 @@ def check_cell_exists(url: str, cell_id: str) -> None:
 
 
 def list_cells(url: str) -> list[CellSummary]:
-    """Return a summary of every cell of a database, sorted by name.
+    """Return a summary of every cell of a database, sorted by cell_id.
 
-    StoreError if it is no store.
+    Raise StoreError if it is no store. Nothing is written.
     """
     accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version)).where(
         VERSION.c.accepted == sa.true()
@@ -139,7 +151,10 @@ def list_cells(url: str) -> list[CellSummary]:
 
 
 def _count_by_cell(connection: sa.Connection, table: sa.Table) -> dict[str, tuple[int, float]]:
-    """Return, by cell, the number of a table's rows and the time of the newest."""
+    """Return, by cell, the number of a table's rows and the largest time, seconds since 1970.
+
+    Cells without rows are left out.
+    """
     query = sa.select(table.c.cell_id, sa.func.count(), sa.func.max(table.c.time)).group_by(
         table.c.cell_id
     )

@@ -1,9 +1,7 @@
-"""Building blocks of the store's queries.
-
-Which cells' rows are meant, joins, and labels as corrected.
-
-A query is about one cell's rows or about those of all cells of its product (`Scope`). `SqlStore`
-and `Database` compose their statements from these functions and columns.
+"""Building blocks of the store's SQL queries: which cells' rows are meant, joins, corrected labels.
+A query is about one cell's rows or about those of all cells of its product (`Scope`). Most
+functions return SQLAlchemy queries and columns and run nothing; `join_product` enters a new cell
+into a product. `SqlStore` and `Database` compose their statements from them.
 """
 
 from dataclasses import dataclass
@@ -34,22 +32,22 @@ from .schema import (
 class Scope:
     """A cell and its product, if it has one.
 
-    What is learned is shared by a product: labelled traces for training, and model versions. Each
-    is numbered in one sequence over all cells of the product. Decisions and their outcomes belong
-    to the cell alone.
+    What is learned is shared by a product: labelled traces for training, model versions, and
+    corrections. Each is numbered in one sequence over all cells of the product. Decisions and their
+    outcomes belong to the cell alone.
     """
 
     cell_id: str
     product: str | None = None
 
     def shared(self, column: sa.Column[Any]) -> sa.ColumnElement[bool]:
-        """Return the condition that a row's cell (`column`) is this one or one of its product."""
+        """Return the SQL condition that a row's cell (`column`) is this one or of its product."""
         return (
             column == self.cell_id if self.product is None else column.in_(cells_of(self.product))
         )
 
     def cells(self, connection: sa.Connection) -> list[str]:
-        """Return the ids of this cell and then of its product's others, sorted."""
+        """Return the id of this cell first, then those of its product's other cells, sorted."""
         peers = connection.execute(
             cells_of(self.product or "").order_by(SETTING.c.cell_id)
         ).scalars()
@@ -58,7 +56,9 @@ class Scope:
     def first_label(self, connection: sa.Connection, window: int) -> int:
         """Return a label number such that the newest `window` training labels are at or after it.
 
-        For a product that is an estimate, 2 * window below the newest: others are not read.
+        Training labels are those of traces that are not quarantined. 1 if there are fewer. For a
+        product that is an estimate, 2 * window below the newest, and may be below 1: the labels are
+        not read.
         """
         if self.product is not None:  # by their numbers, or all would be read to be sorted
             return self.newest(connection, LABEL.c.seq) + 1 - 2 * window
@@ -75,7 +75,8 @@ class Scope:
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
         """Return the number of the next row of a table; it stays free until the transaction ends.
 
-        Where the numbers are the product's, the product is locked for that.
+        `column` is the table's column of numbers. Decisions and events are numbered by cell,
+        everything else by product, if there is one: that is then locked until the transaction ends.
         """
         if self.product is None or column.table in (DECISION, EVENT):
             return Scope(self.cell_id).newest(connection, column) + 1
@@ -85,9 +86,9 @@ class Scope:
     def newest(
         self, connection: sa.Connection, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
     ) -> int:
-        """Return the largest number in a column, over the cell or its product.
+        """Return the largest number in a column over the rows of the cell, or of its product.
 
-        0 if there is none.
+        With `conditions`, only over the rows that fulfil them all. 0 if there is none.
         """
         if self.product is not None:
             return connection.execute(newest_of(self.product, column, *conditions)).scalar() or 0
@@ -114,9 +115,10 @@ def cells_of(product: str) -> sa.Select[Any]:
 def newest_of(
     product: str, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
 ) -> sa.Select[Any]:
-    """Return the query for the largest number in a column over a product's cells.
+    """Return the query for the largest number in a column over a product's cells; it is not run.
 
-    It takes one step down the index for each cell, however many rows there are.
+    With `conditions`, over the rows that fulfil them. It yields NULL if there is none. It takes one
+    step down the index for each cell, however many rows there are.
     """
     table = column.table
     peer = cells_of(product).subquery()
@@ -128,7 +130,7 @@ def newest_of(
 
 
 def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
-    """Return a cell's product; enter a new cell into the product that is named.
+    """Return a cell's product, or None; enter a new cell into the product that is named.
 
     Parameters
     ----------
@@ -141,8 +143,8 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     Raises
     ------
     StoreError
-        For a cell of another product, and for a cell that has worked without one: its labels are
-        numbered by themselves.
+        For a cell of another product, for a name that is empty or not printable, and for a cell
+        that has worked without a product: its labels are numbered by themselves.
     """
     is_own = SETTING.c.cell_id == cell_id
     query = sa.select(SETTING.c.value).where(is_own, SETTING.c.key == PRODUCT_KEY)
@@ -186,7 +188,9 @@ WITH_TRACES = DECISION.outerjoin(TRACE, TRACE_OF_DECISION)
 
 
 def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
-    """Return the column of a label after corrections: 0, 1 or FORGOTTEN; NULL without a label.
+    """Return the SQL column of a label after corrections: 0, 1 or FORGOTTEN (2).
+
+    It is NULL without a label.
 
     Parameters
     ----------
@@ -207,7 +211,11 @@ def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | N
 
 
 def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
-    """Return the columns `predicted`, a position in `ACTIONS`, and `inclusion_probability`."""
+    """Return two SQL columns of a decision: `predicted` and `inclusion_probability`.
+
+    `predicted`, what the model alone would have done, is a position in `ACTIONS`. The probability
+    is the decision's propensity if its action is VERIFY, else 0.
+    """
     positions = {action.value: position for position, action in enumerate(ACTIONS)}
     probability = sa.case(
         (DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0
@@ -230,7 +238,10 @@ SOURCE: sa.ColumnElement[str | None] = sa.case(
 
 
 def past_query(cell_id: str) -> sa.Select[Any]:
-    """Return the query for a cell's decisions with labels, without traces, for `read_decision`."""
+    """Return the query for a cell's decisions with their corrected labels, for `read_decision`.
+
+    Decisions without a label are included; traces are not. The rows are in no order.
+    """
     labels = (
         SUCCESS.label("success"),
         SOURCE.label("source"),
@@ -248,7 +259,8 @@ def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[A
     """Return the query for the labels that train: seq, success, content_hash, decision_id.
 
     Labels that were forgotten and those of quarantined traces are left out. Corrections up to
-    number `corrected_to` are applied; None: all. It runs along the index `label_training`.
+    number `corrected_to` are applied; None: all. Labels of all cells of the scope's product are
+    included. The rows are in no order.
     """
     label = corrected_label(corrected_to)
     query = sa.select(LABEL.c.seq, label.label("success"), *LABEL.c["content_hash", "decision_id"])
@@ -258,7 +270,7 @@ def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[A
 
 
 def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
-    """Return the subquery for the number of a cell's newest decision."""
+    """Return the scalar subquery for the number of a cell's newest decision, NULL if none."""
     decision = DECISION.alias("every")
     query = sa.select(sa.func.max(decision.c.number)).where(decision.c.cell_id == cell_id)
     return query.scalar_subquery()
@@ -267,7 +279,10 @@ def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
 def stretches_query(
     cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: str = ""
 ) -> sa.Select[Any]:
-    """Return the query that counts all decisions of a cell in stretches, oldest first.
+    """Return the query that counts a cell's decisions in stretches of equal length, oldest first.
+
+    A stretch is a run of consecutive decisions, a period of time, or a batch of parts. It has a row
+    only if it has decisions.
 
     Parameters
     ----------
@@ -285,7 +300,8 @@ def stretches_query(
     Returns
     -------
     sqlalchemy.Select
-        With the columns of `Stretch`.
+        With the columns of `Stretch`, in their order. Stretches are sorted by their newest
+        decision.
     """
     number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
     columns = (

@@ -1,7 +1,9 @@
-"""The records that a store takes and returns: decisions, labels, traces, versions, events.
-
-`to_row` and `from_row` convert a record to the row of a table and back; the columns of a table are
-the fields of its record (see schema.py).
+"""The records that a store takes and returns: decisions, labels, traces, versions, events,
+corrections. Beside these dataclasses the file has their conversion to the rows of a table and back
+(`to_row`, `from_row`; the columns of a table are the fields of its record, see schema.py), that of
+arrays to bytes (`pack`, `to_npz`), the errors for reports on unknown or labelled decisions, the
+address of a cell in a store (`CellAddress`), and the rule for which versions keep their arrays
+(`keeps_state`). The store and the engine use it.
 """
 
 import io
@@ -66,7 +68,18 @@ def unknown_decision(decision_id: str) -> ReportError:
 def already_reported(
     decision_id: str, first: tuple[bool, Source], second: tuple[bool, Source]
 ) -> ReportError:
-    """Return the error for a second label of a decision; it names the first one, which stands."""
+    """Return the error for a second label of a decision; it names both labels.
+
+    Parameters
+    ----------
+    decision_id : str
+    first, second : (bool, Source)
+        Success and source of the label that stands, and of the one that came now.
+
+    Returns
+    -------
+    ReportConflictError
+    """
     stored, new = (
         f"{'success' if success else 'failure'} from {source.value}"
         for success, source in (first, second)
@@ -93,9 +106,10 @@ def nothing_to_correct(decision_id: str) -> ReportError:
 
 
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return an event's data as JSON gives it back.
+    """Return an event's data as JSON gives it back, in a new dict; None for None.
 
-    StoreError for values that JSON does not have.
+    A tuple becomes a list. Raise StoreError for values that JSON does not have, NaN and infinity
+    included.
     """
     with instead(
         StoreError,
@@ -115,7 +129,7 @@ def as_text(text: str) -> str:
 def check_state(
     report: RetrainReport, state: Mapping[str, NDArray[Any]] | None
 ) -> dict[str, NDArray[Any]] | None:
-    """Return a copy of a version's arrays.
+    """Return a copy of a version's arrays, by name; None for a dropped candidate without arrays.
 
     Raises StoreError for an accepted version without arrays, and for an array of Python objects,
     which would need a pickle.
@@ -294,11 +308,12 @@ class OutcomeRecord(NamedTuple):
 
 
 def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
-    """Return the outcomes that a rule counts for an overdue check.
+    """Return the outcomes that a rule counts for a check that is overdue.
 
     Whatever the decision was, it counts as wrong: as a failure for the accept side if the part had
-    evidence for success (lower > 0), as a success for the reject side if it had evidence for
-    failure (upper < 1). So there are none, one or two.
+    evidence for success (lower > 0), then as a success for the reject side if it had evidence for
+    failure (upper < 1). So there are none, one or two. Their `seq` is 0, the other side's bound is
+    1 or 0, and `predicted` is VERIFY unless the model alone would have acted on that side.
     """
     outcomes = []
     if decision.lower > 0.0:
@@ -429,7 +444,10 @@ class ModelVersion:
 
 
 def without_rule(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return a version's arrays without its rule's, which its own cell's outcomes set."""
+    """Return a version's arrays without those of its rule, which its own cell's outcomes set.
+
+    They are left out by the prefixes of RULE; the mapping is not changed.
+    """
     return {name: values for name, values in state.items() if not name.startswith(RULE)}
 
 
@@ -456,7 +474,10 @@ class CellAddress(str):
 def address(
     store: str | os.PathLike[str], cell_id: str | None = None, product: str | None = None
 ) -> str:
-    """Return a store's file or URL; a `CellAddress` if a cell or product is given."""
+    """Return a store's file or URL as text; a `CellAddress` if a cell or product is given.
+
+    A product without a cell is that of the cell "cell".
+    """
     url = os.fspath(store)
     return (
         url if cell_id is None and product is None else CellAddress(url, cell_id or "cell", product)
@@ -465,7 +486,11 @@ def address(
 
 @lru_cache
 def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
-    """Return by name the type of each field of a record type, and whether it may be None."""
+    """Return, by name, the type of each field of a record class, and whether it may be None.
+
+    The type is a plain one: that of `dict[str, int]` is `dict`. The result is cached; do not change
+    it.
+    """
     fields: dict[str, tuple[type, bool]] = {}
     for name, hint in get_type_hints(record_type).items():
         is_union = isinstance(hint, UnionType)
@@ -479,9 +504,9 @@ def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
 
 
 def to_row(record: Any, *names: str) -> dict[str, Any]:
-    """Return the fields of a record as the columns of a row, by name.
+    """Return the fields of a record as columns of a row, by name; only `names` if they are given.
 
-    Only `names` if they are given.
+    Enumerations become text, tuples and dicts JSON, arrays packed float32.
     """
     record_type: Any = type(record)
     fields = columns(record_type)
@@ -498,6 +523,10 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
         It may have more columns, and may lack those that are given or have a default.
     **given
         Values of fields that replace those of the row.
+
+    Returns
+    -------
+    record_type
 
     Raises
     ------
@@ -522,7 +551,7 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
 
 
 def _to_column(value: Any, type_: type) -> Any:
-    """Return a field's value for its column, converted to plain text, JSON or packed float32."""
+    """Return a field's value for its column: plain, JSON text or packed float32; None as None."""
     if value is None:
         return None
     if issubclass(type_, StrEnum):
@@ -533,7 +562,10 @@ def _to_column(value: Any, type_: type) -> Any:
 
 
 def _from_column(value: Any, type_: type) -> Any:
-    """Return the field's value that `_to_column` wrote to a column."""
+    """Return the field's value that `_to_column` wrote to a column; `type_` is the field's.
+
+    A tuple becomes a tuple of tuples, an array is flat.
+    """
     if value is None or type_ in (str, int, float):
         return value
     if type_ is tuple:
@@ -548,7 +580,7 @@ def decision_row(item: StoredDecision) -> dict[str, Any]:
 
 
 def trace_row(item: StoredDecision) -> dict[str, Any]:
-    """Return the row of the table `trace` for a decision's trace."""
+    """Return the row of the table `trace` for a decision's trace, packed as float32."""
     channels, samples = item.trace.shape
     return {
         "decision_id": item.decision.id,
@@ -559,7 +591,11 @@ def trace_row(item: StoredDecision) -> dict[str, Any]:
 
 
 def read_decision(row: Any) -> StoredDecision:
-    """Make a decision from a row of `decision`, with its label and trace if selected."""
+    """Return the decision of a row of the table `decision`, with its label and trace if selected.
+
+    Without the trace's columns its trace is NO_TRACE, of shape (0, 0). Raise StoreError for a row
+    that cannot be read.
+    """
     values = row._mapping
     trace = unpack(row.data).reshape(row.channels, row.samples) if "data" in values else NO_TRACE
     return from_row(StoredDecision, values, decision=from_row(Decision, values), trace=trace)
@@ -576,12 +612,15 @@ def unpack(blob: bytes) -> NDArray[np.float32]:
 
 
 def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
-    """Return the rows in pieces of at most CHUNK."""
+    """Return an iterator over the rows in pieces of at most CHUNK, in their order."""
     return (rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK))
 
 
 def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
-    """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name."""
+    """Return arrays as the bytes of an npz file, uncompressed; unlike `np.savez` it takes any name.
+
+    Raise ValueError for an array of Python objects.
+    """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in state.items():
@@ -591,9 +630,9 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays that `to_npz` wrote.
+    """Return the arrays that `to_npz` wrote, by name.
 
-    StoreError, which names the store, for anything else and for a pickle.
+    Raise StoreError, which names the store `name`, for anything else and for a pickle.
     """
     with instead(
         StoreError,
@@ -610,12 +649,12 @@ class VersionError(StoreError):
 
 @dataclass(frozen=True, slots=True)
 class StoredVersion:
-    """A retrain as a store lists it.
+    """A retrain as a store lists it, dropped candidates included.
 
     Attributes
     ----------
     number : int
-        1, 2, ... in each cell, or product.
+        Number of the retrain: 1, 2, ... in each cell, or product.
     time : float
         In seconds since 1970.
     last_seq : int

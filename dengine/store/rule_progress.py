@@ -1,6 +1,5 @@
-"""How far the decision rule of a stored version was updated, read when an engine resumes.
-
-A rule is updated with the outcome of one part after another. An engine that resumes reads here
+"""How far the decision rule of a stored version was updated, read when an engine resumes. A rule is
+updated with the outcome of one part after another. `read_rule_progress` returns a `RuleProgress`:
 which outcomes the stored rule already includes, so that none is counted twice and none is missed.
 """
 
@@ -44,7 +43,7 @@ def read_rule_progress(
     within: int,
     policy_since: int,
 ) -> RuleProgress:
-    """Read how far the stored rule was updated.
+    """Read from the store how far the rule of a version was updated; nothing is written.
 
     Parameters
     ----------
@@ -54,13 +53,14 @@ def read_rule_progress(
     since_version : int
         The rule counts only decisions made by this version or a later one.
     within : int
-        Number of decisions after which a check without a label is overdue.
+        Number of later decisions after which a check without a label is overdue.
     policy_since : int
         The first version since `within` is in force.
 
     Returns
     -------
     RuleProgress
+        With `last_seq` 0 if there is no version, or if the rule must be rebuilt from all outcomes.
     """
     state = {} if version is None else version.state
     overdue_to = max(store.overdue_to(within, policy_since), int(state.get("overdue_to", 0)))

@@ -1,7 +1,7 @@
-"""The tables of a store's database; how they are created, checked and locked.
-
-The columns of a table are the fields of the record that it holds (see records.py). Every row
-belongs to a cell, `cell_id`.
+"""The tables of a store's database, for SQLAlchemy; how they are created, checked and locked. They
+are `setting`, `decision`, `trace`, `label`, `model_version`, `event`, `correction` and `ledger`.
+Their columns are the fields of the records that they hold (see records.py), and every row belongs
+to a cell, `cell_id`. `Database` and the queries use them.
 """
 
 from enum import StrEnum
@@ -37,9 +37,10 @@ COLUMN_TYPES: dict[type, Any] = {
 
 
 def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
-    """Return the columns for a record's fields, for all or only for `names`.
+    """Return new SQLAlchemy columns for the fields of a record class: for all, or only for `names`.
 
-    `key` is part of the primary key.
+    A field that may be None becomes a column that may be NULL. `key` names the field that is part
+    of the primary key.
     """
     selected = {
         name: field for name, field in columns(record).items() if not names or name in names
@@ -57,9 +58,10 @@ def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
 
 
 def _table(name: str, *parts: Any) -> sa.Table:
-    """Return a table of a cell's rows.
+    """Return a new table of a cell's rows, with the columns and indexes `parts`.
 
-    Each has the number of its ledger entry and its sum (`row_sum`).
+    Added are `cell_id`, part of the primary key, the number of the row's ledger entry, and the
+    row's sum (`row_sum`).
     """
     cell = sa.Column("cell_id", sa.String, primary_key=True)
     entry = sa.Column("entry", sa.BigInteger)
@@ -140,7 +142,9 @@ LEDGER = sa.Table(  # an entry for every transaction that added rows or changed 
 def lock(connection: sa.Connection, kind: int, name: str = "") -> None:
     """Lock the tables (TABLES), or a cell or product by name, until the transaction ends.
 
-    Numbers are then committed in their order. To avoid a deadlock take several locks in this order.
+    It waits until another transaction gives the lock up. Numbers are then committed in their order.
+    To avoid a deadlock take several locks in the order TABLES, PRODUCT, CELL. With SQLite it does
+    nothing, since a write transaction already locks the whole file.
     """
     if connection.dialect.name == "postgresql":  # SQLite's BEGIN IMMEDIATE did it already
         statement = sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:name, :kind))")
@@ -148,9 +152,10 @@ def lock(connection: sa.Connection, kind: int, name: str = "") -> None:
 
 
 def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
-    """Create the tables in an empty database, or check that they are ours.
+    """Create the tables in an empty database, or check that they are those of a store.
 
-    Enter the cell if it is new.
+    Columns that an older store lacks are added. The cell is entered if it is new. It does not
+    commit.
 
     Parameters
     ----------
@@ -181,9 +186,9 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
 
 
 def _add_columns(connection: sa.Connection) -> None:
-    """Add the columns of ADDED to a store that an earlier dengine made.
+    """Add the columns of ADDED to the tables of a store that an earlier dengine made.
 
-    They are NULL in its rows.
+    They are NULL in its rows. A table that has them, or is no table of a store, is not changed.
     """
     inspector = sa.inspect(connection)
     for column in ADDED:
@@ -197,7 +202,10 @@ def _add_columns(connection: sa.Connection) -> None:
 
 
 def check_schema(connection: sa.Connection, name: str) -> None:
-    """Raise a StoreError unless a database holds a store of this schema with all columns."""
+    """Raise a StoreError unless a database holds a store of this schema with all columns.
+
+    `name` is the database's, for the error. Columns of ADDED may be missing.
+    """
     inspector = sa.inspect(connection)
     tables = {
         table: {column["name"] for column in inspector.get_columns(table)}

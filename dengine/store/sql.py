@@ -1,4 +1,6 @@
-"""`SqlStore`, an engine's memory in a database: SQLite in a file, or PostgreSQL for a fleet.
+"""`SqlStore`, an engine's memory in a database: SQLite in a file, or PostgreSQL for a fleet. The
+class reads and writes the settings, decisions, labelled traces, outcomes, model versions, events
+and corrections of one cell; the engine, the history and the command line use it.
 
     store = SqlStore("engine.db", cell_id="cell-7")
     store = SqlStore("postgresql+psycopg://user:password@host/database", cell_id="cell-7")
@@ -184,24 +186,24 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     # Settings
 
     def settings(self) -> dict[str, str]:
-        """Return the settings that were saved last; {} for a new store."""
+        """Return the settings that were saved last, by key; {} for a new store."""
         with self.database.reading() as connection:
             return read_settings(connection, self.cell_id)
 
     def save_settings(self, settings: Mapping[str, str]) -> None:
         """Commit new settings in the place of all present ones.
 
-        SettingError if a peer's contradict them.
+        Raise SettingError if a peer's contradict them, and StoreError for a key that the store
+        itself keeps (`RESERVED`); then nothing is changed.
         """
         self.database.write(lambda connection: self._replace_settings(connection, settings))
 
     def _replace_settings(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
         """Replace the engine's settings of the cell in a transaction; the store's own stay.
 
-        StoreError for a setting that is the store's own (`RESERVED`). SettingError if a peer of
-        the product would embed traces differently.
-
-        The product stays locked until the commit.
+        Raise StoreError for a setting that is the store's own (`RESERVED`), and SettingError if a
+        peer of the product would embed traces differently. The product stays locked until the
+        commit.
         """
         for key in sorted(settings.keys() & set(RESERVED)):
             raise StoreError(
@@ -220,7 +222,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             connection.execute(sa.insert(SETTING), rows)
 
     def peers_settings(self) -> dict[str, dict[str, str]]:
-        """Return the settings of the product's other cells, by cell."""
+        """Return the settings of the product's other cells, by cell; {} without a product.
+
+        A cell without settings is left out.
+        """
         with self.database.reading() as connection:
             return self._read_peers(connection)
 
@@ -232,18 +237,22 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     # Decisions
 
     def flush(self) -> None:
-        """Wait until the outbox's records are in the database, at most its time limit."""
+        """Wait until the outbox's records are in the database, at most its time limit.
+
+        A store in memory writes what it was given. Nothing is raised if the database does not
+        answer; StoreError only if the store is closed.
+        """
         self.database.check_open()
         self.before_use()
 
     def get_decision(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
-        """Return a decision with its label.
+        """Return a decision with its label after corrections.
 
         Parameters
         ----------
         decision_id : str
         trace : bool, default True
-            Read its trace, too.
+            Read its trace, too. False: its trace has shape (0, 0).
 
         Returns
         -------
@@ -270,7 +279,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return read_decision(rows[0])
 
     def decision_ids(self) -> Iterator[Sequence[str]]:
-        """Yield the ids of all decisions, in any order, in chunks of CHUNK."""
+        """Yield the ids of all decisions of the cell, in any order, in lists of at most CHUNK.
+
+        A read transaction stays open meanwhile.
+        """
         query = sa.select(DECISION.c.id).where(DECISION.c.cell_id == self.cell_id)
         with self.database.reading() as connection:
             yield from (
@@ -288,17 +300,17 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         corrected_to: int | None = None,
         cell_only: bool = False,
     ) -> LabelledTraces:
-        """Return labelled traces for training, with corrected labels.
+        """Return labelled traces for training, with corrected labels, oldest first.
 
         Forgotten labels and quarantined traces are left out. So is a trace that is not as it was
-        stored, and an event names its decision.
+        stored, and an event with its decision's id is written to the store.
 
         Parameters
         ----------
         limit : int or None
             Number of newest labels; None: all.
         first, last : int, optional
-            Numbers of the first and the last label.
+            Numbers of the first and the last label, both included.
         corrected_to : int or None
             Number of the last correction that is applied, for labels as they stood then; None: all.
         cell_only : bool, default False
@@ -307,6 +319,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Returns
         -------
         LabelledTraces
+
+        Raises
+        ------
+        StoreError
+            If the traces have different shapes, or a label is damaged.
         """
         scope = Scope(self.cell_id) if cell_only else self._scope
         query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
@@ -321,9 +338,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _newest(
         self, connection: sa.Connection, query: sa.Select[Any], limit: int | None, last: int | None
     ) -> Sequence[Any]:
-        """Run a query for the newest `limit` labels; return its rows, newest first.
+        """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
 
-        Of a product they are selected by number first, or all its labels would be sorted.
+        The query has this limit and order. Of a product, labels are first selected by number, or
+        all would be sorted.
         """
         if self.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)
@@ -334,7 +352,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return connection.execute(query).all()  # here more than half are quarantined or forgotten
 
     def news_since(self, seq: int, limit: int) -> ProductNews:
-        """Return what the product's cells stored after label number `seq`.
+        """Return what the cells of the product, this one included, stored after label number `seq`.
+
+        A trace that is not as it was stored is left out, and an event is written to the store.
 
         Parameters
         ----------
@@ -345,6 +365,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Returns
         -------
         ProductNews
+
+        Raises
+        ------
+        StoreError
+            If the traces have different shapes, or a label is damaged.
         """
         query = (
             training_query(self._scope)
@@ -364,10 +389,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _with_traces(
         self, connection: sa.Connection, rows: Sequence[Any], scope: Scope
     ) -> tuple[LabelledTraces, list[str]]:
-        """Read the traces of label rows, oldest first, one by one.
+        """Read the traces of label rows, which are sorted by number, oldest first.
 
-        Returns the labelled traces, and the ids of decisions whose traces are not as they were
-        stored; these are left out.
+        Return the labelled traces in this order, and the ids of decisions whose traces are missing
+        or not as they were stored; these are left out. Raise StoreError if traces have different
+        shapes, or a label is not 0 or 1.
         """
         positions = {row.seq: i for i, row in enumerate(rows)}  # the forgotten are not among them
         traces = np.zeros((0, 0, 0), dtype=np.float32)
@@ -410,7 +436,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return labelled, [rows[i].decision_id for i in np.flatnonzero(~is_kept)]
 
     def _note_damage(self, damaged: Sequence[str], part: str) -> None:
-        """Record an event that names decisions whose damaged trace or label was left out."""
+        """Commit an event that names decisions whose damaged trace or label was left out.
+
+        `part` is "trace" or "label". Nothing happens without decisions, or if there is such an
+        event.
+        """
         if damaged:
             names = f"decision {listed(damaged)}; see dengine verify"
             self._note("damaged", f"left out, since the {part} is not as it was stored: {names}")
@@ -420,11 +450,12 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def outcomes_since(
         self, seq: int, since_version: int = 0, overdue_to: int = 0
     ) -> list[OutcomeRecord]:
-        """Return the outcomes with which a rule is updated, in the order of the labels.
+        """Return the outcomes with which a rule is updated, as corrected, in the labels' order.
 
-        Labels of rejected parts are left out: which of them come back is somebody's choice. Only
-        this cell's labels count, since those of other cells are no evidence for this one, and a
-        detector of drift that counts them would notice too late that this cell has changed.
+        Left out are labels of rejected parts, since which of them come back is somebody's choice
+        (`Source.INSPECTION`), forgotten labels, and those of quarantined traces. Only this cell's
+        labels count, since those of other cells are no evidence for this one, and a detector of
+        drift that counts them would notice too late that this cell has changed.
 
         Parameters
         ----------
@@ -433,8 +464,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         since_version : int, default 0
             Only of decisions by this version or a later one.
         overdue_to : int, default 0
-            Number of the newest decision whose check is overdue. Overdue checks are inserted where
-            the running engine updated the rule with them; every later label stores that position.
+            Number of the newest decision whose check is overdue; 0: no overdue checks. Overdue
+            checks are inserted where the running engine updated the rule with them; every later
+            label stores that position.
 
         Returns
         -------
@@ -511,12 +543,16 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def overdue_to(self, within: int, since_version: int = 0) -> int:
         """Return the number of the newest decision whose check is overdue, if it has no label.
 
+        It is counted back from the newest decision, or is the number that a label recorded, if that
+        is larger. It is 0 if no check is overdue.
+
         Parameters
         ----------
         within : int
             Number of later decisions after which a check is overdue.
         since_version : int, default 0
-            The first version since `within` is in force; before, only the labels tell.
+            The first version since `within` is in force; if the newest decision is by an earlier
+            one, only what the labels recorded counts.
         """
         newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(
             DECISION.c.cell_id == self.cell_id
@@ -530,11 +566,14 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return max(by_labels, last[0].number - within) if is_in_force else by_labels
 
     def n_decisions(self) -> int:
-        """Return the number of the newest decision; 0 before the first."""
+        """Return the number of the cell's newest decision; 0 before the first."""
         return self._read(sa.select(n_decisions(self.cell_id)))[0][0] or 0
 
     def _unlabelled(self, action: Action, since_version: int, *columns: Any) -> sa.Select[Any]:
-        """Return the query for decisions of an action without a label, oldest first."""
+        """Return the query for the cell's decisions of an action that have no label, oldest first.
+
+        Those of quarantined traces, and those by a version before `since_version`, are left out.
+        """
         query = (
             sa.select(*columns)
             .select_from(WITH_LABELS)
@@ -546,7 +585,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
 
     def silent_total(self, since_version: int = 0) -> int:
-        """Return how many accepted parts went on without a report, as the labels count them.
+        """Return how many accepted parts went on without a report, as the cell's labels count them.
 
         Parameters
         ----------
@@ -565,13 +604,14 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         )
 
     def status(self) -> dict[str, Any]:
-        """Return counts of all decisions and labels.
+        """Return counts of all decisions and labels of the cell.
 
         Returns
         -------
         dict
             decisions, quarantined, labels, corrected, forgotten: numbers; actions, reasons,
-            sources: numbers by value.
+            sources: dicts of numbers by value, 0 included. Forgotten labels are not among the
+            labels and sources.
         """
         tally = self.tally()
         actions = tally.by("action")
@@ -598,7 +638,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def put_version(
         self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
     ) -> int:
-        """Commit a retrain.
+        """Commit a retrain, and delete the states of older versions that are no longer kept.
+
+        A store in memory without a product keeps the arrays as they are, and writes them when it is
+        next read.
 
         Parameters
         ----------
@@ -606,13 +649,19 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         last_seq : int
             Number of the newest label that it knew of.
         state : mapping of str to array, or None
-            The version's arrays; None for a dropped candidate.
+            The version's arrays, which are copied; None for a dropped candidate.
 
         Returns
         -------
         int
             The version's number. It is the report's, unless a peer of the product stored a version
             meanwhile: then the next.
+
+        Raises
+        ------
+        StoreError
+            For an accepted version without arrays, for an array of Python objects, and if the
+            database fails.
         """
         arguments = report, last_seq, check_state(report, state), float(self.clock())
         if self.wait is None and self.product is None:
@@ -625,8 +674,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _commit_version(self, *arguments: Any) -> int:
         """Commit the row of a retrain and delete stored states that are no longer kept.
 
-        The arguments are those of `_version_row`. Returns the version's number, which is higher
-        than the one given if a peer has taken that.
+        The arguments are those of `_version_row`. Return the version's number, which is higher than
+        the one given if a peer has taken that.
         """
         row = self._version_row(*arguments)
         return self.database.write(
@@ -634,7 +683,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         )
 
     def _write_versions(self) -> None:
-        """Write the versions that a store in memory was given."""
+        """Write the versions that a store in memory was given, and has not written yet."""
         unwritten = self._unwritten_versions
         self._unwritten_versions = []
         for arguments in unwritten:
@@ -647,7 +696,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         state: Mapping[str, NDArray[Any]] | None,
         now: float,
     ) -> dict[str, Any]:
-        """Return the row of a version, its arrays packed as npz."""
+        """Return the row of a retrain for the table `model_version`, its arrays packed as npz.
+
+        `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError as
+        `check_state` does.
+        """
         arrays = check_state(report, state)
         blob = None if arrays is None else to_npz(arrays)
         return {
@@ -658,9 +711,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         } | to_row(report)
 
     def _insert_version(self, connection: sa.Connection, row: dict[str, Any]) -> int:
-        """Insert a version, and delete the states that `keeps_state` does not keep.
+        """Insert the row of a retrain; return its version's number.
 
-        Return the version's number.
+        If a peer of the product has taken the number of an accepted version, it gets the next. The
+        states that `keeps_state` does not keep are then deleted.
         """
         number: int = row["version"]
         if self.product is not None and row["accepted"]:  # a peer's may have been stored before
@@ -682,9 +736,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return number
 
     def _accepted(self) -> sa.Select[Any]:
-        """Return the query for the accepted versions, newest first.
+        """Return the query for the accepted versions of the cell or its product, newest first.
 
-        Its columns are retrain, version, and whether the state is kept.
+        Its columns are retrain, version, and `kept`, whether the state is kept.
         """
         query = sa.select(
             *VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept")
@@ -693,14 +747,15 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return query.order_by(VERSION.c.retrain.desc())
 
     def last_version(self) -> ModelVersion | None:
-        """Return the newest accepted version.
+        """Return the newest accepted version of the cell or its product, with its arrays.
 
-        For a damaged one an event is recorded, and the one before it is returned.
+        For a damaged one an event is written to the store, and the one before it is returned.
 
         Returns
         -------
         ModelVersion or None
-            None before the first. A peer's version is returned without the state of its rule.
+            None before the first, and if all are damaged. A peer's version is returned without the
+            state of its rule.
         """
         for i, row in enumerate(self._read(self._accepted())):
             if not row.kept and i > 0:
@@ -712,7 +767,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return None
 
     def load_version(self, version: int) -> ModelVersion:
-        """Return an accepted version.
+        """Return an accepted version of the cell or its product, with its arrays.
 
         Parameters
         ----------
@@ -740,9 +795,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return self._load(retrains[version])
 
     def _load(self, retrain: int) -> ModelVersion:
-        """Return the version of a retrain; VersionError if its state is missing or damaged.
+        """Return the version of a retrain with its arrays.
 
-        A peer's version is returned without the state of its rule.
+        A peer's version is returned without the state of its rule. Raise VersionError if the state
+        is missing or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
@@ -762,7 +818,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return ModelVersion(row.version, row.last_seq, state)
 
     def versions(self, cell_only: bool = False) -> list[StoredVersion]:
-        """Return every retrain, dropped ones included, oldest first.
+        """Return every retrain of the cell or its product, dropped ones included, oldest first.
+
+        Their arrays are not read.
 
         Parameters
         ----------
@@ -785,7 +843,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         ]
 
     def retrains(self) -> list[RetrainReport]:
-        """Return the report of every retrain, oldest first."""
+        """Return the report of every retrain of the cell or its product, oldest first."""
         return [version.report for version in self.versions()]
 
     # Events and corrections
@@ -793,12 +851,17 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def put_event(
         self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = ""
     ) -> None:
-        """Commit an event.
+        """Commit an event with the present time.
 
         Parameters
         ----------
         kind, text, data, author
             As in `Event`.
+
+        Raises
+        ------
+        StoreError
+            For data that JSON does not have, and if the database fails.
         """
         self.apply_change(Change(kind, text, data, author))
 
@@ -810,7 +873,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             self.put_event(kind, text)
 
     def events(self, limit: int | None = None) -> list[Event]:
-        """Return the newest events, oldest first.
+        """Return the newest events of the cell, oldest first.
 
         Parameters
         ----------
@@ -830,7 +893,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
 
     def policy_change_after(self, decision_id: str) -> Event | None:
-        """Return the event of the first change of the policy after a decision.
+        """Return the event of the first change of the policy or the shadow mode after a decision.
 
         Parameters
         ----------
@@ -839,7 +902,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Returns
         -------
         Event or None
-            None if there was no change. The order is the ledger's, whatever the clock said.
+            None if there was no change, or there is no such decision. The order is the ledger's,
+            whatever the clock said.
         """
         is_decision = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.id == decision_id)
         decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()
@@ -853,12 +917,17 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def apply_change(self, change: Change) -> int:
         """Commit a person's change and its event in one transaction; return the event's number.
 
+        The change may correct or forget labels, store a version, and replace the settings. If one
+        part fails, nothing is written.
+
         Raises
         ------
         ReportError
             For a decision that is unknown or has no label.
+        SettingError
+            If a peer's settings contradict the new ones.
         StoreError
-            If a peer of the product stored a version meanwhile.
+            If a peer of the product stored a version meanwhile, and if the database fails.
         """
         now = float(self.clock())
         author = as_text(change.author)
@@ -889,7 +958,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _correct(self, connection: sa.Connection, change: Change, event: Mapping[str, Any]) -> None:
         """Insert a correction for each decision of a change.
 
-        `event` has the columns that they share.
+        `event` has the columns that they share: author, event and time. Raise ReportError for a
+        decision that is unknown or has no label.
         """
         stored = self.database.stored_labels(connection, change.decisions)
         for id_ in change.decisions:
@@ -904,7 +974,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.database.insert_corrections(connection, rows)
 
     def corrections(self, after: int = 0) -> list[Correction]:
-        """Return corrections of labels, oldest first.
+        """Return corrections of labels, oldest first, also those that a later one replaced.
 
         Parameters
         ----------
@@ -935,9 +1005,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def decisions(
         self, where: HistoryFilter, limit: int, start_after: str | None = None, newest: bool = True
     ) -> list[StoredDecision]:
-        """Return the newest `limit` decisions of a selection, or the oldest.
-
-        In both cases oldest first.
+        """Return the newest `limit` decisions of a selection, or the oldest; always oldest first.
 
         They are in the order in which they were made, whatever the clock said.
 
@@ -946,15 +1014,15 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         where : HistoryFilter
         limit : int
         start_after : str or None
-            Id of a decision; only those before it (after it, for the oldest) are returned: the next
-            page.
+            Id of a decision, for the next page: only decisions before it are returned; with
+            `newest=False` only those after it.
         newest : bool, default True
             False: the oldest.
 
         Returns
         -------
         list of StoredDecision
-            Without their traces.
+            With corrected labels, without their traces. Empty for an unknown `start_after`.
         """
         conditions = [
             column == str(value)
@@ -985,7 +1053,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def past_labels(self, after: int, upto: int | None = None) -> list[PastLabel]:
         """Return this cell's labels as they were recorded, oldest first.
 
-        A label that is not as it was stored is left out, and an event names its decision.
+        A label that is not as it was stored is left out, and an event with its decision's id is
+        written to the store.
 
         Parameters
         ----------
@@ -1018,7 +1087,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def tally(
         self, last: int | None = None, since_version: int = 0, within: int | None = None
     ) -> Tally:
-        """Count decisions by action, reason, label and so on.
+        """Count the cell's decisions in groups of equal action, reason, corrected label and so on.
 
         Parameters
         ----------
@@ -1032,6 +1101,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Returns
         -------
         Tally
+            With the groups in no order.
         """
         newest = n_decisions(self.cell_id)
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
@@ -1068,13 +1138,14 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         )
 
     def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
-        """Count decisions in at most `n` stretches of equal length, oldest first.
+        """Count the cell's decisions in at most `n` stretches of equal length, oldest first.
 
         The newest may be shorter.
 
         Parameters
         ----------
         n : int
+            Without effect on stretches of time and on batches.
         **by
             `seconds`, `start` or `batch` of `stretches_query`: stretches of time, or batches.
 
@@ -1091,12 +1162,12 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     # The one engine that owns the cell
 
     def claim_cell(self) -> Journal | None:
-        """Claim the cell for this engine, and open its journal.
+        """Claim the cell for this engine, and open its journal; `close` gives both up.
 
         Returns
         -------
         Journal or None
-            None for a store in memory.
+            None for a store in memory, which has no owner.
 
         Raises
         ------
@@ -1122,14 +1193,20 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Commit records of a journal in one transaction.
 
         A record that is stored already and is the same counts as taken. A line stop of a part that
-        silence had confirmed corrects its label. Another decision with the same id, a label
-        without its decision, or any other second label becomes an event, "dead letter": which one
-        is right is never guessed. A store in memory writes them when it is next read.
+        silence had confirmed corrects its label. Another decision with the same id, a label without
+        its decision, or any other second label becomes an event, "dead letter": which one is right
+        is never guessed. A record that the database refuses becomes one, too. A store in memory
+        writes them when it is next read.
 
         Returns
         -------
         list of (str, int)
             Decision id and number of each label, also of one stored before; none of a dead letter.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
         """
         if self.wait is not None:
             return self.database.apply_records(records)
@@ -1151,7 +1228,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return numbers
 
     def _write_memory(self) -> None:
-        """Write what a store in memory was given; a replay, which reads nothing, never does."""
+        """Write the versions and records that a store in memory was given to its database.
+
+        It is called before every read; a replay, which reads nothing, never calls it.
+        """
         self._write_versions()
         unwritten = self._unwritten
         self._unwritten = []
@@ -1159,7 +1239,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             self.database.apply_records(part)
 
     def close(self) -> None:
-        """Disconnect from the database, and free the cell; a store in memory stays as it is."""
+        """Disconnect from the database, and free the cell; a store in memory stays open."""
         if self.wait is not None:
             self.database.close()
         if self._journal is not None:
@@ -1170,7 +1250,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
 
 def _checked_wait(wait: float | None) -> float:
-    """Return a store's time limit in seconds; StoreError if it is not above 0.
+    """Return a store's time limit in seconds; StoreError if it is not above 0, or infinite.
 
     It is the argument, else the environment's DENGINE_STORE_WAIT, else 0.4.
     """

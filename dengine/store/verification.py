@@ -1,4 +1,6 @@
 """Checks whether a store's history is as it was written: rows against sums, entries against rows.
+`verify_history` reads every row of every cell, with a `CellCheck` for each, and returns a
+`HistoryReport` that lists the faults. `dengine verify` uses it.
 
     report = verify_history("engine.db")
     report.ok, report.faults, report.cells[0].digest      # keep the digest elsewhere, for `expect`
@@ -6,8 +8,7 @@
 An intact chain means that nothing in it was changed, added or removed since it was written. Two
 things it cannot show by itself: that the newest entries were cut off, for which a digest that was
 kept elsewhere is passed as `expect`; and that somebody with the right to write made the whole
-history anew, which a keyed ledger shows, or again a digest from elsewhere. `dengine verify` uses
-this.
+history anew, which a keyed ledger shows, or again a digest from elsewhere.
 """
 
 import json
@@ -122,9 +123,10 @@ def verify_history(
     expect: str | None = None,
     on_rows: Callable[[int], None] | None = None,
 ) -> HistoryReport:
-    """Check the history of a store; nothing is written, and engines may run meanwhile.
+    """Check every row of a store's history; nothing is written, and engines may run meanwhile.
 
-    Takes about 80 bytes of memory per row.
+    A row that was changed, added or removed is returned as a fault, not raised. Takes about 80
+    bytes of memory per row.
 
     Parameters
     ----------
@@ -144,8 +146,8 @@ def verify_history(
     Raises
     ------
     StoreError
-        For what is no store of the present schema, for an unknown cell, and for a ledger with
-        another key than the one that DENGINE_LEDGER_KEY names.
+        For what is no store of the present schema, for an unknown cell, for an `expect` that is no
+        digest, and for a ledger with another key than the one that DENGINE_LEDGER_KEY names.
     """
     expected = "" if expect is None else expect.strip().lower()
     if expect is not None and (
@@ -200,7 +202,7 @@ def verify_history(
 def _count_undrained(journal: Path) -> int | None:
     """Return the number of records in a journal that its store has not taken.
 
-    None if it cannot be read.
+    None if there is no journal, or it cannot be read.
     """
     with suppress(StoreError):  # it is damaged, or another user's
         return len(read_undrained(journal)) if journal.exists() else None
@@ -208,7 +210,10 @@ def _count_undrained(journal: Path) -> int | None:
 
 
 def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
-    """Return the cell, or all cells that any table names; StoreError for a cell that none names."""
+    """Return the cell in a list, or all cells that any table names, sorted, if `cell_id` is None.
+
+    Raise StoreError for a cell that no table names. A table that cannot be read is left out.
+    """
     names: set[str] = set()
     for table in METADATA.tables.values():
         with suppress(sa.exc.DatabaseError):  # a damaged table is left out
@@ -258,7 +263,11 @@ class CellCheck:
         self._is_unreadable = False
 
     def run(self) -> list[HistoryFault]:
-        """Read all rows of the cell, and return what is wrong."""
+        """Read all rows of the cell, and return what is wrong, table by table; [] if nothing is.
+
+        Fill `digests` and `rows`, and call `on_rows`. A database error is a fault, too, and not
+        raised.
+        """
         faults = [
             fault for table in CHAINED for fault in self._guarded(table, self._check_rows(table))
         ]
@@ -270,7 +279,7 @@ class CellCheck:
         return faults
 
     def _guarded(self, table: str, faults: Iterator[HistoryFault]) -> Iterator[HistoryFault]:
-        """Yield the faults of a check; a database error ends it with one more fault."""
+        """Yield the faults of a check; a database error ends it as one more fault, not raised."""
         try:
             yield from faults
         except sa.exc.DatabaseError as error:
@@ -278,10 +287,14 @@ class CellCheck:
             yield self._fault(table, "", f"cannot be read to its end: {error.orig}")
 
     def _fault(self, table: str, key: object, problem: str) -> HistoryFault:
+        """Return a fault of this cell."""
         return HistoryFault(self.cell_id, table, str(key), problem)
 
     def _read_raw(self, table: str) -> Iterator[dict[str, Any]]:
-        """Yield the cell's rows of a table as the driver returns them, without conversion."""
+        """Yield the cell's rows of a table as dicts, with values as the driver returns them.
+
+        SQLAlchemy converts nothing, so that damaged values can be read, too.
+        """
         # SQLAlchemy knows no types here, so it converts none.
         query = sa.text(f'SELECT * FROM "{table}" WHERE cell_id = :cell')
         for row in self.connection.execute(
@@ -290,9 +303,10 @@ class CellCheck:
             yield dict(row._mapping)
 
     def _check_rows(self, table: str) -> Iterator[HistoryFault]:
-        """Yield a fault for each row that was changed or is not chained.
+        """Yield a fault for each row of a table, or version state, that was changed or not chained.
 
-        Keep all rows' sums for `_check_ledger`.
+        Keep the sums of all chained rows for `_check_ledger`, count `rows`, and call `on_rows`
+        after each CHUNK rows.
         """
         for row in self._read_raw(table):
             self.rows += 1
@@ -319,9 +333,8 @@ class CellCheck:
     def _check_ledger(self) -> Iterator[HistoryFault]:
         """Yield a fault for each ledger entry that is missing or does not fit.
 
-        Each must fit the entry before and its own rows.
-
-        Fills `digests`.
+        Each must fit the entry before and the rows that `_check_rows` has read. At most SHOWN
+        missing entries are named. Fills `digests`.
         """
         sums = {table: np.frombuffer(packed, SUMS) for table, packed in self._sums.items()}
         sums = {
@@ -387,10 +400,12 @@ class CellCheck:
 def _entry_fault(added: Any, sums: Mapping[str, list[bytes]]) -> str:
     """Return in words why a ledger entry does not fit its rows.
 
+    It compares numbers of rows; if they are equal, it says that the entry or its rows were changed.
+
     Parameters
     ----------
     added : str
-        The entry's column `added`: JSON, number of rows by table.
+        The entry's column `added`: JSON, number of rows by table. It may be damaged.
     sums : mapping of str to list of bytes
         Sums of the rows that are there, by table.
     """

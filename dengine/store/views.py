@@ -1,7 +1,7 @@
 """Records for looking back on a store: filters, past labels, and counts of decisions by outcome.
-
-`SqlStore.decisions`, `past_labels`, `tally` and `stretches` return them; the status, the history
-and the explanations are computed from them.
+`HistoryFilter` selects decisions; `PastLabel`, `Tally` (counts in `DecisionGroup`s) and `Stretch`
+are what `SqlStore.past_labels`, `tally` and `stretches` return. The status, the history and the
+explanations are computed from them.
 """
 
 from collections import Counter
@@ -71,7 +71,8 @@ class HistoryFilter:
 class PastLabel:
     """A label as it was recorded, with what a rule was updated with.
 
-    The fields up to `decided` are those of `NewLabel`, the others those of `OutcomeRecord`.
+    The fields up to `decided` are those of `NewLabel` and of the label's row, the others those of
+    `OutcomeRecord`.
     """
 
     seq: int
@@ -118,7 +119,7 @@ class DecisionGroup:
 
     @property
     def is_false_reject(self) -> bool:
-        """Whether the model rejected these parts, and they were good."""
+        """Whether the model, not an operator's limits, rejected these parts, and they were good."""
         return (
             self.action is Action.REJECT
             and self.reason is not Reason.OUTSIDE
@@ -127,7 +128,11 @@ class DecisionGroup:
 
     @property
     def label(self) -> str:
-        """The label in a word: good, bad, forgotten, overdue or none."""
+        """The label in a word: good, bad, forgotten, overdue or none.
+
+        "overdue": a check was asked for, has brought no label, and so many decisions followed that
+        it is too late. "none": no label, for another reason.
+        """
         if self.source is not None:
             if self.success is None:
                 return "forgotten"
@@ -157,12 +162,12 @@ class Tally:
     def count(self, is_counted: Callable[[DecisionGroup], bool] = lambda group: True) -> int:
         """Return the number of decisions in the groups for which `is_counted` is true.
 
-        By default all.
+        By default in all groups.
         """
         return sum(group.n for group in self.groups if is_counted(group))
 
     def by(self, field: str) -> Counter[Any]:
-        """Return the number of decisions for each value of a field of `DecisionGroup`."""
+        """Return the number of decisions by value of a `DecisionGroup`'s field or property."""
         counts: Counter[Any] = Counter()
         for group in self.groups:
             counts[getattr(group, field)] += group.n
@@ -172,7 +177,8 @@ class Tally:
     def outcomes(self) -> Outcomes:
         """Counts of accepted, rejected and audited parts by label, for the certificate.
 
-        Parts that an operator's limits rejected (`Reason.OUTSIDE`) are not counted as rejected.
+        Audited parts count by what the model alone would have done. Parts that an operator's limits
+        rejected (`Reason.OUTSIDE`) are not counted as rejected.
         """
         by_action = Counter[tuple[Action, str]]()
         audited = Counter[tuple[Action, str]]()  # by what the model alone would have done
@@ -203,7 +209,7 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Counts over consecutive decisions, or over the decisions of a batch of parts.
+    """Counts over consecutive decisions, over a period of time, or over a batch of parts.
 
     Attributes
     ----------
@@ -220,7 +226,7 @@ class Stretch:
     outside : int
         Decided by an operator's limits.
     batch : str or None
-        Name of the batch.
+        Name of the batch; None for a stretch that is no batch.
     """
 
     n: int
