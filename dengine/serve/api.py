@@ -1,9 +1,10 @@
-"""Requests, responses and the OpenAPI document of the HTTP interface.
+"""Reads requests, writes responses, and derives the OpenAPI document of the HTTP interface.
 
-A request has the parameters of the function that handles it, and is read strictly by msgspec. A
-response has the fields of a record of dengine. The OpenAPI document is derived from the same types;
-what a field means is said by `msgspec.Meta` at its type. JSON has no NaN: in a request, null is a
-sample that the sensor did not give; in a response, a number that is not finite.
+`http.HttpApi` uses it. A request has the parameters of the function that handles it, and is read
+strictly by msgspec. A response has the fields of a record of dengine. The OpenAPI document is
+derived from the same types; what a field means is said by `msgspec.Meta` at its type. JSON has no
+NaN: in a request, null is a sample that the sensor did not give; in a response, a number that is
+not finite.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ LARGE_SHARE = 0.025
 
 
 class Refusal(Exception):  # noqa: N818  # a response, not an error
-    """A request that is not served.
+    """Raised to answer a request with an HTTP error; `problem_response` makes the response.
 
     Parameters
     ----------
@@ -99,15 +100,17 @@ class Refusal(Exception):  # noqa: N818  # a response, not an error
 
 
 def field_types(record: type, *without: str) -> Json:
-    """Return the types of a record's fields by name, without some of them."""
+    """Return the types of a record's fields by name, except those of the names in `without`."""
     hints = get_type_hints(record)
     return {name: hint for name, hint in hints.items() if name not in without}
 
 
 def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[Struct]:
-    """Return a struct type of a handler's parameters and of further fields that may be left out.
+    """Return a msgspec struct type with a field for each parameter of a handler.
 
-    The parameter `id_` is the field `id`.
+    A parameter with a default may be left out of a request. So may the `optional_fields`, given as
+    types by name; they are UNSET then. Unknown fields are refused. The parameter `id_` is the field
+    `id`, and the handler's docstring is the type's.
     """
     hints = get_type_hints(handler, include_extras=True)
     members: list[tuple[Any, ...]] = []
@@ -138,7 +141,7 @@ async def read_body(request: Request, struct_type: type[T], *other_types: str) -
     """Decode a request's JSON or MessagePack body into a struct.
 
     Raises Refusal: 415 for another media type, whose text also names `other_types`; 400 for a body
-    that cannot be decoded; 422 for wrong fields.
+    that cannot be decoded, or has a name twice; 422 for wrong fields.
     """
     media = media_type(request)
     if media not in DECODERS:
@@ -162,7 +165,10 @@ async def read_body(request: Request, struct_type: type[T], *other_types: str) -
 
 
 def _count_keys(media: str, body: bytes) -> int:
-    """Return how many keys an encoded object without objects in it has, repeated ones included."""
+    """Return how many keys an encoded object has, repeated ones included.
+
+    `media` is JSON or MessagePack; the object's values must not be objects.
+    """
     if media == JSON:
         return sum(map(bool, STRINGS.findall(body)))
     if body[0] < 0xDE:  # a fixmap: its size stands in the first byte
@@ -173,7 +179,8 @@ def _count_keys(media: str, body: bytes) -> int:
 def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
     """Convert a request's query, the parts of its path, and a raw body, into a struct.
 
-    Raises Refusal for an unknown or repeated name, and a wrong value.
+    `body` has the raw body's bytes under the name of its field. Texts are converted to the fields'
+    types. Raises Refusal 422 for an unknown or repeated name, a missing field and a wrong value.
     """
     pairs = [*request.query_params.multi_items(), *request.path_params.items(), *body.items()]
     try:
@@ -194,11 +201,12 @@ def as_samples(value: Any, channels: int = 1) -> NDArray[np.float32]:
         each channel. None becomes NaN, and a number beyond float32 infinity; the engine recognizes
         both.
     channels : int
-        Of bytes.
+        Number of channels in bytes; lists do not need it.
 
     Returns
     -------
-    array of float32, shape (T,) or (channels, T)
+    array of float32
+        Of shape (channels, T) from bytes and nested lists, (T,) from a flat list.
 
     Raises
     ------
@@ -231,9 +239,10 @@ def as_samples(value: Any, channels: int = 1) -> NDArray[np.float32]:
 
 
 def _look_like_float64(words: NDArray[np.float32]) -> bool:
-    """Return whether words read as float32 are more likely halves of float64 numbers.
+    """Return whether float32 words are more likely halves of float64 numbers, low half first.
 
-    The low halves are then the ends of fractions: bits at random, or zeros.
+    The low halves are then the ends of fractions: bits at random, or zeros. False for fewer than
+    `MIN_WORDS` words and for an odd number.
     """
     if len(words) % 2 or len(words) < MIN_WORDS:
         return False
@@ -253,9 +262,10 @@ def _look_like_float64(words: NDArray[np.float32]) -> bool:
 def _response_type(
     name: str, about: str, record: type | None = None, without: tuple[str, ...] = (), **more: Any
 ) -> type[Struct]:
-    """Return a struct type of a record's fields as JSON has them, without some, and of more fields.
+    """Make the struct type of a response, named `name`.
 
-    Its description is `about` and the record's docstring.
+    It has the record's fields with their types as in JSON, except those in `without`, and the
+    fields of `more`, types by name. Its description is `about` and the record's docstring.
     """
     members = _members(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
@@ -265,9 +275,10 @@ def _response_type(
 
 
 def _members(record: type) -> Json:
-    """Return the types of a record's fields, under the names that `to_jsonable` gives them.
+    """Return the types of a record's fields in JSON, under the names that `to_jsonable` gives them.
 
-    Fields that are marked "apart" are left out; one marked "flat" gives its own fields.
+    Fields that are marked "apart" in their metadata are left out; one marked "flat" gives its own
+    fields in its place.
     """
     hints = get_type_hints(record)
     members: Json = {}
@@ -400,7 +411,11 @@ RESPONSES = {
 
 
 def response_fields(name: str, record: object = None, **more: Any) -> Json:
-    """Return the fields of the response type `name`, from a record and from `more`."""
+    """Return the fields of the response type `name` as a dict for JSON.
+
+    Their values come from `more`, else from the record; fields without a value, and values without
+    a field, are left out.
+    """
     values = (to_jsonable(record) or {}) | more
     return {key: values[key] for key in RESPONSES[name].__struct_fields__ if key in values}
 
@@ -408,7 +423,10 @@ def response_fields(name: str, record: object = None, **more: Any) -> Json:
 def json_response(
     body: Any, status: int = 200, headers: Mapping[str, str] | None = None, media: str = JSON
 ) -> Response:
-    """Return a JSON response; a number that is not finite is null."""
+    """Return an HTTP response with a body as JSON; a number that is not finite becomes null.
+
+    Arrays become lists, and what JSON does not know becomes its text.
+    """
 
     def encoded(value: Any) -> Any:
         return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
@@ -419,9 +437,10 @@ def json_response(
 def problem_response(
     status: int, detail: str, headers: Mapping[str, str] | None = None
 ) -> Response:
-    """Return the response to a request that is not served: a `Problem`, on one line, no password.
+    """Return the response to a request that is not served, a `Problem` as JSON.
 
-    It says when to try again if that can help.
+    Its detail is put on one line, and passwords of URLs are masked. With a status of `RETRY_LATER`
+    a header says when to try again.
     """
     retry = {"Retry-After": str(RETRY_SECONDS)} if status in RETRY_LATER else {}
     line = " ".join(without_password(detail).split())
@@ -430,7 +449,11 @@ def problem_response(
 
 
 def _error_response(request: Request, error: Any) -> Response:
-    """Return the `Problem` of an exception with its status; an unexpected one is logged."""
+    """Return the `Problem` response of an exception; `STATUSES` gives its status.
+
+    An exception that is not expected gets 500 with a general text, and is logged with its
+    traceback.
+    """
     if isinstance(error, Refusal):
         return problem_response(error.status, error.detail, error.headers)
     if isinstance(error, HTTPException):
@@ -495,7 +518,11 @@ class Operation:
         return _request_type(self.handler, self.optional_fields)
 
     async def serve(self, request: Request) -> Response:
-        """Read a request, call the handler with its fields, and return the response."""
+        """Read a request, call the handler with its fields, and return the response.
+
+        A result of the handler that is no response is sent as JSON. Raises Refusal for a request
+        that cannot be read, and what the handler raises; the application turns both into responses.
+        """
         if self.method == "GET":
             values = read_query(request, self.request_type)
         elif self.raw_parameter and media_type(request) == RAW:
@@ -509,7 +536,10 @@ class Operation:
         return result if isinstance(result, Response) else json_response(result)
 
     def describe(self, schemas: Json) -> Json:
-        """Return the operation as OpenAPI has it; `schemas` has every request type and response."""
+        """Return the operation as an OpenAPI operation object.
+
+        `schemas` has the JSON schema of every request type and response by name.
+        """
         request_schema = schemas[self.request_type.__name__]
         is_json = self.response in RESPONSES
         schema = {"$ref": REF.format(name=self.response)} if is_json else {"type": "string"}
@@ -545,7 +575,10 @@ class Operation:
 
 
 def openapi_document(operations: Iterable[Operation], version: str) -> Json:
-    """Return the OpenAPI document of these operations."""
+    """Return the OpenAPI 3.1 document of these operations, which can be encoded as JSON.
+
+    `version` is the version of the interface. Tokens are described as optional.
+    """
     types = [*RESPONSES.values(), *(operation.request_type for operation in operations)]
     _, schemas = msgspec.json.schema_components(types, ref_template=REF)
     paths: dict[str, Json] = {}

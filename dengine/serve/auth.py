@@ -1,4 +1,5 @@
-"""Access control of the HTTP server: tokens, host names, and limits on size, time and rate.
+"""Access control of the HTTP server: `Guard` refuses a request by its token, host name, origin,
+size, time or rate, and `read_tokens` reads the tokens.
 
 A server that only this machine can reach needs no token. But a browser on this machine may also
 send requests for web pages of other sites. `Guard` recognises these by the host name that they use
@@ -107,7 +108,11 @@ class RateLimiter:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def allow(self, client: str) -> bool:
-        """Count one event of a client; return False if that exceeds its rate."""
+        """Return whether a client may have an event now, and take it from its budget if so.
+
+        The budget grows with `rate` up to `burst`. A rate of 0 allows everything. Of more than
+        `MAX_CLIENTS` clients the one that was not seen for longest is forgotten.
+        """
         now = time.monotonic()
         left, counted_at = self._buckets.pop(client, (self.burst, now))
         left = min(self.burst, left + (now - counted_at) * self.rate)
@@ -119,14 +124,16 @@ class RateLimiter:
 
 
 def read_tokens(file: Path) -> tuple[Token, ...]:
-    """Read tokens from a file that only its owner may read.
+    """Read tokens from a file that only its owner may read, in the order of its lines.
 
     Each line is a secret, optionally followed by `viewer` or `operator` and the owner's name.
+    Without these words a token may operate. Empty lines are skipped.
 
     Raises
     ------
     SettingError
-        If the file cannot be read, others may read it, or a line is not of this form.
+        If the file cannot be read, others may read it, it has no token or one twice, a secret is
+        too short or not ASCII, or a line is not of this form.
     """
     with (
         instead(SettingError, f"Cannot read the token file {file}", OSError),
@@ -163,7 +170,10 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach a server that listens at `host`."""
+    """Return whether only this machine can reach a server that listens at `host`.
+
+    True for localhost and a loopback address; False for every other name.
+    """
     try:
         return ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -179,8 +189,8 @@ def host_in_url(host: str) -> str:
 def is_own_host(host: str | None, names: tuple[str, ...]) -> bool:
     """Return whether a request's `Host` header names this server.
 
-    It must be localhost, an IP address, or one of `names`. A web page whose own name was made to
-    resolve to this machine (DNS rebinding) sends another name.
+    It must be localhost, an IP address, or one of `names`, in any case, with or without a port. A
+    web page whose own name was made to resolve to this machine (DNS rebinding) sends another name.
     """
     if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
         return False
@@ -197,7 +207,7 @@ def is_own_host(host: str | None, names: tuple[str, ...]) -> bool:
 
 
 def take_token(scope: Scope, authorization: str) -> str:
-    """Return the secret that a request carries, or "".
+    """Return the secret that a request carries, or "" if it has none that can be read.
 
     It is a bearer token, the password of HTTP Basic, or the rest of a path /RPC2/SECRET. Such a
     path is changed to /RPC2 in `scope`, so that the secret is not logged later.
@@ -207,7 +217,7 @@ def take_token(scope: Scope, authorization: str) -> str:
     scope : Scope
         ASGI scope of the request.
     authorization : str
-        Value of the header `Authorization`.
+        Value of the header `Authorization`, "" without one.
     """
     if scope["path"].startswith(f"{RPC}/"):
         secret = str(scope["path"]).removeprefix(f"{RPC}/")
@@ -269,7 +279,11 @@ class Guard:
             await self.app(scope, _limited(receive, self.access), _with_headers(send))
 
     def _check(self, scope: Scope) -> None:
-        """Raise Refusal for a request that is not allowed; else note its token for the handlers."""
+        """Raise Refusal for a request that is not allowed; else note its token for the handlers.
+
+        In this order it checks the host name, rate and token (`_check_token`), the site that a
+        change comes from, and the announced length of the body.
+        """
         headers = Headers(scope=scope)
         host = headers.get("host")
         if not is_own_host(host, self.access.hosts):
@@ -294,7 +308,13 @@ class Guard:
             raise _too_large(self.access.largest)
 
     def _check_token(self, scope: Scope, headers: Headers) -> None:
-        """Raise Refusal for a wrong token, a viewer's token on a change, or too many requests."""
+        """Check a request's token and rate, and set `CURRENT_TOKEN` to the token, for the handlers.
+
+        It also marks the scope with `LET_IN`. A secret in the path is removed from it. Raises
+        Refusal: 429 for too many requests of a client, 401 without a right token, 403 for a
+        viewer's token on a request that could change something. A wrong token is logged, but not
+        each time. /healthz needs no token.
+        """
         client = (scope.get("client") or ("", 0))[0]
         secret = take_token(scope, headers.get("authorization", ""))
         token = self.access.find_token(secret) if self.access.tokens else ANYBODY
@@ -320,13 +340,19 @@ class Guard:
 
 
 def _limited(receive: Receive, access: Access) -> Receive:
-    """Return `receive`, which then raises Refusal for a body that is too large or too late."""
+    """Return a `receive` that limits the body of a request in size and time.
+
+    It raises Refusal 413 beyond `access.largest` bytes, and 408 if the body is not complete after
+    `access.body_seconds` from now.
+    """
     bytes_left = access.largest
     is_incomplete = True
     deadline = asyncio.get_running_loop().time() + access.body_seconds
 
     async def receive_body() -> Message:
-        """Return the next message; count the body's bytes and keep its deadline."""
+        """Return the next message; count the body's bytes and raise Refusal for too many or too
+        late.
+        """
         nonlocal bytes_left, is_incomplete
         if not is_incomplete:  # the next message says that the client disconnected, at any time
             return await receive()
@@ -355,7 +381,7 @@ def _too_large(largest: int) -> Refusal:
 
 
 def _with_headers(send: Send) -> Send:
-    """Return `send` so that every response gets the security headers."""
+    """Return a `send` that adds the security headers to every response."""
 
     async def send_with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":

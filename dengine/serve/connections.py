@@ -1,10 +1,11 @@
-"""Limits on connections that uvicorn does not set: their number, and the time of a request's head.
+"""`ConnectionPool` and its `Connection`s limit what uvicorn does not: the number of connections,
+and the time of a request's head.
 
 If all places are taken, a new connection replaces the oldest one that is idle and was never
 authorized, so that clients without a token cannot keep out one that has it. A connection is closed
-only after a response: 503 if there is no place, 408 if a request's head takes too long (the time
-of the body is limited by `auth.Guard`), 400 if the request is not HTTP, its head is too long, or
-the client stops in the middle of it.
+only after a response: 503 if there is no place, 408 if a request's head takes too long (the time of
+the body is limited by `auth.Guard`), 400 if the request is not HTTP, its head is too long, or the
+client stops in the middle of it.
 """
 
 import asyncio
@@ -45,10 +46,11 @@ class ConnectionPool:
         self.open: list[Connection] = []  # oldest first
 
     def add(self, connection: "Connection") -> bool:
-        """Add a connection; return False if there is no place for it.
+        """Add a connection; return False if there is no place for it, in all or for its IP address.
 
-        If all places are taken, the oldest connection that is idle and was never authorized is
-        closed to make room.
+        If all places are taken, the oldest connection that is idle and was never authorized is sent
+        503 and closed to make room; if those of its address are taken, the oldest such of that
+        address.
         """
         same_address = [other for other in self.open if other.address == connection.address]
         is_address_full = len(same_address) >= self.per_address
@@ -65,7 +67,10 @@ class ConnectionPool:
         return True
 
     def new_connection(self, **options: Any) -> "Connection":
-        """Return a protocol for one connection, with the options that uvicorn passes."""
+        """Return a protocol for one connection, with the options that uvicorn passes.
+
+        It takes its place in the pool when the client connects.
+        """
         return Connection(self, **options)
 
 
@@ -85,18 +90,18 @@ class Connection(AutoHTTPProtocol):
 
     @property
     def is_answering(self) -> bool:
-        """Return whether a request is being answered."""
+        """Whether a request is being answered."""
         return self.cycle is not None and not self.cycle.response_complete
 
     @property
     def was_authorized(self) -> bool:
-        """Return whether a request on this connection was authorized by `auth.Guard`."""
+        """Whether any request on this connection was authorized by `auth.Guard`."""
         if self.cycle is not None and LET_IN in self.cycle.scope:
             self._was_authorized = True
         return self._was_authorized
 
     def refuse(self) -> None:
-        """Respond that there are too many connections, and close."""
+        """Respond 503, too many connections, and close."""
         self._respond_and_close(
             HTTPStatus.SERVICE_UNAVAILABLE,
             "Expected fewer connections at once (dengine serve --connections); "
@@ -104,7 +109,7 @@ class Connection(AutoHTTPProtocol):
         )
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as of uvicorn's
-        """Take a place in the pool, or refuse the connection."""
+        """Take a place in the pool and start the time of the first head; or respond 503, close."""
         self.transport = transport
         self.address = str((transport.get_extra_info("peername") or ("",))[0])
         self._has_place = self._pool.add(self)
@@ -115,7 +120,7 @@ class Connection(AutoHTTPProtocol):
         self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Give the place in the pool back."""
+        """Give the place in the pool back, and stop the timer."""
         self._stop_timer()
         if self._has_place:
             if self in self._pool.open:  # else it was closed to make room
@@ -123,7 +128,11 @@ class Connection(AutoHTTPProtocol):
             super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Pass bytes on to uvicorn, and limit the size and the time of a request's head."""
+        """Pass bytes on to uvicorn, and limit the size and the time of a request's head.
+
+        A head of more than `MAX_HEAD_BYTES` bytes is answered with 400, and the connection closed.
+        Bytes on a connection that is being closed are dropped.
+        """
         if not self._has_place or self.transport.is_closing():
             return
         self._head_began = self._head_began or not self.is_answering
@@ -142,9 +151,10 @@ class Connection(AutoHTTPProtocol):
             self._start_timer()
 
     def eof_received(self) -> bool:  # type: ignore[override]  # asyncio allows a bool
-        """Note that the client sends no more; return whether a request is still being answered.
+        """Note that the client sends no more; respond 400 if it stopped in the middle of a head.
 
-        Half a head is refused.
+        Returns True while a request is being answered, so that asyncio keeps the connection open
+        for the response.
         """
         self._client_finished = True
         if self._head_began:
@@ -163,7 +173,9 @@ class Connection(AutoHTTPProtocol):
         self._respond_and_close(HTTPStatus.BAD_REQUEST, "Expected an HTTP/1.1 request.")
 
     def _respond_and_close(self, status: HTTPStatus, detail: str) -> None:
-        """Write a response that uvicorn knows nothing of, and close the connection."""
+        """Write a `Problem` response past uvicorn, and close the connection; nothing if it is
+        closing.
+        """
         if self.transport.is_closing():
             return
         response = problem_response(status, detail, {"connection": "close"})

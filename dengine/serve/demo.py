@@ -1,4 +1,4 @@
-"""A cell without a robot for `dengine serve --demo`.
+"""`playing`: a cell without a robot, for `dengine serve --demo`.
 
 It plays the bundled recordings through the service as a robot's program would: insert, ask for a
 decision, report the outcome.
@@ -29,7 +29,10 @@ POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 async def playing(
     service: CellService, data: Any = "insertion", speed: float = 1.0, seed: int = 0
 ) -> AsyncIterator[None]:
-    """Play recordings in a random order, in a task that lasts as long as the context.
+    """Play recordings through the service in a random order, in a task that lasts as long as the
+    context.
+
+    When the context ends, the task is cancelled.
 
     Parameters
     ----------
@@ -37,7 +40,7 @@ async def playing(
     data : object
         Anything that `load_dataset` takes.
     speed : float
-        Parts per second after the first `N_FAST`.
+        Parts per second after the first `N_FAST`, which are played without a pause.
     seed : int
         Of the order.
     """
@@ -50,9 +53,13 @@ async def playing(
 
 
 async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
-    """Insert every part of a recording, ask the service for a decision, and report the outcome.
+    """Insert every part of a recording once, ask the service for a decision, and report the
+    outcome.
 
-    An exception is logged and ends the demonstration, not the server.
+    Reported are the recorded results of verified parts, and failures of accepted ones. The first
+    `N_FAST` parts have no pause, but each waits for a retrain under way; the later ones come at
+    `speed` parts per second. A part for which the queue is full is left out. An exception is logged
+    and ends the demonstration, not the server.
     """
     loop = asyncio.get_running_loop()
     run = uuid.uuid4().hex[:8]

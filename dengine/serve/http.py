@@ -1,4 +1,5 @@
-r"""The HTTP interface of a cell, and the Starlette application with XML-RPC and the web page.
+r"""`HttpApi`, the handlers of the HTTP interface of a cell, and `create_app`, the Starlette
+application that serves it together with XML-RPC and the web page.
 
 curl -d '{"trace": [0.1, 0.3, ...], "request": "order-7"}' \
     -H 'Content-Type: application/json' localhost:8000/decide
@@ -96,8 +97,9 @@ Batch = Annotated[
 class HttpApi:
     """The handlers of all HTTP requests.
 
-    A handler's parameters are the request's fields, and its docstring is its summary in the
-    OpenAPI document.
+    A handler's parameters are the request's fields, and its docstring is its summary in the OpenAPI
+    document. It returns the fields of the response as JSON, or a whole response. What it raises
+    becomes a `Problem`, as `api.STATUSES` says.
 
     Parameters
     ----------
@@ -110,7 +112,7 @@ class HttpApi:
 
     @cached_property
     def operations(self) -> list[Operation]:
-        """Every path and method."""
+        """Every path and method, with its handler, the type of its response and examples."""
         one_channel: Json = {
             "trace": [0.1, 1.5, 2.25, None, 0.4],
             "request": "order-7",
@@ -172,7 +174,8 @@ class HttpApi:
     ) -> Json:
         """Decide on a trace. The same trace and request id get the same decision.
 
-        A body of bytes has the other fields in the query.
+        A body of bytes has the other fields in the query. A decision that is not ready before the
+        deadline is VERIFY, late. 503: the queue is full, nothing was recorded, verify the part.
         """
         samples = api.as_samples(trace, channels)
         response = await self.service.decide(samples, request, part)
@@ -195,7 +198,7 @@ class HttpApi:
     ) -> Json:
         """Report the outcome of a part. The label is on disk when the response comes.
 
-        The same report twice is no error.
+        The same report twice is no error. With an author it is an event, too.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
@@ -203,7 +206,11 @@ class HttpApi:
         return response_fields("ReportResponse", response)
 
     async def _find_id(self, id_: str, part: str) -> str:
-        """Return the id of a decision, given by its id or its part; Refusal for both or neither."""
+        """Return the id of a decision, given by its id or by its part's number.
+
+        Raises Refusal 422 for both or neither, and as `find_decision_id` for a part without a
+        decision or with several. An id is not looked up.
+        """
         if bool(id_) == bool(part):
             raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")
         return id_ or await self.service.read(lambda store: find_decision_id(store, part))
@@ -215,7 +222,10 @@ class HttpApi:
         part: PartNumber = "",
         author: Author = "",
     ) -> Json:
-        """Correct a label, from the next decision on. What was reported stays on record."""
+        """Correct a label, from the next decision on. What was reported stays on record.
+
+        A forgotten label counts again.
+        """
         decision_id = await self._find_id(id_, part)
         return await self._change(
             author, lambda engine, by: engine.correct(decision_id, success, by)
@@ -242,16 +252,21 @@ class HttpApi:
         return await self._change(author, lambda engine, by: engine.rollback(version, by))
 
     async def policy(self, author: Author = "", **changes: Any) -> Json:
-        """Change settings of the policy, from the next decision on; shadow verifies every part."""
+        """Change settings of the policy, from the next decision on; shadow verifies every part.
+
+        Settings that are left out stay as they are. Many changes start the decision rule anew.
+        """
         return await self._change(
             author, lambda engine, by: engine.set_policy(replace(engine.policy, **changes), by)
         )
 
     async def retrain(self, author: Author = "") -> Json:
-        """Begin a retrain on all labels, unless one is under way."""
+        """Begin a retrain on all labels, unless one is under way. The response does not wait for
+        its end.
+        """
 
         def begin(engine: DataEngine, by: str) -> Changed:
-            """Start the retrain and record who asked for it; return what changed."""
+            """Start the retrain, record as an event who asked for it, and return what changed."""
             core = core_of(engine)
             if core.is_retraining:
                 text = "A retrain is under way already; nothing changed."
@@ -266,10 +281,12 @@ class HttpApi:
     async def export(self, author: Author = "") -> Response:
         """Download the model that decides now: a TorchScript file and its checksum, in a zip.
 
-        An accepted part that waits for its confirmation is not part of it.
+        The download is an event. An accepted part that waits for its confirmation is not part of
+        the model.
         """
 
         def copy_model(engine: DataEngine) -> Exportable:
+            """Return the exportable model as a copy, which later learning does not change."""
             exported = core_of(engine).exported()
             # The engine goes on learning while the copy is exported.
             return replace(exported, model=copy.deepcopy(exported.model))
@@ -293,7 +310,7 @@ class HttpApi:
             bool, Meta(description="Include the state of the safe mode's detectors.")
         ] = False,
     ) -> Json:
-        """Return how the cell is doing."""
+        """Return how the cell is doing: counts of decisions, version, faults, queue and alarm."""
         status = await self.service.status(last, watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
         return response_fields("Status", status, alarm=status.alarm, **line)
@@ -320,7 +337,7 @@ class HttpApi:
         ] = "",
         **where: Any,
     ) -> Json:
-        """Return decisions, newest first.
+        """Return decisions, newest first, and in `older` where the next page begins.
 
         since and until are times in seconds since 1970; the first is included, the last is not.
         predicted is what the model alone would have done. part is a part's number.
@@ -338,13 +355,14 @@ class HttpApi:
     async def explanation(
         self, id_: Annotated[str, Meta(description="Of the decision, or its part's number.")]
     ) -> Json:
-        """Explain a decision, with its trace, the band of good parts, and some bad parts."""
+        """Explain a decision, with its trace, the band of good parts, and the newest bad parts."""
         return await self.service.read(lambda store: _read_explanation(store, id_))
 
     async def course(
         self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0, batch: Batch = ""
     ) -> Json:
-        """Return counts of the decisions in stretches, and the retrains and safe modes meanwhile.
+        """Return counts of the decisions in stretches, oldest first, and the retrains and safe
+        modes meanwhile.
 
         A stretch is a shift, a batch, or without these a share of the decisions.
         """
@@ -361,7 +379,9 @@ class HttpApi:
         return response_fields("Course", course)
 
     async def embedding(self) -> Json:
-        """Return where the labelled and the newest parts lie in the model's embedding."""
+        """Return where the labelled and the newest parts lie in the model's embedding, in two
+        dimensions.
+        """
         engine = self.service.engine
         parts = await self.service.read(
             lambda store: part_map(store, engine.recipe, engine.version)
@@ -369,7 +389,7 @@ class HttpApi:
         return response_fields("PartMap", parts)
 
     async def versions(self) -> Json:
-        """Return every retrain; one that is kept can be rolled back to."""
+        """Return every retrain, dropped ones included; one that is kept can be rolled back to."""
         versions = await self.service.read(lambda store: store.versions())
         return response_fields("Versions", versions=versions)
 
@@ -379,9 +399,12 @@ class HttpApi:
         return response_fields("Events", events=events[::-1])
 
     async def changes(self) -> Response:
-        """Server-sent events: hello with the server's version, changed after changes, tick."""
+        """Server-sent events: hello with the server's version, changed after changes, tick after a
+        silence.
+        """
 
         async def event_stream() -> AsyncIterator[str]:
+            """Yield hello, then changed or tick, as texts of server-sent events."""
             yield f"retry: {RECONNECT_MS}\nevent: hello\ndata: {__version__}\n\n"
             async for changed in self.service.changes(TICK):
                 yield f"event: {'changed' if changed else 'tick'}\ndata: -\n\n"
@@ -420,14 +443,19 @@ class HttpApi:
         return FileResponse(STATIC / "docs.html")
 
     async def _find(self, id_: str) -> StoredDecision:
-        """Return a stored decision; UnknownDecisionError for an unknown id."""
+        """Return a stored decision with its trace; raise UnknownDecisionError for an unknown id."""
         stored = await self.service.find(id_)
         if stored is None:
             raise unknown_decision(id_)
         return stored
 
     async def _change(self, author: str, work: Callable[[DataEngine, str], Changed]) -> Json:
-        """Call `work` with the engine and the checked author, and return the `Changed` response."""
+        """Call `work` in the engine's thread with the engine and the author, and return its
+        `Changed`.
+
+        The result is in the form of the response. Raises Refusal for an author that
+        `_checked_author` does not take.
+        """
         by = _checked_author(author)
         changed = await self.service.call(lambda engine: work(engine, by))
         return response_fields("Changed", changed)
@@ -436,7 +464,8 @@ class HttpApi:
 def _checked_author(author: str) -> str:
     """Return the author for the event log: the token's name if it has one, else the given name.
 
-    Raises Refusal without a name, and for another name than the token's.
+    Runs of spaces become one. Raises Refusal 422 without a name, and for another name than the
+    token's.
     """
     owner = CURRENT_TOKEN.get().name
     name = " ".join(author.split())
@@ -450,9 +479,10 @@ def _checked_author(author: str) -> str:
 def _read_newest(
     store: SqlStore, where: HistoryFilter, limit: int, before: str | None, unlabelled: bool
 ) -> list[StoredDecision]:
-    """Return up to `limit` decisions older than the id `before`, newest first.
+    """Return up to `limit` decisions that `where` selects, newest first, without their traces.
 
-    With `unlabelled` only verified ones whose label was never reported; a forgotten label was.
+    With `before` only those older than the decision of this id. With `unlabelled` only verified
+    ones whose label was never reported; a forgotten label was.
     """
     if unlabelled:
         where = replace(where, action=Action.VERIFY, label="none")
@@ -463,7 +493,12 @@ def _read_newest(
 
 
 def _read_explanation(store: SqlStore, id_: str) -> Json:
-    """Return the explanation of a decision as a response, with the band and bad parts, rounded."""
+    """Return the explanation of a decision, given by its id or its part's number, as a response.
+
+    It has the decision's trace, the band of good parts, the traces of the newest bad parts (at most
+    `N_BADS`), rounded for a picture, and the corrections of its label. Raises UnknownDecisionError
+    and ReportConflictError as `find_decision_id`.
+    """
     explanation = explain(store, id_)
     trace = explanation.trace
     labelled = store.labelled(N_LABELS)
@@ -486,7 +521,7 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
 
 
 def _zip_export(source: Exportable) -> bytes:
-    """Return a zip archive of an exported model and its checksum."""
+    """Return a zip archive, in bytes, of a model exported to TorchScript and its checksum."""
     from ..export import export_torchscript
 
     with TemporaryDirectory(prefix="dengine-export-") as folder:
@@ -514,12 +549,13 @@ def create_app(
     ----------
     service : CellService
     access : Access, optional
-        None: everybody on this machine, without a token.
+        None: without tokens, for this machine alone.
     xmlrpc, page : bool
         Whether XML-RPC and the web page are served beside HTTP.
     beside : sequence of callable
         Each is called with the service and returns an async context, which lasts as long as the
-        application, in the same event loop: an OPC UA server, for example.
+        application, in the same event loop: an OPC UA server, for example. One that fails to start
+        ends the application; its error is `app.state.failure`.
     recorder : Recorder, optional
         Of the traces for `decide_recorded`; the caller closes it.
 
@@ -539,7 +575,10 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        """Run what `beside` starts as long as the application; note a failure to start."""
+        """Enter what `beside` returns, and leave it when the application ends.
+
+        Where that fails, the error is kept in `app.state.failure` and raised.
+        """
         async with AsyncExitStack() as stack:
             try:
                 for start in beside:

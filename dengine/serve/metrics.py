@@ -1,4 +1,4 @@
-"""Prometheus metrics of a server: `GET /metrics` of `dengine serve`.
+"""`Metrics`: the Prometheus metrics of a server, which `GET /metrics` of `dengine serve` returns.
 
 Histograms count decisions, reports and retrains with their durations; gauges show the state of the
 engine when Prometheus reads them.
@@ -76,7 +76,11 @@ class Metrics:
         service.observers.append(self.observe)
 
     def observe(self, response: ServiceResponse | ReportResponse | RetrainReport) -> None:
-        """Count a response or a retrain in its histogram."""
+        """Add the duration of a response or a retrain to the histogram of its type.
+
+        The histogram is divided by the fields that `HISTOGRAMS` names, an action and its reason for
+        one.
+        """
         kind = type(response)
         record = response.decision if isinstance(response, ServiceResponse) else response
         labels = [str(getattr(record, name)).lower() for name in HISTOGRAMS[kind].labels]
@@ -87,7 +91,7 @@ class Metrics:
         return generate_latest(self._registry), CONTENT_TYPE_LATEST
 
     def collect(self) -> Iterator[Metric]:
-        """Yield gauges and counters of the state now; called by the registry.
+        """Yield gauges and counters with the state of engine and queue now; the registry calls it.
 
         It reads no database, so that it works while the store is unavailable.
         """

@@ -1,4 +1,5 @@
-"""OPC UA: methods for a PLC to call, and variables for a SCADA system to read.
+"""`opcua_server` serves a cell over OPC UA: methods for a PLC to call, and variables for a SCADA
+system to read.
 
     async with opcua_server(service, port=4840):
         ...
@@ -154,9 +155,10 @@ class TokenUsers(UserManager):
         password: Any = None,
         certificate: Any = None,
     ) -> User | None:
-        """Return the user of a new session, or None to refuse it.
+        """Return the user of a new session, who may read and call; or None to refuse the session.
 
-        None for a wrong user or token, and without a certificate where the server encrypts.
+        None for a wrong user name or token, and without a certificate where the server encrypts.
+        Without tokens everybody is let in.
         """
         if self._encrypted and not certificate:
             return None
@@ -194,6 +196,11 @@ async def opcua_server(
         Passwords of the user `dengine`; None: everybody may read and call.
     cert, key : path, optional
         PEM or DER files. With them the server speaks only Basic256Sha256, signed and encrypted.
+
+    Yields
+    ------
+    Server
+        It listens, and its variables have the present status.
 
     Raises
     ------
@@ -244,7 +251,7 @@ async def opcua_server(
 
 
 class AddressSpace:
-    """The nodes of one cell.
+    """The nodes of one cell in an OPC UA server: its variables, methods and alarm events.
 
     Parameters
     ----------
@@ -261,7 +268,7 @@ class AddressSpace:
         self._alarm = ""
 
     async def build(self) -> None:
-        """Create the object with its variables and methods, and the generator of alarm events."""
+        """Create the object Cell, its variables and methods, and the generator of alarm events."""
         self._index = await self._server.register_namespace(NAMESPACE)
         objects = self._server.nodes.objects
         cell = await objects.add_object(self._node_id(CELL), self._browse_name(CELL))
@@ -291,7 +298,13 @@ class AddressSpace:
         self._events.event.SourceName = CELL
 
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
-        """Decide on a flat trace, channel by channel, and return `DECIDE_RESULTS` in order."""
+        """Decide on a flat trace, channel after channel, and return the values of `DECIDE_RESULTS`
+        in order.
+
+        If the queue is full or the store unavailable, the result is VERIFY with an empty id. Raises
+        SettingError for an empty trace and one that the channels do not divide, and TraceError, as
+        `DataEngine.decide`, for one that the engine does not take.
+        """
         if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
             raise SettingError(
                 f"Expected as many samples of each channel, got {len(trace)} of {channels} "
@@ -306,15 +319,20 @@ class AddressSpace:
         return [await self._calls.report(decision_id, success)]
 
     async def follow_changes(self) -> None:
-        """Refresh the variables after each change, and at least every `MAX_REFRESH` seconds."""
+        """Refresh the variables after each change, and at least every `MAX_REFRESH` seconds.
+
+        It refreshes at most once in `MIN_REFRESH` seconds, and ends when the service ends
+        listening.
+        """
         async for _ in self._service.changes(MAX_REFRESH):
             await self.refresh()
             await asyncio.sleep(MIN_REFRESH)  # meanwhile the newest decisions reach the store
 
     async def refresh(self) -> None:
-        """Write the cell's status into the variables.
+        """Read the cell's status and write it into the variables.
 
-        If it cannot be read, they keep their values, with a status that says that these are old.
+        If it cannot be read, that is logged, and the variables keep their values, with a status
+        that says that these are old.
         """
         try:
             await self.write_status(await self._calls.status())
@@ -328,7 +346,11 @@ class AddressSpace:
                     await node.write_value(ua.DataValue(old.Value, status))
 
     async def write_status(self, status: Mapping[str, Any]) -> None:
-        """Write a status into the variables; send an event if an alarm begins or ends."""
+        """Write a status, as `RobotCalls.status` returns it, into the variables.
+
+        If the text of the alarm has changed since the last call, send an event, also where it is
+        empty and an alarm has ended.
+        """
         for name, variable in VARIABLES.items():
             if variable.key:
                 value = status[variable.key]
@@ -350,7 +372,8 @@ class AddressSpace:
     ) -> Callable[..., Awaitable[Any]]:
         """Return a call as asyncua needs a method, which raises nothing.
 
-        It returns the results, or for an error a status code, and then writes a line to
+        The method checks its arguments and returns the call's results as variants; for wrong
+        arguments and for an error it returns a status code, and writes a line that says why to
         LastRefused.
         """
         listed = ", ".join(
@@ -393,7 +416,10 @@ class AddressSpace:
 def _argument_error(
     variants: tuple[ua.Variant, ...], arguments: list[Argument]
 ) -> tuple[int | None, str]:
-    """Return a status code and a text for wrong arguments of a call; None and "" for right ones."""
+    """Return a status code and a text for wrong arguments of a call; None and "" for right ones.
+
+    Number, types and arrays are checked; null is right for a text alone.
+    """
     n = len(variants)
     if n < len(arguments):
         return StatusCodes.BadArgumentsMissing, f", got {n} of {len(arguments)} arguments"
@@ -424,7 +450,7 @@ def _status_code(code: int) -> ua.StatusCode:
 
 
 def _as_ua_argument(argument: Argument) -> ua.Argument:
-    """Return an argument as asyncua describes it to clients."""
+    """Return an argument with its type, array rank and description, as clients see it."""
     rank = ua.ValueRank.OneDimension if argument.is_array else ua.ValueRank.Scalar
     dimensions = [0] if argument.is_array else []
     return ua.Argument(

@@ -53,7 +53,8 @@ class RetrainingProcess(ProcessPoolExecutor):
         (self._process,) = set(multiprocessing.active_children()) - other_processes
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Call a function in the process, after earlier calls.
+        """Call a picklable function in the process, after earlier calls; return a future of its
+        result.
 
         Raises BrokenExecutor if the process has ended.
         """
@@ -61,17 +62,21 @@ class RetrainingProcess(ProcessPoolExecutor):
         return super().submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Kill the process, also during a retrain; an engine waits for its retrain before this."""
+        """Kill the process at once, also during a retrain, whose future then fails.
+
+        An engine waits for its retrain before this. With `wait` it returns when the executor's
+        thread has ended.
+        """
         self._process.kill()
         super().shutdown(wait, cancel_futures=cancel_futures)
 
 
 @contextmanager
 def _signals_blocked() -> Iterator[None]:
-    """Block SIGINT and SIGTERM, so that a process started inside inherits the block.
+    """Block SIGINT and SIGTERM in this thread, so that a process started inside inherits the block.
 
     Ctrl-C signals all processes of a terminal. The retraining process must outlive the signal,
-    since the server ends it in order.
+    since the server ends it in order. On Windows it does nothing.
     """
     if not hasattr(signal, "pthread_sigmask"):  # on Windows `_end_with_parent` ignores them
         yield
@@ -105,7 +110,10 @@ class _SharedPickle:
 
 
 def _unpickle(pickled: bytes, path: str, sizes: list[int]) -> Any:
-    """Return the value of a `_SharedPickle`, reading arrays of these sizes in bytes from a file."""
+    """Return the value of a `_SharedPickle`, reading arrays of these sizes in bytes from a file.
+
+    Raises EOFError if the file is shorter.
+    """
     arrays = [np.empty(size, np.uint8) for size in sizes]
     with Path(path).open("rb") as file:
         if [file.readinto(array.data) for array in arrays] != sizes:
@@ -117,17 +125,20 @@ _NEWEST_RESULT: list[_SharedPickle] = []  # is kept until the next call, long af
 
 
 def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _SharedPickle:
-    """Call a function with its arguments, in the retraining process."""
+    """Call a function with its arguments, in the retraining process, and return its pickled result.
+
+    The result is kept until the next call, so that the server's process has time to read it.
+    """
     fn, args, kwargs = call
     _NEWEST_RESULT[:] = [_SharedPickle(fn(*args, **kwargs))]
     return _NEWEST_RESULT[0]
 
 
 def _end_with_parent() -> None:
-    """Prepare the retraining process: end it with its parent, and let decisions go first.
+    """Prepare the retraining process, in which it runs first: let it end with its parent.
 
-    It runs first in the new process. The process ends with its parent even during a call into C++;
-    it leaves one core to decisions and lowers its priority.
+    It ends even during a call into C++. Where that can be set, it also leaves one core to decisions
+    and has a lower priority. On Windows it ignores the ending signals.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned
@@ -148,7 +159,10 @@ def _end_with_parent() -> None:
 
 
 def _log_start(began: float, started: Future[None]) -> None:
-    """Log how long the process took to start, since the monotonic time `began`."""
+    """Log how many seconds the process took to start, unless it failed; called when it is ready.
+
+    `began` is the monotonic time of the start.
+    """
     if not started.cancelled() and started.exception() is None:
         log.info(
             "ready to retrain, in a process of its own, after %.1f s", time.monotonic() - began
@@ -156,7 +170,7 @@ def _log_start(began: float, started: Future[None]) -> None:
 
 
 def _warm_up() -> None:
-    """Import torch and its optimisers, before the first retrain."""
+    """Import torch and its optimisers in this process, before the first retrain."""
     from ..reducers.torch_reducer import warm_optimizer
 
     warm_optimizer()

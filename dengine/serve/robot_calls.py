@@ -1,4 +1,4 @@
-"""The methods that a robot's program or a PLC can call, over XML-RPC and OPC UA.
+"""`RobotCalls`: the methods that a robot's program or a PLC can call, over XML-RPC and OPC UA.
 
 They use only the types that such programs have: int, bool, float, string, list, and a struct of
 these. A controller that has base64 sends a trace as bytes, raw float32, little-endian, in a tenth
@@ -61,10 +61,12 @@ Call = Callable[..., Awaitable[Any]]
 
 
 class Recorder(Protocol):
-    """Cuts insertions out of what a robot sends, as `RtdeRecorder` does. Its methods may block."""
+    """Cuts insertions out of the signals that a robot sends, as `RtdeRecorder` does. Its methods
+    may block.
+    """
 
     def arm(self) -> None:
-        """Wait for an insertion from now on."""
+        """Wait for an insertion from now on; a recording that was not fetched is dropped."""
 
     def record(self, timeout: float) -> Any:
         """Return the next insertion; raise an error after `timeout` seconds.
@@ -74,7 +76,7 @@ class Recorder(Protocol):
 
 
 class RobotCalls:
-    """The methods, on one service.
+    """The methods that a robot's program can call, on one service.
 
     Parameters
     ----------
@@ -95,7 +97,11 @@ class RobotCalls:
         return {name: getattr(self, name) for name in CALLS}
 
     async def begin(self, request: Any = "") -> str:
-        """Begin a new part and arm the recorder.
+        """Begin a new part: forget pieces of its trace, and have the recorder wait for its
+        insertion.
+
+        The newest `MAX_PARTS` parts may have pieces at once. A recorder that fails is logged, and
+        `decide_recorded` then verifies the part. Without a recorder only the pieces are begun.
 
         Parameters
         ----------
@@ -106,6 +112,11 @@ class RobotCalls:
         -------
         str
             The id.
+
+        Raises
+        ------
+        ReportError
+            For an id that is no id.
         """
         id_ = uuid.uuid4().hex if request == "" else as_id(request)
         self._pieces.pop(id_, None)
@@ -130,11 +141,18 @@ class RobotCalls:
         request : str
             As `begin` returned it.
         samples : list of float, or bytes
+            Bytes are raw float32, little-endian.
 
         Returns
         -------
         int
             Number of samples so far.
+
+        Raises
+        ------
+        TraceError
+            For a part that was not begun, or not lately; a piece of several channels; more than
+            `MAX_SAMPLES` samples.
         """
         pieces = self._pieces.get(as_id(request))
         if pieces is None:
@@ -170,12 +188,24 @@ class RobotCalls:
         Returns
         -------
         struct
-            action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version.
+            action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If the
+            queue is full or the store unavailable: verify, an id "" and the reason "busy"; nothing
+            is recorded.
+
+        Raises
+        ------
+        TraceError, ReportError
+            As `DataEngine.decide`.
         """
         return await self.decide_array(as_samples(trace), request, part)
 
     async def decide_added(self, request: Any, part: Any = "") -> Struct:
-        """Decide on the pieces of a part's trace, and return the same struct for each call."""
+        """Decide on the pieces of a part's trace, and return the struct of `decide`.
+
+        A part that has a decision gets it again. A recorded decision drops the pieces; after a
+        VERIFY with an empty id they stay, so that the call can be repeated. Raises TraceError
+        without pieces.
+        """
         if (stored := await self._find(request)) is not None:
             return stored
         pieces = self._pieces.get(as_id(request))
@@ -190,7 +220,11 @@ class RobotCalls:
         return result
 
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
-        """Decide on the insertion since `begin`, and return the same struct for each call.
+        """Decide on the insertion since `begin`, and return the struct of `decide`.
+
+        It waits up to `RECORD_SECONDS` for the recording. A part that has a decision gets it again.
+        Without a recording the result is verify, with an id "" and the reason "not_recorded";
+        nothing is recorded then.
 
         Parameters
         ----------
@@ -198,6 +232,16 @@ class RobotCalls:
             As `begin` returned it; "": of the newest `begin`.
         part : str or int
             The part's number; "": none.
+
+        Returns
+        -------
+        struct
+            As of `decide`.
+
+        Raises
+        ------
+        SettingError
+            For a server without a recorder.
         """
         if self._recorder is None:
             raise SettingError(
@@ -234,7 +278,8 @@ class RobotCalls:
     async def decide_array(self, trace: ArrayLike, request: Any, part: Any) -> Struct:
         """Decide on a trace of shape (T,) or (C, T), and return the struct of `decide`.
 
-        If the queue is full or the store unavailable, it is an unrecorded VERIFY.
+        If the queue is full or the store unavailable, that is logged, and the struct is an
+        unrecorded VERIFY with an id "". Raises TraceError and ReportError as `DataEngine.decide`.
         """
         id_ = as_id(request) if request != "" else None
         try:
@@ -245,12 +290,18 @@ class RobotCalls:
         return _as_struct(response.decision)
 
     async def report(self, decision_id: Any, success: Any) -> bool:
-        """Report the outcome of a part, True for good.
+        """Report the outcome of a part, True for good; wait until it is on disk.
 
         Returns
         -------
         bool
-            False if nothing was recorded under this id, or the report cannot be stored now.
+            True if the label is on disk, also if it was reported before. False, and nothing is
+            reported, if the id is "" or unknown, or the report cannot be stored now.
+
+        Raises
+        ------
+        ReportError
+            For a report that contradicts an earlier one, and what is no label.
         """
         if decision_id == "":  # of an unrecorded VERIFY
             return False
@@ -294,7 +345,9 @@ class RobotCalls:
         }
 
     async def _find(self, request: Any) -> Struct | None:
-        """Return the recorded decision on a request; None without one, or if it cannot be read."""
+        """Return the struct of the decision that a request has; None without one, or if it cannot
+        be read.
+        """
         try:
             stored = await self._service.find(as_id(request))
         except (BusyError, StoreError):
@@ -308,7 +361,7 @@ def one_line(text: str) -> str:
 
 
 def _as_struct(decision: Decision) -> Struct:
-    """Return a decision in the types of a robot's program, its action as an integer."""
+    """Return a decision as a struct of plain types, its action as an integer."""
     return {
         "action": ACTIONS.index(decision.action),
         "id": decision.id,
@@ -320,7 +373,7 @@ def _as_struct(decision: Decision) -> Struct:
 
 
 def _unrecorded_verify(reason: str) -> Struct:
-    """Return the struct of a VERIFY that was not recorded; its id is empty."""
+    """Return the struct of a VERIFY that was not recorded: its id is "", its bound 0 to 1."""
     return {
         "action": ACTIONS.index(Action.VERIFY),
         "id": "",

@@ -1,7 +1,7 @@
-"""The process that serves one cell: its port, TLS, engine, signals and log, and its orderly end.
+"""`serve`, which `dengine serve` runs: the process that serves one cell, with its port, TLS,
+engine, signals and log, and its orderly end.
 
-`serve` is what `dengine serve` runs. It puts the engine's service, the HTTP application and uvicorn
-together.
+It puts the engine's service, the HTTP application and uvicorn together.
 """
 
 import json
@@ -46,7 +46,9 @@ class LineFormatter(logging.Formatter):
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line of a record, with the traceback of an exception as JSON."""
+        """Return a record as one line, with message and, if there is an exception, its traceback as
+        JSON.
+        """
         utc = datetime.fromtimestamp(record.created, UTC)
         time = utc.isoformat(timespec="milliseconds").replace("+00:00", "Z")
         message = f"message={json.dumps(without_password(record.getMessage()))}"
@@ -58,7 +60,10 @@ class LineFormatter(logging.Formatter):
 
 @contextmanager
 def log_lines_to(stream: TextIO) -> Iterator[None]:
-    """Write all logs to a stream as of `LineFormatter`, dengine's own from INFO on."""
+    """Write the logs of all libraries to a stream as of `LineFormatter`, until the block ends.
+
+    dengine's own are written from INFO on. The handlers that were there before get none meanwhile.
+    """
     handler = logging.StreamHandler(stream)
     handler.setFormatter(LineFormatter())
     root = logging.getLogger()
@@ -96,16 +101,16 @@ def serve(
     recorder: Callable[[], AbstractContextManager[Recorder | None]] = nullcontext,
     **interfaces: bool,
 ) -> None:
-    """Serve a cell until SIGTERM, SIGINT, or Ctrl-Break of Windows.
+    """Serve a cell until SIGTERM, SIGINT, or Ctrl-Break of Windows; it blocks until then.
 
     Then the requests in the queue are answered, and the engine is closed. Logs go to stderr.
 
     Parameters
     ----------
     make : callable
-        Opens the engine, given the executor that it retrains in.
+        Opens the engine, given the executor that it retrains in, a process of its own.
     store : str or None
-        The store's name, for a second connection that only reads.
+        The store's name, for a second connection that only reads; None: a store in memory.
     say : callable
         Called with a line that says where the server listens, once it does.
     beside : sequence of callable
@@ -208,16 +213,18 @@ class CellServer(uvicorn.Server):
         self._say = say
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start to listen, and call `say`."""
+        """Start the application and listen; call `say` unless the start failed."""
         await super().startup(sockets)
         if not self.should_exit:
             self._say()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Handle the ending signals as a request to end.
+        """Handle the ending signals, within the block, as a request to end in order.
 
-        uvicorn would raise them again after the end, which would change the exit code.
+        The first one ends the listening to changes and lets uvicorn finish. uvicorn would raise the
+        signals again after the end, which would change the exit code. In another thread than the
+        main one nothing is handled.
         """
         # Python delivers signals to the main thread alone.
         if threading.current_thread() is not threading.main_thread():
@@ -225,6 +232,7 @@ class CellServer(uvicorn.Server):
             return
 
         def end(number: int, frame: FrameType | None) -> None:
+            """Log the signal, end the listening to changes, and ask uvicorn to end."""
             log.info("%s: ending, what is in line is answered", signal.Signals(number).name)
             self._service.end_listening()
             self.handle_exit(number, frame)
@@ -239,9 +247,10 @@ class CellServer(uvicorn.Server):
 
 @contextmanager
 def quick_switches() -> Iterator[None]:
-    """Shorten the switch interval of threads, and exclude present objects from garbage collection.
+    """Shorten, within the block, the time that a decision can wait for another thread.
 
-    Both shorten the time that a decision can wait.
+    It shortens the interval after which Python switches threads, and excludes the objects that
+    exist now from garbage collection.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)
@@ -254,7 +263,10 @@ def quick_switches() -> Iterator[None]:
 
 @contextmanager
 def bound(host: str, port: int) -> Iterator[socket.socket]:
-    """Open a listening socket, and close it afterwards; SettingError if it cannot be opened."""
+    """Open a listening TCP socket, and close it when the block ends; port 0 takes a free one.
+
+    Raises SettingError if it cannot be opened.
+    """
     with instead(
         SettingError,
         f"Cannot listen at {host}, port {port}",
@@ -274,9 +286,10 @@ def bound(host: str, port: int) -> Iterator[socket.socket]:
 
 
 def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
-    """Return uvicorn's options for TLS, empty without files.
+    """Return uvicorn's options for TLS, an empty dict without files.
 
-    Raises SettingError for files that cannot be used, and for a key with a password.
+    The files are loaded once to check them. Raises SettingError for only one of the two, for files
+    that cannot be used, and for a key with a password.
     """
     if cert is None and key is None:
         return {}

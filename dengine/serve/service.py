@@ -1,12 +1,12 @@
-"""The one engine that all interfaces of a server share, and the queue of requests to it.
+"""`CellService`: the one engine that all interfaces of a server share, the thread that owns it, and
+the queue of requests to it.
 
     service = CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db")
     response = await service.decide(trace, "order-7")
 
-One thread owns the engine. A request waits for it in a queue, at most until the deadline, after
-which the part is verified. What only reads the store does so over a second connection
-(`CellService.read`), so that no decision waits for it. HTTP, XML-RPC, OPC UA and the demonstration
-are built on this module.
+A request waits for the thread in a queue, at most until the deadline, after which the part is
+verified. What only reads the store does so over a second connection (`CellService.read`), so that
+no decision waits for it. HTTP, XML-RPC, OPC UA and the demonstration are built on this module.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Job(NamedTuple):
     def run(self, engine: DataEngine) -> None:
         """Do the work, even if the caller timed out, and set the future's result or exception.
 
-        Without a caller an exception is logged.
+        Without a caller the result is dropped, and an exception is logged. Nothing is raised.
         """
         has_caller = self.future.set_running_or_notify_cancel()
         try:
@@ -113,7 +113,7 @@ class ReportResponse:
     repeated : bool
         The same label was reported before, and nothing changed.
     retrain : RetrainReport or None
-        The retrain in line that the label set off, if any.
+        The retrain that the label set off and that is finished already, if any.
     seconds : float
         From the request to the response.
     """
@@ -188,27 +188,28 @@ class CellService:
     async def decide(
         self, trace: ArrayLike, request: str | None = None, part: str | int | None = None
     ) -> ServiceResponse:
-        """Decide on a trace.
+        """Decide on a trace, in the engine's thread or, where nothing has to wait, at once.
 
         Parameters
         ----------
         trace : array, shape (T,) or (C, T)
         request : str, optional
             The caller's id, a different one for each trace. The same id and trace get the same
-            decision, after a restart too.
+            decision, after a restart too, and it is on disk when this returns.
         part : str or int, optional
             The part's number.
 
         Returns
         -------
         ServiceResponse
+            After the deadline a decision VERIFY, `Reason.LATE`, which is counted in `late`.
 
         Raises
         ------
         TraceError, ReportError
             As `DataEngine.decide`.
         BusyError
-            If the queue is full.
+            If the queue is full or the service is closing; nothing is recorded.
         """
         begin = time.monotonic()
         is_idle = not (self.waiting or self._closing)
@@ -226,6 +227,7 @@ class CellService:
         # With the caller's id the decision must be on disk before the response: the caller may
         # send the request again. Without one it cannot.
         def work(engine: DataEngine, late: bool) -> Decision:
+            """Decide in the engine's thread; `late` says that the caller has timed out."""
             decision_id = id_ if late or request is not None else None
             return core_of(engine).decide(trace, part, decision_id, timed_out=late)
 
@@ -259,16 +261,18 @@ class CellService:
 
         Raises
         ------
-        ReportError
+        ReportError, StoreError
             As `DataEngine.report`.
         BusyError
-            If the queue is full.
+            If the queue is full or the service is closing.
         """
         begin = time.monotonic()
         label = as_success(success)
 
         def work(engine: DataEngine) -> tuple[bool, RetrainReport | None]:
-            """Return whether the label was reported before, and the retrain that it set off."""
+            """Report unless the label is known; return whether it was, and the retrain that it set
+            off.
+            """
             stored = engine.find(decision_id)
             if stored is not None and stored.success is label:
                 return True, None
@@ -286,24 +290,35 @@ class CellService:
         return self._notify_observers(response)
 
     async def find(self, decision_id: str) -> StoredDecision | None:
-        """Return a decision with its trace and label; None for an unknown id."""
+        """Return a decision with its trace and label, after waiting for the engine's thread.
+
+        None for an unknown id. Raises BusyError if the queue is full, and StoreError where the id
+        cannot be looked up.
+        """
         return await self.call(lambda engine: engine.find(decision_id), read_only=True)
 
     async def call(self, work: Callable[[DataEngine], T], read_only: bool = False) -> T:
-        """Call a function with the engine in its thread, and return or raise what it does.
+        """Call a function with the engine in the engine's thread, and return or raise what it does.
 
-        With `read_only` the function changes nothing, and listeners to `changes` are not notified.
+        It waits in the queue, without a deadline. With `read_only` the function changes nothing,
+        and listeners to `changes` are not notified. Raises BusyError if the queue is full.
         """
         return await asyncio.wrap_future(self.submit(work, read_only))
 
     def submit(self, work: Callable[[DataEngine], T], read_only: bool = False) -> Future[T]:
-        """Put a call as of `call` into the queue, from any thread, and return its future."""
+        """Put a call as of `call` into the queue, from any thread, and return a future of its
+        result.
+
+        Raises BusyError if the queue is full.
+        """
         return self._enqueue(lambda engine, late: work(engine), read_only)
 
     async def read(self, work: Callable[[SqlStore], T]) -> T:
         """Call a function with a store that has every decision so far, and return its result.
 
-        The function runs in a thread of its own, or in the engine's if the store is in memory.
+        The engine is flushed first, so this waits in the queue. The function runs in a thread of
+        its own, over the second connection, or in the engine's thread if the store is in memory.
+        Raises BusyError if the queue is full, and what the function raises.
         """
         await self.call(lambda engine: engine.flush(), read_only=True)
         if self.read_store is self.engine.store:
@@ -311,7 +326,7 @@ class CellService:
         return await asyncio.to_thread(work, self.read_store)
 
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Return the status as of `DataEngine.status`, without occupying the engine's thread."""
+        """Return the status as of `DataEngine.status`; the engine's thread only flushes for it."""
         stored = await self.read(lambda store: status(store, last, watching))
         return self.core.complete_status(stored)
 
@@ -348,14 +363,14 @@ class CellService:
             self._listeners.discard(listener)
 
     def end_listening(self) -> None:
-        """End every iteration over `changes`, because the server is about to close."""
+        """End every iteration over `changes`, for good, because the server is about to close."""
         self._listening_ended = True
         self._notify_listeners()
 
     def close(self) -> None:
-        """Answer the requests in the queue, close the engine, and end its thread.
+        """Answer the requests in the queue, close the engine and the stores, and end the threads.
 
-        A second call does nothing.
+        It blocks until then. Later requests get BusyError; a second call does nothing.
         """
         if self._closing:
             return
@@ -374,9 +389,9 @@ class CellService:
             self.read_store.close()
 
     def _enqueue(self, work: Callable[[DataEngine, bool], T], read_only: bool = False) -> Future[T]:
-        """Put work into the queue and return its future.
+        """Put work into the queue for the engine's thread, and return a future of its result.
 
-        Raises BusyError if the service is closing or the queue is full, which is counted.
+        Raises BusyError if the service is closing or the queue is full, which is counted in `busy`.
         """
         job = Job(Future(), work, read_only)
         if self._closing or not self._thread.is_alive():
@@ -406,9 +421,11 @@ class CellService:
         return response
 
     def _run_jobs(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
-        """Open the engine, and run jobs until None comes; the body of the engine's thread.
+        """Open the engine, run jobs until None comes, and close it; the body of the engine's
+        thread.
 
-        Sets `opened` to the engine, or to the exception that opening it raised.
+        Sets `opened` to the engine, or to the exception that opening it raised, which ends the
+        thread. The listeners are notified after each job that may have changed something.
         """
         try:
             engine = make()
@@ -430,9 +447,10 @@ class CellService:
             self._in_use.acquire()  # never released: the engine is closed from now on
 
     def _next_job(self, engine: DataEngine) -> Job | None:
-        """Return the next job, or None at the end.
+        """Wait for the next job in the queue and return it; None means that the service ends.
 
-        While the queue is empty, retrains are processed: a new version is swapped in by steps.
+        While the queue is empty, retrains are processed: a new version is swapped in by steps, and
+        a finished one is passed to observers and listeners. Errors of that are logged.
         """
         core = core_of(engine)
         # The time right after a response is best for other work: the next part is farthest away.

@@ -1,4 +1,5 @@
-"""XML-RPC for a robot's program: `rpc_factory("xmlrpc", "http://HOST:8000/RPC2")`.
+"""The XML-RPC interface of a server, for a robot's program: `rpc_factory("xmlrpc",
+"http://HOST:8000/RPC2")`.
 
 The methods are those of `RobotCalls`. Every response is HTTP 200 with a value, or a fault with a
 code and one line of text; only what is not XML-RPC at all gets 405 or 415. defusedxml reads the
@@ -47,9 +48,10 @@ NO_REPORT = 2  # a report that does
 
 
 def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
-    """Return the method's name and the arguments of a call.
+    """Return the method's name and the arguments of an XML-RPC call.
 
-    Arguments are numbers, booleans, texts, bytes and lists. Raises ValueError for anything else.
+    Arguments are numbers, booleans, texts, bytes and lists. Raises ValueError for anything else,
+    and for XML that is malformed or has a document type.
     """
     values: Any = xmlrpc.client.Unmarshaller(use_builtin_types=True)
     values.dispatch = {name: values.dispatch[name] for name in TAGS}
@@ -68,13 +70,17 @@ def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
 
 
 def routes(service: CellService, recorder: Recorder | None = None) -> list[Route]:
-    """Return the route of POST /RPC2.
+    """Return a list with the route of POST /RPC2, which calls the methods of `RobotCalls`.
 
     Parameters
     ----------
     service : CellService
     recorder : Recorder, optional
         Of the traces for `decide_recorded`; the caller closes it.
+
+    Returns
+    -------
+    list of Route
     """
     calls = RobotCalls(service, recorder).table()
 
@@ -92,7 +98,11 @@ def routes(service: CellService, recorder: Recorder | None = None) -> list[Route
 
 
 async def call_method(calls: dict[str, Call], body: bytes) -> bytes:
-    """Call the method that a request names, and return its value or a fault as XML."""
+    """Call the method that an XML-RPC request names, and return its value or a fault as XML.
+
+    It raises nothing: a body that cannot be read, an unknown method, wrong arguments and each error
+    of the method become faults. An unexpected error is logged.
+    """
     try:
         if len(body) <= SMALL_BODY:
             name, arguments = parse_call(body)
@@ -119,6 +129,6 @@ async def call_method(calls: dict[str, Call], body: bytes) -> bytes:
 
 
 def fault(code: int, text: str) -> bytes:
-    """Return a fault as XML, its text one printable line."""
+    """Return an XML-RPC fault as bytes, its text cut to one printable line."""
     error = xmlrpc.client.Fault(code, one_line(text))
     return xmlrpc.client.dumps(error, methodresponse=True).encode("utf-8", "replace")
