@@ -1,12 +1,15 @@
-"""Explains why a decision came out as it did, from what its store keeps.
+"""Explains why a decision came out as it did, from what its store keeps. `explain` returns an
+`Explanation`: sentences, the bounds with their thresholds (`Bound`), the nearest references
+(`Neighbour`), the novelty scores, and the envelope of the successes (`Envelope`).
+`load_past_version` restores a model version as it was at a decision, `load_rule` the present
+decision rule. `DataEngine.explain`, `dengine explain` and the web page use this.
 
     for sentence in explain(store, "0123456789ab-412").sentences: ...
 
 Counts, bounds, action and reason are shown as they were recorded. The neighbours, the novelty
 scores and the thresholds of a guarantee were not recorded: they are computed again from the version
 that decided, if the store keeps its state. That needs no reducer, since the store has each
-version's references, the embedding of each trace, and the time of each label. `DataEngine.explain`,
-`dengine explain` and the web page use this.
+version's references, the embedding of each trace, and the time of each label.
 """
 
 from __future__ import annotations
@@ -65,7 +68,8 @@ class PastVersion:
     labels : list of PastLabel or None
         The label of each reference, in the order of the index; None if it is unknown.
     thresholds : (float, float) or None
-        That a decision's bounds had to reach; None if they are not kept.
+        That a decision had to reach: accepted where lower >= the first, rejected where 1 - upper >=
+        the second. None if they are not kept.
     last_seq : int
         Number of the newest label that it could know.
     novelty : Novelty or None
@@ -82,7 +86,10 @@ class PastVersion:
 def load_past_version(
     store: SqlStore, version: int, recipe: Recipe, item: StoredDecision | None
 ) -> PastVersion | None:
-    """Load a model version as it was when a decision was made.
+    """Load a model version from the store as it was when a decision was made.
+
+    Its references and its rule include the labels that had come by then. Later corrections are not
+    applied. Nothing is written.
 
     Parameters
     ----------
@@ -91,7 +98,7 @@ def load_past_version(
     recipe : Recipe
         Of that moment.
     item : StoredDecision or None
-        The decision, with its trace; None: the version as it is now.
+        The decision, with its trace; None: the version with all labels that came under it.
 
     Returns
     -------
@@ -128,9 +135,10 @@ def load_past_version(
 
 
 def _was_known(label: PastLabel, item: StoredDecision, stops_all: bool) -> bool:
-    """Return whether the engine knew a label when it made a decision.
+    """Return whether the engine knew a label when it made the decision `item`; never its own label.
 
-    Under `stops="all"` silence confirms a part before its label is stored.
+    A label is known from its time on. Under `stops="all"` a label from silence is known from the
+    next decision on, before it is stored.
     """
     if stops_all and label.source is Source.CONFIRMED:
         return label.decided < item.time
@@ -138,7 +146,10 @@ def _was_known(label: PastLabel, item: StoredDecision, stops_all: bool) -> bool:
 
 
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
-    """Return the index of a stored version's references, with those that were added later."""
+    """Return the index of a stored version's references, and add the labels that came later to it.
+
+    A label without a point is left out. In a full index each replaces the oldest reference.
+    """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])
     is_full = int(stored.state["total"]) > n
@@ -152,9 +163,9 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
 
 
 def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty | None:
-    """Return the novelty scores of a decision that was novel, by its version's gate.
+    """Compute the novelty scores of a decision that was novel, with its version's gate.
 
-    None for any other.
+    None for any other decision, and if the gate cannot be restored.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
@@ -169,9 +180,10 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
 
 
 def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
-    """Return the decision rule from a version's state.
+    """Return the decision rule of a policy with the state that a version stored.
 
-    None if the state has none, has another rule than the policy's, or was stored while stale.
+    None if the state has none, has another rule than the policy's, or was stored while stale, and
+    if the rule is a class of the user's that is not imported.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # Nothing is imported because a store names it; a running engine has imported it.
@@ -189,7 +201,9 @@ def _restore_thresholds(
 ) -> Thresholds | None:
     """Return the thresholds of a version's rule after it was updated with later labels.
 
-    None if they are not kept.
+    They are (accept, reject): a part was accepted where lower >= the first, rejected where 1 -
+    upper >= the second. Labels of quarantined traces and of inspected rejects do not update the
+    rule. None if the state is not kept, or the rule has no such thresholds.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
@@ -204,7 +218,10 @@ def _restore_thresholds(
 
 
 def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
-    """Return the decision rule as it is now, updated with all stored outcomes.
+    """Return the decision rule as it is now: the stored rule, updated with all outcomes since.
+
+    If outcomes were corrected or a check is overdue, it is rebuilt from all outcomes. Nothing is
+    written.
 
     Parameters
     ----------
@@ -233,7 +250,7 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
 
 
 def _update(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
-    """Update a rule with the outcome of one part."""
+    """Update a rule, in place, with the outcome of one part."""
     rule.observe(outcome.silent, outcome.novel)
     rule.update(
         outcome.lower,
@@ -311,10 +328,13 @@ def envelope_of(
 ) -> Envelope | None:
     """Compute the envelope of successes, and where a trace leaves it.
 
+    At each sample the envelope contains the middle 95 % of the successes.
+
     Parameters
     ----------
     successes : array of float32, shape (n, C, T)
     trace : array of float32, shape (C, T)
+        It may have NaN and infinite samples, which count as inside.
     rate_hz : float
         Sampling rate.
 
@@ -346,7 +366,11 @@ def envelope_of(
 
 
 def _find_excesses(excess: NDArray[np.float64], rate_hz: float) -> Iterator[Excess]:
-    """Yield the pieces in which the signed excess (C, T) has one sign, channel by channel."""
+    """Yield the pieces of the excess (C, T) that are above 0, or below 0, throughout.
+
+    They come channel by channel, in the order of time. The excess is in widths of the band:
+    positive above it, negative below it, 0 inside.
+    """
     for channel, row in enumerate(excess):
         side = np.sign(row)
         # Where a piece begins or ends.
@@ -369,9 +393,8 @@ DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "ver
 class Novelty:
     """How novel a trace was, in four respects.
 
-    Squared distance to the nearest reference over its limit.
-
-    Above 1 is novel.
+    Each is the squared distance to the nearest reference over its limit; a trace with one above 1
+    is novel.
     """
 
     level: float
@@ -428,7 +451,7 @@ class Circumstances:
         With the policy of that moment.
     spec : TraceSpec
     model : str or None
-        Name of a model that was handed in.
+        Name of a model that was handed in; None: the recipe describes the model.
     seed : int
         Of the engine.
     thresholds : (float, float) or None
@@ -449,14 +472,15 @@ class Circumstances:
 
     @property
     def baseline(self) -> str:
-        """Name of a model that counts and decides by its own method; "" if the recipe says how."""
+        """Name of a handed-in model that decides by its own method; "" for any other model."""
         return self.model if self.model is not None and self.thresholds is None else ""
 
 
 def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
     """Return a decision's bounds with their thresholds and what more evidence it would have needed.
 
-    Returns None if no bound was computed: for faulty and novel traces, and before the first model.
+    Returns None if no bound was computed: for faulty and novel traces, for parts outside an
+    operator's limits, and before the first model; and for a decision that was lost.
     """
     if decision.reason not in BOUNDED or _was_lost(decision):
         return None
@@ -476,9 +500,9 @@ def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
 
 
 def _was_lost(decision: Decision) -> bool:
-    """Return whether a decision was lost and recorded again from a line stop.
+    """Return whether a decision was lost, and recorded again when its part stopped the line.
 
-    An accept without evidence.
+    Such a decision is an accept with the bounds 0 and 1.
     """
     fields = (decision.reason, decision.action, decision.lower, decision.upper)
     return fields == (Reason.CERTAIN, Action.ACCEPT, 0.0, 1.0)
@@ -487,7 +511,8 @@ def _was_lost(decision: Decision) -> bool:
 def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float | None, str]:
     """Return accept threshold (of lower), reject threshold (of upper), and their origin in words.
 
-    A threshold is None if it is unknown, or if nothing could pass on that side.
+    A part was accepted where lower >= the first, rejected where upper <= the second. A threshold is
+    None if it is unknown, or if nothing could pass on that side.
     """
     policy = circumstances.recipe.policy
     if circumstances.baseline or policy.guarantee not in RULES:
@@ -505,16 +530,21 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
 
 
 def is_score(policy: Policy, decision: Decision) -> bool:
-    """Return whether a decision's `lower` and `upper` are one score of the heads, no interval."""
+    """Return whether a decision's `lower` and `upper` are one score of the heads, and no interval.
+
+    The heads are the reducer's classifiers; their score is a probability of success. It is so under
+    the guarantees "pooled" and "cost", where lower equals upper.
+    """
     return policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper
 
 
 def _count_needed(
     policy: Policy, decision: Decision, threshold: float | None, success: int
 ) -> int | None:
-    """Return how many more labels of one kind (1 or 0) would have reached a threshold.
+    """Return how many more labels of one kind within the radius would have reached a threshold.
 
-    None if no number would.
+    `success` is 1 for successes and `lower`, 0 for failures and `upper`. 0 if the threshold was
+    reached; None if no number up to MAX_NEEDED would do, and if there is no threshold.
     """
     if threshold is None:
         return None
@@ -532,7 +562,10 @@ def _count_needed(
 def _explain_in_words(
     item: StoredDecision, bound: Bound | None, circumstances: Circumstances
 ) -> Iterator[str]:
-    """Yield the sentences that explain a decision: its reason, its bounds, its outcome."""
+    """Yield the sentences that explain a decision: its reason, its bounds, its outcome.
+
+    Without a bound the sentences on bounds are left out.
+    """
     decision = item.decision
     reason = (
         ": the decision was lost, and recorded again from its line stop; its evidence is unknown."
@@ -552,7 +585,10 @@ def _explain_in_words(
 def _explain_audit(
     decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
 ) -> str:
-    """Return the reason in words for an audit, with the value of its coin."""
+    """Return the rest of the sentence on an audit: what the model alone would have done, the coin.
+
+    The coin is computed again from the trace and the engine's seed.
+    """
     (coin,) = toss(content_hash(trace[None]), audit_salt(circumstances.seed)).tolist()
     alone = f" as an audit: the model alone would have {DID[decision.predicted]} it"
     coin_fell = (
@@ -565,7 +601,11 @@ def _explain_audit(
 def _explain_saturated(
     decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
 ) -> str:
-    """Return the reason in words for a saturated trace, with the first sample at the limit."""
+    """Return the rest of the sentence on a saturated trace.
+
+    It has the number of samples that touch the sensor's range, and the time in seconds and the
+    channel of the first.
+    """
     spec = circumstances.spec
     touching: NDArray[Any] = np.zeros((0, 2))
     if spec.limit is not None:
@@ -583,7 +623,7 @@ def _explain_saturated(
 def _explain_not_finite(
     decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
 ) -> str:
-    """Return the reason in words for a trace with NaN or infinity, with their number."""
+    """Return the rest of the sentence on a trace with NaN or infinity: how many samples are."""
     n = int((~np.isfinite(trace)).sum())
     return (
         f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded "
@@ -594,7 +634,7 @@ def _explain_not_finite(
 def _explain_outside(
     decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
 ) -> str:
-    """Return the reason in words for a trace outside force limits, with those that it leaves."""
+    """Return the rest of the sentence on a trace outside an operator's limits: which it leaves."""
     x = torch.from_numpy(trace)
     windows = circumstances.recipe.policy.windows
     left = [str(limits) for limits in windows if ForceLimitsGate([limits], circumstances.spec)(x)]
@@ -644,7 +684,11 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
 def _bound_sentences(
     decision: Decision, bound: Bound, circumstances: Circumstances
 ) -> Iterator[str]:
-    """Yield the sentences on a decision's evidence, its bounds, and what it would have needed."""
+    """Yield the sentences on a decision's evidence, its bounds, and what it would have needed.
+
+    The last is said of the action that the model decided on; for an uncertain decision of the
+    action that needed fewer labels.
+    """
     n = decision.n_success + decision.n_failure
     interval = f"{decision.lower:.3f} to {decision.upper:.3f}"
     if circumstances.baseline:
@@ -700,10 +744,20 @@ def _needed_sentence(
     needed: int | None,
     kinds: tuple[str, str, str],
 ) -> str:
-    """Return the sentence on what one action would have needed.
+    """Return the sentence on what an accept or a reject would have needed.
 
-    `kinds` is the word for one label of the kind that is needed, for several, and for one of the
-    other kind.
+    Parameters
+    ----------
+    action : {"accept", "reject"}
+    condition : str
+        What had to hold, with a field {} for the threshold.
+    threshold : float or None
+        None: nothing could pass.
+    needed : int or None
+        Number of labels that were missing; 0: it was enough, None: no number would do.
+    kinds : (str, str, str)
+        The word for one label of the kind that is needed, for several, and for one of the other
+        kind.
     """
     if threshold is None:
         return f"To {action}: no level held, so nothing could be {action}ed."
@@ -723,7 +777,7 @@ class Neighbourhood:
     Attributes
     ----------
     distances : array of float64, shape (n,)
-        To every reference; infinite to those of the trace's own part.
+        To every reference, in the order of the index; infinite to those of the trace's own part.
     radius : float
     n_success, n_failure : int
         Labels within the radius, counted again.
@@ -818,6 +872,8 @@ class Explanation:
 def find_decision_id(store: SqlStore, part: str) -> str:
     """Return the id of the decision on a part.
 
+    If a part was decided on again after rejects, the rejects do not count.
+
     Parameters
     ----------
     store : SqlStore
@@ -827,14 +883,13 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     Returns
     -------
     str
-        Earlier rejects of the part do not count, if it was decided on again.
 
     Raises
     ------
     UnknownDecisionError
         If there is none.
     ReportConflictError
-        If there are several.
+        If there are several; the message has their ids.
     """
     decisions = store.decisions(HistoryFilter(part=part), 20)
     not_rejected = [item for item in decisions if item.decision.action is not Action.REJECT]
@@ -855,7 +910,7 @@ def find_decision_id(store: SqlStore, part: str) -> str:
 
 
 def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanation:
-    """Explain one decision from what its store keeps.
+    """Explain one decision from what its store keeps; nothing is trained or embedded.
 
     Parameters
     ----------
@@ -872,9 +927,9 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     Raises
     ------
     ReportError
-        For a decision that the store does not hold.
+        For a decision that the store does not hold, and for a part with several decisions.
     StoreError
-        For a store that no engine has used.
+        For a store that no engine has used, and for a damaged trace.
     """
     settings = store.settings()
     if "recipe" not in settings:
@@ -923,7 +978,10 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
 
 
 def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
-    """Return why safe mode had begun when a decision was made in it; "" for any other decision."""
+    """Return why safe mode had begun when a decision was made in it; "" for any other decision.
+
+    It is the text of the last such event before the decision, "" if there is none.
+    """
     if item.decision.reason is not Reason.SAFE_MODE:
         return ""
     began = (
@@ -937,9 +995,9 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
 def _find_neighbourhood(
     item: StoredDecision, version: PastVersion | None, recipe: Recipe
 ) -> Neighbourhood | None:
-    """Return the neighbourhood of a decision's trace.
+    """Return the distances of a decision's trace to a version's references, and its counts.
 
-    None if it was not embedded, or the version is not kept.
+    None if the trace was not embedded, or the version is not kept.
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:
@@ -953,7 +1011,10 @@ def _find_neighbourhood(
 def _nearest(
     store: SqlStore, neighbourhood: Neighbourhood | None, version: PastVersion | None, n: int
 ) -> Iterator[Neighbour]:
-    """Yield the `n` nearest references of other parts with their traces, nearest first."""
+    """Yield the `n` nearest references of other parts with their traces, nearest first.
+
+    Nothing without a neighbourhood or version. What is not known of a reference is None.
+    """
     if neighbourhood is None or version is None:
         return
     index = version.index
@@ -979,9 +1040,10 @@ def _nearest(
 def _find_envelope(
     store: SqlStore, item: StoredDecision, version: PastVersion | None, spec: TraceSpec
 ) -> Envelope | None:
-    """Return the envelope of the successes known when a decision was made.
+    """Return the envelope of the successes among the labels known when a decision was made.
 
-    If these were too few, those known now are taken; None if these are too few, too.
+    They are the newest MAX_SUCCESSES labels without the decision's own trace. If these are too few,
+    the labels known now are taken; None if these are too few, too.
     """
     for last in (None if version is None else version.last_seq, None):
         labelled = store.labelled(MAX_SUCCESSES, last=last)
@@ -998,7 +1060,10 @@ def _notes(
     bound: Bound | None,
     circumstances: Circumstances,
 ) -> Iterator[str]:
-    """Yield sentences on what was computed again, and where it differs from what was recorded."""
+    """Yield sentences on what was computed again, and where it differs from what was recorded.
+
+    Also why no neighbours are shown.
+    """
     decision = item.decision
     policy = circumstances.recipe.policy
     if item.quarantined:

@@ -1,4 +1,7 @@
-"""The map of the parts for the web page: where known and newest parts lie in the embedding."""
+"""The map of the parts for the web page: where known and newest parts lie in the embedding.
+`part_map` reads it from the store as a `PartMap`, a list of `Mark`s: the newest references of the
+model with their labels, and the newest decisions.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -56,7 +59,7 @@ class PartMap:
         Oldest first, the known parts before the newest; empty before the first model, and for a
         model that keeps no references.
     radius : float or None
-        Around the newest parts; None if there are none.
+        Within which labels count, to be drawn around the newest parts; None if there are none.
     probability : bool
         Whether x is a probability.
     """
@@ -68,7 +71,22 @@ class PartMap:
 
 
 def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
-    """Read the map of the parts for a model version; 0: before the first, an empty map."""
+    """Read the map of the parts for a model version from the store.
+
+    Parameters
+    ----------
+    store : SqlStore
+    recipe : Recipe
+        With the radius and the reducer.
+    version : int
+        The model version; 0: before the first, an empty map.
+
+    Returns
+    -------
+    PartMap
+        With the newest 250 references, and those of the newest 10 decisions that this version made.
+        A part that is both is a newest one.
+    """
     recent = [item.decision for item in store.decisions(HistoryFilter(), N_NAMED)]
     ids = [decision.id for decision in recent[-N_NEWEST:] if decision.model_version == version]
     newest = list(_newest_marks(store, ids))
@@ -81,7 +99,10 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
 
 
 def _newest_marks(store: "SqlStore", ids: list[str]) -> Iterator[Mark]:
-    """Yield the marks of decisions that were embedded, in the order of their ids."""
+    """Yield the marks of these decisions, in the ids' order, each at its mean over the spaces.
+
+    Decisions without an embedding are left out.
+    """
     for item in filter(None, map(store.get_decision, ids)):
         decision = item.decision
         if decision.embedding is not None:
@@ -92,8 +113,9 @@ def _newest_marks(store: "SqlStore", ids: list[str]) -> Iterator[Mark]:
 def _known_marks(
     store: "SqlStore", recipe: Recipe, version: int, parts: dict[str, str | None]
 ) -> list[Mark]:
-    """Return the marks of the newest parts among a version's references, oldest first.
+    """Return the marks of the newest N_KNOWN references of a version, oldest first.
 
+    References whose label is unknown are left out; [] if the version's references are not kept.
     `parts` has the parts' numbers by decision id.
     """
     past = load_past_version(store, version, recipe, None)

@@ -1,10 +1,12 @@
 """The status of an engine and the history of its decisions, read from its store without traces.
+`status` returns a `Status` (counts, error estimates, certificate, alarm), `history` iterates over
+decisions, `as_frame` makes a DataFrame of them, `read_course` returns counts over time for a
+picture. `DataEngine.status` and `history`, the command line, the web page and the servers show
+them.
 
     report = status(store)
     report.newest.verified_share, report.ever.bad_accepts.upper, report.alarm
     for item in history(store, last=50, action="accept", label="bad"): ...
-
-`DataEngine.status` and `history`, the command line, the web page and the servers show them.
 """
 
 from __future__ import annotations
@@ -62,7 +64,7 @@ class ErrorEstimate:
     lower, upper : float
         Wilson interval of the share of wrong ones, for a single look; 0 and 1 if nothing is known.
     tolerance : float
-        1 - LB.
+        The share that the policy allows: 1 - LB, or what the prices of the guarantee "cost" give.
     verdict : {"kept", "broken", "open"}
         Whether the interval is below the tolerance, above it, or contains it.
     """
@@ -240,9 +242,11 @@ class Status:
 
     @property
     def alarm(self) -> str:
-        """What somebody should look at, the most urgent only, as a sentence.
+        """What somebody should look at, in a sentence, of several the most urgent; "" if nothing.
 
-        "" if there is nothing.
+        In this order: the store, safe mode, bad accepts, good rejects, dropped retrains, shadow
+        mode's errors, novel traces, parts outside limits, errors of the model. Only the newest
+        decisions count.
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -288,7 +292,7 @@ class Status:
 
 
 def retrain_fault(dropped: Sequence[str], version: int) -> str:
-    """Return an alarm in words if retrains are dropped again and again, else "".
+    """Return an alarm in words if the last 3 or more retrains were dropped, else "".
 
     Parameters
     ----------
@@ -310,7 +314,7 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
 
 
 def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:
-    """Read the status of an engine from its store.
+    """Read the status of an engine from its store; nothing is written.
 
     Parameters
     ----------
@@ -323,6 +327,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     Returns
     -------
     Status
+        With `store_fault`, `retraining` and `store_lag` as of an engine that does not run.
 
     Raises
     ------
@@ -376,7 +381,7 @@ COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten")
 
 
 def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
-    """Return the counts over a tally's decisions, and over the retrains since the first."""
+    """Return the counts over a tally's decisions, and the retrains since the first of these."""
     outcomes = tally.outcomes
     first = tally.first
     n = tally.count()
@@ -429,7 +434,8 @@ def _estimate_error(
 ) -> ErrorEstimate:
     """Return the estimate if `n_wrong` of `n_known` parts were decided wrongly.
 
-    `n` is the number of all parts, by default `n_known`.
+    Its bounds are the two-sided Wilson interval at error level `alpha`, 0 and 1 without known
+    parts. `n` is the number of all parts, by default `n_known`.
     """
     low, high = wilson_interval(n_known - n_wrong, n_wrong, alpha)
     lower = 1.0 - high
@@ -447,9 +453,9 @@ def _estimate_error(
 
 
 def _verdict(lower: float, upper: float, tolerance: float) -> str:
-    """Return "kept", "broken" or "open".
+    """Return "kept" if the interval is below the tolerance, "broken" if above, else "open".
 
-    The interval is below the tolerance, above it, or contains it.
+    An upper end equal to the tolerance is below it.
     """
     if upper <= tolerance:
         return "kept"
@@ -457,7 +463,7 @@ def _verdict(lower: float, upper: float, tolerance: float) -> str:
 
 
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
-    """Estimate how many of the accepted parts were bad.
+    """Estimate how many of the accepted parts were bad, audited ones included.
 
     If every outcome is known it is by these, else by audits, whose coin knows no outcome, so that
     they speak for all. Under `stops="all"` a part whose outcome is still open is left out. Line
@@ -472,7 +478,8 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     Returns
     -------
     ErrorEstimate
-        Of no part if none was accepted: those of shadow mode are in `Span.would_accept`.
+        At the policy's alpha. Of no part if none was accepted: those of shadow mode are in
+        `Span.would_accept`.
     """
     tolerance = policy.tolerances[0]
     if not outcomes.accepted:
@@ -494,9 +501,10 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
 
 
 def read_watch(store: SqlStore, recipe: Recipe) -> Watch | None:
-    """Return how close the detectors of drift are to an alarm.
+    """Return how close the detectors of drift are to an alarm, by the rule as it is now.
 
-    None if the rule has none, or its state is not kept.
+    The rule is the stored one, updated with all outcomes since. None if it has no detectors, or its
+    state is not kept. In a safe mode that novel traces began, each is 0.
     """
     from ..decision.member_rules import MemberRule  # torch
     from .explain import load_rule
@@ -542,21 +550,23 @@ MIN_STRETCH = 20  # decisions of a stretch: a share of fewer jumps
 
 
 def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
-    """Read the course of a store.
+    """Read the course of a store: counts over time, retrains, safe modes.
 
     Parameters
     ----------
     store : SqlStore
     recipe : Recipe
+        With the policy's tolerance.
     last : int
-        Number of newest decisions that are marked.
+        Number of newest decisions that are marked; it is only returned.
     **by
-        `seconds`, `start` or `batch`, as of `SqlStore.stretches`. The newest 120 stretches are
-        returned.
+        `seconds`, `start` or `batch`, as of `SqlStore.stretches`. By default a stretch has at least
+        20 decisions.
 
     Returns
     -------
     Course
+        With the newest 120 stretches at most.
     """
     modes = [event for event in store.events() if event.kind in MODES]
     n = max(1, min(MAX_STRETCHES, store.tally().count() // MIN_STRETCH))
@@ -572,7 +582,8 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     ----------
     store : SqlStore
     last : int or None
-        Number of newest decisions of the selection; None: all, read as the iteration goes on.
+        Number of newest decisions of the selection, which are read at once; None: all, read as the
+        iteration goes on.
     **where
         The selection: fields of `HistoryFilter`.
 
@@ -583,7 +594,7 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     Raises
     ------
     SettingError
-        For a value that a field cannot have.
+        For a value that a field cannot have, and for a `last` below 1.
     """
     is_valid = last is None or 1 <= last < MAX_LAST
     expect(
@@ -630,7 +641,7 @@ def iterate_decisions(
 
 
 def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
-    """Return decisions as a DataFrame.
+    """Return decisions as a DataFrame, in their order.
 
     Parameters
     ----------
@@ -639,8 +650,8 @@ def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        A row for each, by its id: the fields of `Decision` but for the embedding, `time` in UTC,
-        and `label`, "good", "bad" or None.
+        A row for each, indexed by its id: the fields of `Decision` but for the embedding, `time` in
+        UTC, and `label`, "good", "bad" or None.
     """
     import pandas as pd
 
@@ -656,7 +667,9 @@ def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
 def read_retrains_and_events(
     store: SqlStore, since: float | None = None, until: float | None = None
 ) -> dict[str, list[StoredVersion | Event]]:
-    """Return "retrains" and "events" of a cell between two times, oldest first.
+    """Return the retrains and the events of a cell between two times, each oldest first.
+
+    Dropped retrains are included, those of the product's other cells are not.
 
     Parameters
     ----------
@@ -667,6 +680,7 @@ def read_retrains_and_events(
     Returns
     -------
     dict of str to list
+        "retrains": list of StoredVersion; "events": list of Event.
     """
     first = since or float("-inf")
     end = float("inf") if until is None else until
