@@ -40,7 +40,10 @@ def without_password(text: str) -> str:
 
 
 def shortened(value: Any) -> str:
-    """Return the `repr` of a value, cut to some 60 characters, for a message."""
+    """Return the `repr` of a value for a message, its middle cut out beyond some 60 characters.
+
+    An integer of more digits than Python prints is described by its number of bits.
+    """
     try:
         return _REPR.repr(value)
     except ValueError:  # an integer of more digits than Python prints
@@ -51,9 +54,10 @@ def shortened(value: Any) -> str:
 
 
 def excerpt(text: str, at: int = 0) -> str:
-    """Return the `repr` of some 60 characters of a text around position `at`, for a message.
+    """Return the `repr` of the 60 characters of a text around position `at`, for a message.
 
-    The character at that position is named if it is not printable ASCII.
+    "..." stands where text is left out. If the character at that position is not printable ASCII,
+    its Unicode name, code point and position, counted from 1, follow.
     """
     begin = max(min(at - MAX_LENGTH // 2, len(text) - MAX_LENGTH), 0)
     end = begin + MAX_LENGTH
@@ -68,16 +72,19 @@ def excerpt(text: str, at: int = 0) -> str:
 
 
 def listed(names: Iterable[Any]) -> str:
-    """Return the first eight of some names, and how many more there are, for a message."""
+    """Return the first eight names, joined by commas, and how many more there are, for a message.
+
+    Each name is cut to 100 characters.
+    """
     names = list(names)
     first = ", ".join(str(name)[:100] for name in names[:8])
     return f"{first} and {len(names) - 8} more" if len(names) > 8 else first
 
 
 def as_options(text: str) -> str:
-    """Return a message with its advice for Python written as options of the command line.
+    """Return a message in which Python's arguments are written as options of the command line.
 
-    `TraceSpec(rate_hz=500)` becomes `--rate-hz 500`.
+    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`; the rest stays.
     """
 
     def to_option(match: re.Match[str]) -> str:
@@ -153,7 +160,7 @@ def expect(
     do : str
         What the user can do about it.
     error : type
-        Class of the error. Its message is "Expected `wanted`, got `actual`; `do`."
+        Class of the error that is raised. Its message is "Expected `wanted`, got `actual`; `do`."
     """
     if not valid:
         advice = f"; {do}" if do else ""
@@ -171,9 +178,10 @@ def instead(
     error : type
         Class of the new error. An exception of this class passes unchanged.
     message : str
-        Beginning of the new message; the message of the caught exception follows.
+        Beginning of the new message; the message of the caught exception, cut to 300 characters,
+        follows.
     *caught : type
-        Exceptions to catch.
+        Exceptions to catch. All others pass unchanged.
     do : str
         What the user can do about it, the end of the new message.
     """

@@ -1,7 +1,8 @@
 """Files: outputs, written as a whole or not at all, and NumPy archives, read safely.
 
 `output_file` and `write_output` never replace a file unasked, and never a database. `read_archive`
-unpacks no Python objects, and no more bytes than the machine can hold.
+unpacks no Python objects, and no more bytes than the machine can hold. `write_manifest` lists the
+checksums of files, and `read_key` reads the secret that signs exports.
 """
 
 import hashlib
@@ -38,9 +39,9 @@ MIN_KEY_BYTES = 16
 
 
 def read_key(path: str | os.PathLike[str], error: type[DengineError]) -> bytes:
-    """Return the secret in a key's file, without the line's end.
+    """Return the secret in a key's file, without line ends behind it.
 
-    Raises `error` if the file cannot be read, or has fewer than 16 bytes.
+    Raises `error` if the file cannot be read, or the secret has fewer than 16 bytes.
     """
     message = f"The key's file {path} cannot be read"
     with instead(error, message, OSError, do="dengine export --make-key writes one"):
@@ -89,7 +90,7 @@ def read_errors(
     kind : str
         What it should be, for the error: "a Parquet file".
     package : str
-        Package that reads such files. DataError at once if it is not installed.
+        Package that reads such files. If it is not installed, this call itself raises DataError.
     extra : str
         Extra of dengine that installs the package, for that error.
     also : tuple of type
@@ -116,7 +117,7 @@ def read_archive(
     source : path or bytes
         The file, or its content.
     names : collection of str, optional
-        Arrays that are wanted, those that are there. None: all.
+        Arrays to read; a name that the archive does not have is passed over. None: all.
     name : str
         What to call the archive in errors; the path by default.
 
@@ -124,7 +125,7 @@ def read_archive(
     -------
     arrays : dict of str to array
     all_names : list of str
-        Names of all arrays in the archive.
+        Names of all arrays in the archive, read or not, in its order.
 
     Raises
     ------
@@ -154,7 +155,8 @@ def is_database(path: Path) -> bool:
 def check_output(path: str | os.PathLike[str], force: bool = False) -> None:
     """Raise OutputError if a file must not be written.
 
-    Call it before the work whose result the file is to hold.
+    Call it before the work whose result the file is to hold. A file that does not exist yet is
+    accepted, and nothing is created.
 
     Parameters
     ----------
@@ -194,7 +196,8 @@ def output_file(
 ) -> Iterator[Path]:
     """Context manager that gives the path of an empty file to write.
 
-    If the block ends well, the file is synced and renamed to `path`; if not, it is deleted.
+    If the block ends well, the file is synced and renamed to `path`; if it raises, the file is
+    deleted and `path` stays as it was.
 
     Parameters
     ----------
@@ -208,12 +211,13 @@ def output_file(
     Yields
     ------
     Path
-        A file with a random name in the same folder.
+        An empty file with a random name in the same folder.
 
     Raises
     ------
     OutputError
-        If `check_output` refuses the path, or the system does.
+        If `check_output` refuses the path, or for an OSError or ValueError, also one that the block
+        raises.
     """
     target = Path(path)
     with _write_errors(target):
@@ -239,10 +243,11 @@ def output_file(
 
 
 def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> Path:
-    """Add the SHA-256 of files to `manifest.json` of their folder, and return its path.
+    """Add the SHA-256 of files to `manifest.json` in their folder, and return its path.
 
-    It is made if there is none. Write it last: the files that it lists are complete. Raises
-    OutputError if there is a file of that name that is no manifest, unless `force`.
+    Entries of other files stay, and the manifest is created if there is none. Write it last: it
+    then lists only complete files. Raises OutputError if a file of that name is no manifest, unless
+    `force`.
     """
     target = folder / MANIFEST
     sums: dict[str, str] = {}
@@ -255,7 +260,7 @@ def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> 
 
 
 def _write_errors(target: Path) -> AbstractContextManager[None]:
-    """Return a context manager that raises OutputError, with advice, for an error of the system."""
+    """Return a context manager that raises OutputError with advice for OSError and ValueError."""
     do = (
         "choose a folder that exists, is writable and has room, and a file that no program has open"
     )

@@ -1,11 +1,12 @@
-"""Permanent hashes of traces and parts, which deal folds and audits and recognise parts.
+"""Permanent hashes of traces and parts: they assign folds, draw audits and recognise parts.
 
 A label may be counted for a query only in an embedding that never saw that label, so every trace
 has a fold for life. The fold must not depend on ids, order or time: it comes from the number of the
 part if that is given, else from the content of the trace, so that a controller that knows only the
-samples computes the same. The content hash also tosses the audit coin. The arithmetic is on 64-bit
-integers that wrap around, the same in NumPy, TorchScript and C++. `traces.TraceGate` computes the
-content hash and `decision.decider.Decider` tosses the coin in TorchScript.
+samples computes the same. The content hash also decides at random, but repeatably, which parts are
+audited. The arithmetic is on 64-bit integers that wrap around, the same in NumPy, TorchScript and
+C++. `traces.TraceGate` computes the content hash and `decision.decider.Decider` the random integers
+of audits in TorchScript.
 """
 
 import numpy as np
@@ -21,7 +22,7 @@ FoldArray = NDArray[np.int64]
 
 
 def hash_weights(size: int) -> FoldArray:
-    """Return odd weights, one for each sample position.
+    """Return pseudo-random odd weights, one for each sample position; the same at each call.
 
     Parameters
     ----------
@@ -45,7 +46,9 @@ def hash_weights(size: int) -> FoldArray:
 
 
 def content_hash(X: NDArray[np.floating]) -> FoldArray:
-    """Hash the content of traces.
+    """Hash the content of traces, a weighted sum of the samples that wraps around at 64 bits.
+
+    Each sample is first rounded down to 1/65,536 of its unit and clipped to ±2**46.
 
     Parameters
     ----------
@@ -87,7 +90,10 @@ def trace_hash(content: int, part: str | None) -> int:
 
 
 def toss(hashes: FoldArray, salt: int = 0) -> FoldArray:
-    """Return uniform integers below 2**30, a fixed function of each hash and the salt."""
+    """Return a pseudo-random integer from 0 to 2**30 - 1 for each hash, int64 of shape (n,).
+
+    It is a fixed function of the hash and the salt: nothing is drawn.
+    """
     with np.errstate(over="ignore"):
         h = np.asarray(hashes, dtype=np.int64) ^ np.int64(salt)
         h = (h ^ (h >> 32)) * np.int64(MIX)
@@ -106,5 +112,5 @@ def content_fold(X: NDArray[np.floating], folds: int) -> FoldArray:
 
 
 def audit_salt(seed: int) -> int:
-    """Return the salt of the audit coin: another coin than the folds', and one for each seed."""
+    """Return the salt of `toss` for audits under a seed; it differs from the folds' salt, 0."""
     return AUDIT_SALT ^ (seed & 0x7FFFFFFF)

@@ -6,12 +6,12 @@ from .errors import SettingError, instead, shortened
 
 
 def import_class(path: str) -> type:
-    """Import the class that `module:Class` names.
+    """Import the module in `module:Class` and return the class.
 
     Raises
     ------
     SettingError
-        If the module cannot be imported, whatever it raises, or has no such class.
+        If the module cannot be imported, whatever it raises, or has no class of that name.
     """
     module, _, name = path.partition(":")
     message = f"Expected module:Class that can be imported here, got {shortened(path)}"

@@ -74,7 +74,10 @@ class ForceLimits:
 
     @classmethod
     def parse(cls, text: str) -> ForceLimits:
-        """Return the limits that a text describes; raise SettingError for any other text."""
+        """Return the limits that a text as START:END:LOW:HIGH describes.
+
+        An empty LOW or HIGH is no limit. Raises SettingError for any other text.
+        """
         pairs = [field.partition("=") for field in text.split(":")]
         options: dict[str, Any] = {}
         try:
@@ -91,7 +94,7 @@ class ForceLimits:
 
 
 def _is_channel(value: Any) -> bool:
-    """Return whether a value is a channel's index, or a name that the text form can hold."""
+    """Return whether a value can name a channel: an index, or a name that fits the text form."""
     if not isinstance(value, str):
         return is_whole(value, 0, MOST)
     return is_name(value) and not value.isdecimal() and {*" :="}.isdisjoint(value)

@@ -175,7 +175,8 @@ class Recipe:
         ----------
         recipe : str, path, Recipe or estimator
             A name in `RECIPES`, the path of a TOML file, a Recipe, which is returned unchanged, or
-            a reducer of your own: `module:Class`, or a scikit-learn transformer.
+            a reducer of your own, `module:Class` or a scikit-learn transformer, which gets the
+            default settings. A text is tried in this order.
 
         Raises
         ------
@@ -200,9 +201,11 @@ class Recipe:
 
     @classmethod
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
-        """Parse the text that `to_toml` writes.
+        """Parse the text that `to_toml` writes, and return the recipe.
 
-        Raises SettingError, which begins with `where`, for an unknown key or a value out of range.
+        Settings that are missing get their defaults, and "none" is read as None. Raises
+        SettingError, which begins with `where`, for text that is not TOML, an unknown key or a
+        value out of range.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
@@ -228,8 +231,8 @@ class Recipe:
     ) -> Recipe:
         """Parse the recipe among the settings of a store, without importing a class that it names.
 
-        Raises StoreError if the radius is missing and such a class would have to be imported for
-        its default: the store is damaged.
+        Raises StoreError if `radius` or `retrain_every` is missing and a user's class would have to
+        be imported for its default: the store is damaged. Raises SettingError as `from_toml`.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
@@ -242,9 +245,10 @@ class Recipe:
     def to_toml(self) -> str:
         """Return the recipe as TOML, in which None is written as "none".
 
-        A reducer object is written as `module:Class` and its parameters. Where these are no plain
-        values, as in a pipeline, it is written as "object Class", and the object must be handed in
-        again.
+        Defaults that belong to the reducer's class are written as values; the class is imported for
+        them. A reducer object is written as `module:Class` and its parameters. Where these are no
+        plain values, as in a pipeline, it is written as "object Class", and the object must be
+        handed in again.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain["reducer"], params = _name_and_params(self.reducer, self.params)
@@ -264,9 +268,10 @@ class Recipe:
         return replace(self, policy=replace(self.policy, **changes))
 
     def make_reducer(self, seed: int) -> Any:
-        """Return the reducer: the object that was given, or a new one of the name.
+        """Return the reducer: the object that was given, uncopied, or a new one of the name.
 
-        A new one gets the seed as `random_state`, and `folds`, where it takes them.
+        A new one gets the seed as `random_state`, and `folds`, where it takes them, and then the
+        recipe's `params`, which win.
         """
         if not isinstance(self.reducer, str):
             return self.reducer
@@ -278,7 +283,10 @@ class Recipe:
 
 
 def _check_keys(table: Mapping[str, Any], record_type: Any, where: str) -> None:
-    """Raise SettingError for a key that is no field of a dataclass."""
+    """Raise SettingError if a table has a key that is no field of the dataclass `record_type`.
+
+    The message begins with `where`.
+    """
     names = sorted(f.name for f in fields(record_type))
     unknown = sorted(set(table) - set(names))
     if unknown:
@@ -311,7 +319,8 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
     """Return a reducer as TOML can describe it: a name, and parameters with plain values.
 
     A name is returned with the `params` given. An object gives its `module:Class` and its own
-    parameters, or "object Class" and none, where these are not plain or the class is local.
+    parameters without those that are None; or "object Class" and no parameters, where these are not
+    plain, or its class is local or stands in `__main__`.
     """
     if isinstance(reducer, str):
         return reducer, params
@@ -329,9 +338,10 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
 
 
 def describe_estimator(estimator: Any) -> str:
-    """Return an estimator's class and parameters, nested ones included, as text.
+    """Return an estimator as text: its class and all parameters, nested ones included, by name.
 
-    The text is the same in every process: objects are named by their class alone.
+    The text is the same in every process, because a value that is not plain is named by its class
+    alone.
     """
     params = estimator.get_params(deep=True)
     values = (

@@ -161,7 +161,7 @@ class TraceSpec:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """The unit of each channel."""
+        """The unit of each channel, a tuple of `channels` texts."""
         return (self.unit,) * self.channels if isinstance(self.unit, str) else self.unit
 
 
@@ -339,7 +339,8 @@ def as_success(value: Any, owner: str = "") -> bool:
 def as_outcome(value: Any, owner: str = "") -> Outcome:
     """Convert an `Outcome`, or its text as in "stopped", to an `Outcome`.
 
-    Raises ReportError for any other value, True and None too. `owner` names the decision in it.
+    Raises ReportError for any other value, also for True and None; `owner` says in its message
+    whose outcome it is.
     """
     whose = f" of {owner}," if owner else ""
     message = f"Expected an Outcome, {', '.join(Outcome)},{whose} got {shortened(value)}"
@@ -349,7 +350,11 @@ def as_outcome(value: Any, owner: str = "") -> Outcome:
 
 
 def source_of(action: Action, audit: bool, success: bool) -> Source:
-    """Return the source of a label by the decision: its action, and whether it was an audit."""
+    """Return the source of a label, derived from its decision and from the label itself.
+
+    INSPECTION after a reject; AUDIT or VERIFICATION after a verification, by `audit`; CONFIRMED or
+    STOP after an accept, by `success`.
+    """
     if action is Action.REJECT:
         return Source.INSPECTION
     if action is Action.VERIFY:

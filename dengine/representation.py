@@ -17,8 +17,9 @@ from .errors import without_password
 def to_html(record: Any) -> str:
     """Return the `repr` of a record as an HTML table, for its `_repr_html_`.
 
-    Each part of the `repr` between commas is a row. Its attribute `sentences`, if it has one, gives
-    the paragraphs below the table.
+    The text before the first ": " is the heading; each part behind it, between ", ", is a row. The
+    texts in its attribute `sentences`, if it has one, are paragraphs below the table. All is
+    escaped.
     """
     title, _, parts = repr(record).strip("<>").partition(": ")
     left = "style='text-align: left'"
@@ -59,6 +60,6 @@ def to_jsonable(value: Any) -> Any:
 
 @cache
 def _shown_fields(record_type: type) -> tuple[tuple[str, bool], ...]:
-    """Return the name of each field that is not "apart", and whether it is "flat"."""
+    """Return a dataclass's fields that are not "apart": each name, and whether it is "flat"."""
     shown = (field for field in fields(record_type) if "apart" not in field.metadata)
     return tuple((field.name, "flat" in field.metadata) for field in shown)

@@ -1,12 +1,14 @@
 """The contract of a reducer, as checks that its author can run.
 
     from dengine.testing import check_reducer
-    check_reducer(MyReducer())  # an AssertionError names the clause that is broken
+    check_reducer(MyReducer()) # an AssertionError names the clause that is broken
 
-`REDUCER_CHECKS` holds the clauses one by one, for pytest's parametrize. Any transformer of sklearn
-may be checked. It is used as in an engine: in one space if it uses no labels, else cross-fitted.
-Honest counting rests on the clause `labels_of_a_fold_move_nothing_in_its_space`. `toy_traces` makes
-the traces of these checks, and of examples.
+`REDUCER_CHECKS` holds the clauses one by one, for pytest's parametrize. Each takes a reducer, works
+on clones of it, returns None and raises AssertionError if its clause is broken. Any transformer of
+sklearn may be checked. It is used as in an engine: in one space if it uses no labels, else
+cross-fitted in two folds. Honest counting rests on the clause
+`labels_of_a_fold_move_nothing_in_its_space`. `toy_traces` makes the traces of these checks, and of
+examples.
 """
 
 from collections.abc import Callable
@@ -77,11 +79,11 @@ QUERIES = toy_traces(20, seed=5)[0]
 
 
 def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
-    """Check `embed`, `transform` and `embed_references` of a trained clone.
+    """Assert that `embed`, `transform` and `embed_references` of a trained clone fit together.
 
-    `embed` must return finite float32 (n, K, d), the same from two clones; `transform` (n, d); and
-    `embed_references` the row of `embed` in the space of each fold. The caller's traces must not be
-    written to.
+    `embed` must return finite float32 of shape (n, K, d), the same from two trained clones, with K
+    of 2 or more if labels are used; `transform` must return (n, d); `embed_references` must return
+    of each row of `embed` the space of its fold. The caller's traces must not be written to.
     """
     is_estimator = isinstance(reducer, BaseEstimator)
     assert is_estimator, f"{type(reducer).__name__} is no scikit-learn estimator"
@@ -105,7 +107,11 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
 
 
 def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
-    """Check honest counting: the labels of fold k change no bit of space k, in two trainings."""
+    """Assert honest counting: the labels of fold k change no bit of space k.
+
+    For each k a clone is trained twice in a row with the labels of fold k flipped and shuffled; the
+    embeddings of new traces in space k must equal those with the true labels.
+    """
     X, y = toy_traces()
     trained = _train_clone(reducer, times=2)
     Z = trained.embed(QUERIES)
@@ -119,9 +125,10 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
 
 
 def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
-    """Check that a reducer whose `fit` needs labels has `uses_labels = True`.
+    """Assert that a reducer whose `fit` needs labels has `uses_labels = True`.
 
-    Otherwise it gets none, and every retrain would fail.
+    Otherwise it gets none, and every retrain would fail. An error of its `fit` that is not due to
+    missing labels is raised as it is.
     """
     X, y = toy_traces()
     try:
@@ -136,7 +143,10 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
 
 
 def fit_starts_afresh(reducer: Any) -> None:
-    """Check that `fit` on A and then on B gives the same as `fit` on B."""
+    """Assert that `fit` on A and then on B gives the same `transform` as `fit` on B alone does.
+
+    The points must be equal bit for bit.
+    """
     A, labels_a = toy_traces(seed=1)
     B, labels_b = toy_traces(seed=2)
     once = as_reducer(clone(reducer), FOLDS).fit(B, labels_b)
@@ -146,9 +156,9 @@ def fit_starts_afresh(reducer: Any) -> None:
 
 
 def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
-    """Check that a trace embedded alone, as in a cell, lies where it lies in a batch.
+    """Assert that a trace embedded alone, as in a cell, lies where it lies in a batch.
 
-    They may differ by a ten-thousandth of the embedding's root mean square radius.
+    The two points may differ by a ten-thousandth of the embedding's root mean square radius.
     """
     trained = _train_clone(reducer)
     together = trained.embed(QUERIES)
@@ -161,7 +171,7 @@ def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
 
 
 def any_length_and_several_channels_work(reducer: Any) -> None:
-    """Check that traces of other lengths, and of several channels, are embedded."""
+    """Assert that traces of other lengths, and of three channels, are embedded to finite points."""
     for channels, samples in SHAPES:
         X, y = toy_traces(70, samples, channels)
         trained = as_reducer(clone(reducer), FOLDS)
@@ -173,7 +183,7 @@ def any_length_and_several_channels_work(reducer: Any) -> None:
 
 
 def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
-    """Check that `fit` and `transform` raise ValueError for a trace with a NaN."""
+    """Assert that `fit` and `transform` raise ValueError for a trace with a NaN."""
     X, y = toy_traces()
     X[3, 0, 7] = np.nan
     unfitted = as_reducer(clone(reducer), FOLDS)
@@ -187,7 +197,10 @@ def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
 
 
 def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
-    """Check that the compiled module, if there is one, embeds as `embed` does."""
+    """Assert that its `module()` compiles to TorchScript and embeds as `embed` does, within 1e-4.
+
+    Passes if the reducer has no module, None.
+    """
     trained = _train_clone(reducer)
     module = trained.module()
     if module is not None:
@@ -197,7 +210,10 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
 
 
 def its_state_restores_it_bit_for_bit(reducer: Any) -> None:
-    """Check that the state, if there is one, holds plain arrays and restores every bit."""
+    """Assert that its state holds plain arrays, and that a clone restored from it embeds the same.
+
+    Passes if the reducer has no state, None.
+    """
     trained = _train_clone(reducer)
     state = trained.get_state()
     if state is not None:
@@ -209,7 +225,11 @@ def its_state_restores_it_bit_for_bit(reducer: Any) -> None:
 
 
 def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
-    """Check that an engine that is closed and opened again decides the same, bit for bit."""
+    """Assert that an engine that is closed and opened again decides the same, bit for bit.
+
+    The engine runs 90 cycles with a store in a temporary folder. Its first retrain must be
+    accepted.
+    """
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)
     with TemporaryDirectory() as folder:
@@ -248,7 +268,8 @@ def check_reducer(reducer: Any) -> None:
     Raises
     ------
     AssertionError
-        For the first clause that is broken; the message names it.
+        For the first clause that is broken; the message names it. An error of the reducer's own
+        passes unchanged.
     """
     for check in REDUCER_CHECKS:
         try:
@@ -259,9 +280,11 @@ def check_reducer(reducer: Any) -> None:
 
 
 def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reducer:
-    """Return a clone of a reducer, trained `times` times on the toy traces as an engine does it.
+    """Return a clone of a reducer, trained `times` times in a row on the toy traces.
 
-    labels : in place of those of the traces.
+    It is trained as in an engine, in 2 folds by content, for at most 8 optimiser steps each time.
+
+    labels : replace the labels of the toy traces; None keeps them.
     """
     X, y = toy_traces()
     trained = as_reducer(clone(reducer), FOLDS)
@@ -273,7 +296,10 @@ def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Re
 
 
 def _decide_all(engine: DataEngine, X: NDArray[np.float32]) -> list[tuple[Any, ...]]:
-    """Decide on each trace; return what a decision says, without its id and time."""
+    """Let an engine decide on each trace of X; return what was decided, without ids and reasons.
+
+    Each tuple holds action, lower, upper, n_success, n_failure, embedding and model_version.
+    """
     names = ("action", "lower", "upper", "n_success", "n_failure", "embedding", "model_version")
     decisions = [engine.decide(x) for x in X]
     return [tuple(getattr(decision, name) for name in names) for decision in decisions]

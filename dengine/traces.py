@@ -66,7 +66,8 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> NDArray[np.float32]:
     Raises
     ------
     TraceError
-        For a trace of another shape, or of values that are no real numbers.
+        For a trace of another shape, for values that are no real numbers, and for a DataFrame whose
+        columns do not fit. NaN and infinities pass; `TraceGate` finds them.
     """
     x = _as_real(trace if isinstance(trace, np.ndarray) else _frame_to_array(trace, trace_spec))
     x = x[None, :] if x.ndim == 1 else x
@@ -119,9 +120,9 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> NDArray[np.f
 
 
 def as_labels(y: ArrayLike) -> NDArray[np.int64]:
-    """Convert labels, shape (n,), to int64: 1 for success, 0 for failure.
+    """Convert labels, shape (n,), to int64: 1 for success, 0 for failure; booleans are accepted.
 
-    Raises DataError for any other value.
+    Raises DataError if there is any other value.
     """
     labels = np.asarray(y)
     if not np.isin(labels, (0, 1)).all():
@@ -131,9 +132,9 @@ def as_labels(y: ArrayLike) -> NDArray[np.int64]:
 
 
 def spec_of(x: NDArray[np.float32], trace: Any = None) -> TraceSpec:
-    """Return the `TraceSpec` of a converted trace (C, T).
+    """Return the `TraceSpec` of a converted trace `x` (C, T), with defaults for all but its shape.
 
-    The columns are named where `trace`, as it came before it was converted, is a DataFrame.
+    If `trace`, the same trace before its conversion, is a DataFrame, the columns get its names.
     """
     columns = tuple(map(str, _channel_columns(trace))) if _is_frame(trace) else ()
     return TraceSpec(samples=x.shape[1], channels=x.shape[0], columns=columns)
@@ -148,7 +149,7 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     ----------
     x : Tensor of float32, shape (..., T)
     samples : int
-        The wanted length.
+        The length to return.
     fit : int
         Position in `FITS` of "cut", "pad" or "resample". The first two keep each sample's time from
         the start; resample stretches the whole trace by linear interpolation.
@@ -156,8 +157,8 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     Returns
     -------
     Tensor of float32, shape (..., samples)
-        If `can_fit_length` is False, the missing samples, at least the last one, are NaN, which
-        `TraceGate` finds.
+        If `can_fit_length` is False, the trace is cut or padded with NaN, and at least its last
+        sample is NaN, so that `TraceGate` finds it.
     """
     have = x.size(-1)
     last = have - 1
@@ -190,7 +191,7 @@ def can_fit_length(have: int, samples: int, fit: int) -> bool:
 def is_time_column(name: str) -> bool:
     """Return whether a column's name says that it is a clock, and no channel.
 
-    As `%time`, `t [ms]`, `Zeit/s`, `header.stamp` and `t_ms` do.
+    Names such as `%time`, `t [ms]`, `Zeit/s`, `header.stamp` and `t_ms` do.
     """
     words = [word.lower() for word in WORDS.findall(NAME_SUFFIX.sub("", name.strip()))]
     if not CLOCK_WORDS.isdisjoint(words):
@@ -231,7 +232,7 @@ def _frame_to_array(trace: Any, trace_spec: TraceSpec | None) -> Any:
 
 
 def _channel_columns(frame: Any) -> list[Any]:
-    """Return the columns of a DataFrame that are no clock by their dtype or name."""
+    """Return the columns of a DataFrame, in order, that no dtype or name marks as a clock."""
     types = {name: str(frame[name].dtype).lower() for name in frame.columns}
     return [
         name
@@ -241,7 +242,11 @@ def _channel_columns(frame: Any) -> list[Any]:
 
 
 def _as_real(values: ArrayLike) -> NDArray[np.float32]:
-    """Convert numbers to a float32 array; raise TraceError for what are no real numbers."""
+    """Convert numbers to a float32 array; one that is float32 already is returned uncopied.
+
+    What float32 cannot hold becomes an infinity. Raises TraceError for values that are no real
+    numbers and for rows of different lengths.
+    """
     try:
         array: NDArray[Any] = np.asarray(values)
     except (ValueError, TypeError) as error:
@@ -257,10 +262,10 @@ def _as_real(values: ArrayLike) -> NDArray[np.float32]:
 
 
 def _match_spec(x: NDArray[np.float32], trace_spec: TraceSpec) -> NDArray[np.float32]:
-    """Return traces (..., C, T) with the channels and samples of a `TraceSpec`.
+    """Return traces (..., C, T) fitted to the number of samples of a `TraceSpec`.
 
-    Another length is fitted as `trace_spec.fit` says. Raises TraceError for another number of
-    channels, and for another length if that is "strict".
+    Traces of that length are returned as they are; others are fitted as `trace_spec.fit` says, or
+    raise TraceError if that is "strict". Another number of channels raises TraceError.
     """
     channels, samples = x.shape[-2:]
     if channels != trace_spec.channels:
@@ -349,15 +354,18 @@ class TraceGate(nn.Module):
         Returns
         -------
         reason : int
-            Position in `REASONS` of the fault; 0 if there is none.
+            Position in `REASONS` of the first fault found: not finite, constant, saturated or too
+            large; 0 if there is none.
         content_hash : int
-            As `folds.content_hash`.
+            As `folds.content_hash`; also of a faulty trace.
         """
         return self.check(x, self.limit)
 
     @torch.jit.export
     def check(self, x: Tensor, limit: float) -> tuple[int, int]:
-        """Check a trace, as `forward` does, by another limit of the sensor's range."""
+        """Check a trace as `forward` does, with `limit` in place of the sensor's range of the
+        `TraceSpec`.
+        """
         lowest, highest = torch.aminmax(x)
         low = float(lowest.item())  # NaN if there is one anywhere in the trace
         high = float(highest.item())
@@ -427,8 +435,9 @@ class ForceLimitsGate(nn.Module):
     def forward(self, x: Tensor) -> int:
         """Check a trace (C, T) of float32.
 
-        Returns 0 if it keeps all limits, 1 if it leaves one and is to be verified, 2 if it leaves
-        one that rejects.
+        Returns 0 if it keeps all limits, or there are none; 1 if it leaves one and is to be
+        verified; 2 if it leaves one that rejects. A trace without a sample in the stretch of a
+        limit leaves it.
         """
         if self.limits.size(0) == 0:
             return 0
@@ -443,15 +452,20 @@ class ForceLimitsGate(nn.Module):
 def convert_trace(
     trace: Any, trace_spec: TraceSpec | None, may_start_over: bool
 ) -> NDArray[np.float32]:
-    """Convert a trace as `as_trace`, with advice in its TraceError on how to start over.
+    """Convert a trace as `as_trace` does, and explain in a TraceError how to start over.
 
     Parameters
     ----------
     trace, trace_spec
         As in `as_trace`.
     may_start_over : bool
-        Whether the `TraceSpec` was inferred from the first trace and no label was reported yet:
-        the error then says that the first trace may have been the wrong one.
+        Whether the `TraceSpec` was inferred from the first trace and no label was reported yet: the
+        error then says that the first trace may have been the wrong one. False: the error of
+        `as_trace` passes unchanged.
+
+    Returns
+    -------
+    array of float32, shape (C, T)
     """
     try:
         return as_trace(trace, trace_spec)
@@ -473,7 +487,7 @@ def _spec_advice(trace: Any) -> str:
 
 
 def infer_trace_spec(x: NDArray[np.float32], trace: Any) -> tuple[TraceSpec, bool]:
-    """Infer the `TraceSpec` of all traces from the first one.
+    """Infer the `TraceSpec` of all traces from the first one: its shape and column names.
 
     Parameters
     ----------

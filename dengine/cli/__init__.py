@@ -2,8 +2,8 @@
 
     dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3
 
-A verb is a function in one of this folder's modules and a name in the list below. Verbs import what
-they need when they run, so that `--help` answers at once.
+A verb is a function in one of this folder's modules and a name in the list at the end of this one.
+Verbs import what they need when they run, so that `--help` answers at once.
 """
 
 import sys
@@ -45,14 +45,23 @@ class Verbs(click.Group):
     """
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Run a verb; a character that the screen's encoding lacks becomes a question mark."""
+        """Parse the arguments and run a verb, as click does; it usually ends the process.
+
+        Before that stdout and stderr are set to print "?" for a character that their encoding
+        lacks.
+        """
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, TextIOWrapper) and not stream.encoding.lower().startswith("utf"):
                 stream.reconfigure(errors="replace")
         return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a verb and turn its expected errors into click's, with passwords masked."""
+        """Run a verb and return its result; raise its expected errors as click's.
+
+        Passwords in their messages are masked. The current folder is added to the end of
+        `sys.path`, so that `module:Class` is found there. Ctrl-C ends the process with exit code
+        130.
+        """
         folder = str(Path.cwd())
         if folder not in sys.path:
             # `module:Class` is also searched in the current folder; last, so it shadows nothing.

@@ -36,7 +36,7 @@ SIGNIFICANT = 0.01  # p-values below it are called drift
 @options.data_options(argument=True)
 @options.out_option
 def data(source: DataChoice, out: Out | None) -> None:
-    """Describe a data set, and list what is wrong with it.
+    """Describe a data set, and list what is wrong with it; --out draws it too.
 
     DATA is one of: a folder of CSV files, one for each insertion, with the label in its name or in
     a column; a wide .csv or .parquet file, with a row for each insertion; a long one, with a row
@@ -81,7 +81,10 @@ def data(source: DataChoice, out: Out | None) -> None:
 
 
 def _drift_row(drift: "Drift") -> tuple[str, str, str]:
-    """Return the cells of a table: the quantity, its means over tenths, and whether it drifts."""
+    """Return three cells of a table: the quantity, its means over tenths, and whether it drifts.
+
+    Drift is a p-value below `SIGNIFICANT`.
+    """
     means = " ".join(f"{mean:.2g}" for mean in drift.tenths)
     if math.isnan(drift.rho):
         return drift.name, means, "never changes"
@@ -147,8 +150,9 @@ def train(
     """Import labelled traces into a store and train on them.
 
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant)
-    is stored, but never trained on. A store that has been used keeps its own recipe and seed.
-    Ctrl-C keeps what was imported; the same command continues there.
+    is stored, but never trained on. A store that has been used keeps its own recipe and seed. If
+    the new version is not used, the exit code is 1. Ctrl-C keeps what was imported; the same
+    command continues there.
     """
     from ..datasets.importing import import_labelled, stored_form
     from ..engine.engine import DataEngine, core_of

@@ -52,7 +52,7 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """Return the time in seconds since 1970; a usage error for what is no time."""
+        """Return the time in seconds since 1970; a usage error for a text that is no time."""
         ago = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value)
         if ago:
             return time.time() - float(ago[1]) * SECONDS_OF[ago[2]]
@@ -109,7 +109,7 @@ def history(store: str, events: bool, **criteria: Any) -> None:
 
 
 def _label_text(stored: StoredDecision) -> str:
-    """Return a decision's label with its source: `good verified`, `bad stop`, "-" without one."""
+    """Return a label with its source, as "good verified" or "bad stop"; "-" without a label."""
     if stored.success is None:
         return "-"
     source = "" if stored.source is None else stored.source.value
@@ -145,7 +145,11 @@ COLUMNS: dict[str, Callable[[StoredDecision], str]] = {
 
 
 def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> str:
-    """Return a table of decisions as text; retrains and events are lines between its rows."""
+    """Return a table of decisions as text, in the order of the items.
+
+    Retrains and events are lines between its rows, cut to 119 characters. Without any item it is a
+    sentence that says so.
+    """
     from ..store.records import StoredDecision
 
     lines: list[str | list[str]] = []
@@ -168,7 +172,7 @@ def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> s
 
 
 def _event_line(item: StoredVersion | Event) -> str:
-    """Return the line of an event or a retrain: its time, what happened, and why."""
+    """Return the line of an event or a retrain: its time in UTC, what happened, and why."""
     from ..store.records import Event
 
     time_text = format_time(item.time, SHORT_TIME)
@@ -238,7 +242,11 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
 
 
 def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
-    """Yield (title, text) rows: who decided, why, what was found again, and the envelope."""
+    """Yield (title, text) rows of an explanation.
+
+    They say when and by which version it was decided, the part, why, what was found when it was
+    computed again, and how the trace lies to the envelope.
+    """
     decision = explanation.decision.decision
     version = decision.model_version
     decider = f"version {version}" if version else "no model"
@@ -263,7 +271,11 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
 
 
 def _excess_rows(explanation: Explanation) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of a table of where the trace leaves the envelope, the farthest first."""
+    """Yield table rows of where the trace leaves the envelope, at most 5, the farthest first.
+
+    Each has the channel's name, begin and end in seconds, and how far, in widths of the band. There
+    are none without an envelope.
+    """
     spec = explanation.spec
     names = spec.columns or [f"channel {i + 1}" for i in range(spec.channels)]
     if explanation.envelope is None:

@@ -100,7 +100,11 @@ class NameChoice(click.ParamType[Any]):
         return f"[{'|'.join(filter(None, [*names_of(self.kind), self.custom]))}]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the name; a usage error for any other value."""
+        """Return the name; fail with a usage error for any other value.
+
+        If the option takes an object of the user's own, a value with a dot, colon or slash is
+        returned unchecked.
+        """
         names = names_of(self.kind)
         if value not in names and not (self.custom and {".", ":", "/"} & set(value)):
             custom = f", or {self.custom} of your own" if self.custom else ""
@@ -130,7 +134,10 @@ class CommaList(click.ParamType[Any]):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[Any, ...]:
-        """Return the values as a tuple; a usage error if there is none or one is wrong."""
+        """Return the converted values as a tuple; a usage error if there is none or one is wrong.
+
+        A tuple, such as a default, is returned as it is.
+        """
         if isinstance(value, tuple):
             return value
         items = [item.strip() for item in str(value).split(",") if item.strip()]
@@ -153,6 +160,8 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
     """
 
     def decorate(command: Command) -> Command:
+        """Return the command with the options, and with one argument in their place."""
+
         @wraps(command)
         def bundled(**values: Any) -> Any:
             taken = {name: values.pop(name) for name in options}
@@ -172,7 +181,10 @@ def drop_none(**values: Any) -> dict[str, Any]:
 
 
 def _address(store: str | None, cell_id: str | None, product: str | None = None) -> str | None:
-    """Return a store's address with its cell and product; None without a store."""
+    """Return a store's address: its file or URL, as a `CellAddress` if a cell or product is given.
+
+    None without a store; then a cell or product is a usage error.
+    """
     from ..store.records import address
 
     if store is None and (cell_id or product):
@@ -190,7 +202,13 @@ _PRODUCT = (
 
 
 def existing_store(store: Option) -> Option:
-    """Return `store` together with `--cell`, handed on as one address."""
+    """Return a decorator that adds `store` and `--cell`, handed on as one address, `store`.
+
+    Parameters
+    ----------
+    store : option
+        The argument or option that takes the store's file or URL.
+    """
     cell = click.option("--cell", "--cell-id", "cell_id", metavar="NAME", help=_CELL_ID)
     return bundle_options("store", _address, {"store": store, "cell_id": cell})
 
@@ -199,7 +217,10 @@ store_argument = existing_store(click.argument("store", metavar="STORE"))
 
 
 def store_option(text: str, *names: str, required: bool = False) -> Option:
-    """Return `--store`, which may not exist yet, `--cell-id` and `--product`, as one address.
+    """Return a decorator that adds `--store`, `--cell-id` and `--product`.
+
+    They are handed on as one address; the store need not exist. The address, the verb's argument
+    `store`, is None without `--store`.
 
     Parameters
     ----------
@@ -238,7 +259,7 @@ class RecipeChoice:
     settings: Mapping[str, Any]
 
     def load(self, base: Any = "conv") -> Recipe:
-        """Return the recipe, or `base`, with the given settings.
+        """Return the recipe, or `base` if no name was given, with the given settings.
 
         Raises
         ------
@@ -260,7 +281,10 @@ class RecipeChoice:
         return self.load() if self.name or self.settings else None
 
     def make_contender(self) -> Contender:
-        """Return who plays in a replay: dengine by this recipe, or the baseline of this name."""
+        """Return the contender of a replay: dengine with this recipe, or the baseline of this name.
+
+        Both get the settings that were given.
+        """
         from ..experiments.replay import Contender
 
         if self.name in names_of("baseline"):
@@ -308,7 +332,10 @@ _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
 def _windows(
     context: click.Context, option: click.Parameter, values: tuple[str, ...]
 ) -> tuple[str, ...] | None:
-    """Return the windows that were given, without empty ones; None if none was given."""
+    """Return the windows that were given, without empty ones; None if the option was not given.
+
+    An empty tuple removes all windows of a recipe. It is a callback of click's.
+    """
     return tuple(filter(None, values)) if values else None
 
 
@@ -366,7 +393,10 @@ class DataChoice:
     options: Mapping[str, Any]
 
     def load(self) -> Dataset:
-        """Return the data set; print its notes and what was left out of it to stderr.
+        """Load the data set and return it.
+
+        Its notes and the first recordings that were left out are printed to stderr, but not with
+        `--json`.
 
         Raises
         ------
@@ -383,9 +413,10 @@ class DataChoice:
 
 
 def fault_lines(data: Dataset, most: int) -> list[str]:
-    """Return lines that name the recordings that could not be read, at most `most` of them.
+    """Return lines that list the recordings that could not be read, for people.
 
-    The list is empty if every recording could be read.
+    The first line counts them, at most `most` are named, and a last line counts the others. The
+    list is empty if every recording could be read.
     """
     n_faults = len(data.faults)
     if not n_faults:
@@ -480,7 +511,9 @@ def _data_choice(data: str, **options: Any) -> DataChoice:
 
 
 def data_options(default: str | None = "insertion", argument: bool = False) -> Option:
-    """Return `--data` with the options of how it is read, handed on as one `DataChoice`, `source`.
+    """Return a decorator that adds `--data` and the options of how it is read.
+
+    They are handed on as one `DataChoice`, the verb's argument `source`.
 
     Parameters
     ----------
@@ -508,7 +541,9 @@ def recorder_settings(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def trace_spec_from(options: Mapping[str, Any]) -> TraceSpec | None:
-    """Return the contract of live traces from those of the options in `TRACE` that were given.
+    """Return the contract of live traces, by those options of `TRACE` that were given.
+
+    `--channels` with one number gives how many there are; with names, their columns.
 
     Returns
     -------
@@ -538,7 +573,10 @@ def trace_spec_from(options: Mapping[str, Any]) -> TraceSpec | None:
 
 
 def n_jobs_option(default: int, text: str) -> Option:
-    """Return `--n-jobs`, a number of processes as joblib counts them; 0 is taken for -1."""
+    """Return a decorator that adds `--n-jobs`, a number of processes as joblib counts them.
+
+    0 is turned into -1, one process for each core.
+    """
 
     def all_cores_for_0(context: click.Context, option: click.Parameter, n_jobs: int) -> int:
         return n_jobs or -1
@@ -554,7 +592,16 @@ def n_jobs_option(default: int, text: str) -> Option:
 
 
 def require_modules(purpose: str, extra: str, *modules: str) -> None:
-    """Raise SettingError if a module is not installed; the error names the extra that has it."""
+    """Raise SettingError if a module is not installed; the error has the command that installs it.
+
+    Parameters
+    ----------
+    purpose : str
+        What they are needed for, for the error.
+    extra : str
+        Extra of dengine that installs them.
+    *modules : str
+    """
     if missing := ", ".join(name for name in modules if find_spec(name) is None):
         raise SettingError(
             f'Expected {missing} for {purpose}, not installed: pip install "dengine[{extra}]".'

@@ -36,7 +36,10 @@ EXPLAIN = "--explain"
 
 
 def _context_flag(name: str, text: str) -> Callable[[Any], Any]:
-    """Return a flag that is kept in click's context instead of being handed to the verb."""
+    """Return a decorator that adds a flag whose value is kept in click's context under its name.
+
+    The verb does not receive it as an argument.
+    """
 
     def keep(context: click.Context, option: click.Parameter, value: bool) -> None:
         context.meta[name] = value
@@ -49,7 +52,7 @@ explain_option = _context_flag(EXPLAIN, "Explain the columns below the table.")
 
 
 def legend_or_hint(legend: str) -> str:
-    """Return the legend of a table where `--explain` was given, else a line that names the flag."""
+    """Return the legend of a table if `--explain` was given, else a line that names that flag."""
     if click.get_current_context().meta.get(EXPLAIN):
         return legend
     return "--explain says what the columns mean."
@@ -77,7 +80,9 @@ class Out:
     force: bool = False
 
     def write(self, contents: Mapping[str, Any]) -> list[Path]:
-        """Write files, and a manifest of them unless the only one is `path` itself.
+        """Write files, creating their folder, and a manifest of them, and return their paths.
+
+        There is no manifest if the file is `path` itself.
 
         Parameters
         ----------
@@ -87,7 +92,7 @@ class Out:
         Returns
         -------
         paths : list of Path
-            Of the files that were written.
+            Of the files that were written, the manifest last.
 
         Raises
         ------
@@ -165,8 +170,8 @@ def print_result(
 def print_parts(*parts: Any) -> None:
     """Print tables and texts to stdout, with the passwords of database URLs masked.
 
-    A text of one line is wrapped between words, which keeps long paths whole. A text of several
-    lines is printed as it is.
+    They fit the terminal, or 80 columns where there is none. A text of one line is wrapped between
+    words, which keeps long paths whole. A text of several lines is printed as it is.
     """
     from rich.console import Console
 
@@ -183,7 +188,7 @@ def print_parts(*parts: Any) -> None:
 def table_of_rows(
     title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")
 ) -> "Table":
-    """Return a table whose first column is bold; passwords are masked.
+    """Return a rich Table whose first column is bold; passwords are masked.
 
     Parameters
     ----------
@@ -204,7 +209,7 @@ def table_of_rows(
 
 
 def table_of_records(title: str, records: Iterable[Any], *names: str) -> "Table":
-    """Return a table with a row for each record and a column for each of the named fields."""
+    """Return a rich Table with a row for each record and a column for each of the named fields."""
     rows = [[format_value(name, getattr(record, name)) for name in names] for record in records]
     return table_of_rows(title, rows, [heading(name) for name in names])
 
@@ -235,7 +240,7 @@ def format_value(name: str, value: Any) -> str:
         The field's name. Its ending tells the unit, see `FORMATTERS`: `_s`, `_bytes`, `share` ...
     value : object
         A number, a text, a dataclass, or a mapping or sequence of these. "-" stands for None, for
-        NaN and for "".
+        NaN and for "". A mapping gives its items that are not 0, or "none".
     """
     if isinstance(value, str) or value is None:
         return without_password(value) if value else "-"
@@ -261,7 +266,7 @@ def format_value(name: str, value: Any) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """Return a duration as people write it: 180 µs, 35 ms, 4.6 s, 240 s."""
+    """Return a duration in seconds as people write it: 180 µs, 35 ms, 4.6 s, 240 s."""
     if seconds < 0.9995e-3:
         return f"{1e6 * seconds:.0f} µs"
     if seconds < 9.95e-3:
@@ -296,7 +301,7 @@ FORMATTERS: dict[str, Callable[[float], str]] = {
 
 
 def certificate_record(certificate: "Certificate") -> dict[str, Any]:
-    """Return a certificate for JSON: its numbers, its verdict and its sentences."""
+    """Return a certificate as a dict for JSON: its numbers, its verdict and its sentences."""
     sentences = ("kept", "sentence", "sentence_on_rejects")
     return asdict(certificate) | {name: getattr(certificate, name) for name in sentences}
 
@@ -349,8 +354,9 @@ class StepInterruptedError(Exception):
 def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a progress bar, and let Ctrl-C or SIGTERM end the work between two steps.
 
-    The first signal makes the next call of `count` raise StepInterruptedError. A second one acts at
-    once, as it would have without this block.
+    It replaces the handlers of these signals until the block ends. The first signal makes the next
+    call of `count` raise StepInterruptedError. A second one acts at once, as it would have without
+    this block.
 
     Parameters
     ----------
@@ -371,6 +377,7 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
     previous = {number: signal.getsignal(number) for number in END_SIGNALS}
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        """Remember the signal, and restore the handler that a second one finds."""
         nonlocal interrupted
         interrupted = True
         signal.signal(number, previous[signal.Signals(number)])
@@ -378,6 +385,7 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
     with progress_bar(label, total) as advance:
 
         def count(n: int) -> None:
+            """Record n finished steps; raise StepInterruptedError if a signal has arrived."""
             nonlocal n_done
             n_done += n
             advance(n)

@@ -97,7 +97,10 @@ class PlayedTasks(NamedTuple):
 
 
 def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> PlayedTasks:
-    """Play the tasks with a progress bar; on Ctrl-C return those that were finished."""
+    """Play the tasks with a progress bar; return the finished replays with what they cost.
+
+    Ctrl-C ends the work, and those that were finished until then are returned.
+    """
     from ..experiments.grid import iterate_replays
 
     replays: dict[int, Replay] = {}
@@ -136,7 +139,9 @@ _SHUFFLES = "Number of shuffled replays of each recipe."
 
 
 def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
-    """Return the options of how streams are played, handed on as one `Stream`, `stream`.
+    """Return a decorator that adds the options of how streams are played.
+
+    They are handed on as one `Stream`, the verb's argument `stream`.
 
     Parameters
     ----------
@@ -149,6 +154,7 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
     """
 
     def make_stream(repeats: int, in_order: bool, seed: int, **settings: Any) -> Stream:
+        """Return the stream; a usage error if `--repeats` is given beside `--in-order`."""
         if in_order:
             source = click.get_current_context().get_parameter_source("repeats")
             if source is not ParameterSource.DEFAULT:
@@ -206,7 +212,9 @@ POLICY_LISTS = GRID_LISTS | {
 def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
 
-    Ctrl-C shows the replays that were finished.
+    Shows what was decided and how much of it was wrong, over all shuffles, and whether the accepted
+    parts kept to LB. --out writes a CSV file and pictures. Ctrl-C shows the replays that were
+    finished.
     """
     _replay_and_print([choice.make_contender()], {"confirms": [confirm]}, **played)
 
@@ -253,8 +261,9 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Methods are reducers and baselines, under one policy or a grid of policies. umap-learn takes
-    much longer than the others. Ctrl-C shows the replays that were finished.
+    Methods are reducers and baselines, under one policy or a grid of policies. Each is shown as by
+    `dengine replay`. umap-learn takes much longer than the others. Ctrl-C shows the replays that
+    were finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
@@ -271,7 +280,15 @@ def compare(
 
 
 def _refuse_value_beside_list(settings: Mapping[str, Any], lists: Iterable[str]) -> None:
-    """Raise UsageError if one value was given for a setting of which a list is tried."""
+    """Raise UsageError if a setting has both one value (`--alpha`) and a list to try (`--alphas`).
+
+    Parameters
+    ----------
+    settings : mapping
+        Settings that were given one value, by name.
+    lists : iterable of str
+        Names of the lists, such as "alphas".
+    """
     for name in settings:
         if f"{name}s" in lists:
             flag = f"--{name.replace('_', '-')}"
@@ -289,7 +306,7 @@ def _replay_and_print(
 ) -> None:
     """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
 
-    Exits with code 130 after Ctrl-C.
+    After Ctrl-C the finished replays are shown, and the process ends with exit code 130.
     """
     from ..experiments import tables
     from ..experiments.grid import grid_tasks
@@ -344,7 +361,7 @@ def _costs_line(n_replays: int, costs: Mapping[str, float]) -> str:
 def _group_replays(
     replays: Sequence[Replay], key: Callable[[Replay], str]
 ) -> dict[str, list[Replay]]:
-    """Return the replays by their key, in the order of first appearance."""
+    """Return the replays grouped by their key; keys stand in the order of their first replay."""
     groups: dict[str, list[Replay]] = {}
     for replay in replays:
         groups.setdefault(key(replay), []).append(replay)
@@ -352,7 +369,10 @@ def _group_replays(
 
 
 def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> str:
-    """Return the title of tables and pictures: who played what, how often, and how many cycles."""
+    """Return the title of tables and pictures: who played what, how often, and how many cycles.
+
+    The bundled data set is called "simulated insertions".
+    """
     counts = sorted({len({replay.seed for replay in group}) for group in by_name.values()})
     n_cycles = len(next(iter(by_name.values()))[0])
     order = "in recorded order" if in_order else "shuffled"
@@ -370,7 +390,11 @@ def _varies(frame: pd.DataFrame, *names: str) -> bool:
 def _replay_files(
     frame: pd.DataFrame, replays: Sequence[Replay], title: str
 ) -> Iterator[tuple[str, Any]]:
-    """Yield (file name, content): the CSV, curves or the grid with its tables, and the maps."""
+    """Yield (file name, content) of what `--out` keeps: tables as frames or text, and figures.
+
+    These are the CSV of all replays; tables and figures of a grid if interval, alpha or LB vary,
+    else one figure of curves; and a map of the first replay of each contender that embeds.
+    """
     import numpy as np
 
     from ..experiments.figures import curves, embedding_map, grid_figure
@@ -392,14 +416,15 @@ def _replay_files(
 
 
 def _file_name(title: str) -> str:
-    """Return the name of a picture, in characters that every file system takes."""
+    """Return a title as the name of a .png file, in characters that every file system takes."""
     return re.sub(r"[^\w.=-]+", "_", title) + ".png"
 
 
 def _row_name(replay: Replay, frame: pd.DataFrame, *always: str) -> str:
-    """Return a name that tells a replay's row from others.
+    """Return a label for a replay in figures: its contender and some settings, by commas.
 
-    It is the contender's, with the settings that vary in the frame and those named in `always`.
+    The settings are those that vary in the frame, of guarantee, stops, confirm and interval, and
+    those named in `always`.
     """
     policy = replay.recipe.policy
     settings = {
@@ -517,13 +542,13 @@ def costs(
 
 
 def _n_complete(replays: Sequence[Replay], n_policies: int) -> int:
-    """Return the number of shuffles that every policy has played."""
+    """Return the number of shuffles, by their seeds, that all `n_policies` policies have played."""
     seeds = [replay.seed for replay in replays]
     return sum(seeds.count(seed) == n_policies for seed in set(seeds))
 
 
 def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
-    """Return the cells of a policy's row, under the titles in `COLUMNS`."""
+    """Return the cells of a policy's row under the titles in `COLUMNS`, ">" for the chosen one."""
     alpha = f"{row.policy.alpha:g}"
     bound = percent(row.policy.lower_bound, "g")
     if row.policy.guarantee == "cost":
@@ -545,7 +570,10 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
 
 
 def _error_cell(error: ErrorRate) -> str:
-    """Return `wrong of decided` with the interval of the share below it; "-" without decisions."""
+    """Return "wrong of decided" with the interval of the share in a second line.
+
+    It is "-" without decisions.
+    """
     if not error.decided:
         return "-"
     interval = f"{100 * error.lower:.2g} to {percent(error.upper, '.2g')}"

@@ -173,7 +173,11 @@ def run(
 
 
 def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
-    """Let the engine drive the cell with a progress bar, until Ctrl-C or until the cell fails."""
+    """Let the engine drive the cell with a progress bar, and return what was done.
+
+    It ends after `cycles`, at Ctrl-C or SIGTERM, or when the cell fails, whose error is returned
+    and not raised. When safe mode begins or ends, a line is printed to stderr, unless `--json`.
+    """
     from ..experiments.replay import ObservedCycle, observe_cycles, to_replay
 
     observed = list[ObservedCycle]()
@@ -216,7 +220,10 @@ def _make_simulated_cell(
     source: DataChoice,
     **others: Any,
 ) -> CellToDrive:
-    """Return the simulated cell, with a seed that gives parts which the store has not seen."""
+    """Return the simulated cell, with a seed that gives parts which the store has not seen.
+
+    The seed grows with the decisions in the store, and differs between the cells of a product.
+    """
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters
 
@@ -234,7 +241,9 @@ def _make_simulated_cell(
 def _make_replay_cell(
     store: SqlStore, source: DataChoice, cycles: int, **others: Any
 ) -> CellToDrive:
-    """Return a cell that plays a recording from the first part on that the store does not know.
+    """Return a cell that plays a recording, from the part after the last one that the store knows.
+
+    It knows a part whose trace has a label, and the one that was accepted last.
 
     Raises
     ------
@@ -263,7 +272,7 @@ def _make_replay_cell(
 
 
 def _make_robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
-    """Return the cell of a Universal Robots controller, connected, with its traces' contract.
+    """Connect to a Universal Robots controller; return its cell, with its traces' contract.
 
     Raises
     ------
@@ -285,7 +294,7 @@ def _make_robot_cell(source: DataChoice, host: str | None, **others: Any) -> Cel
 
 
 def host_and_port(address: str) -> tuple[str, int]:
-    """Split HOST[:PORT] of a robot controller; the default is RTDE's port.
+    """Split HOST[:PORT] of a robot controller, and return both; the default is RTDE's port.
 
     Raises
     ------
@@ -326,7 +335,7 @@ COLUMNS = {  # title -> count of a stretch
 def _print_run(replay: Replay, record: dict[str, Any], cell: Any, out: Out | None) -> None:
     """Print the result of a run: a table of stretches, what was saved, and the cell's own report.
 
-    Adds the counts to `record`, and writes run.csv and run.png to `out`.
+    Adds the counts to `record`, which `--json` prints, and writes run.csv and run.png to `out`.
     """
     from ..experiments.figures import run_picture
     from ..experiments.metrics import Costs
@@ -374,9 +383,10 @@ def _print_run(replay: Replay, record: dict[str, Any], cell: Any, out: Out | Non
 
 
 def _stretch_cells(stretch: Mapping[str, Any], total: Mapping[str, Any]) -> dict[str, str]:
-    """Return the cells of a stretch of cycles by their titles.
+    """Return a table row, title -> cell, for the counts of a stretch of cycles.
 
-    Columns that say nothing in the whole run, of windows or of parts per hour, are left out.
+    Columns that say nothing in the whole run, whose counts are `total`, are left out: parts outside
+    a window, and parts per hour.
     """
     cells = {
         "cycles": f"{stretch['first_cycle']} to {stretch['last_cycle']}",

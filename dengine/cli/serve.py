@@ -165,7 +165,11 @@ def serve(
 def _open_engine(
     store: str, seed: int | None, shadow: bool, executor: "Executor", **settings: Any
 ) -> "DataEngine":
-    """Open or create the engine that the server drives; it logs when safe mode begins or ends."""
+    """Open the engine that the server drives, or create it with its store, and return it.
+
+    It logs when safe mode begins or ends. With `shadow` the shadow mode is turned on, and the store
+    keeps that.
+    """
     from ..engine.engine import DataEngine
     from ..serve.server import log_safe_mode
 

@@ -87,7 +87,10 @@ def status(store: str, last: int, check_seconds: float) -> None:
 
 
 def _overview_table(store: str, report: "Status") -> Any:
-    """Return a table of counts, with a column for the newest decisions and one for all."""
+    """Return a rich Table of counts and shares, a row for each, false accepts first.
+
+    It has a column for the newest decisions and one for all.
+    """
     spans = (report.newest, report.ever)
     names = [field.name for field in fields(report.ever)]
     names.sort(key=lambda name: name != "false_accepts")  # what is bad comes first
@@ -100,7 +103,11 @@ def _overview_table(store: str, report: "Status") -> Any:
 
 
 def _present_rows(report: "Status") -> list[tuple[str, str]]:
-    """Return (title, text) rows of what holds now: settings, certificate, retrains and events."""
+    """Return (title, text) rows of what holds now, an alarm first.
+
+    They are the cell, the settings, the contract of traces, the certificate, the last and the worst
+    retrain, and the newest events, the newest first.
+    """
     rows = []
     if report.alarm:
         rows.append(("look at", report.alarm))
@@ -130,12 +137,15 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
 
 
 def _without_audits(counts: dict[str, int]) -> dict[str, int]:
-    """Return counts with another title for "audit", for a policy that has no audits."""
+    """Return counts with the key "audit" renamed to "certain but checked".
+
+    For a policy without audits: what has that reason was verified in shadow mode.
+    """
     return {TITLES["audits"] if name == "audit" else name: n for name, n in counts.items()}
 
 
 def _span_cell(name: str, span: "Span") -> str:
-    """Return the cell of one field of a span of decisions."""
+    """Return the text of a span's field: a time, a number, or a share of errors and its verdict."""
     value = getattr(span, name)
     if name in ("first", "last"):
         return format_time(value)
@@ -149,14 +159,14 @@ def _span_cell(name: str, span: "Span") -> str:
 
 
 def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
-    """Return how the share of wrong decisions compares with the tolerance, after the line stops.
+    """Return a text on the share of wrong decisions: counts, interval and verdict on the tolerance.
 
     Parameters
     ----------
     estimate : ErrorEstimate
         The interval of the share, and what it rests on.
     n_stops : int
-        Line stops, which are named first where the share does not include them.
+        Line stops, which stand first in the text if the share does not include them; 0 names none.
     """
     stops = ""
     if n_stops and estimate.basis != "every outcome":

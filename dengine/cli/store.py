@@ -1,8 +1,8 @@
 """The verbs that change or check a store by hand.
 
-`dengine report`, `correct`, `forget`, `rollback`, `policy` and `retrain` change a store's engine;
-`verify` checks the store's history, `backup` copies it, and `import-labels` takes the labels of an
-exported cell.
+`dengine report`, `correct`, `forget`, `rollback`, `policy` and `retrain` change a store's engine,
+or show its policy; `verify` checks the store's history, `backup` copies it, and `import-labels`
+takes the labels of an exported cell.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MOST_FAULTS = 20  # that are shown
 
 
 def _login() -> str:
-    """Return the login name, "" if the system has none for this user."""
+    """Return the user's login name, "" if the system has none."""
     try:
         return getpass.getuser()
     except (OSError, KeyError, ImportError):  # in a container a user's number may have no name
@@ -56,14 +56,21 @@ author_option = click.option(
 
 
 def store_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add STORE, `--author` and `--allow-import`, which every verb that changes an engine has."""
+    """Add STORE, `--author` and `--allow-import`, which every verb that changes an engine has.
+
+    Returns the command with these options; STORE reaches it as an address.
+    """
     return options.store_argument(options.allow_import_option(author_option(command)))
 
 
 def _change_and_print(
     store: str, author: str, allow_import: bool, change: Callable[[DataEngine], Changed]
 ) -> None:
-    """Open the store's engine, change it, and print what changed with the new certificate."""
+    """Open the store's engine, let `change` change it, and print what changed.
+
+    The engine is closed before that is printed. The JSON document also has the policy and the
+    certificate after the change.
+    """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
 
@@ -95,6 +102,7 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
     from ..history.explain import find_decision_id
 
     def change(engine: DataEngine) -> Changed:
+        """Report the label and record an event; report nothing if the decision has that label."""
         id_ = find_decision_id(engine.store, part)
         stored = engine.find(id_)
         if stored is not None and stored.success is LABELS[label]:
@@ -196,7 +204,8 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels as they count.
 
-    A candidate that fails its gate is dropped and recorded, and the previous version stays in use.
+    A candidate that fails its gate is dropped and recorded, the previous version stays in use, and
+    the exit code is 1.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -253,7 +262,7 @@ def verify(context: click.Context, store: str, cell: str | None, expect: str | N
 
 
 def _verification_lines(report: HistoryReport) -> list[str]:
-    """Return lines about each cell, each fault and the verdict."""
+    """Return lines for people: about each cell, then the faults, at most 20, then the verdict."""
     lines = []
     for cell in report.cells:
         digest = cell.digest or "none"

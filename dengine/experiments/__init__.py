@@ -1,1 +1,4 @@
-"""Replays of recorded streams, grids of them, their tables and pictures; live runs."""
+"""Replays of recorded streams, with grids, baselines, costs, tables and figures.
+
+The command line and the scripts in `training/` use them; an engine in a cell does not.
+"""

@@ -104,7 +104,10 @@ class Baseline(ABC):
         return cls.candidates[cls.chosen]
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Train from scratch.
+        """Train from scratch and return self.
+
+        With labels of one class, or too few for the method, it is untrained afterwards, and every
+        part is verified.
 
         Parameters
         ----------
@@ -120,14 +123,20 @@ class Baseline(ABC):
         return self
 
     def add(self, x: ArrayLike, y: Any) -> Self:
-        """Learn one labelled trace (C, T), if the method learns between two trainings."""
+        """Learn one labelled trace (C, T) and return self.
+
+        Nothing is learned before a training has succeeded, or if the method has no such step.
+        """
         self._last = None
         if self.is_trained:
             self._add(as_traces(np.asarray(x)[None]), bool(y == 1))
         return self
 
     def count(self, X: ArrayLike) -> tuple[Counts, Counts]:
-        """Return (n_success, n_failure), each (n,): the labels behind each prediction."""
+        """Return (n_success, n_failure), each (n,): the labels behind each prediction.
+
+        They are 0 if the method counts none.
+        """
         prediction = self.predict(X)
         zeros = np.zeros(len(prediction.lower), dtype=np.int64)
         return zeros + prediction.n_success, zeros + prediction.n_failure
@@ -135,13 +144,17 @@ class Baseline(ABC):
     def predict_interval(self, X: ArrayLike) -> tuple[Floats, Floats]:
         """Return (lower, upper), each (n,), of the success probability.
 
-        They are equal if the method has no interval.
+        They are equal if the method has no interval, and 0 and 1 before a training has succeeded.
         """
         prediction = self.predict(X)
         return prediction.lower, prediction.upper
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:
-        """Return an `Action` for each trace of X (n, C, T)."""
+        """Return an `Action` for each trace of X (n, C, T), as an array of objects, shape (n,).
+
+        ACCEPT where the lower bound reaches the accept threshold, REJECT where the upper bound is
+        at or below the reject threshold, else VERIFY; see `thresholds`.
+        """
         from ..decision.rule import action_of
 
         default = (self.policy.lower_bound, 1.0 - self.policy.lower_bound)
@@ -154,7 +167,11 @@ class Baseline(ABC):
         return np.array([ACTIONS[number] for number in numbers], dtype=object)
 
     def predict(self, X: ArrayLike) -> BaselinePrediction:
-        """Return the prediction for traces X (n, C, T), computed once for the same traces."""
+        """Return the prediction for traces X (n, C, T).
+
+        The last one is cached, and returned again for the same traces until a training or an `add`.
+        Before a training has succeeded the interval is (0, 1).
+        """
         traces = as_traces(X)
         key = traces.tobytes()
         if self._last is None or self._last[0] != key:
@@ -262,7 +279,7 @@ class AgreeingNeighbours(Baseline):
         self._references.add(_rows(X), good)
 
     def _predict(self, X: Traces) -> BaselinePrediction:
-        """Return the share of successes among the k nearest, and their counts."""
+        """Return the share of successes among the k nearest, as both bounds, and their counts."""
         distances = self._references.squared_distances(_rows(X))
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]
         n_success = self._references.good[nearest].sum(axis=1)
@@ -353,7 +370,10 @@ class WilsonKernelDensity(Baseline):
         self._components = ScaledComponents(DIMENSIONS, whiten=True, seed=self.seed)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
-        """Find the components and the bandwidth; return False if there are too few traces."""
+        """Find the components and the bandwidth; return False if there are too few traces.
+
+        All traces become references. A bandwidth that was not given is chosen by the newest 1,000.
+        """
         Z = self._components.fit(X)
         if Z is None:
             return False
@@ -375,13 +395,16 @@ class WilsonKernelDensity(Baseline):
 
 
 def kernel_counts(distances: Floats, good: Labels, bandwidth: float) -> tuple[Floats, Floats]:
-    """Sum the kernel weights of successes and of failures, in two dimensions.
+    """Sum the kernel weights of successes and of failures around each query, in two dimensions.
+
+    A reference at squared distance D weighs 2 exp(-D / (2 bandwidth**2)).
 
     Parameters
     ----------
     distances : array, shape (n, m)
-        Squared distances to m references.
+        Squared distances of n queries to m references.
     good : array of bool, shape (m,)
+        Whether each reference is a success.
     bandwidth : float
 
     Returns
@@ -394,15 +417,17 @@ def kernel_counts(distances: Floats, good: Labels, bandwidth: float) -> tuple[Fl
 
 
 def choose_bandwidth(references: LabelledPoints, alpha: float) -> float:
-    """Return the bandwidth of `BANDWIDTHS` under which the labels are most likely.
+    """Return the bandwidth among `BANDWIDTHS` under which the references' labels are most likely.
 
-    Each label is left out in turn when its likelihood is computed.
+    Each label is left out in turn when its probability is computed, as the centre of Wilson's
+    interval at error level `alpha`.
     """
     z = normal_quantile(alpha)
     distances = references.squared_distances(references.points)
     np.fill_diagonal(distances, np.inf)
 
     def log_likelihood(bandwidth: float) -> float:
+        """Return the sum over the references of their labels' leave-one-out log-probability."""
         n_success, n_failure = kernel_counts(distances, references.good, bandwidth)
         rate = (n_success + z * z / 2.0) / (n_success + n_failure + z * z)
         return float(np.log(np.where(references.good, rate, 1.0 - rate)).sum())
@@ -453,7 +478,7 @@ class GaussianProcess(Baseline):
         self._components = ScaledComponents(self.n_components, whiten=False, seed=self.seed)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
-        """Train on the newest labels; return False if they are of one class or too few."""
+        """Train on the newest 500 labels; return False if they are of one class or too few."""
         from sklearn.gaussian_process import GaussianProcessClassifier
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
@@ -472,7 +497,7 @@ class GaussianProcess(Baseline):
         return True
 
     def _predict(self, X: Traces) -> BaselinePrediction:
-        """Return the credible interval of the success probability."""
+        """Return the credible interval of the success probability; no labels are counted."""
         from scipy.special import expit
 
         Z = self._components.transform(X)
@@ -484,7 +509,7 @@ class GaussianProcess(Baseline):
 def risk_bound(n_wrong: int, n: int, delta: float) -> float:
     """Return the largest risk at which n_wrong errors or fewer in n have probability delta.
 
-    The paper's B*, the inversion of the binomial tail; 1 if nothing was seen.
+    The paper's B*, the inversion of the binomial tail. It is 1 if all n are wrong, or n is 0.
 
     References
     ----------
@@ -497,7 +522,7 @@ def risk_bound(n_wrong: int, n: int, delta: float) -> float:
 
 
 def guaranteed_threshold(confidence: Floats, wrong: Labels, risk: float, delta: float) -> float:
-    """Find the confidence from which on a classifier errs with at most the given risk.
+    """Find the least confidence from which on a classifier errs with at most the given risk.
 
     With probability 1 - delta over these traces the risk beyond the threshold is at most `risk`, if
     they are independent draws from what will be decided: ceil(log2 m) thresholds are tried by
@@ -509,12 +534,15 @@ def guaranteed_threshold(confidence: Floats, wrong: Labels, risk: float, delta: 
         Of traces that the classifier was not trained on.
     wrong : array of bool, shape (m,)
         Whether it errs on each.
-    risk, delta : float
+    risk : float
+        Share of errors that is tolerated.
+    delta : float
+        Probability with which the guarantee may fail.
 
     Returns
     -------
     threshold : float
-        Infinity if no threshold can be guaranteed.
+        One of `confidence`; infinity if no threshold can be guaranteed.
     """
     if not len(confidence):
         return math.inf
@@ -592,7 +620,11 @@ class RocketSelective(Baseline):
         self._classifier: Any = make_pipeline(features, StandardScaler(), regression)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
-        """Train on some labels, choose both thresholds on the others; return False if too few."""
+        """Train on some labels and choose both thresholds on the others; return whether it trained.
+
+        It needs both classes among the labels that train, and one label at least to choose on. A
+        side without a guaranteed threshold gets an infinite one and is never decided.
+        """
         order = np.random.default_rng(self.seed).permutation(len(X))
         n_held_out = round(self.holdout * len(X))
         train = np.sort(order[n_held_out:])
@@ -610,7 +642,10 @@ class RocketSelective(Baseline):
         return BaselinePrediction(p, p)
 
     def _threshold(self, p: Floats, right: Labels) -> float:
-        """Return from which probability on one side is decided; infinity if none is guaranteed.
+        """Return the probability of one side from which on that side is decided.
+
+        Infinity if none is guaranteed. Only traces with a probability above one half are
+        considered.
 
         Parameters
         ----------

@@ -102,7 +102,8 @@ class CostCurve:
     def cheapest(self) -> PolicyCost:
         """The policy with the lowest expected cost among those that decided anything.
 
-        Of equal ones the strictest.
+        Of equal ones that with the highest LB, then the lowest alpha. If none decided anything, all
+        are compared.
         """
         deciding = [row for row in self.rows if row.certain] or self.rows
 
@@ -113,9 +114,10 @@ class CostCurve:
 
     @property
     def verdict(self) -> str:
-        """Whether the cheapest policy costs less than verifying everything.
+        """Whether the cheapest policy costs less than verifying everything: one of three texts.
 
-        "pays" if its whole interval is below that, "may pay" if its mean is, else "does not pay".
+        "does not pay" if its expected cost or its mean cost is not below that, "pays" if its whole
+        interval is, else "may pay".
         """
         row = self.cheapest
         if max(row.expected_cost, row.cost) >= self.costs.check:
@@ -132,7 +134,12 @@ class CostCurve:
 
     @property
     def sentence(self) -> str:
-        """The result for people."""
+        """The verdict for people, in one to three sentences.
+
+        It names the cheapest policy, its cost per part with the interval, and what verifying
+        everything costs; if it only may pay, also which share of bad parts among the accepted would
+        still pay.
+        """
         row = self.cheapest
         verify_all = f"verifying everything costs {self.costs.check:g} a part"
         if not any(item.certain for item in self.rows):
@@ -162,9 +169,9 @@ class CostCurve:
         )
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return a table with a row for each policy, and whether it was chosen.
+        """Return a DataFrame with a row for each policy, its costs, shares and error rates.
 
-        Shares are from 0 to 1, costs in the user's unit.
+        The column `chosen` is True for `policy`. Shares are from 0 to 1, costs in the user's unit.
         """
         import pandas as pd
 
@@ -254,7 +261,8 @@ def priced_tasks(
 def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
     """Return the cost curve of finished replays of one recipe.
 
-    Shuffles that not every policy has played are left out.
+    Shuffles that not every policy has played are left out. Of the others, by their seeds, the first
+    half chooses and the second half reports.
 
     Raises
     ------
@@ -292,7 +300,10 @@ def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
 def _policy_cost(
     policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay], costs: Costs
 ) -> PolicyCost:
-    """Return the row of one policy from the shuffles that choose and those that report."""
+    """Return one policy's costs, shares and errors over the reporting shuffles.
+
+    Only its expected cost comes from the choosing ones.
+    """
     accepted = float(np.mean([replay.accepted for replay in reporting]))
     rejected = float(np.mean([replay.rejected for replay in reporting]))
     certain = accepted + rejected
@@ -317,10 +328,11 @@ def _policy_cost(
 
 
 def _expected_cost(replays: Sequence[Replay], costs: Costs) -> float:
-    """Return the cost per part with each share of wrong decisions at its Jeffreys mean.
+    """Return the mean cost per part, with each share of wrong decisions at its Jeffreys mean.
 
-    That is (wrong + 1/2) / (decided + 1) in one shuffle. No error among 25 accepted parts does not
-    mean that there is never one: by the plain mean a few decisions would look free at any price.
+    That is (wrong + 1/2) / (decided + 1), with both counts the mean of one shuffle. No error among
+    25 accepted parts does not mean that there is never one: by the plain mean a few decisions would
+    look free at any price.
     """
     counts = [replay.stretch() for replay in replays]
     accepted = float(np.mean([count["accepted"] for count in counts]))
@@ -334,7 +346,20 @@ def _expected_cost(replays: Sequence[Replay], costs: Costs) -> float:
 
 
 def cost_per_part(replay: Replay, costs: Costs, part: slice = slice(None)) -> float:
-    """Return the mean cost per part over some cycles of a replay."""
+    """Return the mean cost per part over some cycles of a replay: checks and wrong decisions.
+
+    Parameters
+    ----------
+    replay : Replay
+    costs : Costs
+    part : slice, default all
+        The cycles; at least one.
+
+    Returns
+    -------
+    cost : float
+        In the unit of `costs`.
+    """
     counts = replay.stretch(part)
     n_certain = counts["accepted"] + counts["rejected"]
     saved = costs.saved(n_certain, counts["false_positive"], counts["false_negative"])

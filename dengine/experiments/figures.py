@@ -81,7 +81,20 @@ TRUTH_MARKS: dict[Any, tuple[str, Style]] = {
 
 
 def sliding_sum(values: NDArray[Any], window: int) -> Floats:
-    """Return the sum of the last `window` values, (..., n), or of all if there are fewer."""
+    """Sum over a sliding window.
+
+    Parameters
+    ----------
+    values : array, shape (..., n)
+    window : int
+        1 or more.
+
+    Returns
+    -------
+    sums : array of float64, shape (..., n)
+        At each position the sum of it and the `window` - 1 values before it, or of fewer at the
+        beginning.
+    """
     total = np.cumsum(np.asarray(values, dtype=np.float64), axis=-1)
     out = total.copy()
     out[..., window:] -= total[..., :-window]
@@ -89,12 +102,12 @@ def sliding_sum(values: NDArray[Any], window: int) -> Floats:
 
 
 def sliding_mean(values: NDArray[Any], window: int) -> Floats:
-    """Return the mean of the last `window` values, (..., n), or of all if there are fewer."""
+    """Return the mean over a sliding window as `sliding_sum` has it, shape (..., n)."""
     return sliding_sum(values, window) / sliding_sum(np.ones(values.shape[-1]), window)
 
 
 def fit_window(window: int, replays: Sequence[Replay]) -> int:
-    """Return the window, or a third of the longest replay if that is less."""
+    """Return the window in cycles, or a third of the longest replay if that is less; at least 1."""
     return min(window, max(1, max(map(len, replays)) // 3))
 
 
@@ -140,6 +153,15 @@ def note(axes: Axes, text: str, colour: str = BLACK) -> None:
 def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) -> Path:
     """Write a figure in the format that the file's suffix names, creating the folder.
 
+    Parameters
+    ----------
+    figure : Figure
+    path : path
+        Without a suffix the format is PNG.
+    dpi : int, default 120
+    force : bool, default False
+        Whether a file that exists is replaced.
+
     Returns
     -------
     path : Path
@@ -159,10 +181,11 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
 def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure:
     """Draw where the newest parts of a replay lie: left by their label, right by their decision.
 
-    Each retrain moves the map. The first two dimensions are drawn, the mean over the spaces. The
-    circle is the neighbourhood of the newest part, with the recipe's radius. Units are equal on
-    both axes, unless the first dimension is a probability: then the second is only for the eye, and
-    the circle is cut off above and below.
+    Each part is drawn where it lay when it was decided, though each retrain moves the map; those
+    that no model embedded are left out. The first two dimensions are drawn, the mean over the
+    spaces. The circle is the neighbourhood of the newest part, with the recipe's radius. Units are
+    equal on both axes, unless the first dimension is a probability: then the second is only for the
+    eye, and the circle is cut off above and below.
 
     Parameters
     ----------
@@ -214,7 +237,11 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
 
 
 def _set_map_limits(axes: Axes, z: Floats, is_probability: bool) -> None:
-    """Set the limits of a map around points (n, 2): a square, or 0 to 1 for a probability."""
+    """Set the limits of both axes around points (n, 2), with a margin.
+
+    The panel is a square in data units; for a probability x goes from 0 to 1, and y fits the
+    points.
+    """
     low = z.min(axis=0)
     high = z.max(axis=0)
     half = 0.56 * (high - low) + 1e-9
@@ -226,7 +253,7 @@ def _set_map_limits(axes: Axes, z: Floats, is_probability: bool) -> None:
 
 
 def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, label: str) -> None:
-    """Draw a circle and its centre (2,) into all axes, and the label below them."""
+    """Draw a circle with its centre (2,) into all axes, and the label below the figure."""
     from matplotlib.patches import Circle
 
     for axes in figure.axes:
@@ -260,9 +287,11 @@ def window_curves(
     certain = sliding_mean(np.stack([r.accepted | r.rejected for r in replays]), window)
 
     def sum_in_window(name: str) -> Floats:
+        """Return how many cycles a field marks in each window, over all replays."""
         return sliding_sum(sum(getattr(r, name).astype(int) for r in replays), window)
 
     def share(wrong: str, decided: str) -> Floats:
+        """Return the share of wrong ones of those decided, (n,), in the windows of all replays."""
         n_decided = sum_in_window(decided)
         shares = sum_in_window(wrong) / np.maximum(n_decided, 1.0)
         return np.where(n_decided >= fewest, shares, np.nan)
@@ -327,10 +356,10 @@ def _draw_replays(
     colour: str,
     prefix: str = "",
 ) -> None:
-    """Draw the certain share with its spread and the precision above, and the errors below.
+    """Draw the curves of replays: the share of certain decisions and precision above, errors below.
 
-    The legend has the counts of the errors: where too few parts were decided alike for a curve,
-    they still say what went wrong.
+    A band shows the spread of the certain share over the replays. The legend has the counts of the
+    errors: where too few parts were decided alike for a curve, they still say what went wrong.
     """
     lines = window_curves(replays, window, FEWEST)
     counts = [replay.stretch() for replay in replays]
@@ -349,7 +378,7 @@ def _draw_replays(
 
 
 def _draw_bounds(top: Axes, bottom: Axes, bound: float) -> None:
-    """Draw LB into the upper axes and the tolerance into the lower ones."""
+    """Draw dotted lines: LB into the upper axes, the tolerance 100 - LB into the lower ones."""
     top.axhline(100 * bound, label=f"LB = {100 * bound:g} %", **LIMIT)
     tolerance = 100 * (1 - bound)
     bottom.axhline(tolerance, label=f"tolerance 100 - LB = {tolerance:g} %", **LIMIT)
@@ -358,8 +387,8 @@ def _draw_bounds(top: Axes, bottom: Axes, bound: float) -> None:
 def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW) -> Figure:
     """Draw the paper's figure of its grid.
 
-    It has a row for each alpha, from the largest, a column for each LB, and in each cell what
-    `curves` draws.
+    It has a row for each alpha, from the largest, a column for each LB, and in each cell the two
+    panels that `curves` draws; a cell without replays stays empty.
 
     Parameters
     ----------
@@ -455,7 +484,11 @@ def run_picture(run: Replay, title: str = "", window: int = 100) -> Figure:
 
 
 def _draw_rate(axes: Axes, run: Replay, clock_s: Floats, window: int) -> None:
-    """Draw the good parts per hour of a run, and what they would be if all were verified."""
+    """Draw the good parts per hour of a run, and what they would be if all were verified.
+
+    Nothing is drawn before the first full window; the second line needs a verified part. `clock_s`
+    (n,) is the time at each cycle's end, in seconds of production.
+    """
     x = np.arange(1, len(run) + 1)
     seconds = np.diff(clock_s, prepend=0.0)
     shown = x >= window  # a rate over few cycles is mostly luck
@@ -557,10 +590,11 @@ def _draw_policies(
 
 
 def explained_picture(explanation: Explanation) -> Figure:
-    """Draw why a decision came out as it did.
+    """Draw why a decision came out as it did; return the figure.
 
-    Above, a panel for each channel, of at most four: the trace, its nearest references and the
-    envelope of known successes. Below: the distances of the references, and the bound.
+    Above, a panel for each channel, of at most four, those that leave the envelope farthest: the
+    trace, its nearest references and the envelope of known successes. Below: the distances of the
+    references, and the bound.
     """
     stored = explanation.decision
     decision = stored.decision
@@ -594,7 +628,11 @@ def explained_picture(explanation: Explanation) -> Figure:
 
 
 def _draw_trace(axes: Axes, explanation: Explanation, channel: int) -> None:
-    """Draw one channel: the envelope, the neighbours' traces, the trace, and where it leaves."""
+    """Draw one channel of the explained trace over the traces of its neighbours and the envelope.
+
+    Stretches in which it clearly leaves the envelope are shaded. Without an envelope only the
+    traces are drawn.
+    """
     x = np.arange(explanation.trace.shape[1]) / explanation.spec.rate_hz
     envelope = explanation.envelope
     if envelope is not None:
@@ -633,7 +671,8 @@ def _draw_trace(axes: Axes, explanation: Explanation, channel: int) -> None:
 def _draw_distances(axes: Axes, explanation: Explanation) -> None:
     """Draw the nearest references by distance, with a row for each fold, and the radius.
 
-    The references of one fold live in one space of the embedding.
+    The references of one fold live in one space of the embedding. Without neighbours a note says
+    so.
     """
     neighbours = explanation.neighbours
     radius = explanation.radius
@@ -660,7 +699,10 @@ def _draw_distances(axes: Axes, explanation: Explanation) -> None:
 
 
 def _draw_bound(axes: Axes, bound: Bound | None) -> None:
-    """Draw the interval of the success rate, its point estimate and the two thresholds."""
+    """Draw the interval of the success rate, its point estimate and the two thresholds.
+
+    If `bound` is None, a note says that no bound was asked for.
+    """
     x_label = "success rate in the neighbourhood"
     axes.set(yticks=[], xlim=(-0.02, 1.02), ylim=(-1.0, 1.0), xlabel=x_label)
     if bound is None:
@@ -686,7 +728,7 @@ def _draw_bound(axes: Axes, bound: Bound | None) -> None:
 
 
 def data_picture(data: Dataset, title: str = "") -> Figure:
-    """Draw a data set: the traces of good and bad parts, and how the set changes in its order.
+    """Draw a data set's traces, and how it changes in its order; return the figure.
 
     Above, a panel for each channel, of at most three: the median trace of good and of bad parts,
     and where the middle 80 % lie. Below: the share of good parts and each trace's mean, in recorded
@@ -722,7 +764,9 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 def _draw_drift(
     figure: Any, X: NDArray[np.float32], y: NDArray[Any], finite: NDArray[np.bool_], label: str
 ) -> None:
-    """Draw the sliding share of good parts, and the first channel's mean of each finite trace.
+    """Draw the share of good parts in a sliding tenth of the set, and each finite trace's mean.
+
+    The mean is that of the first channel, over the trace.
 
     Parameters
     ----------

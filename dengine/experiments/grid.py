@@ -85,7 +85,7 @@ class KeptReplays:
         self._data_digest = digest((data.name, data.X, data.y, data.part, data.rate_hz))
 
     def path(self, task: Task) -> Path:
-        """Return where the replay of a task is kept.
+        """Return the path of a task's replay in the folder, whether or not it is there.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class KeptReplays:
         return self.folder / f"{name}.npz"
 
     def get(self, task: Task) -> Replay | None:
-        """Return the kept replay of a task, or None if it is missing or its file is damaged.
+        """Read the kept replay of a task; return None if there is none or its file is damaged.
 
         It has the present name and recipe of the contender.
         """
@@ -139,7 +139,7 @@ class KeptReplays:
             return None
 
     def put(self, task: Task, replay: Replay) -> None:
-        """Keep the finished replay of a task; its file is written whole or not at all."""
+        """Write the finished replay of a task, as a whole or not at all, over an earlier one."""
         arrays: dict[str, Any] = {}
         values: dict[str, Any] = {}
         for field in fields(replay):
@@ -156,7 +156,10 @@ class KeptReplays:
 
 @cache
 def _digest_of_source() -> str:
-    """Return a hash of dengine's source and of the versions of Python and of the `LIBRARIES`."""
+    """Return a hash of dengine's source and of the versions of Python and of the `LIBRARIES`.
+
+    It is computed once in a process.
+    """
     versions = {
         distribution.metadata["Name"]: distribution.version
         for name in LIBRARIES
@@ -170,7 +173,7 @@ def _digest_of_source() -> str:
 
 @cache  # a file that changes while a grid is played is not what was imported
 def _source_of(part: Any) -> str:
-    """Return the source file's text of a class or function; "" if it was typed or compiled."""
+    """Return the text of the source file of a class or function; "" if it has none that is text."""
     try:
         return Path(getsourcefile(part) or "").read_text(encoding="utf-8")
     except (OSError, TypeError, UnicodeDecodeError):
@@ -178,7 +181,10 @@ def _source_of(part: Any) -> str:
 
 
 def _parts_of(reducer: Any) -> list[Any]:
-    """Return the classes of a transformer and of the estimators in it, and the functions in it."""
+    """Return what a transformer's code consists of, without repeats.
+
+    These are its class, those of the estimators among its parameters, and the functions there.
+    """
     params = reducer.get_params(deep=True).values()
     estimators = [reducer, *(param for param in params if hasattr(param, "fit"))]
     classes = [type(estimator) for estimator in estimators]
@@ -186,7 +192,7 @@ def _parts_of(reducer: Any) -> list[Any]:
 
 
 def load_contenders(recipes: Sequence[Any]) -> list[Contender]:
-    """Load contenders, each from anything that `Contender.load` takes.
+    """Load contenders, each from anything that `Contender.load` takes; one text is one contender.
 
     Raises
     ------
@@ -279,7 +285,7 @@ def iterate_replays(
 
 
 def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
-    """Play one task in a worker; return its position with the replay."""
+    """Play one task, in this process or a worker; return `i`, its position, and the replay."""
     played = replay(
         data,
         task.contender,
@@ -350,7 +356,24 @@ def grid_tasks(
     cycles: int | None = None,
     shuffle: bool = True,
 ) -> list[Task]:
-    """Return every combination of settings as a task; None leaves a setting to the recipe."""
+    """Return every combination of settings as a task, the seeds varying fastest.
+
+    Parameters
+    ----------
+    recipes : str or sequence
+        As `load_contenders` takes them.
+    alphas, lower_bounds, intervals, guarantees : sequence
+        Settings of the policy; None leaves one to the recipe.
+    seeds : iterable of int
+    confirms : sequence of bool
+    cycles, shuffle
+        The same for all tasks; see `Task`.
+
+    Returns
+    -------
+    tasks : list of Task
+        By contender, interval, alpha, lower bound, guarantee, confirm and seed.
+    """
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound", "guarantee")
     combinations = product(
@@ -368,7 +391,7 @@ def grid_tasks(
 def play_tasks(
     dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None
 ) -> list[Replay]:
-    """Play tasks as `iterate_replays` does; return their replays in the order of the tasks."""
+    """Play all tasks as `iterate_replays` does; return their replays in the order of the tasks."""
     played = iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep)
     replays = {position: replay for position, replay, _ in played}
     return [replays[i] for i in range(len(tasks))]

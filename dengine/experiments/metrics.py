@@ -100,7 +100,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
 
 
 def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> NDArray[np.float64]:
-    """Return (size,) counts: how often each trace was marked by the field `name` of the replays."""
+    """Return how often each trace was marked by the field `name` of the replays, shape (size,)."""
     counts = np.zeros(size)
     for replay in replays:
         counts += np.bincount(replay.index[getattr(replay, name)], minlength=size)
@@ -156,6 +156,11 @@ class Costs:
             Number of decisions without a check.
         false_positive, false_negative : float, default 0.0
             Bad parts accepted and good parts rejected among them.
+
+        Returns
+        -------
+        saved : float
+            In the unit of the costs; negative if the errors cost more than the checks.
         """
         checks = self.check * certain
         return checks - self.escape * false_positive - self.false_reject * false_negative

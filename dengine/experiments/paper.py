@@ -71,7 +71,11 @@ def paper_table(frame: "pd.DataFrame", recipe: str, interval: str) -> str:
 
 
 def _paper_cell(counts: "pd.DataFrame", published: tuple[float, float] | None) -> str:
-    """Return a cell of `paper_table`; "-" where nothing was played."""
+    """Return a cell of `paper_table` as text; "-" where nothing was played.
+
+    `counts` has a row for each replay, with false positives and certain predictions; `published` is
+    the paper's pair.
+    """
     if not len(counts):
         return "-"
     pairs = zip(counts.mean(), counts.std().fillna(0.0), strict=True)
@@ -80,7 +84,7 @@ def _paper_cell(counts: "pd.DataFrame", published: tuple[float, float] | None) -
 
 
 def findings(frame: "pd.DataFrame") -> list[str]:
-    """Check which of the paper's findings the replays of a grid confirm.
+    """Check which of the paper's findings the replays of a grid confirm, and say it in lines.
 
     A finding that the replays say nothing about is left out: for baselines, which have their own
     rules, the findings about intervals.
@@ -113,7 +117,12 @@ def _finding(holds: bool, claim: str, measured: str) -> str:
 
 
 def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
-    """Yield the lines of the findings about one recipe and interval, from the rows of its grid."""
+    """Yield the lines of the findings about one recipe and interval, from the rows of its grid.
+
+    The findings: whether the certain predictions vary with alpha and LB, whether the mean share of
+    false positives stays below 1 - LB, and, for Wilson, whether a lower alpha delays the first
+    certain prediction. Baselines get the second one alone.
+    """
     who = f"{recipe}, {interval}"
     is_ours = recipe.split(" ")[0] not in BASELINES
     cells = rows.groupby(["alpha", "lower_bound"], sort=False)
@@ -146,7 +155,11 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
 
 
 def grid_lines(frame: "pd.DataFrame") -> list[str]:
-    """Return tables and findings as the lines of a Markdown page, by guarantee and feedback."""
+    """Return the lines of a Markdown page with the tables and findings of a grid.
+
+    It has a heading for each guarantee and feedback, below it a table for each recipe and interval,
+    and a list of the findings.
+    """
     caption = (
         "false positives / certain, mean ± standard deviation over the shuffles [the paper's, on "
         "its own parts]"

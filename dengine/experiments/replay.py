@@ -113,7 +113,10 @@ class Contender:
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
     def engine(self, seed: int) -> DataEngine:
-        """Return a new engine in memory that repeats exactly under a seed."""
+        """Return a new engine in memory, with the baseline as its model if there is one.
+
+        It counts steps and not seconds in a retrain, so that the same seed repeats exactly.
+        """
         model = None
         if self.baseline is not None:
             model = make_baseline(self.baseline, self.recipe.policy, seed, **self.params)
@@ -250,7 +253,7 @@ class Replay:
         return np.asarray((self.action != Action.REJECT) & (self.truth == 1.0))
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return a table with a row for each cycle, numbered from 1.
+        """Return a DataFrame with a row for each cycle, numbered from 1.
 
         Its columns are the fields of shape (n,), and embedding_1, embedding_2, ... of the position.
         """
@@ -267,12 +270,15 @@ class Replay:
         return pd.DataFrame(columns, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
 
     def stretches(self, n: int) -> list[dict[str, Any]]:
-        """Cut the run into at most n stretches of about equal length; return `stretch` of each."""
+        """Cut the run into stretches of about equal length; return the `stretch` of each.
+
+        There are n of them, or one for each cycle if there are fewer cycles; none without cycles.
+        """
         edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
         return [self.stretch(slice(begin, end)) for begin, end in pairwise(edges)]
 
     def stretch(self, part: slice = slice(None)) -> dict[str, Any]:
-        """Return counts over some of the cycles.
+        """Count decisions, errors and stops over some of the cycles.
 
         Parameters
         ----------
@@ -390,7 +396,8 @@ class ObservedCycle(NamedTuple):
 def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[ObservedCycle]:
     """Let the engine drive a cell, and yield each cycle as it ends.
 
-    Reads the cell's attributes `truth` and `clock`, if it has them.
+    The truth is the cell's attribute `truth` if it has one, else the label that was reported. The
+    clock is its attribute `clock`, None without one. The cell may end before `cycles`.
     """
     for cycle in engine.run(cell, cycles):
         truth = getattr(cell, "truth", cycle.success)
@@ -399,7 +406,11 @@ def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Obse
 
 
 def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
-    """Return the run that these cycles make; it may have been interrupted."""
+    """Return observed cycles, in their order, as a `Replay`; it is empty if there are none.
+
+    The fields of a recorded data set (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their
+    defaults.
+    """
     cycles = [item.cycle for item in observed]
     decisions = [cycle.decision for cycle in cycles]
     clocks = [item.clock for item in observed if item.clock is not None]
@@ -424,9 +435,10 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
 
 
 def _positions(decisions: list[Decision]) -> Floats:
-    """Return the mean embeddings (n, d), where d is the width of the newest one.
+    """Return the embedding of each decision, the mean over its spaces, (n, d).
 
-    A reducer may widen as it sees more traces; narrower embeddings and missing ones are NaN.
+    d is the width of the newest one, 2 without any. A reducer may widen as it sees more traces;
+    rows with a narrower embedding, or none, are NaN.
     """
     means = [
         np.mean(decision.embedding, axis=0) if decision.embedding else np.empty(0)
@@ -453,6 +465,11 @@ def watch(
     cycles : int
     on_cycle : callable or None, default None
         Called with each finished cycle.
+
+    Returns
+    -------
+    run : Replay
+        Of fewer cycles if the cell ended before.
     """
     observed = []
     for item in observe_cycles(engine, cell, cycles):
@@ -474,7 +491,7 @@ def replay(
     confirm: bool = False,
     on_cycle: Callable[[int], None] | None = None,
 ) -> Replay:
-    """Play a data set through a fresh engine in memory, in one pass.
+    """Play a data set through a fresh engine in memory, in one pass; return what was decided.
 
     Parameters
     ----------

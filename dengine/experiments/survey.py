@@ -118,7 +118,15 @@ class Survey:
 
 
 def survey_dataset(data: Dataset) -> Survey:
-    """Survey a data set; labels are only counted, nothing is learned from them."""
+    """Count the traces, labels, faults and repeats of a data set, and test its order for drift.
+
+    Labels are only counted, nothing is learned from them. Repeats and drift are looked for among
+    the usable traces: finite, not constant and not too large.
+
+    Returns
+    -------
+    survey : Survey
+    """
     X = as_traces(data.X)
     n_good = int(data.y.sum())
     finite = np.isfinite(X).all(axis=(1, 2))
@@ -171,7 +179,10 @@ def _spread(values: NDArray[Any] | None) -> Spread | None:
 
 
 def _drifts(data: Dataset, X: NDArray[np.float32], usable: NDArray[np.bool_]) -> tuple[Drift, ...]:
-    """Return the drift of the labels and of each channel's mean over usable traces (n, C, T)."""
+    """Return the drift of the labels, named "good", and then of each channel's mean.
+
+    The labels are those of all traces, the means those of usable traces of X (n, C, T) alone.
+    """
     names = data.channels or tuple(f"channel {i + 1}" for i in range(X.shape[1]))
     means = channel_means(np.where(usable[:, None, None], X, 0))
     means = np.where(usable[:, None], means, np.nan)
@@ -180,7 +191,10 @@ def _drifts(data: Dataset, X: NDArray[np.float32], usable: NDArray[np.bool_]) ->
 
 
 def _drift(name: str, values: NDArray[np.float64]) -> Drift:
-    """Return the drift of values (n,) in recorded order, leaving out those that are NaN."""
+    """Return the drift of values (n,) in recorded order, leaving out those that are NaN.
+
+    The correlation is NaN for fewer than three values, and if they are all equal.
+    """
     from scipy.stats import spearmanr
 
     position = np.arange(len(values))

@@ -119,7 +119,8 @@ def _share_right(n_wrong: int, n_decided: int) -> float:
 def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a sentence for each pooled row: whether the accepted parts kept to LB.
 
-    It names those of the row's settings in which the rows differ.
+    It ends in "kept", "broken", or that there are too few accepted parts to say; or it says that no
+    part was accepted. It names those of the row's settings in which the rows differ.
     """
     varying = [
         name for name in ("interval", "alpha", "confirm") if len({row[name] for row in rows}) > 1
@@ -149,7 +150,10 @@ def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 def pooled_table(
     rows: Sequence[Mapping[str, Any]], title: str = "Replays", legend: str = LEGEND
 ) -> Table:
-    """Return the pooled rows as a table for the screen, with their guarantee and feedback."""
+    """Return the rows of `pool` as a rich Table for the screen.
+
+    The first column has recipe, guarantee and feedback, and the interval if the rows differ in it.
+    """
     several_intervals = len({row["interval"] for row in rows}) > 1
     shown = []
     for row in rows:
@@ -165,13 +169,14 @@ def pooled_table(
 def table_of_numbers(
     title: str, rows: Sequence[Mapping[str, str]], caption: str, total: bool = False
 ) -> Table:
-    """Return a table of right-aligned numbers behind the names of the rows.
+    """Return a rich Table of right-aligned numbers behind the names of the rows.
 
     Parameters
     ----------
     title, caption : str
     rows : sequence of mappings
-        Column title -> cell; the first column has the names of the rows.
+        Column title -> cell, the same titles in each, one row at least; the first column has the
+        names of the rows.
     total : bool, default False
         Draw a line above the last row.
     """
@@ -227,7 +232,10 @@ CELLS: dict[str, Any] = {
 
 
 def retrain_line(retrains: Sequence[RetrainReport]) -> str:
-    """Return a sentence: how many retrains there were, the slowest, and why some were dropped."""
+    """Return a sentence: how many retrains there were, the slowest, and how many were dropped.
+
+    Of the dropped ones it gives the last one's reason.
+    """
     if not retrains:
         return "No retrain."
     slowest = max(retrain.seconds for retrain in retrains)
@@ -241,7 +249,7 @@ def retrain_line(retrains: Sequence[RetrainReport]) -> str:
 
 
 def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Path:
-    """Write a frame as CSV, creating the folder; return its path.
+    """Write a frame as CSV without its index, creating the folder; return the file's path.
 
     Raises
     ------
