@@ -33,8 +33,6 @@ UNKNOWN_RATE = (
     " rate_hz=..."
 )
 MAX_LABEL_WORDS = 12  # more different words are no labels
-# Words of parts that nobody has decided on: a proposal does not call them good or bad.
-UNDECIDED = ("pending", "pendiente", "en attente", "offen", "open", "todo", "tbd", "in progress")
 expect_data = partial(expect, error=DataError)
 
 
@@ -84,7 +82,11 @@ class UnknownWordError(UnreadableError):
 
 
 class UnlabelledError(UnreadableError):
-    """A recording whose label is empty, for its part was not checked yet."""
+    """A recording whose label is empty or a word as pending: its part was not checked yet."""
+
+    def __init__(self, word: str) -> None:
+        super().__init__(f"Expected a label, got {word or 'none'}")
+        self.word = word
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -121,7 +123,8 @@ class Dataset:
     rates : array of float64, shape (n,), optional
         Rate of each recording in hertz, by its own timestamps; NaN where it has none.
     unlabelled : int
-        Recordings that were left out because their label is empty.
+        Recordings that were left out because their part was not checked yet: their label is empty,
+        or a word as pending.
     ordered : bool, default True
         Whether the order of the traces is that of the recording. False for files that are ordered
         by their label, as in folders `good/` and `bad/`.
@@ -355,8 +358,8 @@ class RecordingCollector:
         Words in the place of labels whose meaning is unknown.
     label_file : str
         Path of a file that may list labels, for advice; "" for none.
-    unlabelled : int
-        Recordings whose label is empty.
+    unlabelled_words : Counter
+        Words of the recordings whose parts were not checked yet; "" for an empty label.
     ordered : bool
         As in `Dataset`.
     """
@@ -368,18 +371,33 @@ class RecordingCollector:
     notes: Counter[str] = field(default_factory=Counter)
     unknown_words: Counter[str] = field(default_factory=Counter)
     label_file: str = ""
-    unlabelled: int = 0
+    unlabelled_words: Counter[str] = field(default_factory=Counter)
     ordered: bool = True
+
+    @property
+    def unlabelled(self) -> int:
+        """Number of the recordings whose parts were not checked yet."""
+        return self.unlabelled_words.total()
+
+    def unlabelled_text(self, n_all: int, what: str = "recordings") -> str:
+        """Return how many of all have no label yet, with their words, for a note or an error.
+
+        what : what is counted.
+        """
+        counts = self.unlabelled_words.most_common(4)
+        words = [f"{shortened(word)} {n} times" for word, n in counts if word]
+        text = f"{self.unlabelled} of {n_all} {what} of {self.name} have no label yet"
+        return f"{text} ({', '.join(words)})" if words else text
 
     def add(self, source: str, read: Callable[[], Recording], line: int = 0) -> None:
         """Add the recording that `read` returns, or a fault if it raises.
 
-        A recording whose label is empty is only counted. `line` of the source, if it is known.
+        A recording without a label yet is only counted. `line` of the source, if it is known.
         """
         try:
             self.recordings.append(read())
-        except UnlabelledError:
-            self.unlabelled += 1
+        except UnlabelledError as error:
+            self.unlabelled_words[error.word] += 1
         except (OSError, TraceError, UnreadableError) as error:
             if isinstance(error, UnknownWordError):
                 self.unknown_words[error.word] += 1
@@ -398,7 +416,6 @@ class RecordingCollector:
         if sum(self.unknown_words.values()) <= (n_known / 9 if is_one_sided else n_known):
             return
         words = [word for word, _ in self.unknown_words.most_common()]
-        words = [word for word in words if word.lower() not in UNDECIDED] or words
         if is_one_sided:
             bad = set(words) if 1 in labels else set()
         else:
@@ -415,6 +432,9 @@ class RecordingCollector:
         actual = ", ".join(f"{shortened(word)} {n} times" for word, n in counts)
         if is_one_sided:
             actual += f" beside {n_known} {'good' if 1 in labels else 'bad'} ones"
+        if self.unlabelled:
+            n_all = n_known + len(self.faults) + self.unlabelled
+            actual += f", and {self.unlabelled_text(n_all)}"
         wanted = f"labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0"
         raise DataError(f"Expected {wanted}, got {actual}; {do}.")
 
@@ -429,7 +449,7 @@ class RecordingCollector:
             n = len(self.faults) + self.unlabelled
             details = [str(fault) for fault in self.faults[:3]]
             if self.unlabelled:
-                details.insert(0, f"{self.unlabelled} have no label yet")
+                details.insert(0, self.unlabelled_text(n))
             wanted = f"labelled recordings in {self.name}"
             raise DataError(f"Expected {wanted}, found none of {n}: {'; '.join(details)}.")
 
@@ -464,8 +484,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     notes = [f"{text}{f' ({n} times)' if n > 1 else ''}." for text, n in collector.notes.items()]
     if collector.unlabelled:
         n = len(recordings) + len(collector.faults) + collector.unlabelled
-        have = f"{collector.unlabelled} of {n} recordings of {collector.name}"
-        notes.append(f"{have} have no label yet: they are left out.")
+        notes.append(f"{collector.unlabelled_text(n)}: they are left out.")
     if not rate:
         notes.append(UNKNOWN_RATE)
     # A recording without a number is a part of its own.

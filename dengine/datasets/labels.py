@@ -8,6 +8,7 @@ nok ng fail failed bad failure unsuccessful schlecht n.i.O. nio no 0; and a word
 after a not, as in `run_7_not_ok.csv`. A file's name ends in the word, except for numbers:
 `part_7_NOK_1.csv` is bad. A number alone, 1 or 0, is a label of a name only if the user says so.
 A column whose name means the bad outcome, as `failed` or `Ausschuss`, says bad by true, yes or 1.
+An empty label, and a word as pending or unknown, is that of a part that was not checked yet.
 """
 
 import os
@@ -43,9 +44,12 @@ MEANING = {
     **dict.fromkeys((*GOOD, "yes", "io", "1"), True),
     **dict.fromkeys((*BAD, "no", "0"), False),
 }
+# Labels of parts that nobody has decided on yet: in a cell each, in a name the words.
 UNCHECKED = (
-    *EMPTY_CELLS,
-    *("-", "--", "?", "unknown", "unlabelled", "unlabeled", "unchecked", "not checked", "pending"),
+    *(*EMPTY_CELLS, "-", "--", "?"),
+    *("unknown", "unbekannt", "unlabelled", "unlabeled", "unchecked", "not checked", "undecided"),
+    *("untested", "ungeprüft", "nicht geprüft", "pending", "pendiente", "en attente", "in arbeit"),
+    *("in progress", "offen", "open", "todo", "tbd"),
 )
 # What a file manager adds to the name of a copy.
 COPY_SUFFIX = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)
@@ -68,6 +72,10 @@ NOT_OK = rf"{APART}\.[\W_]*o\.?k|no\.?k"
 WORD = rf"{NOT}(?P<word>(?i:{WORDS}|{NOT_IO}|i[\W_]?o|{NOT_OK}|o\.k))"
 IN_NAME = re.compile(f"{WORD_START}{WORD}{WORD_END}")
 AT_END = re.compile(f"{WORD_START}{WORD}$")
+UNCHECKED_WORDS = "|".join(
+    word.replace(" ", r"[\W_]*") for word in UNCHECKED if re.search(LETTER, word)
+)
+UNCHECKED_AT_END = re.compile(rf"{WORD_START}(?i:{UNCHECKED_WORDS})$")
 LABEL_COLUMNS = (
     *("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome"),
     *("ergebnis", "bewertung", "urteil"),
@@ -150,13 +158,13 @@ def label_of(word: Any, words: LabelMap = NO_WORDS) -> int:
     UnknownWordError
         If the meaning of the word is unknown.
     UnlabelledError
-        If it is empty, as the cell of a part that was not checked yet.
+        If it is empty or in `UNCHECKED`, as the cell of a part that was not checked yet.
     """
     text = str(word).strip().lower()
     if text in words:
         return int(words[text])
     if text in UNCHECKED:
-        raise UnlabelledError(f"Expected a label, got {text or 'none'}")
+        raise UnlabelledError("" if text in EMPTY_CELLS else text)
     match = IN_CELL.fullmatch(text.removesuffix(".0").removesuffix("."))
     if match is None:
         raise UnknownWordError(str(word).strip())
@@ -286,24 +294,25 @@ class LabelColumn:
         return int(not flag)
 
     def label_of_cells(self, cells: Iterable[Any]) -> int:
-        """Return the label that all cells mean; empty ones do not count.
+        """Return the label that all cells mean; those of a part that is not checked do not count.
 
         Raises UnreadableError if they differ, and as `label_of`.
         """
-        stated = _stated(cells)
+        texts = list(dict.fromkeys(str(cell).strip() for cell in cells))
+        stated = self.stated(texts)
         if len(stated) < 2:
-            return self.label_of(stated[0] if stated else "")
+            return self.label_of(next(filter(None, stated or texts), ""))
         with suppress(UnknownWordError):
             labels = {self.label_of(text) for text in stated}
             if len(labels) == 1:
                 return labels.pop()
         raise UnreadableError(f"Expected one label in column {self.name}, got {listed(stated)}")
 
-
-def _stated(cells: Iterable[Any]) -> list[str]:
-    """Return the different texts of cells that are not empty."""
-    texts = dict.fromkeys(map(str, cells))
-    return [text for text in texts if text.strip().lower() not in UNCHECKED]
+    def stated(self, cells: Iterable[Any]) -> list[str]:
+        """Return the different texts of cells that may be labels: no empty ones, no `UNCHECKED`."""
+        unchecked = set(UNCHECKED) - set(self.words)
+        texts = dict.fromkeys(map(str, cells))
+        return [text for text in texts if text.strip().lower() not in unchecked]
 
 
 def _read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
@@ -344,7 +353,7 @@ def labels_in_names_and_column(
         """Return the label of a path or of its column."""
         try:
             in_name = _find_word(name, options.words)
-        except NoLabelError:
+        except (NoLabelError, UnlabelledError):
             label = label_column.label_of_cells(_read_cells(paths[name], column, options))
             notes[f"Its name tells no label: that in column {column} is taken"] += 1
             return label, None
@@ -358,7 +367,7 @@ def labels_in_names_and_column(
             meaning = ("bad", "good")
             actual = (
                 f"its {place} says {meaning[in_name.label]} ({in_name.text}), its column {column}"
-                f" says {meaning[label]} ({listed(_stated(cells))})"
+                f" says {meaning[label]} ({listed(label_column.stated(cells))})"
             )
             do = f"name the one to trust: label={column!r}, or a pattern of the path (label)"
             raise UnreadableError(f"Expected one label, {actual}; {do}")
@@ -397,11 +406,15 @@ def _find_label(name: str, words: LabelMap) -> LabelAndPart:
 def _find_word(name: str, words: LabelMap) -> _FoundLabel:
     """Return the word in a path that is its label.
 
-    Raises NoLabelError if there is none, UnreadableError if several contradict each other.
+    Raises NoLabelError if there is none, UnlabelledError if there is only a word of `UNCHECKED`,
+    and UnreadableError if several labels contradict each other.
     """
     labels = _found_labels(name, words)
     deciding = [label for label in labels if label.decides]
     if not deciding:
+        endings = (ending for text, _ in _components(name) for ending in _endings(text))
+        for match in filter(None, map(UNCHECKED_AT_END.search, endings)):
+            raise UnlabelledError(match[0].lower())
         raise NoLabelError([_last_word(text) for text, _ in _components(name)])
     first = deciding[0]
     for other in labels:

@@ -435,7 +435,8 @@ def _from_arrays(
         """Return a label, NaN for an empty one, and 0 for an unknown word, which is counted."""
         try:
             return label_column.label_of(word)
-        except UnlabelledError:
+        except UnlabelledError as error:
+            collector.unlabelled_words[error.word] += 1
             return np.nan
         except UnreadableError:
             collector.unknown_words[str(word)] += 1
@@ -453,12 +454,13 @@ def _from_arrays(
     if not is_empty.any():
         return make_dataset(X, labels, name=name, **about)
     n = int(is_empty.sum())
+    collector.unlabelled_words[""] += n - collector.unlabelled
     actual = f"{n} that have no label yet"
     expect_data(not is_empty.all(), f"labelled traces in {name}", actual)
     for key in ("part", "cause"):
         if about.get(key) is not None:
             about[key] = np.asarray(about[key])[~is_empty]
-    note = f"{n} of {len(labels)} traces of {name} have no label yet: they are left out."
+    note = f"{collector.unlabelled_text(len(labels), 'traces')}: they are left out."
     about |= {"notes": (*about["notes"], note), "unlabelled": n}
     return make_dataset(np.asarray(X)[~is_empty], labels[~is_empty], name=name, **about)
 

@@ -218,7 +218,7 @@ def _label_source(
         return in_names, None
     column = header[place]
     in_column = labels.labels_in_column(named, column, options)
-    if set(_count_labels(named, in_names)) == {None}:
+    if set(_count_labels(named, in_names)) <= {None, ""}:
         return in_column, column
     counts = _count_labels(list(named)[:: max(len(named) // TRIED, 1)], in_column)
     if not counts[0] + counts[1]:

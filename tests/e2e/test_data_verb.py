@@ -464,7 +464,8 @@ def test_a_part_without_a_verdict_is_counted_as_unlabelled_and_left_out(
         "--repeats",
         1,
     )
-    assert "20 of 30 recordings of wide have no label yet: they are left out." in played.stderr
+    note = r"20 of 30 recordings of wide have no label yet( \('.*' 20 times\))?: they are left out\."
+    assert re.search(note, played.stderr)
 
 
 def test_numbers_that_are_missing_in_an_array_of_labels_are_unlabelled_and_other_numbers_are_refused(

@@ -301,8 +301,15 @@ LABEL_FORMS: Mapping[str, tuple[list[str], list[str]]] = {
         ["run_7_NOK - Kopie (3).csv", "1/x_nok.csv", "run_7_false copy.csv"],
     ),
 }
-# The label of a part that was not checked yet.
-NOT_CHECKED = ("", "nan", "NaN", "None", "-", "n/a", " ", "NULL", "?", "pending")
+# The label of a part that was not checked yet, and names that say so.
+NOT_CHECKED = (
+    *("", "nan", "NaN", "None", "-", "n/a", " ", "NULL", "?", "pending", "Unknown", "offen"),
+    *("open", "todo", "TBD", "in progress", "pendiente", "en attente", "not checked", "untested"),
+)
+NOT_CHECKED_NAMES = (
+    *("7_pending.csv", "pending/7.csv", "7_in_progress.csv", "part_7_offen_2.csv", "7 TBD (2).csv"),
+    *("part_7_not-checked.csv", "runUnknown.csv", "7_OK_pending.csv"),
+)
 
 
 def in_code(words: Mapping[str, object] | tuple[str, ...]) -> str:
@@ -335,7 +342,8 @@ def tables() -> dict[str, str]:
         *head,
         *label_rows,
         "",
-        f"A recording with an empty label, or {empty}, is counted as unlabelled and left out.",
+        f"A recording with an empty label, or {empty}, is counted as unlabelled and left out. So is"
+        f" one whose name says so, as in {in_code(NOT_CHECKED_NAMES)}.",
     ]
     return {"recordings": "\n".join(lines), "labels": "\n".join(labels)}
 

@@ -1,5 +1,6 @@
 """Recordings as people have them: every form gives the same traces, and what cannot be read is named and alone is lost."""
 
+import re
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from dengine import DataEngine, Dataset, TraceSpec, load_dataset
 from dengine.datasets.importing import import_labelled
 from dengine.datasets.labels import labels_in_names, means_bad
 from dengine.errors import DataError, TraceError
-from tests.support.recording_forms import LABEL_FORMS
+from tests.support.recording_forms import LABEL_FORMS, NOT_CHECKED_NAMES
 
 
 def write_csv(
@@ -157,7 +158,7 @@ BROKEN: dict[str, tuple[list[str], int, str]] = {
         "Expected a step of 0.002 s in time, got a gap of 0.032 s",
     ),
     "too_short_True.csv": (ROWS[:12], 0, "Expected 20 to 80 samples, to pad them to 40, got 11"),
-    "unlabelled.csv": (ROWS, 0, "Expected a label at the end of the name"),
+    "no_word.csv": (ROWS, 0, "Expected a label at the end of the name"),
     "twice_True.csv": (
         [f"{row},{row.split(',')[1]}" for row in ROWS],
         1,
@@ -848,11 +849,43 @@ def test_parts_with_dates_are_in_the_order_of_their_times(small: Dataset) -> Non
         assert any("order of the rows, which is not that" in note for note in data.notes)
 
 
-def test_a_word_of_an_undecided_part_is_not_proposed_as_a_label(small: Dataset) -> None:
+def test_a_word_of_an_undecided_part_is_unlabelled_and_never_proposed_as_a_label(
+    small: Dataset,
+) -> None:
     verdicts = np.where(small.y == 1, "conforme", "no conforme").astype(object)
     verdicts[[2, 7]] = "pendiente"
-    with pytest.raises(DataError, match="label_map='conforme=good,no conforme=bad' or"):
+    with pytest.raises(DataError, match="label_map='conforme=good,no conforme=bad' or") as caught:
         load_dataset((list(small.X), list(verdicts)))
+    assert "2 of 24 recordings of data have no label yet ('pendiente' 2 times)" in str(caught.value)
     label_map = "conforme=good,no conforme=bad"
     data = load_dataset((list(small.X), list(verdicts)), label_map=label_map)
-    assert (len(data.y), len(data.faults)) == (22, 2)
+    assert (len(data.y), data.unlabelled, data.faults) == (22, 2, ())
+    note = "2 of 24 recordings of data have no label yet ('pendiente' 2 times): they are left out."
+    assert note in data.notes
+    data = load_dataset((small.X, verdicts), label_map=label_map)
+    assert (len(data.y), data.unlabelled) == (22, 2)
+    assert "2 of 24 traces of data have no label yet ('pendiente' 2 times)" in data.notes[0]
+    # Who states what such a word means has a label, in cells as in a listing.
+    data = load_dataset((list(small.X), list(verdicts)), label_map=f"{label_map},pendiente=bad")
+    assert (len(data.y), data.unlabelled) == (24, 0)
+
+
+@pytest.mark.parametrize("name", NOT_CHECKED_NAMES)
+def test_a_name_that_says_pending_is_an_unlabelled_recording(
+    name: str, few: Path, small: Dataset
+) -> None:
+    write_csv(few / name, small.X[5])
+    data = load_dataset(few)
+    assert (len(data), data.unlabelled, data.faults) == (4, 1, ())
+    assert re.search("1 of 5 recordings of cell have no label yet .'.*' 1 times", data.notes[0])
+
+
+def test_a_column_labels_what_a_name_calls_pending(few: Path, small: Dataset) -> None:
+    for path in few.iterdir():
+        path.rename(path.with_name(f"{path.name.split('_')[1]}_pending.csv"))
+    for path in few.iterdir():
+        frame = pd.read_csv(path)
+        number = int(path.name.split("_")[0]) - 1
+        frame.assign(verdict=words(small)[number]).to_csv(path, index=False)
+    data = load_dataset(few)
+    np.testing.assert_array_equal(data.y, small.y[:4])
