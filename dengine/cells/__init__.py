@@ -1,4 +1,7 @@
-"""Cells that an engine drives: the protocol, recordings, a simulation, Universal Robots."""
+"""Cells that an engine drives: the protocol `Cell`, recordings (`ReplayCell`), a simulation in
+MuJoCo (`SimulatedCell`), and Universal Robots over RTDE (`UrCell`, with a recorder and a simulated
+controller).
+"""
 
 import lazy_loader
 

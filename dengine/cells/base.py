@@ -1,4 +1,6 @@
-"""`Cell`, the protocol of everything that `DataEngine.run` can drive, and its check."""
+"""`Cell`, the protocol of everything that `DataEngine.run` can drive: four methods, insert, verify,
+proceed and reject. `check_cell` refuses an object that lacks one of them.
+"""
 
 from inspect import getattr_static
 from typing import Any, Protocol, runtime_checkable
@@ -23,14 +25,25 @@ class Cell(Protocol):
         """Run the expensive verification of the inserted part; return whether it is good."""
 
     def proceed(self) -> Outcome:
-        """Go on without the verification; return what became known of the part."""
+        """Go on without the verification.
+
+        Returns
+        -------
+        Outcome
+            What became known of the part: STOPPED (it was bad and stopped the line), CONFIRMED (it
+            is good) or UNKNOWN.
+        """
 
     def reject(self) -> None:
         """Send the part back to the bin."""
 
 
 def check_cell(cell: Any) -> None:
-    """Raise SettingError for an object without a method of `Cell`, before a run and not in it."""
+    """Raise SettingError for an object that lacks a method of `Cell`; no method is called.
+
+    The message names the missing methods. Attributes are looked up statically first, so that a cell
+    that reacts to their reading does nothing.
+    """
     # Static look-up first: a cell may react to the reading of its attributes.
     missing = [
         name

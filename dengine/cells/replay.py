@@ -1,4 +1,6 @@
-"""`ReplayCell`, a recorded data set that an engine drives like a cell."""
+"""`ReplayCell`, a recorded data set that an engine drives like a cell: it plays the labelled traces
+one after another, and answers a verification with the recorded label.
+"""
 
 from typing import Any
 
@@ -35,16 +37,19 @@ class ReplayCell:
 
     @property
     def truth(self) -> bool:
-        """Return whether the newest part is good."""
+        """Whether the newest part is good, by its recorded label."""
         return bool(self.data.y[self.order[self.position]])
 
     @property
     def part(self) -> str | None:
-        """Return the number of the newest part; None if the data set has no part numbers."""
+        """Number of the newest part; None if the data set has no part numbers."""
         return None if self.data.part is None else str(self.data.part[self.order[self.position]])
 
     def insert(self) -> NDArray[np.floating]:
-        """Return the next trace, (channels, T)."""
+        """Go on to the next trace and return it, (T,) or (channels, T) as in the data set.
+
+        Raise IndexError after the last one.
+        """
         if self.position + 1 >= len(self.order):
             raise IndexError(f"The recording has {len(self.order)} cycles, and all were played.")
         self.position += 1

@@ -1,10 +1,12 @@
-"""`SimulatedCell`, a robot cell in MuJoCo that a `DataEngine` can drive.
+"""`SimulatedCell`, a robot cell in MuJoCo that a `DataEngine` can drive. `insert_once` simulates
+one insertion, by the physics of world.py and the conditions of conditions.py; `read_sensor` adds
+the faults of the force sensor. The label follows from the height of the part.
 
     cell = SimulatedCell(seed=0)
     for cycle in DataEngine().run(cell, cycles=600): ...
 
-It simulates the gripper, the part, the fixture, the force sensor and the height check. It runs as
-fast as the computer can; `SimulatedCell.clock` counts the seconds that production would take.
+It runs as fast as the computer can; `SimulatedCell.clock` counts the seconds that production would
+take.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -47,12 +49,15 @@ def read_sensor(
 ) -> NDArray[np.float32]:
     """Return what the sensor reports of a true force: low-pass, faults, quantisation, lost samples.
 
+    A lost sample repeats the last one that was not lost. `rng` is advanced.
+
     Parameters
     ----------
     force : array of float64, shape (samples,)
         True force along z in newtons, at 500 Hz.
     faults : SensorFaults
     parameters : CellParameters
+        Only `bandwidth_hz` is used.
     rng : numpy.random.Generator
         Source of the noise.
 
@@ -112,10 +117,29 @@ class SimulatedInsertion:
 def insert_once(
     parameters: CellParameters, seed: int, cycle: int, time_step_s: float = TIME_STEP_S
 ) -> SimulatedInsertion:
-    """Simulate one cycle.
+    """Simulate one cycle: draw its conditions, push the part, and read the sensor.
 
     The same `parameters`, `seed` and `cycle` give the same insertion, in any order and process.
-    `time_step_s` is the step of the physics in seconds.
+
+    Parameters
+    ----------
+    parameters : CellParameters
+    seed : int
+    cycle : int
+        Number of the cycle, from 0.
+    time_step_s : float
+        Step of the physics in seconds.
+
+    Returns
+    -------
+    SimulatedInsertion
+
+    Raises
+    ------
+    DengineError
+        If MuJoCo is not installed.
+    SettingError
+        For a time step or sizes that cannot be simulated.
     """
     world_rng, sensor_rng, _ = _streams(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
@@ -137,9 +161,10 @@ def insert_once(
 
 
 def _cause(conditions: Conditions, pushed: Push) -> str:
-    """Return the cause of a failure, one of `CAUSES`.
+    """Return the cause of a failed insertion, one of `CAUSES` but "none".
 
-    It is the fault that was drawn, if it had an effect, else follows from where the part stopped.
+    It is the fault that was drawn, if it had an effect; else it follows from where the part
+    stopped, and whether it slipped in the gripper.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):
@@ -156,13 +181,16 @@ def _cause(conditions: Conditions, pushed: Push) -> str:
 def _streams(
     seed: int, cycle: int
 ) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
-    """Return independent generators of one cycle: for the world, the sensor, and the line."""
+    """Return three independent random generators of one cycle: for world, sensor and line.
+
+    They depend on seed and cycle alone.
+    """
     world, sensor, line = np.random.SeedSequence(entropy=seed, spawn_key=(cycle,)).spawn(3)
     return np.random.default_rng(world), np.random.default_rng(sensor), np.random.default_rng(line)
 
 
 class SimulatedCell:
-    """A simulated `Cell`.
+    """A simulated `Cell`; after each `insert` call exactly one of verify, proceed and reject.
 
     Parameters
     ----------
@@ -173,8 +201,8 @@ class SimulatedCell:
     seed : int, default 0
         The same seed gives the same insertions, whatever is decided about them.
     cycles : int, default 600
-        Length of the scenario; a change "half way" comes after half of it. The cell can go on
-        after it.
+        Length of the scenario; a change "half way" comes after half of it. The cell can go on after
+        it.
 
     Attributes
     ----------
@@ -204,11 +232,15 @@ class SimulatedCell:
 
     @property
     def truth(self) -> bool:
-        """Return whether the newest part is good."""
+        """Whether the newest part is good; False before the first."""
         return self.last is not None and self.last.success
 
     def insert(self) -> NDArray[np.float32]:
-        """Pick a part, push it into the fixture; return the force in newtons, 2 s at 500 Hz."""
+        """Pick a part, push it into the fixture, and return the force, float32 of shape (1000,).
+
+        It is in newtons, 2 s at 500 Hz. The clock goes on by `cycle_s`. Raise DengineError if the
+        last part still waits for verify, proceed or reject.
+        """
         if self._waiting:
             raise DengineError(
                 "Expected verify(), proceed() or reject() after insert(), got insert(); call one."
@@ -222,7 +254,10 @@ class SimulatedCell:
         return insertion.trace
 
     def verify(self) -> bool:
-        """Check the height; return whether the part is good. A bad one goes back to the bin."""
+        """Check the height of the part; return whether it is good. A bad one goes back to the bin.
+
+        The clock goes on by `verify_s`. Raise DengineError if no part waits.
+        """
         success = self._take("verify").success
         self.clock += self.parameters.verify_s
         return success
@@ -230,8 +265,10 @@ class SimulatedCell:
     def proceed(self) -> Outcome:
         """Pass the part on without a check; return what became known of it.
 
-        A bad part stops the line, except for a share `CellParameters.silent_share`, of which
-        nothing becomes known. Of good parts a share `confirm_share` is confirmed.
+        A bad part stops the line (STOPPED, and the clock goes on by `stop_s`), except for a share
+        `CellParameters.silent_share`, of which nothing becomes known (UNKNOWN). Of good parts a
+        share `confirm_share` is CONFIRMED, the others are UNKNOWN. Raise DengineError if no part
+        waits.
         """
         success = self._take("proceed").success
         chance = float(_streams(self.seed, self._done - 1)[2].random())  # depends on the part alone
@@ -243,11 +280,14 @@ class SimulatedCell:
         return Outcome.STOPPED
 
     def reject(self) -> None:
-        """Send the part back to the bin without a check."""
+        """Send the part back to the bin without a check. Raise DengineError if no part waits."""
         self._take("reject")
 
     def _take(self, call: str) -> SimulatedInsertion:
-        """Return the waiting insertion, which waits no more; DengineError if none waits."""
+        """Return the insertion that waits for a decision; afterwards none waits.
+
+        `call` is the method's name, for the DengineError that is raised if none waits.
+        """
         if self.last is None or not self._waiting:
             raise DengineError(
                 f"Expected insert() before {call}(), got {call}() with no part waiting; insert one."

@@ -1,7 +1,7 @@
 """Conditions of a simulated insertion: the cell's settings, one cycle's draw, and scenarios.
-
 `CellParameters` says from which ranges `draw_conditions` draws the `Conditions` of a cycle; a
-scenario changes the parameters in the course of a run. Units are in the names.
+scenario (`nominal`, `wear`, `variant`, `bias_jump`) is a function that changes the parameters in
+the course of a run. Units are in the names. `SimulatedCell` and `simulate` use them.
 """
 
 from collections.abc import Callable
@@ -210,14 +210,28 @@ _DRAWN_BY: dict[str, str | Range] = {
 
 
 def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Conditions:
-    """Draw the conditions of one insertion.
+    """Draw the conditions of one insertion, its fault included; `rng` is advanced.
 
-    Every quantity is drawn in every cycle, so that a change of one does not change the others.
+    Every quantity is drawn in every cycle, so that a change of one does not change the others. At
+    most one fault is drawn; it replaces the normal values that it concerns.
+
+    Parameters
+    ----------
+    parameters : CellParameters
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    Conditions
     """
     p = parameters
 
     def draw(setting: str | Range) -> float:
-        """Draw a value by a setting of the parameters, or in a range."""
+        """Draw a value: by a setting's name, or in a range.
+
+        A range is drawn uniformly, a single number is the standard deviation of a normal draw
+        around 0.
+        """
         value = getattr(p, setting) if isinstance(setting, str) else setting
         return float(rng.uniform(*value) if isinstance(value, tuple) else rng.normal(0.0, value))
 
@@ -250,14 +264,20 @@ def nominal(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
 
 
 def wear(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Return the parameters with more friction as the tool wears: linear, by 0.35 in all."""
+    """Return the parameters with more friction as the tool wears.
+
+    Both ends of the range grow linearly, by 0.35 from the first to the last cycle; then they stay.
+    """
     low, high = parameters.friction
     grown = 0.35 * min(1.0, cycle / max(1, cycles - 1))
     return replace(parameters, friction=(low + grown, high + grown))
 
 
 def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Return from half way on a variant of the part: heavier, a tighter fit, a smaller chamfer."""
+    """Return the parameters unchanged before half way, from then on those of a variant of the part.
+
+    The variant is 2.5 times as heavy, has a tighter fit and a smaller chamfer.
+    """
     if cycle < cycles // 2:
         return parameters
     low, high = parameters.part_mass_kg
@@ -270,7 +290,7 @@ def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
 
 
 def bias_jump(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Return from half way on a force sensor with 8 N more offset; all else is unchanged."""
+    """Return the parameters, from half way on with 8 N more offset of the force sensor."""
     if cycle < cycles // 2:
         return parameters
     return replace(parameters, bias_offset_n=parameters.bias_offset_n + 8.0)
@@ -285,6 +305,9 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 def find_scenario(name: str) -> Scenario:
-    """Return the scenario of this name; SettingError for an unknown one."""
+    """Return the scenario of this name, a function of (parameters, cycle, cycles).
+
+    Raise SettingError for an unknown name.
+    """
     expect(name in SCENARIOS, f"a scenario of {', '.join(SCENARIOS)}", name, "choose one of these")
     return SCENARIOS[name]

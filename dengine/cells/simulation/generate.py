@@ -1,8 +1,8 @@
-"""Simulate many insertions in parallel and save them as a data set.
+"""Simulates many insertions in parallel (`simulate`) and saves them as a data set
+(`save_insertions`). A seed gives the same insertions for any number of processes. `dengine
+simulate` uses it.
 
     save_insertions("traces.npz", simulate(100, seed=0), seed=0)
-
-A seed gives the same insertions for any number of processes.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ def simulate(
     progress: Callable[[int], object] = lambda n: None,
     time_step_s: float = TIME_STEP_S,
 ) -> list[SimulatedInsertion]:
-    """Simulate the first n cycles of a cell.
+    """Simulate the first n cycles of a cell in parallel processes.
 
     In the nominal scenario insertion i depends on (seed, i) alone; in the others also on i / n.
 
@@ -48,6 +48,13 @@ def simulate(
     -------
     list of SimulatedInsertion
         In the order of the cycles.
+
+    Raises
+    ------
+    SettingError
+        For an unknown scenario, and for n below 1.
+    DengineError
+        If MuJoCo is not installed.
     """
     from joblib import Parallel, delayed
 
@@ -73,14 +80,31 @@ def save_insertions(
 ) -> Path:
     """Write insertions as a compressed .npz file that `load_dataset` reads; return its path.
 
+    The folder is created if need be, and the file is written in full or not at all. Traces are
+    rounded to integer steps of `scale`, 0.01 N or more.
+
     The arrays are X int16 (n, 1000) with `scale`, so that X * scale is in `unit`; y int8 (n,);
     cause str; height_mm float32; cycle int32; `conditions` float32 (n, m), all values that were
     drawn, with their names `condition_names`; and rate_hz, unit, seed, scenario, simulated.
 
+    Parameters
+    ----------
+    path : str or path
+    insertions : sequence of SimulatedInsertion
+    seed : int
+    scenario : str, default "nominal"
+        Seed and scenario are stored, so that the file can be made again.
+    force : bool, default False
+        Replace a file that exists.
+
+    Returns
+    -------
+    Path
+
     Raises
     ------
     OutputError
-        If the file exists, without `force`.
+        If the file exists, without `force`, or cannot be written.
     """
     buffer = BytesIO()
     X = np.stack([insertion.trace for insertion in insertions])

@@ -1,4 +1,6 @@
 """The physics of one insertion: `push` builds gripper, part and fixture in MuJoCo and pushes once.
+`fixture_xml` writes the model in MuJoCo's XML (MJCF); the result is a `Push` with the true force,
+the part's height and its slip. `insert_once` uses it.
 
 Lengths inside MuJoCo are metres. The rim of the fixture is at z = 0 and its seat at z = -DEPTH_MM.
 The hole is built from boxes, because MuJoCo replaces colliding meshes by their convex hulls, which
@@ -38,7 +40,7 @@ class Push:
     force : array of float64, shape (1000,)
         Force along z in newtons that a sensor without faults would read; pushing is positive.
     height_mm : float
-        Height of the part's top above its nominal seated height; of the floor if there is no part.
+        Height of the part's top above its nominal seated height; without a part -40.
     slip_mm : float
         How far the part slid up in the gripper.
     """
@@ -51,7 +53,24 @@ class Push:
 def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     """Lower the gripper until its target or its force limit; record the force for 2 s at 500 Hz.
 
-    Raises DengineError without MuJoCo, and SettingError for sizes that MuJoCo refuses.
+    The simulation has no randomness.
+
+    Parameters
+    ----------
+    conditions : Conditions
+    time_step_s : float
+        Step of the physics in seconds; it must divide 2 ms.
+
+    Returns
+    -------
+    Push
+
+    Raises
+    ------
+    DengineError
+        If MuJoCo is not installed.
+    SettingError
+        For a step that does not divide 2 ms, and for sizes that MuJoCo refuses.
     """
     with instead(
         DengineError,
@@ -86,9 +105,11 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
 def _drive(
     mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int
 ) -> NDArray[np.float64]:
-    """Run the controller of the push; return the force (1000,) in newtons.
+    """Run the controller of the push; return the force (1000,) in newtons, at 500 Hz.
 
-    The force is zeroed before the motion, with the part in the gripper.
+    `steps` is the number of physics steps per sample; `data` is advanced. The force is zeroed
+    before the motion, with the part in the gripper; pushing is positive. Near its limit the push
+    slows down, and above it the gripper moves back.
     """
     for _ in range(_SETTLE_SAMPLES):
         mujoco.mj_step(model, data, steps)
@@ -111,7 +132,11 @@ def _drive(
 
 
 def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
-    """Return the MuJoCo model (MJCF) of the cell under these conditions."""
+    """Return the MuJoCo model (MJCF, as text) of the whole cell under these conditions.
+
+    It has the fixture, the carriage with its drive, the elastic wrist with the force sensor, and
+    the part.
+    """
     c = conditions
     tool_z = (c.gap_mm + c.protrusion_mm + PROTRUSION_MM) / 1000 + 0.06
     k_lateral = 1000 * c.lateral_n_mm
@@ -166,7 +191,7 @@ def _damping(stiffness: float, inertia: float, ratio: float = 0.6) -> float:
 
 
 def _part(c: Conditions) -> str:
-    """Return the MJCF of the part in the gripper; "" if the grasp missed it.
+    """Return the MJCF of the part in the gripper, as text; "" if the grasp missed it.
 
     Dry friction holds the part until the push exceeds the grip.
     """
@@ -189,7 +214,10 @@ def _part(c: Conditions) -> str:
 
 
 def _fixture(c: Conditions) -> str:
-    """Return the MJCF of the fixture: four walls with a 45 degree chamfer, a floor, and debris."""
+    """Return the MJCF of the fixture, as text: four walls with a 45° chamfer, a floor, debris.
+
+    Debris, a soft box on the floor, is there only if its thickness is above 0.
+    """
     half = (WIDTH_MM + c.clearance_mm) / 2000
     depth = DEPTH_MM / 1000
     chamfer = c.chamfer_mm / 1000
@@ -209,7 +237,8 @@ def _fixture(c: Conditions) -> str:
 def _wall(side: int, half: float, chamfer: float, depth: float) -> str:
     """Return the MJCF of wall `side` (0 to 3): the wall at +x, turned by quarter turns about z.
 
-    Half width, chamfer and depth of the hole are in metres.
+    It is text with three boxes, the chamfer among them. Half width, chamfer and depth of the hole
+    are in metres.
     """
     wall = _WALL_MM / 1000
     reach = half + chamfer + wall

@@ -23,7 +23,10 @@ from .protocol import PORT
     "--speed", default=1.0, show_default=True, help="Against real time; 0: as fast as it is read."
 )
 def main(data: str, host: str, port: int, speed: float) -> None:
-    """Listen until interrupted."""
+    """Start a simulated controller that plays a data set, and run it until it is interrupted.
+
+    Exit with a message if the data set cannot be loaded.
+    """
     try:
         program = RobotProgram(data)
     except DengineError as error:

@@ -1,13 +1,15 @@
-"""`UrCell`, a cell with a Universal Robots controller that carries out orders.
+"""`UrCell`, a cell with a Universal Robots controller that carries out orders: insert, verify,
+proceed, reject. `Verb` are the orders, `ResultCode` are the results, and both are numbers in
+registers.
 
 with UrCell("192.168.1.10") as cell, DataEngine.open_or_create("cell.db") as engine:
     for cycle in engine.run(cell, cycles=300): ...
 
-dengine and the robot's program exchange numbers in integer registers. dengine writes an order,
-`10 * number + verb`, to `input_int_register_24`. The program carries it out and writes
-`10 * number + result code` to `output_int_register_24`. A single register holds a whole message,
-so that neither side can read half of one. Each order has a number of its own, so that an order
-that is sent twice is carried out once, and an old result is recognised. While the robot inserts,
+dengine and the robot's program exchange numbers in integer registers. dengine writes an order, `10
+* number + verb`, to `input_int_register_24`. The program carries it out and writes `10 * number +
+result code` to `output_int_register_24`. A single register holds a whole message, so that neither
+side can read half of one. Each order has a number of its own, so that an order that is sent twice
+is carried out once, and an old result is recognised. While the robot inserts,
 `output_int_register_25` holds the order's number, which triggers the recording. A program that
 starts anew writes the result code VOID for an order that it finds. `ur_cell.script` beside this
 file is such a program.
@@ -83,8 +85,9 @@ def encode_message(number: int, code: Verb | ResultCode) -> int:
 class UrCell(AbstractContextManager["UrCell"]):
     """A `Cell` whose methods are orders to the program that runs on the robot.
 
-    The trace is recorded while the robot inserts. Missing samples of a trace are NaN: the engine
-    verifies the part and does not learn from it.
+    Each method waits until the robot has carried the order out. The trace is recorded while the
+    robot inserts. Missing samples of a trace are NaN: the engine verifies the part and does not
+    learn from it. Opening connects to the controller and waits until its program is ready.
 
     Parameters
     ----------
@@ -130,7 +133,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         self.last: InsertionRecord | None = None
         self.incomplete = 0
         try:
-            self._number = self._take_over()
+            self._number = self._wait_until_ready()
         except BaseException:
             self.close()
             raise
@@ -143,12 +146,16 @@ class UrCell(AbstractContextManager["UrCell"]):
         self.close()
 
     def report(self) -> StreamReport:
-        """Return the counts of all packages, and of the traces with missing samples."""
+        """Return the counts of packages since the opening, and of traces with missing samples."""
         return replace(self.recorder.report(), incomplete=self.incomplete)
 
     def insert(self) -> NDArray[np.float32]:
-        """Have a part inserted; return its trace, (T,) or (C, T), NaN for lost samples."""
-        self._ask(Verb.INSERT)
+        """Have a part inserted, wait for it, and return its trace, (T,) or (C, T).
+
+        Lost samples are NaN; all are if the start was lost. Set `last`, and count an incomplete
+        trace.
+        """
+        self._execute_order(Verb.INSERT)
         if self.last is None:  # the start was lost, or the trigger is wrong
             self.last = self.recorder.cut()
         self.incomplete += self.last.missing > 0
@@ -156,18 +163,23 @@ class UrCell(AbstractContextManager["UrCell"]):
 
     def verify(self) -> bool:
         """Have the part measured; return whether it is good. A bad part goes back to the bin."""
-        return self._ask(Verb.VERIFY) is ResultCode.GOOD
+        return self._execute_order(Verb.VERIFY) is ResultCode.GOOD
 
     def proceed(self) -> Outcome:
         """Have the line go on without measuring; return what became known of the part."""
-        return OUTCOMES[self._ask(Verb.PROCEED)]
+        return OUTCOMES[self._execute_order(Verb.PROCEED)]
 
     def reject(self) -> None:
         """Have the part put back to the bin without measuring."""
-        self._ask(Verb.REJECT)
+        self._execute_order(Verb.REJECT)
 
-    def _ask(self, verb: Verb) -> ResultCode:
-        """Send an order and wait for its result; after INSERT also for the end of the trace."""
+    def _execute_order(self, verb: Verb) -> ResultCode:
+        """Send an order, wait at most `order_timeout` seconds for its result, and return that.
+
+        What was received before is discarded. After INSERT, also wait for the end of the trace, and
+        set `last` to it, or to None if no insertion was seen. Raise CellError if the robot does not
+        answer in time, fails, or its program stops.
+        """
         self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1
         self.last = None if verb is Verb.INSERT else self.last
@@ -186,7 +198,10 @@ class UrCell(AbstractContextManager["UrCell"]):
         return result
 
     def _timeout_error(self, expected: str) -> CellError:
-        """Return the error for a robot that did not do what was expected of it in time."""
+        """Return the CellError for a robot that did not do in time what was expected of it.
+
+        The message ends with the reason, as far as the connection tells it.
+        """
         stream = self.recorder.stream
         reason = "it did not; does its program do what ur_cell.script does, is it paused?"
         if stream.trouble:
@@ -194,9 +209,9 @@ class UrCell(AbstractContextManager["UrCell"]):
         return CellError(f"Expected the robot at {stream.where} {expected} in time, {reason}")
 
     def _find_result(self, row: Row, verb: Verb) -> ResultCode | None:
-        """Return the result of the present order if this package holds it, else None.
+        """Return the result code of the present order if this package holds it, else None.
 
-        Raises CellError for a failure, and if the robot's program has stopped.
+        Raise CellError if the order failed or is void, and if the robot's program has stopped.
         """
         number, code = divmod(int(row.values[ANSWER]), 10)
         state = int(row.values[RUNTIME])
@@ -216,8 +231,11 @@ class UrCell(AbstractContextManager["UrCell"]):
             )
         return None
 
-    def _take_over(self) -> int:
-        """Wait until the program runs and its last order has a result; return its number."""
+    def _wait_until_ready(self) -> int:
+        """Wait until the program runs and owes no result; return the number of its last order.
+
+        Raise CellError after `start_timeout` seconds, with what is missing.
+        """
         problem = ""
         for row in self.recorder.rows(self.start_timeout):
             ordered, answered, state = (int(row.values[name]) for name in (ORDER, ANSWER, RUNTIME))

@@ -1,10 +1,12 @@
-"""`FakeController`, a simulated controller that speaks RTDE over TCP, for tests and trials.
+"""`FakeController`, a simulated controller that speaks RTDE over TCP, for tests and trials. It runs
+a `RobotProgram`, which carries out the orders of a `UrCell` with the traces of a data set, and can
+produce the faults that occur in practice, each a `Trouble`.
 
     with FakeController(RobotProgram("insertion")) as fake:
         with UrCell(fake.host, port=fake.port) as cell: ...
 
-It follows the published protocol as far as a client can see it, sends 500 packages per second (or
-more), and can produce the faults that occur in practice; see `Trouble`.
+It follows the published protocol as far as a client can see it, and sends 500 packages per second
+(or more).
 """
 
 import os
@@ -87,17 +89,27 @@ class RobotProgram:
         self._run = self._cycles()
 
     def step(self, inputs: Values) -> Values:
-        """Run one control cycle with these inputs; return the outputs, values by column."""
+        """Run one control cycle with these inputs; return all outputs. Both are values by column.
+
+        The dict that is returned is `outputs` itself, which the next cycle changes.
+        """
         self._inputs = inputs
         next(self._run)
         return self.outputs
 
     def restart(self) -> None:
-        """Start the program anew, so that a waiting order is void."""
+        """Start the program anew at the next control cycle; a waiting order gets the result VOID.
+
+        Parts that were inserted stay so.
+        """
         self._run = self._cycles()
 
     def _cycles(self) -> Iterator[None]:
-        """Run the program; each yield ends a control cycle."""
+        """Run the program without an end; each yield ends a control cycle.
+
+        At its start it writes the result VOID for an order that it finds. Then it carries out each
+        order with a new number, and writes its result to the outputs.
+        """
         self.place = None
         last = int(self._inputs.get(ORDER, 0)) // 10
         self.outputs.update({PHASE: 0, ANSWER: encode_message(last, ResultCode.VOID)})
@@ -110,7 +122,11 @@ class RobotProgram:
             yield
 
     def _carry_out(self, number: int, verb: int) -> Any:
-        """Simulate one order, a yield per control cycle; return its result code (`yield from`)."""
+        """Simulate one order, a yield per control cycle; return its result code (`yield from`).
+
+        VERIFY, PROCEED and REJECT answer for the newest inserted part, by its label. FAILED if
+        there is none, and for an unknown order.
+        """
         if verb == Verb.INSERT:
             return (yield from self._insert(number))
         if verb not in tuple(Verb) or not self.played:
@@ -127,7 +143,11 @@ class RobotProgram:
         return ResultCode.CONFIRMED if self.confirm else ResultCode.UNKNOWN
 
     def _insert(self, number: int) -> Any:
-        """Play the next trace, one sample per cycle; return DONE, or FAILED after the last."""
+        """Play the next trace into the outputs, one sample per control cycle; return DONE.
+
+        Before it come `approach` cycles, after it two at rest. While it plays, the output PHASE has
+        the order's number, and `place` is set. Return FAILED if all traces were played.
+        """
         if len(self.played) == len(self.data):
             return ResultCode.FAILED  # the bin is empty
         part = len(self.played)
@@ -176,7 +196,7 @@ FIELDS = {  # patterns of the names of fields, and their types
 
 
 def type_of(name: str) -> str:
-    """Return the type of a field; NOT_FOUND if there is no such field."""
+    """Return the RTDE type of a field by its name, such as "DOUBLE"; NOT_FOUND if there is none."""
     types = (type_ for pattern, type_ in FIELDS.items() if re.fullmatch(pattern, name))
     return next(types, NOT_FOUND)
 
@@ -209,7 +229,7 @@ class Trouble:
 
 
 class Client:
-    """A connected client with its recipes and the bytes that are delayed for it."""
+    """A connected client of `FakeController`: its recipes, and bytes that are delayed for it."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -222,7 +242,10 @@ class Client:
         self.delayed = b""
 
     def send(self, data: bytes) -> bool:
-        """Send bytes; return whether the client is still connected."""
+        """Send bytes; return whether the client is still connected and has started to receive.
+
+        A client that has gone, or does not read for 5 s, is disconnected.
+        """
         try:
             self.socket.sendall(data)
         except OSError:  # gone, or it does not read
@@ -230,14 +253,17 @@ class Client:
         return self.started
 
     def hang_up(self, how: int = socket.SHUT_WR) -> None:
-        """Shut the connection down; by default, what was sent still arrives."""
+        """Shut the connection down; by default, what was sent still arrives.
+
+        Nothing is sent any more. `how` is the argument of `socket.shutdown`.
+        """
         self.started = False
         with suppress(OSError):
             self.socket.shutdown(how)
 
 
 class FakeController(AbstractContextManager["FakeController"]):
-    """A server on a port that runs a program until it is closed.
+    """A server on a port that runs a program until it is closed, in threads that it starts at once.
 
     Parameters
     ----------
@@ -292,7 +318,7 @@ class FakeController(AbstractContextManager["FakeController"]):
             thread.start()
 
     def close(self) -> None:
-        """End all connections and threads."""
+        """End all connections, and wait until all threads have ended."""
         self._closing.set()
         with suppress(OSError):
             self._server.shutdown(socket.SHUT_RDWR)
@@ -307,9 +333,12 @@ class FakeController(AbstractContextManager["FakeController"]):
         self.close()
 
     def hang_up(self, anew: bool = False) -> None:
-        """Close every connection.
+        """Close every connection; clients may connect again.
 
-        anew : act as switched off and on: the clock starts anew, and no input is written.
+        Parameters
+        ----------
+        anew : bool, default False
+            Act as switched off and on: the clock starts anew, and all inputs are forgotten.
         """
         with self._lock:
             if anew:
@@ -329,7 +358,10 @@ class FakeController(AbstractContextManager["FakeController"]):
                 self._threads[-1].start()
 
     def _serve(self, client: Client) -> None:
-        """Respond to a client until it disconnects."""
+        """Carry out a client's requests until it disconnects, or sends something else than RTDE.
+
+        It is the body of the client's thread; afterwards the client is forgotten.
+        """
         with self._lock:
             self._clients.append(client)
         packages = PackageReader()
@@ -343,7 +375,11 @@ class FakeController(AbstractContextManager["FakeController"]):
             self._clients.remove(client)
 
     def _respond(self, client: Client, type_: PackageType, payload: bytes) -> None:
-        """Carry out one request of a client, and send the response if the protocol has one."""
+        """Carry out one request of a client, and send the response if the protocol has one.
+
+        Text is ignored, and data sets `inputs`; neither has a response. The others are: declare
+        outputs or inputs, start, pause, and ask for versions.
+        """
         is_allowed = type_ not in self.refuses
         match type_:
             case PackageType.TEXT:
@@ -385,7 +421,10 @@ class FakeController(AbstractContextManager["FakeController"]):
     def _recipe(
         self, number: int, names: bytes, refused: Collection[PackageType | str], why: str
     ) -> RtdeRecipe:
-        """Return a recipe of these fields; refused ones have the type `why`."""
+        """Return a recipe of the fields in `names`, a text with commas between them.
+
+        Refused ones have the type `why`.
+        """
         listed = names.decode().split(",")
         return RtdeRecipe(
             number,
@@ -394,7 +433,10 @@ class FakeController(AbstractContextManager["FakeController"]):
         )
 
     def _run(self) -> None:
-        """Run control cycles at the set speed until the server is closed."""
+        """Run control cycles until the server is closed: the body of a thread.
+
+        They come at the set speed; without one, as fast as the clients read.
+        """
         due = time.monotonic()
         while not self._closing.is_set():
             with self._lock:
@@ -406,7 +448,11 @@ class FakeController(AbstractContextManager["FakeController"]):
                 time.sleep(IDLE_S)
 
     def _step(self) -> bool:
-        """Run one control cycle; return whether a client received data."""
+        """Run one control cycle: the program, troubles, and a package to each client that is due.
+
+        Return whether a client was to receive one. A sample of an insertion that no client was sent
+        is added to `lost`.
+        """
         values = {
             **STATE,
             **self.inputs,
@@ -433,7 +479,10 @@ class FakeController(AbstractContextManager["FakeController"]):
         return bool(started)
 
     def _send(self, client: Client, values: Values, trouble: str) -> bool:
-        """Send a client the package of this cycle; return whether it will arrive, now or later."""
+        """Send a client the package of this cycle, or what `trouble` makes of it.
+
+        Return whether the package will arrive, now or later.
+        """
         if self._cycle < self._until["drop"] or client.output is None:
             return False
         data = client.output.pack(values)

@@ -1,4 +1,7 @@
 """Encoding and decoding of RTDE, the protocol over which a Universal Robots controller sends data.
+`Package` and `PackageReader` convert between bytes and packages, `RtdeRecipe` between a data
+package and its values, and `CHANNELS` has the names of forces and poses. The client in stream.py
+and the simulated controller use them; nothing is sent here.
 
 A package is its size (uint16, with the header), its type (uint8) and a payload; all numbers are
 big-endian. A recipe is a list of fields to which the controller has assigned types. A data package
@@ -72,7 +75,10 @@ class PackageReader:
         self._bytes = bytearray()
 
     def feed(self, piece: bytes) -> Iterator[Package]:
-        """Add bytes, and yield every package that is complete; CellError if they are not RTDE."""
+        """Add bytes, and yield every package that is complete; an incomplete rest is kept.
+
+        Raise CellError for bytes that are no RTDE package.
+        """
         self._bytes += piece
         while len(self._bytes) >= HEADER.size:
             size, letter = HEADER.unpack_from(self._bytes)
@@ -113,7 +119,10 @@ class RtdeRecipe:
         )
 
     def pack(self, values: Mapping[str, float]) -> bytes:
-        """Return a data package with these values by column; 0 for columns that are left out."""
+        """Return a data package, with its header, of these values by column.
+
+        Columns that are left out are 0. Numbers for an integer field are cut to integers.
+        """
         numbers = [
             values.get(name, 0) if letter == "d" else int(values.get(name, 0))
             for name, letter in zip(self.columns, self.layout.format[2:], strict=True)
@@ -121,7 +130,10 @@ class RtdeRecipe:
         return Package(PackageType.DATA, self.layout.pack(self.number, *numbers)).to_bytes()
 
     def unpack(self, payload: bytes) -> dict[str, float]:
-        """Return the values of a data package by column; CellError for one of another recipe."""
+        """Return the values in the payload of a data package, by column.
+
+        Raise CellError for a package of another recipe or size.
+        """
         if len(payload) != self.layout.size or payload[0] != self.number:
             number = payload[0] if payload else "none"
             raise CellError(
@@ -143,10 +155,14 @@ def read_recipe(payload: bytes, names: Sequence[str], direction: str) -> RtdeRec
     direction : str
         "input" or "output", for messages.
 
+    Returns
+    -------
+    RtdeRecipe
+
     Raises
     ------
     CellError
-        If the controller does not have a field.
+        If the controller does not have a field, or the response has another number of types.
     HeldError
         If another client writes a field.
     """

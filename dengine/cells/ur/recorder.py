@@ -1,4 +1,6 @@
-"""`RtdeRecorder`, which records insertions from a Universal Robots controller.
+"""`RtdeRecorder`, which records insertions from a Universal Robots controller. It waits for a
+trigger in the stream of packages, places each sample by the controller's clock, and returns an
+`InsertionRecord`: the trace and what is missing in it. `UrCell` and users who only record use it.
 
 with RtdeRecorder("192.168.1.10", trigger="bit=0") as recorder:
     while True:
@@ -113,7 +115,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self._armed: int | None = None  # number of connections when `arm` was called
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection and end its thread."""
         self.stream.close()
 
     def __exit__(self, *raised: object) -> None:
@@ -131,8 +133,22 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def record(self, timeout: float = 60.0) -> InsertionRecord:
         """Wait for the next insertion after the last one, or after `arm`, and return it.
 
-        If the controller falls silent during an insertion, the part that was received is returned.
-        Raises CellError if no insertion begins within `timeout` seconds.
+        An insertion that is not complete after `timeout` seconds, for example since the controller
+        fell silent, is returned with NaN for what is missing.
+
+        Parameters
+        ----------
+        timeout : float, default 60
+            Seconds.
+
+        Returns
+        -------
+        InsertionRecord
+
+        Raises
+        ------
+        CellError
+            If no insertion begins within `timeout`.
         """
         for row in self.rows(timeout):
             if (record := self.feed(row)) is not None:
@@ -150,7 +166,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         )
 
     def rows(self, seconds: float) -> Iterator[Row]:
-        """Yield packages as they arrive, for this many seconds."""
+        """Yield packages as they arrive, for this many seconds; each is taken from the stream."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             if (row := self.stream.take(left)) is not None:
@@ -158,11 +174,15 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
     @property
     def begun(self) -> bool:
-        """Return whether an insertion has begun and is not complete."""
+        """Whether an insertion has begun and is not complete."""
         return self._start is not None
 
     def feed(self, row: Row) -> InsertionRecord | None:
-        """Add a package; return the insertion that it completes, if any."""
+        """Add a package of the stream; return the insertion that it completes, else None.
+
+        If the controller's clock was set back, an insertion that has begun is returned as far as it
+        was received, and everything before is discarded.
+        """
         record = None
         if (
             self._rows and row.timestamp < self._rows[-1].timestamp - self._step / 2
@@ -179,13 +199,16 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
             del self._rows[
                 : -self._before - 2
             ]  # keeps two more: the edge, and the connection before it
-        last = self._first() + (self.spec.samples - 1.5) * self._step
+        last = self._first_time() + (self.spec.samples - 1.5) * self._step
         return self.cut() if row.timestamp > last else record
 
     def cut(self) -> InsertionRecord:
-        """Return and forget the insertion as far as it was received; NaN if its start was lost."""
+        """Return the insertion as far as it was received, and forget it.
+
+        Samples that did not come are NaN; all are if its start was lost, or none has begun.
+        """
         start = self._start
-        first = self._first()
+        first = self._first_time()
         rows = self._rows
         armed = self._armed
         self._forget()
@@ -203,12 +226,15 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         trace = placed.trace[0] if len(self._columns) == 1 else placed.trace
         return InsertionRecord(trace, len(placed.missing), placed.repeated, reconnects)
 
-    def _first(self) -> float:
-        """Return the time of the trace's first sample; NaN before an insertion begins."""
+    def _first_time(self) -> float:
+        """Return the time of the trace's first sample, in seconds of the controller's clock.
+
+        NaN before an insertion begins.
+        """
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
     def _forget(self) -> None:
-        """Discard packages, start and arming."""
+        """Discard packages, start and arming, so that the next insertion is looked for."""
         self._finder.forget()
         self._rows = []
         self._start = None

@@ -1,4 +1,8 @@
-"""`RtdeStream`, which receives all packages of a controller in a thread, and reconnects."""
+"""`RtdeStream`, which receives all packages of a controller in a thread, and reconnects.
+`RtdeClient` is one connection; the stream makes a new one when it is lost, buffers the packages as
+`Row`s, writes inputs, and counts what was missing in a `StreamReport`. `RtdeRecorder` reads from
+it.
+"""
 
 import socket
 import struct
@@ -77,13 +81,15 @@ class RtdeClient:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._incoming = self._received()
         try:
-            if self._ask(PackageType.VERSION, struct.pack(">H", VERSION))[:1] != b"\1":
+            if self._request(PackageType.VERSION, struct.pack(">H", VERSION))[:1] != b"\1":
                 raise CellError(
                     f"Expected RTDE protocol version {VERSION} at {self.where}, "
                     "which refuses it; update it."
                 )
             named = struct.pack(">d", rate_hz) + ",".join(outputs).encode()
-            self._outputs = read_recipe(self._ask(PackageType.OUTPUTS, named), outputs, "output")
+            self._outputs = read_recipe(
+                self._request(PackageType.OUTPUTS, named), outputs, "output"
+            )
             if unknown := ", ".join(set(columns) - {*self._outputs.columns}):
                 number = "a number of the controller, as actual_q[5] or output_double_register_24"
                 raise SettingError(
@@ -91,9 +97,9 @@ class RtdeClient:
                 )
             if inputs:
                 self._inputs = read_recipe(
-                    self._ask(PackageType.INPUTS, ",".join(inputs).encode()), inputs, "input"
+                    self._request(PackageType.INPUTS, ",".join(inputs).encode()), inputs, "input"
                 )
-            if self._ask(PackageType.START, b"")[:1] != b"\1":
+            if self._request(PackageType.START, b"")[:1] != b"\1":
                 raise CellError(
                     f"Expected {self.where} to start sending, it refuses to{self._last_text}."
                 )
@@ -102,13 +108,19 @@ class RtdeClient:
             raise
 
     def rows(self) -> Iterator[Values]:
-        """Yield the values of every data package by column, without an end."""
+        """Yield the values of every data package by column, as they arrive, without an end.
+
+        Raise CellError if the connection is lost or silent for `timeout` seconds.
+        """
         for package in self._incoming:
             if package.type is PackageType.DATA:
                 yield self._outputs.unpack(package.payload)
 
     def send(self, values: Values) -> None:
-        """Write the input fields, in one package."""
+        """Write the input fields in one package; a column that is left out is written as 0.
+
+        Raise CellError if the connection is lost.
+        """
         self._send(self._inputs.pack(values))
 
     def close(self) -> None:
@@ -117,8 +129,12 @@ class RtdeClient:
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
-    def _ask(self, type_: PackageType, payload: bytes) -> bytes:
-        """Send a request and return the payload of its response."""
+    def _request(self, type_: PackageType, payload: bytes) -> bytes:
+        """Send a request, wait for its response, and return the payload of the response.
+
+        Other packages that arrive before are dropped. For START the first data package counts as a
+        yes, and is kept for `rows`. Raise CellError if the connection is lost.
+        """
         self._send(Package(type_, payload).to_bytes())
         while (package := next(self._incoming)).type is not type_:
             if type_ is PackageType.START and package.type is PackageType.DATA:
@@ -137,7 +153,10 @@ class RtdeClient:
             self._socket.sendall(data)
 
     def _received(self) -> Iterator[Package]:
-        """Yield packages as they arrive; keep the text of messages, for errors."""
+        """Yield packages as they arrive, without an end; texts are kept for errors instead.
+
+        Raise CellError if the connection is lost, silent for `timeout` seconds, or sends no RTDE.
+        """
         packages = PackageReader()
         while True:
             try:
@@ -212,9 +231,9 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     """Receives packages in a thread and buffers them for `take`.
 
     The parameters are those of `RtdeClient`, and `clock`, which returns seconds. The first
-    connection raises CellError if it fails. A connection that is lost later is made again, with
-    as many attempts as that takes, and the newest inputs are written again, unless they are old or
-    the controller was restarted.
+    connection raises CellError if it fails. A connection that is lost later is made again, with as
+    many attempts as that takes, and the newest inputs are written again, unless they are old or the
+    controller was restarted. The buffer holds 60 s of packages; older ones are dropped.
 
     Attributes
     ----------
@@ -253,7 +272,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         self._thread.start()
 
     def close(self) -> None:
-        """Close the connection and end the thread."""
+        """Close the connection, and wait until the thread has ended."""
         self._closing.set()
         with self._news:
             client = self._client
@@ -266,12 +285,12 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         self.close()
 
     def report(self) -> StreamReport:
-        """Return the counts so far."""
+        """Return the counts so far; `incomplete` is 0, which a `UrCell` fills in."""
         with self._news:
             return StreamReport(**self._counts)
 
     def take(self, timeout: float) -> Row | None:
-        """Return and remove the oldest buffered package; None if none comes within `timeout` s."""
+        """Remove and return the oldest buffered package; None if none comes in `timeout` s."""
         with self._news:
             self._news.wait_for(lambda: self._rows or self._closing.is_set(), timeout)
             return self._rows.popleft() if self._rows else None
@@ -283,9 +302,13 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             return self._session
 
     def write(self, values: Values | None) -> None:
-        """Write inputs now, or once there is a connection again.
+        """Write inputs now, or once there is a connection again; return at once.
 
-        None: do not write the newest inputs again after a reconnection.
+        Parameters
+        ----------
+        values : mapping of str to float, or None
+            By column. None writes nothing: the newest inputs are then not written again after a
+            reconnection.
         """
         with self._news:
             self._written = values
@@ -293,7 +316,11 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             self._send()
 
     def _send(self) -> None:
-        """Write the newest inputs; the caller holds the lock, so that their order is kept."""
+        """Write the newest inputs, if there are some and a connection; the caller holds the lock.
+
+        A lost connection is noted in `trouble` and not raised: the thread reconnects and writes
+        them again.
+        """
         if self._client is not None and self._written is not None:
             try:
                 self._client.send(self._written)
@@ -301,7 +328,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
                 self.trouble = str(error)
 
     def _read(self) -> None:
-        """Receive packages and reconnect until the stream is closed (the thread's work)."""
+        """Receive packages and reconnect until the stream is closed: the body of the thread."""
         while self._client is not None:
             client = self._client
             try:
@@ -324,7 +351,11 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
                         new_client.close()
 
     def _keep(self, row: Row) -> None:
-        """Count and buffer a package; write inputs again if the connection is new."""
+        """Count a package, buffer it, and wake who waits in `take`.
+
+        The first package of a new connection also has the inputs written again, if they are at most
+        REPEAT_S old. After a restart of the controller they are forgotten instead.
+        """
         with self._news:
             if self._newest is not None:
                 steps = round((row.timestamp - self._newest.timestamp) / self.step)
@@ -342,7 +373,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             self._news.notify_all()
 
     def _connect(self, until: float = float("inf")) -> RtdeClient | None:
-        """Try to connect until it succeeds; return None if the stream is closed meanwhile.
+        """Try to connect until it succeeds; return the connection, None if the stream is closed.
 
         `until`, a time of `time.monotonic`, is given for the first connection. Then a failure
         raises its error; but an input that another client writes is waited for until that time.
