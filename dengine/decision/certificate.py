@@ -43,6 +43,9 @@ BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # never 1: after one bad part its capit
 def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) -> float:
     """Return the log capital of the bet that the mean failure probability is below the tolerance.
 
+    The capital starts at 1, so the result is 0 for no parts. It falls with each bad part and rises
+    with all others. Six fixed stakes are mixed.
+
     Parameters
     ----------
     n : int
@@ -75,18 +78,22 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
 
     Parameters
     ----------
-    n, n_bad : int
-        As of `log_evidence`.
+    n : int
+        Number of parts, of known outcome or not.
+    n_bad : int
+        Parts among them that are known to be bad.
     alpha : float
         Error level, between 0 and 1.
     propensity : float, default 1.0
-        As of `log_evidence`; 1 if every outcome is known, 0 if none is.
+        Probability with which the outcome of each part was asked for: 1 if every outcome is known,
+        0 if none is.
 
     Returns
     -------
     float
-        The largest tolerance that the evidence does not refute, found by bisection. It is never
-        less than n_bad / (n propensity), and 1 if nothing is known.
+        From 0 to 1: the largest tolerance that the evidence does not refute, found by bisection and
+        rounded up. It is never less than n_bad / (n propensity), and 1 if the evidence is too
+        little to refute any tolerance, as for n = 0 or propensity = 0.
 
     Raises
     ------
@@ -131,7 +138,10 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
 
     Returns
     -------
-    step, limit : int
+    step : int
+        At least 1.
+    limit : int
+        The smallest, above 1, whose mean number of parts to a false alarm is `parts` or more.
 
     References
     ----------
@@ -155,9 +165,10 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
 
 
 def _run_length(share: float, step: int, limit: int) -> float:
-    """Return the mean number of parts until a CUSUM that starts at 0 reaches its limit.
+    """Return the mean number of parts until a CUSUM that starts at 0 reaches `limit`.
 
-    It is exact (Brook and Evans, 1972, Biometrika 59).
+    A part is wrong with the probability `share` and then adds `step`; a right one takes 1. The mean
+    is exact, not simulated (Brook and Evans, 1972, Biometrika 59).
     """
     # The mean from the sum s is a[s] + b[s] t, where t is the mean from the largest sum; it is
     # computed downwards, and the equation at 0 gives t. At and beyond the limit both are 0.
@@ -275,7 +286,8 @@ class Certificate:
         """Lower bound on what was saved by not checking accepted parts, in the unit of the prices.
 
         It is n_unchecked check - escape min(n_unchecked, n upper), an expectation as the bound is:
-        an audited part saves no check, and it cannot escape. None without prices.
+        an audited part saves no check, and it cannot escape. It may be negative: then not checking
+        may have cost money. None without prices.
         """
         if self.prices is None:
             return None
@@ -291,7 +303,12 @@ class Certificate:
 
     @property
     def sentence(self) -> str:
-        """The claim about accepted parts as one sentence, with what was saved."""
+        """The claim about accepted parts in English: "Of 1,203 parts ..., at most 3.5 % were bad".
+
+        It names the confidence and the tolerance. Where nothing can be claimed it says so, and why.
+        With prices, and a bound below 1, a second sentence says what not checking saved at least,
+        rounded down, or "nothing for certain".
+        """
         unknown = (
             "silence is no success: set audit_rate, or stops='all' where every bad part stops the "
             "system"
@@ -309,7 +326,10 @@ class Certificate:
 
     @property
     def sentence_on_rejects(self) -> str:
-        """The claim about rejected parts as one sentence."""
+        """The claim about rejected parts as one sentence.
+
+        Where nothing can be claimed it says so, and why.
+        """
         unknown = "nobody looks at what is rejected: set audit_rate"
         return self._claim(self.rejected, "rejected without a check", "reject", "good", unknown)
 
@@ -317,7 +337,9 @@ class Certificate:
         """Return the claim about a group of parts as one sentence.
 
         `which` describes the parts, `verb` is what the model does with them, `wrong` what they were
-        if that was wrong, `unknown` the reason where no outcome is known.
+        if that was wrong. The sentence gives the bound as a percentage, rounded up. If the group is
+        empty, if no outcome was asked for (`unknown` is the reason), or if too few outcomes are
+        known, it says that nothing can be claimed.
         """
         parts = f"{group.n:,} part{'s' if group.n != 1 else ''}"
         but = " beyond the known stops" if verb == "accept" else ""
@@ -341,7 +363,10 @@ class Certificate:
 
 
 def _round_up(bound: float) -> str:
-    """Return a bound in per cent, rounded up: a sentence must not promise more than the bound."""
+    """Return a probability in per cent, rounded up, as in "3.5 %": never less than the bound.
+
+    It has one digit after the point from 1 % on, two from 0.1 % on, and four below.
+    """
     digits = 4
     if bound >= 0.01:
         digits = 1
@@ -364,7 +389,7 @@ def certify(
     tolerance : float
         Share of accepted parts that may be bad, between 0 and 1.
     stops : {"all", "some"}
-        As in `Policy`.
+        As in `Policy`: whether every bad accepted part stops the line and becomes known.
     audit_rate : float
         Probability with which a certain decision is verified all the same; if it changed, the
         smallest value.
@@ -372,16 +397,22 @@ def certify(
     Returns
     -------
     Certificate
+        Without prices.
+
+    Raises
+    ------
+    SettingError
+        For `stops` or a tolerance out of range.
 
     Notes
     -----
     Under "all", or if every accepted part was confirmed or stopped the line, all outcomes are
-    known. Otherwise the bound comes from audits and is about all parts that the model would have
-    accepted, let go or audited; it is never below the share known to be bad. Where both are
-    possible they share alpha, so that whoever sees now the one and now the other is wrong with
-    probability alpha at most. Rejected parts are known by audits; the share that was found good
-    without being asked for is a floor of that bound. A forgotten or overdue label counts as a wrong
-    decision.
+    known, and the bound is about the accepted parts. Otherwise it comes from audits and is about
+    all parts that the model would have accepted, let go or audited; it is never below the share
+    known to be bad. Without audits it is 1. Where both ways are possible they share alpha, so that
+    whoever sees now the one and now the other is wrong with probability alpha at most. Rejected
+    parts are known by audits; the share that was found good without being asked for is a floor of
+    that bound. A forgotten or overdue label counts as a wrong decision.
     """
     expect(stops in ("all", "some"), "stops among all, some", stops)
     expect(0.0 < tolerance < 1.0, "0 < tolerance < 1", tolerance, "0.05 tolerates 5 % of errors")

@@ -56,33 +56,17 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         self.capacity = capacity
 
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
-        """Replace all references.
+        """Forget all references and take these in their place.
+
+        It sets `classes_`, the sorted classes, of which the last is the success. A lone class 0,
+        False or -1 counts as failure, any other lone class as success.
 
         Parameters
         ----------
         Z : array, shape (n, d)
-            Embeddings.
+            Embeddings. Of more than `capacity` the last rows stay.
         y : array, shape (n,)
             Labels of at most two classes.
-
-        Returns
-        -------
-        self
-        """
-        Z, y = validate_data(self, Z, y)
-        self.classes_ = classes_of(y)
-        self._create_index(np.asarray(Z).shape[1])
-        return self._add(Z, y)
-
-    def partial_fit(self, Z: ArrayLike, y: ArrayLike, classes: ArrayLike | None = None) -> Self:
-        """Add references.
-
-        Parameters
-        ----------
-        Z : array, shape (n, d)
-        y : array, shape (n,)
-        classes : array, optional
-            Both classes, for the first call; None: those in `y`.
 
         Returns
         -------
@@ -91,7 +75,31 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Raises
         ------
         ValueError
-            For a label of another class.
+            For more than two classes, and for arrays that scikit-learn refuses.
+        """
+        Z, y = validate_data(self, Z, y)
+        self.classes_ = classes_of(y)
+        self._create_index(np.asarray(Z).shape[1])
+        return self._add(Z, y)
+
+    def partial_fit(self, Z: ArrayLike, y: ArrayLike, classes: ArrayLike | None = None) -> Self:
+        """Add references; beyond `capacity` the oldest leave.
+
+        Parameters
+        ----------
+        Z : array, shape (n, d)
+        y : array, shape (n,)
+        classes : array, optional
+            Both classes. It is read on the first call only; None: those in `y`.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            For a label that is not among the classes of the first call.
         """
         is_first = "index_" not in vars(self)
         Z, y = validate_data(self, Z, y, reset=is_first)
@@ -134,7 +142,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return np.array([ACTIONS[int(position)] for position in positions], dtype=object)
 
     def predict_proba(self, Z: ArrayLike) -> NDArray[np.float64]:
-        """Return the observed rates of failure and success within the radius.
+        """Return the observed rates of both classes within the radius.
 
         Parameters
         ----------
@@ -143,7 +151,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Returns
         -------
         array of float64, shape (n, 2)
-            0.5 without neighbours. Ones of shape (n, 1) if only one class was seen.
+            Rate of failure, rate of success, in the order of `classes_`; 0.5 each without
+            neighbours. Ones of shape (n, 1) if only one class was seen.
         """
         n_success, n_failure = self.count(Z)
         n = n_success + n_failure
@@ -189,7 +198,11 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         self.neighbours_ = self.neighbours_over(self.index_)
 
     def _add(self, Z: Any, y: Any) -> Self:
-        """Add embeddings with labels to the index; returns self."""
+        """Add embeddings with labels to the index; returns self.
+
+        The last of `classes_` is stored as success. A lone class 0, False or -1 is stored as
+        failure.
+        """
         success = np.asarray(y) == self.classes_[-1]
         if len(self.classes_) == 1 and self.classes_[0] in (0, False, -1):
             success = ~success  # a lone class of zeros is all failures
@@ -197,7 +210,10 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return self
 
     def _decisions(self, Z: ArrayLike) -> NDArray[np.float64]:
-        """Return action, lower, upper, n_success and n_failure of each row of Z, shape (n, 5)."""
+        """Decide on each row of Z (n, d); raises NotFittedError before `fit`.
+
+        Returns float64 (n, 5): position in `ACTIONS`, lower, upper, n_success, n_failure.
+        """
         check_is_fitted(self)
         valid = validate_data(self, Z, reset=False)
         embeddings = torch.from_numpy(np.array(valid, dtype=np.float32))
@@ -212,12 +228,13 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
 
 def classes_of(y: ArrayLike) -> NDArray[Any]:
-    """Return the classes among labels, two at most.
+    """Return the sorted distinct labels in `y`, two at most.
 
     Raises
     ------
     ValueError
-        In scikit-learn's words, for more classes and for continuous labels.
+        For more than two classes and for continuous labels, in the words that scikit-learn's checks
+        of estimators expect.
     """
     check_classification_targets(y)
     classes = np.unique(np.asarray(y))

@@ -2,8 +2,8 @@
 
 A notebook cell that is run again defines another class, which is compiled. But if a method, a
 helper's method, a function or a constant of a module is replaced, the class stays the same, and
-torch answers with the code of before. `scripting.script` remembers what it compiled; the model then
-answers in Python, and the export refuses.
+torch answers with the code of before. `scripting.script` calls `remember_code` on all that it
+compiles. Where `is_code_changed` then says so, the model answers in Python, and the export refuses.
 """
 
 import sys
@@ -25,20 +25,29 @@ _COMPILED: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 
 
 def remember_code(module: nn.Module) -> None:
-    """Note the present code of a module, and of all modules in it, as compiled."""
+    """Note the present code of a module, and of all modules in it, as compiled.
+
+    Classes and functions that were noted before keep their first note.
+    """
     for unit in _user_code(module):
         _COMPILED.setdefault(unit, _code_text(unit))
 
 
 def is_code_changed(module: nn.Module) -> bool:
-    """Return whether a module, or one in it, has other code than was compiled in this process."""
+    """Return whether a module, or one in it, has other code now than `remember_code` noted.
+
+    False for code that was never noted.
+    """
     return any(
         unit in _COMPILED and _COMPILED[unit] != _code_text(unit) for unit in _user_code(module)
     )
 
 
 def _user_code(module: nn.Module) -> Iterator[Any]:
-    """Yield the classes and functions of a module that are not a library's."""
+    """Yield the class of a module and of each submodule, and the functions among their attributes.
+
+    Classes and functions of `LIBRARIES` are left out; a class may come more than once.
+    """
     for submodule in module.modules():
         functions = [value for value in vars(submodule).values() if isinstance(value, FunctionType)]
         for unit in (type(submodule), *functions):
@@ -47,22 +56,25 @@ def _user_code(module: nn.Module) -> Iterator[Any]:
 
 
 def _is_of_library(value: Any) -> bool:
-    """Return whether a module, class or function belongs to `LIBRARIES`."""
+    """Return whether a module, class or function belongs to a package in `LIBRARIES`."""
     attribute = "__name__" if isinstance(value, ModuleType) else "__module__"
     name = getattr(value, attribute, None)
     return str(name).partition(".")[0] in LIBRARIES
 
 
 def _code_text(unit: Any) -> str:
-    """Return a text that changes whenever code or constants that the unit refers to change."""
+    """Return a text that changes with the code and constants that a class or function refers to."""
     return repr(_describe(unit, set(), set()))
 
 
 def _describe(value: Any, names: set[str], seen: set[int]) -> Any:
-    """Return all code that a value refers to, and the constants in it, as nested tuples and lists.
+    """Describe all code that a value refers to, and the constants in it, for comparison by `repr`.
 
-    `names` are those that the referring code mentions: of a module only these count. `seen` holds
-    the ids of values that were described already, and grows.
+    A class gives a list of (name, description) of its members and of its bases' members, a module
+    the same of the variables in `names`, a function what `_describe_function` returns, a property
+    its getter, a constant its text. Anything else, a library's code, and what was described before
+    give a name only. `names` are the names that the referring code mentions. `seen` holds the ids
+    of values that were described already; it is added to.
     """
     if isinstance(value, staticmethod | classmethod):
         return _describe(value.__func__, names, seen)
@@ -89,7 +101,11 @@ def _describe(value: Any, names: set[str], seen: set[int]) -> Any:
 
 
 def _describe_function(function: FunctionType, seen: set[int]) -> Any:
-    """Return instructions, defaults, and a description of all that a function refers to."""
+    """Return (instructions, text of the defaults, referred values) of a function.
+
+    The referred values are (name, description) of each global and closure variable that the code
+    mentions, by name. `seen` is added to, as by `_describe`.
+    """
     mentioned = set(_names(function.__code__))
     namespace = function.__globals__
     values = {name: namespace[name] for name in mentioned & namespace.keys()}
@@ -101,7 +117,7 @@ def _describe_function(function: FunctionType, seen: set[int]) -> Any:
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """Yield the names that code mentions, nested functions included."""
+    """Yield the names of globals and attributes that code mentions, nested functions included."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -109,7 +125,10 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _instructions(code: CodeType) -> Any:
-    """Return bytecode, names and constants of code, nested functions included."""
+    """Return (bytecode, names, constants) of code, to compare by.
+
+    The constants are texts, and for a nested function again such a triple.
+    """
     constants = [
         _instructions(constant) if isinstance(constant, CodeType) else repr(constant)
         for constant in code.co_consts

@@ -3,9 +3,11 @@
     >>> decider = Decider(predictor, DecisionConditions(TraceSpec(1000), audit_rate=0.02), (5, 2))
     >>> fault, content, action, *_ = decider(torch.from_numpy(x), part=0)
 
-The engine asks a `Decider` and adds an id, a model version and a time; the exported file contains
-one. Both therefore decide alike. TorchScript compiles it if it can compile the predictor; a
-predictor that is plain Python is asked through the same lines.
+The file holds `Decider`, the `DecisionConditions` that it is made for, and the predictor
+`VerifyAll` for the time without a model. The engine asks a `Decider` and adds an id, a model
+version and a time; the exported file contains one. Both therefore decide alike. TorchScript
+compiles it if it can compile the predictor; a predictor that is plain Python is asked through the
+same lines.
 """
 
 from dataclasses import dataclass
@@ -94,6 +96,9 @@ class Decider(nn.Module):
     def forward(self, x: Tensor, part: int = 0) -> Verdict:
         """Decide on one trace.
 
+        First come faults of the trace, then the operator's force limits, then the model, then the
+        audit coin. The model is asked only if the trace has no fault and is within the limits.
+
         Parameters
         ----------
         x : Tensor of float32, shape (C, T)
@@ -111,13 +116,14 @@ class Decider(nn.Module):
             Content hash of the trace (`folds.content_hash`).
         action, predicted : int
             Positions in `Action`: what to do, and what the model alone would do. They differ in an
-            audit, and where a force limit rejects.
+            audit, and where a force limit rejects. `predicted` is VERIFY where the model was not
+            asked.
         reason : int
-            Position in `Reason`.
+            Position in `Reason`; the fault's of a faulty trace.
         lower, upper : float
             Bound on the success probability; (0, 1) without a prediction.
         n_success, n_failure : int
-            Labels within the radius.
+            Labels within the radius; 0 without a prediction.
         embedding : Tensor of float32, shape (K, d)
         propensity : float
             Probability, fixed beforehand, that this part is verified: the audit rate if the model
@@ -149,18 +155,22 @@ class Decider(nn.Module):
 
     @torch.jit.export
     def check(self, x: Tensor) -> tuple[int, int]:
-        """Return fault and content hash of a trace (C, T), as of `forward`."""
+        """Return (fault, content hash) of a trace (C, T), as of `forward`; nothing is predicted."""
         return self.gate.check(x, float(self.sensor_limit.item()))
 
     def is_audited(self, content: int, rate: float) -> bool:
-        """Return whether the audit coin of this content hash falls, as `folds.audited` has it."""
+        """Return whether a trace with this content hash is audited.
+
+        That is a fixed function of hash and seed, true for a share `rate` of all hashes.
+        """
         return self.toss(content ^ int(self.audit_salt.item())) < int(rate * self.coin_range)
 
     @torch.jit.export
     def toss(self, value: int) -> int:
-        """Return `folds.toss` of one hash, an integer below 2**30.
+        """Return a uniform integer below 2**30 that is a fixed function of the value.
 
-        The arithmetic is on tensors because int64 wraps around there, compiled or not.
+        It is `folds.toss` without a salt. The arithmetic is on tensors because int64 wraps around
+        there, compiled or not.
         """
         h = torch.tensor(value)
         h = (h ^ (h >> 32)) * self.mix
@@ -192,11 +202,17 @@ class VerifyAll(nn.Module):
 
 @lru_cache(16)
 def decider_without_model(conditions: DecisionConditions, reason: Reason) -> Decider:
-    """Return a decider that verifies every part for `reason`; a force limit may still reject."""
+    """Return a decider that verifies every part for `reason`; a force limit may still reject.
+
+    Deciders are cached, so the same arguments give the same object.
+    """
     return Decider(VerifyAll(reason), conditions)
 
 
 @lru_cache(16)
 def trace_gate(channels: int, samples: int) -> TraceGate:
-    """Return the gate of traces of this shape; it has no state, so all deciders share it."""
+    """Return the gate that checks traces (C, T) of this shape for faults and hashes them.
+
+    It has no state, so all deciders share it.
+    """
     return TraceGate(TraceSpec(channels=channels, samples=samples))

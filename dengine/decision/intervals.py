@@ -58,7 +58,7 @@ def normal_quantile(alpha: float) -> float:
     Raises
     ------
     SettingError
-        If alpha is not between 0 and 1, or too small to be told from 0.
+        If alpha is not between 0 and 1, or so small that 1 - alpha / 2 rounds to 1.
     """
     valid = 0.0 < alpha / 2.0 < 1.0 - alpha / 2.0 < 1.0
     expect(valid, "0 < alpha < 1", alpha, "0.05 asks for a 95 % interval")
@@ -207,7 +207,22 @@ def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[An
 
 
 def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any, Any]:
-    """Compute Wald limits of arrays or tensors; parameters and result as of `wilson_limits`."""
+    """Compute Wald limits of float64 arrays (`xp` is numpy) or tensors (`xp` is torch).
+
+    Parameters
+    ----------
+    xp : module
+        `numpy` or `torch`, whose functions are used.
+    n_success, n_failure : float64 array or tensor, of one shape
+        Counts of each kind.
+    z : float
+        Normal quantile, see `normal_quantile`.
+
+    Returns
+    -------
+    lower, upper : float64 array or tensor of that shape
+        Cut to [0, 1]; (0, 1) where nothing was counted.
+    """
     n = xp.where(n_success + n_failure > 0.0, n_success + n_failure, 1.0)
     half_width = z / xp.sqrt(n) * xp.sqrt(n_success * n_failure / (n * n))
     rate = n_success / n
@@ -215,9 +230,10 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
 
 
 def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
-    """Compute `wilson_interval` of two integers at the normal quantile z; TorchScript compiles it.
+    """Compute `wilson_interval` of two integers at the normal quantile z.
 
-    Returns lower and upper, (0, 1) where both counts are 0.
+    Returns (lower, upper) within [0, 1], which is (0, 1) where both counts are 0. TorchScript
+    compiles it.
     """
     total = float(n_success + n_failure)
     if total == 0.0:
@@ -229,9 +245,10 @@ def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float
 
 
 def wald_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
-    """Compute `wald_interval` of two integers at the normal quantile z; TorchScript compiles it.
+    """Compute `wald_interval` of two integers at the normal quantile z.
 
-    Returns lower and upper, (0, 1) where both counts are 0.
+    Returns (lower, upper) within [0, 1], which is (0, 1) where both counts are 0. TorchScript
+    compiles it.
     """
     total = float(n_success + n_failure)
     if total == 0.0:
@@ -250,8 +267,8 @@ def scalar_interval(
 ) -> tuple[float, float]:
     """Evaluate any interval of `INTERVALS` on two integers; TorchScript cannot compile it.
 
-    It has the parameters of a `ScalarBound` behind `interval` and `alpha`; z is not used.
-    Returns lower and upper as floats.
+    It has the parameters of a `ScalarBound` behind `interval` and `alpha`; z is not used. Returns
+    lower and upper as floats. Raises ValueError for a negative count.
     """
     lower, upper = INTERVALS[interval](n_success, n_failure, alpha)
     return float(lower), float(upper)
@@ -260,10 +277,12 @@ def scalar_interval(
 def _beta_interval(
     n_success: ArrayLike, n_failure: ArrayLike, alpha: float, prior: float, other_prior: float
 ) -> Bounds:
-    """Return quantiles of Beta distributions as (lower, upper).
+    """Return quantiles of Beta distributions, at alpha / 2 and 1 - alpha / 2, as (lower, upper).
 
     `prior` is added to the count of the side that an end belongs to (successes for the lower end,
-    failures for the upper one), `other_prior` to the other count.
+    failures for the upper one), `other_prior` to the other count. The lower end is 0 without a
+    success, the upper end 1 without a failure. The ends are arrays of the counts' shape, or floats
+    for scalar counts. Raises SettingError for an alpha, ValueError for counts out of range.
     """
     from scipy.special import betaincinv
 

@@ -1,7 +1,7 @@
-"""The rules that learn from outcomes: watched, pooled and priced.
+"""The rules that learn from outcomes: `WatchedRule`, `PooledRule` and `PricedRule`.
 
-All three decide by `members.MemberEvidence`, which opens and closes levels of the score.
-`policy.RULES` says which one belongs to which guarantee.
+All three derive from `MemberRule` and decide by `members.MemberEvidence`, which opens and closes
+levels of the score. `policy.RULES` says which one belongs to which guarantee.
 """
 
 import torch
@@ -58,7 +58,10 @@ class MemberRule(DecisionRule):
 
     @torch.jit.unused
     def start_in_safe_mode(self, safe_mode: int) -> None:
-        """Verify everything from the start, as after an alarm; 0 changes nothing."""
+        """Verify everything from the start, as after an alarm.
+
+        `safe_mode` is the position of the reason in `SAFE_MODES`; 0 changes nothing.
+        """
         if safe_mode:
             self.evidence.start_safe_mode(safe_mode)
 

@@ -46,10 +46,10 @@ FEW_NOVEL = 25.0  # traces in a row that are not novel; a novel one takes back 1
 
 
 def max_recent_errors(tolerance: float) -> int:
-    """Return how many of `N_RECENT` outcomes may be wrong.
+    """Return the smallest k such that more than k wrong ones of `N_RECENT` outcomes are unlikely.
 
-    More are wrong with a probability of at most `TAIL_PROBABILITY` where each is wrong with the
-    probability `tolerance`.
+    More are wrong with a probability of at most `TAIL_PROBABILITY` where each outcome is wrong with
+    the probability `tolerance`, independently.
     """
     tail = 1.0
     k = -1
@@ -60,13 +60,16 @@ def max_recent_errors(tolerance: float) -> int:
 
 
 def log_capital_steps(tolerance: float, inclusion_probability: float) -> list[float]:
-    """Return what each part adds to the log capital of the bet.
+    """Return what each outcome adds to the log capital of the bet that the tolerance is kept.
+
+    A checked part's outcome was asked for with certainty, an audited part's with the probability
+    `inclusion_probability`.
 
     Returns
     -------
     list of 4 floats
-        For each checked part, in addition for each wrong one of these; the same for audited parts,
-        which are included with the probability `inclusion_probability`.
+        What a checked part adds, above 0; what a wrong checked part adds on top of that, below 0;
+        the same two for an audited part.
     """
     stake = BET / (1.0 - BET * tolerance)
     steps: list[float] = []
@@ -78,7 +81,7 @@ def log_capital_steps(tolerance: float, inclusion_probability: float) -> list[fl
 
 
 def weighted_sum(counts: list[int], weights: list[float]) -> float:
-    """Return the sum of counts[i] * weights[i]."""
+    """Return the sum of counts[i] * weights[i] over two lists of equal length."""
     total = 0.0
     for count, weight in zip(counts, weights):  # noqa: B905  strict is not TorchScript
         total += count * weight
@@ -190,7 +193,8 @@ class MemberEvidence(nn.Module):
     def action(self, lower: float, upper: float) -> int:
         """Return the action that a bound allows at present: 0 verify, 1 accept, 2 reject.
 
-        A part that could as well be accepted as rejected is verified.
+        It accepts where `lower` reaches the threshold of side 0, and rejects where 1 - `upper`
+        reaches that of side 1. Where both hold, or neither, it verifies.
         """
         thresholds: list[float] = self.thresholds.tolist()
         accepts = lower >= thresholds[0]
@@ -200,10 +204,12 @@ class MemberEvidence(nn.Module):
         return 1 if accepts else 2
 
     def observe(self, n_silent: int, novel: bool) -> None:
-        """Update the detectors with accepted parts of unknown outcome, and with this trace.
+        """Step the drift detectors with parts of unknown outcome and the novelty of one trace.
 
-        `n_silent` accepted parts went on since the last label, and count as not wrong. `novel` says
-        whether the trace of the part at hand was novel. An alarm starts the safe mode.
+        `n_silent` accepted parts went on since the last label. They count as not wrong, and outside
+        of the safe mode as not novel. `novel` says whether the trace of the part at hand was novel.
+        It counts outside of the safe mode, where it may start one, and in the safe mode for novel
+        traces, where the detector counts how long few have been novel.
         """
         self.step_detector(0, self.correct_step, n_silent)
         safe_mode = int(self.safe_mode.item())
@@ -222,11 +228,12 @@ class MemberEvidence(nn.Module):
         predicted: int,
         inclusion_probability: float,
     ) -> None:
-        """Count the outcome of a part on both sides, choose the thresholds, and end the safe mode.
+        """Count a part's outcome on both sides, choose the thresholds, and end a safe mode if due.
 
-        Parameters and their meaning as of `DecisionRule.update`. The safe mode ends when the side
-        that raised the alarm has an open level again; after too many novel traces, when novel ones
-        are few again and either side has one.
+        Parameters and their meaning as of `DecisionRule.update`. A wrong outcome may raise an
+        alarm, which starts the safe mode. The safe mode ends when the side that raised the alarm
+        has an open level again; after too many novel traces, when novel ones are few again and
+        either side has one.
         """
         self.count_outcome(0, lower, not success, predicted, inclusion_probability)
         self.count_outcome(1, 1.0 - upper, success, predicted, inclusion_probability)
@@ -246,8 +253,12 @@ class MemberEvidence(nn.Module):
     ) -> None:
         """Count one part of known outcome on one side, then choose the threshold of that side.
 
-        The detector takes every part that reaches the threshold; levels and members take a part
-        only if its outcome was asked for (`inclusion_probability` > 0) or all outcomes are known.
+        If the score reaches the threshold, the drift detector of the side takes a step first, which
+        may start the safe mode. The levels that the score reaches, and the members if it is one,
+        count the part only if its outcome was asked for (`inclusion_probability` > 0) or all
+        outcomes are known. A member reaches the target level, or the model was certain of it
+        (`predicted` is the side's action). The threshold stays as it is if the part was counted
+        nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
@@ -277,11 +288,11 @@ class MemberEvidence(nn.Module):
         self.choose_threshold(side)
 
     def step_detector(self, detector: int, step: float, times: int) -> None:
-        """Add `step` to a CUSUM several times; start the safe mode if it reaches its limit.
+        """Add `step` to a CUSUM `times` times; start the safe mode if the sum reaches its limit.
 
-        The sum restarts at 0 where it would fall below.
-
-        With more than one step, `step` is negative, so that none but the last can start from 0.
+        The sum restarts at 0 where it would fall below. With more than one step, `step` must be
+        negative. Nothing happens if `times` is 0. An alarm during a safe mode starts the safe mode
+        anew, under that of the two reasons that stands first in `SAFE_MODES`.
         """
         if times <= 0:
             return
@@ -298,7 +309,9 @@ class MemberEvidence(nn.Module):
     def start_safe_mode(self, safe_mode: int) -> None:
         """Close both sides until the members from now on show that the tolerance is kept.
 
-        `safe_mode` is the position of the reason in `SAFE_MODES`.
+        `safe_mode` is the position of the reason in `SAFE_MODES`. The detectors and the counts
+        since the last alarm restart at 0, and the target is the strictest level again. The counts
+        over all time stay.
         """
         self.detector_sums.zero_()
         self.member_counts_since_alarm.zero_()
@@ -311,7 +324,10 @@ class MemberEvidence(nn.Module):
         """Set the target level and the threshold of one side from the counts.
 
         The target is the lowest level whose parts since the last alarm, and whose newest parts, are
-        good enough. The threshold is that level if the members show as much, else `CLOSED`.
+        good enough; if there is none, it is the strictest level. The threshold is the target's
+        score if there is one and the members, of all time and since the last alarm, are good
+        enough, else `CLOSED`. The watched rule has no target: its threshold stays, and after an
+        alarm is the first level again once the parts since then show that the tolerance is kept.
         """
         levels: list[list[int]] = self.level_counts_since_alarm[side].flatten(1).tolist()
         if self.is_watched:  # only an alarm closes it
@@ -338,12 +354,16 @@ class MemberEvidence(nn.Module):
     def allows_more(self, side: int, counts: list[int]) -> bool:
         """Return whether counts allow more parts of their kind, by the bet or by the account.
 
-        `counts` holds checked parts, wrong ones of these, audited parts, wrong ones of these.
+        `counts` holds checked parts, wrong ones of these, audited parts, wrong ones of these. The
+        priced rule asks the account, which must not be overdrawn; the others ask the bet.
         """
         if self.is_priced:
             return weighted_sum(counts, self.balance_steps[side]) >= self.required_balance[side]
         return self.keeps_tolerance(side, counts)
 
     def keeps_tolerance(self, side: int, counts: list[int]) -> bool:
-        """Return whether the bet shows that the parts keep the tolerance; `counts` as above."""
+        """Return whether the bet shows, at level alpha, that these parts keep the side's tolerance.
+
+        `counts` holds checked parts, wrong ones of these, audited parts, wrong ones of these.
+        """
         return weighted_sum(counts, self.capital_steps[side]) >= self.required_log_capital

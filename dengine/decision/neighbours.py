@@ -53,7 +53,7 @@ class RadiusNeighbours(nn.Module):
         return self.uncertain if self.rule.safe_mode() == 0 else self.safe_mode
 
     def forward(self, z: Tensor, part: int = 0) -> tuple[int, float, float, int, int]:
-        """Decide on one embedded trace.
+        """Decide on one embedded trace; the rule and the references are read only.
 
         Parameters
         ----------
@@ -67,7 +67,10 @@ class RadiusNeighbours(nn.Module):
         action : int
             0 verify, 1 accept, 2 reject.
         lower, upper : float
+            Bound on the success probability, from the counts; if `scored`, both are the mean of the
+            first axis over the K spaces, and the action follows from it.
         n_success, n_failure : int
+            Labels within the radius, several of one part counted as fewer.
         """
         distances = self.references.squared_distances(z, part)
         n_success, n_failure = self.references.count_near(distances, self.radius)

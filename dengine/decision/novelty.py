@@ -97,9 +97,9 @@ class NoveltyGate(nn.Module):
         self.register_buffer("norms", torch.zeros(4, REFERENCES))
 
     def forward(self, x: Tensor) -> bool:
-        """Return whether a trace (C, T) of float32 is unlike all references.
+        """Return whether a trace (C, T) of float32 is novel: any of its `scores` is above 1.
 
-        A trace whose features overflow to NaN is novel.
+        A trace whose features overflow to NaN is novel. Nothing is novel if the gate is disabled.
         """
         if self.disabled:
             return False
@@ -108,9 +108,11 @@ class NoveltyGate(nn.Module):
 
     @torch.jit.export
     def scores(self, x: Tensor) -> Tensor:
-        """Return squared distances of a trace (C, T) to the nearest reference, over their limits.
+        """Return how far a trace (C, T) lies from its nearest reference, (4,) float32.
 
-        Shape (4,) float32: by level, texture, distortion and gaps.
+        Each is a squared distance over its limit, so above 1 is novel: by level, texture,
+        distortion and gaps. A score may be a little below 0 near a reference with a larger reach,
+        and it is NaN or infinite where features overflow.
         """
         plain = self.plain_features(x)
         features = torch.cat([plain, plain @ self.discriminants])
@@ -119,10 +121,12 @@ class NoveltyGate(nn.Module):
         return nearest + (z * z).sum(1)
 
     def plain_features(self, x: Tensor) -> Tensor:
-        """Return the features of traces (..., C, T) without distortions, (..., P).
+        """Return the features of traces (..., C, T) that are not distortions, (..., P) float32.
 
-        They are, for each channel, minima, maxima and logarithms of roughness of the segments, and
-        the gaps.
+        For each channel they are the S minima and the S maxima of the segments, then logarithms of
+        roughness, which is a norm of differences: of first differences in the S segments, of second
+        differences in the S segments, and three of first differences for gaps: in the quietest of
+        the longer brief stretches, in the quietest and in the loudest of the brief ones.
         """
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
         steps = x[..., 1:] - x[..., :-1]  # from sample to sample
@@ -142,7 +146,7 @@ class NoveltyGate(nn.Module):
     def roughness(self, x: Tensor, length: int, stride: int) -> Tensor:
         """Return the norm of each stretch of `length` values of x (..., T), shape (..., n).
 
-        A shorter x is one stretch.
+        A stretch begins at every `stride`-th value. A shorter x is one stretch.
         """
         stretches = x.unfold(-1, max(0, min(length, x.size(-1))), stride)
         norms: Tensor = torch.linalg.vector_norm(stretches, dim=-1)
@@ -154,13 +158,16 @@ def fit_novelty(
 ) -> NoveltyGate:
     """Fit the gate that takes these traces for usual; there is no randomness.
 
+    At most `REFERENCES` of the traces, evenly spaced in time, become its references.
+
     Parameters
     ----------
     traces : array of float32, shape (n, C, T)
         Finite, with any labels, oldest first.
     margin : float
         Factor on the limits, which are 99.5 % quantiles of the references' squared distances to one
-        another.
+        another. With fewer than 200 different traces, and for distortions fewer than `REFERENCES`,
+        the limits are wider.
     parts : array of int64, shape (n,), optional
         Hashes of the parts; None: each trace is a part of its own. Only distances between different
         parts and different traces count, for what came twice is near itself.
@@ -217,10 +224,10 @@ def fit_novelty(
 
 
 def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
-    """Return a twentieth of the usual roughness of traces (n, C, T), shape (C, 2*S + 3).
+    """Return what is added to each roughness before its logarithm, float32, shape (C, 2*S + 3).
 
-    There is a value for each stretch. A channel that never moved has the least number above 0: any
-    sound is far away.
+    It is a twentieth of the roughness that the median of the traces x (n, C, T) has over as long a
+    stretch, and 1e-12 for a channel that never moved: any sound is then far away.
     """
     n_samples = x.size(2)
     steps = torch.zeros(x.size(1))
@@ -232,9 +239,10 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
 
 
 def _distort(x: Tensor) -> list[Tensor]:
-    """Return what a sensor or a clock would make of traces (n, C, T): `DISTORTIONS` of their shape.
+    """Return distorted copies of traces (n, C, T): a list of `DISTORTIONS` tensors of that shape.
 
-    They are gain, fading gain, offset, drift, a step, speed and delay, each both ways.
+    They are what a sensor or a clock would make of the traces, each both ways: gain and fading gain
+    (4), offset, drift and a step (6), speed and delay (4). Beyond its ends a trace is mirrored.
     """
     n_samples = x.size(2)
     t = torch.linspace(0.0, 1.0, n_samples)
@@ -254,10 +262,11 @@ def _distort(x: Tensor) -> list[Tensor]:
 
 
 def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) -> Tensor:
-    """Return Fisher's discriminants between traces and their distortions, float32, (P, D).
+    """Return Fisher's discriminants between traces and their distortions, float32, shape (P, D).
 
-    x (n, C, T) are the traces, plain (n, P) float64 their features, used (P,) bool the features
-    that the discriminants read.
+    Column j separates the traces from their j-th distortion. x (n, C, T) are the traces, plain (n,
+    P) float64 their features. used (P,) bool marks the features that the discriminants read; the
+    rows of the others are 0.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
@@ -275,11 +284,12 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
 
 
 def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
-    """Return offset and gain, (P,) each, that standardise features (n, P) of float64.
+    """Return (offset, gain), float64 (P,) each, so that offset + gain * features is standardised.
 
-    A glitch among the references must not be the measure of the others, so the outermost values of
-    each feature are drawn in. A feature that never moved is far away once it moves, but not by the
-    rounding of its own size.
+    A glitch among the references must not be the measure of the others, so mean and deviation are
+    computed after the outermost values of each feature (n, P) are drawn in. A floor is added to the
+    deviation: a feature that never moved is far away once it moves, but not by the rounding of its
+    own size.
     """
     n = len(features)
     n_outer = 1 + n // TAIL_TRACES
@@ -294,9 +304,10 @@ def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> tuple[Tensor, int]:
-    """Return which traces (n, C, T) are equal or of one part, (n, n) bool, and how many differ.
+    """Return which traces are equal or of one part, (n, n) bool, and how many are not repeats.
 
-    Each trace is the same as itself.
+    `traces` is (n, C, T). The diagonal is True. The number counts the traces that are not the same
+    as an earlier one. Without `parts`, only equal traces are the same.
     """
     for samples in (traces[..., ::16], traces):  # a few samples tell most apart
         numbers: dict[bytes, int] = {}
@@ -310,12 +321,14 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
 
 
 def _limits(points: Tensor, same: Tensor) -> tuple[float, Tensor]:
-    """Return the usual squared distance between nearest points (n, P), and each point's reach.
+    """Return (usual squared distance between nearest points, reach of each point (n,)).
 
-    `same` (n, n) bool marks points that are not other ones. The usual distance is the QUANTILE,
-    capped by what nine in ten show, so that a few outliers are not the measure of the others. The
-    reach (n,) of a point is the usual distance; an outlier's is that to its third nearest outlier,
-    if all others are twice as far: a cluster of them is a kind of its own.
+    `points` is (n, P); `same` (n, n) bool marks pairs whose distance does not count. The usual
+    distance is the QUANTILE of the distances to the nearest other point, capped by what nine in ten
+    show, so that a few outliers are not the measure of the others; it is 0.001 at least. The reach
+    of a point is the usual distance; an outlier's is the squared distance to its third nearest
+    outlier, if that is larger and all points that are no outliers are twice as far: such a cluster
+    is a kind of its own.
     """
     norms = points.square().sum(1)
     squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)

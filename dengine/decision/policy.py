@@ -121,7 +121,11 @@ class Policy:
             )
 
     def _checked_windows(self) -> tuple[ForceLimits, ...]:
-        """Return the windows as `ForceLimits`, parsing texts; SettingError for others."""
+        """Return the windows as a tuple of `ForceLimits`, parsing texts.
+
+        Raises SettingError if they are no tuple or list, or one of them is neither a text of limits
+        nor a `ForceLimits`.
+        """
         given = self.windows if isinstance(self.windows, tuple | list) else (None,)
         windows: Any = tuple(
             ForceLimits.parse(window) if isinstance(window, str) else window for window in given
@@ -131,7 +135,11 @@ class Policy:
         return windows  # type: ignore[no-any-return]
 
     def _checked_prices(self) -> tuple[float, float, float]:
-        """Return the prices as floats; SettingError if an error is not above two checks."""
+        """Return the three prices as floats.
+
+        Raises SettingError if they are not three finite numbers above 0, or if an error costs no
+        more than two checks.
+        """
         prices = (0.0, 0.0, 0.0)
         has_three = isinstance(self.prices, tuple | list) and len(self.prices) == 3
         if has_three and all(map(is_number, self.prices)):
@@ -143,14 +151,15 @@ class Policy:
         return prices
 
     def to_values(self) -> dict[str, Any]:
-        """Return every setting by its name, windows as one text, "none" if there are none."""
+        """Return every setting by its name; the windows are one text, "none" if there are none."""
         return asdict(self) | {"windows": " ".join(map(str, self.windows)) or NO_WINDOWS}
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
-        """Return the policy that `to_values` wrote; missing settings have their defaults.
+        """Return the policy whose settings `to_values` wrote; missing settings have their defaults.
 
-        Names that are no settings are ignored.
+        The windows are one text, separated by spaces, or "none". Names that are no settings are
+        ignored. Raises SettingError for a value out of its range.
         """
         names = [field.name for field in fields(cls)]
         settings = {name: values[name] for name in names if name in values}
@@ -165,7 +174,11 @@ class Policy:
 
     @property
     def tolerances(self) -> tuple[float, float]:
-        """Share of the accepted parts that may be bad, and of the rejected that may be good."""
+        """Share of accepted parts that may be bad, and share of rejected parts that may be good.
+
+        Both are 1 - LB; under the guarantee "cost" they are check / escape and check / false
+        reject.
+        """
         if self.guarantee != "cost":
             return 1.0 - self.lower_bound, 1.0 - self.lower_bound
         check, escape, false_reject = self.prices
@@ -194,6 +207,9 @@ class Policy:
 
     def rule(self) -> DecisionRule:
         """Make a decision rule that has learned nothing yet.
+
+        It is the class that `RULES` names for `guarantee` and `stops`, or the user's
+        `module:Class`, made with alpha, lower_bound and interval.
 
         Returns
         -------
@@ -239,6 +255,7 @@ class Policy:
         Returns
         -------
         Certificate
+            With the prices if the guarantee is "cost".
         """
         if self.stops == "all":
             bad = outcomes.false_accepts + outcomes.forgotten_accepts
@@ -258,7 +275,10 @@ class Policy:
         return INTERVALS[self.interval](n_success, n_failure, error_level)
 
     def action(self, lower: float, upper: float) -> Action:
-        """Return the action that one bound allows by the paper's rule."""
+        """Return the action that one bound allows by the paper's rule, whatever the guarantee is.
+
+        ACCEPT where lower >= LB, REJECT where upper <= 1 - LB, otherwise VERIFY.
+        """
         from .rule import action_of
 
         reject_threshold = 1.0 - self.lower_bound

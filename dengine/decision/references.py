@@ -4,8 +4,9 @@
     >>> index.add(points, labels, spaces)
     >>> n_success, n_failure = index.count(queries, radius=0.3)
 
-The search is brute force in float32. It takes tens of microseconds and compiles to TorchScript, so
-one implementation counts in the engine, in the scikit-learn classifier and in the exported file.
+The file holds `RadiusIndex` and `label_agreement`, by which repeated parts are weighed. The search
+is brute force in float32. It takes tens of microseconds and compiles to TorchScript, so one
+implementation counts in the engine, in the scikit-learn classifier and in the exported file.
 
 Trials must be independent to be counted. A part is known by a hash of its number, or of its trace.
 Its own references have no vote on it, and m references of one part are worth m / (1 + (m - 1) rho)
@@ -40,12 +41,15 @@ def label_agreement(
     spaces: NDArray[np.int64],
     parts: NDArray[np.int64],
 ) -> float:
-    """Bound from above how far the labels of one part go together beyond what its place explains.
+    """Bound from above how strongly the labels of one part agree: their intraclass correlation.
+
+    It is computed after the success rate around each point is subtracted from its label, because
+    neighbouring parts agree as well.
 
     Parameters
     ----------
     points : array of float32, shape (n, d)
-        The newest `SAMPLE` are used.
+        The last `SAMPLE` are used.
     labels : array of int, shape (n,)
         1 is success, 0 is failure.
     spaces : array of int64, shape (n,)
@@ -56,8 +60,8 @@ def label_agreement(
     Returns
     -------
     float
-        Upper confidence bound on the intraclass correlation, from 0 to 1; 1 if fewer than
-        `FEWEST_PARTS` parts came twice.
+        Upper confidence bound on the intraclass correlation, one-sided at 95 %, from 0 to 1; 1 if
+        fewer than `FEWEST_PARTS` parts came twice.
     """
     points = points[-SAMPLE:]
     labels = labels[-SAMPLE:]
@@ -88,9 +92,10 @@ def label_agreement(
 def _success_rate_around(
     points: NDArray[np.float32], labels: NDArray[np.int8], part: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return, for each point, the success rate among the nearest points of other parts, (n,).
+    """Return for each point the success rate among the nearest points of other parts, float64 (n,).
 
-    Half a success in one trial is added to the counts: the rate is one half without neighbours.
+    The `N_NEIGHBOURS` nearest are taken, or all if there are fewer. Half a success in one trial is
+    added to the counts: the rate is one half without neighbours.
     """
     from scipy.spatial.distance import cdist
 
@@ -167,7 +172,10 @@ class RadiusIndex(nn.Module):
         return self.size()
 
     def column(self, name: str) -> NDArray[Any]:
-        """Return one attribute of the n points in the index, by slot.
+        """Return one attribute of the n points in the index, in the order of their slots.
+
+        Until the index is full that is the order of age; then new points overwrite the oldest
+        slots.
 
         Parameters
         ----------
@@ -176,7 +184,7 @@ class RadiusIndex(nn.Module):
         Returns
         -------
         array, shape (n,), of points (n, d)
-            Labels are int8; most columns are views.
+            Labels are a copy, int8, 1 for success; the others are views of the index.
         """
         block = self.numbers if name == "numbers" else getattr(self, name).numpy()
         values: NDArray[Any] = block[..., : len(self)]
@@ -186,7 +194,7 @@ class RadiusIndex(nn.Module):
 
     @torch.jit.export
     def size(self) -> int:
-        """Return the number of points in the index."""
+        """Return the number of points in the index, which is at most `capacity`."""
         return min(int(self.total.item()), self.capacity)
 
     @torch.jit.export
@@ -199,6 +207,7 @@ class RadiusIndex(nn.Module):
         label : float
             1.0 is success, 0.0 is failure.
         space : int
+            Space of the point, from 0 to K - 1.
         part : int, default 0
             Hash of its part; 0 for an unknown part.
         """
@@ -212,7 +221,11 @@ class RadiusIndex(nn.Module):
 
     @torch.jit.export
     def set_part(self, slot: int, part: int) -> None:
-        """Set the part of a slot, and keep `first`, `repeats` and `part_filter` in order."""
+        """Replace the part of a slot by the hash `part`; 0 is an unknown part.
+
+        `first`, `repeats` and `part_filter` are updated for the part that leaves and the one that
+        comes.
+        """
         leaving = int(self.parts[slot].item())
         if leaving != 0 and int(self.repeats.item()) > 0:
             same = self.parts == leaving
@@ -243,6 +256,7 @@ class RadiusIndex(nn.Module):
         Returns
         -------
         Tensor of float32, shape (n,)
+            In the order of the slots; shape (0,) for an empty index.
         """
         n = self.size()
         query = z.t()  # (d, K)
@@ -263,12 +277,13 @@ class RadiusIndex(nn.Module):
         distances : Tensor of float32, shape (n,)
             Squared, as of `squared_distances`.
         radius : float
-            A point at this distance counts.
+            Not squared. A point at this distance counts.
 
         Returns
         -------
         n_success, n_failure : int
-            Several points of one part are worth less than as many parts, see `count_votes`.
+            (0, 0) for an empty index. If any part came more than once, several points of one part
+            are worth less than as many parts, see `count_votes`.
         """
         n = distances.size(0)
         if n == 0:
@@ -285,7 +300,8 @@ class RadiusIndex(nn.Module):
         """Count the votes of the points `inside`, (n,) bool, where parts came more than once.
 
         m points of a part are worth m / (1 + (m - 1) agreement) votes: one vote where its labels
-        always agree. Returns successes and failures, rounded, for bounds are of whole trials.
+        always agree, m where they are independent. Returns (successes, failures), each rounded to a
+        whole number, for bounds are of whole trials.
         """
         slots = inside.nonzero().flatten()
         first = self.first.index_select(0, slots)
@@ -315,11 +331,12 @@ class RadiusIndex(nn.Module):
         parts: ArrayLike | None = None,
         numbers: ArrayLike | None = None,
     ) -> None:
-        """Add many points; of more than fit, the newest.
+        """Add many points, the first row as the oldest; in a full index they replace the oldest.
 
         Parameters
         ----------
         points : array, shape (n, d)
+            Of more than `capacity` rows the last ones are added.
         labels : array, shape (n,)
             1 is success, 0 is failure.
         spaces : array of int, shape (n,), optional
@@ -357,7 +374,7 @@ class RadiusIndex(nn.Module):
             self._index_parts()
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
-        """Change the label of a point, or remove the point.
+        """Change the label of the point with a number, or remove the point.
 
         Parameters
         ----------
@@ -366,13 +383,14 @@ class RadiusIndex(nn.Module):
         part : int
             Hash of its part.
         label : int or None
-            None removes the point; the others keep their order of age.
+            1 is success, 0 is failure. None removes the point; the others keep their order of age
+            and move to the first slots.
 
         Returns
         -------
         bool
-            False, with nothing changed, if the point is of another part. True also if the point has
-            left already.
+            False, with nothing changed, if the point is of another part. True also if there is no
+            such point, because it has left already.
         """
         slots = np.flatnonzero(self.column("numbers") == number)
         if not len(slots):
@@ -402,7 +420,7 @@ class RadiusIndex(nn.Module):
             self.agreement.fill_(label_agreement(*columns))
 
     def _index_parts(self) -> None:
-        """Compute `first`, `repeats` and `part_filter` anew from `parts`."""
+        """Compute `first`, `repeats` and `part_filter` anew from `parts`, in place."""
         parts = self.column("parts")
         slots = np.arange(self.capacity)
         _, first, inverse = np.unique(parts, return_index=True, return_inverse=True)
@@ -413,7 +431,7 @@ class RadiusIndex(nn.Module):
         self.part_filter[torch.from_numpy(parts & self.filter_mask)] = True
 
     def count(self, queries: ArrayLike, radius: float) -> Counts:
-        """Count labels around queries, in Python.
+        """Count labels around each query; no part is excluded.
 
         Parameters
         ----------
@@ -435,7 +453,8 @@ class RadiusIndex(nn.Module):
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Return the state as plain arrays, copies, which `from_state` takes.
 
-        They are points (d, n), labels, spaces, parts and numbers (n,), agreement and total ().
+        They are points (d, n), labels, spaces, parts and numbers (n,), in the order of the slots,
+        and agreement and total (), by name.
         """
         names = ("labels", "spaces", "parts", "numbers")
         state = {"points": self.column("points").T.copy()}
@@ -444,7 +463,11 @@ class RadiusIndex(nn.Module):
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
-        """Return an index with the points of a state, in the same slots."""
+        """Return a new index with the points of a state, in the same slots.
+
+        `state` is what `get_state` returned; `capacity` must be that of the index that it came
+        from.
+        """
         index = cls(len(state["points"]), capacity)
         columns = (state[name] for name in ("labels", "spaces", "parts", "numbers"))
         index.add(state["points"].T, *columns)
@@ -453,7 +476,7 @@ class RadiusIndex(nn.Module):
         return index
 
     def digest(self) -> str:
-        """Return the SHA-256 of the points, as hexadecimal digits.
+        """Return the SHA-256 of points, labels and spaces, in slot order, as 64 hexadecimal digits.
 
         The bytes are points (d, n) float32, labels float32 and spaces int64, one after the other.
         """

@@ -91,7 +91,7 @@ class DecisionRule(nn.Module):
         self.extra_arguments: tuple[Any, ...] = ()
 
     def forward(self, n_success: int, n_failure: int) -> tuple[int, float, float]:
-        """Return action (0 verify, 1 accept, 2 reject), lower and upper for label counts."""
+        """Return (action, lower, upper) for label counts: 0 verify, 1 accept, 2 reject."""
         lower, upper = self.bound(n_success, n_failure, self.z)
         return self.action(lower, upper), lower, upper
 

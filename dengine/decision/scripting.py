@@ -22,18 +22,25 @@ _SCRIPTING = threading.Lock()
 def script(module: nn.Module) -> Any:
     """Compile a module with `torch.jit.script`, without its deprecation notice.
 
-    TorchScript works in the supported range of PyTorch. One thread compiles at a time: where two
-    parse at once, Python's parser raises "AST constructor recursion depth mismatch".
+    TorchScript works in the supported range of PyTorch. The call waits while another thread
+    compiles: where two parse at once, Python's parser raises "AST constructor recursion depth
+    mismatch".
 
     Parameters
     ----------
     module : nn.Module
-        The module to compile; its code is remembered, see `code.is_code_changed`.
+        The module to compile. Its code is remembered, so that `code.is_code_changed` notices a
+        later change.
 
     Returns
     -------
     torch.jit.ScriptModule
         It shares the tensors of `module`.
+
+    Raises
+    ------
+    RuntimeError
+        If TorchScript cannot compile it.
     """
     with _SCRIPTING, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r".*torch\.jit\..* is deprecated.*")
@@ -57,12 +64,12 @@ def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
     module : nn.Module
         The module to write to.
     arrays : mapping of str to array
-        One array for each name in `module.state_dict()`.
+        One array for each name in `module.state_dict()`; they are cast to the tensors' dtypes.
 
     Raises
     ------
     StoreError
-        If the names or shapes are not those of the module.
+        If the names or shapes are not those of the module; nothing is written then.
     """
     tensors = module.state_dict()  # shares its tensors with the module
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}

@@ -1,7 +1,8 @@
 """The two contracts of a model: `Model` for baselines, `EngineModel` for the engine.
 
-`BaselineAdapter` makes an `EngineModel` of a baseline. dengine's own `neighbours.ModelPrediction`
-implements both. Calls that must not raise into the cell go through `engine.guard.GuardedModel`.
+`as_engine_model` makes an `EngineModel` of a baseline by `BaselineAdapter`, and `Exportable` is
+what a model hands to an exporter. dengine's own `neighbours.ModelPrediction` implements both
+contracts. Calls that must not raise into the cell go through `engine.guard.GuardedModel`.
 """
 
 from __future__ import annotations
@@ -65,8 +66,7 @@ class Model(Protocol):
 
 
 class EngineModel(ABC):
-    """The model that the engine drives: it predicts, takes references, trains a successor, and is
-    stored.
+    """The model that the engine drives: it predicts, learns references, retrains and is stored.
 
     A subclass implements `train`, `predict_one`, `add_reference` and `successor`; every other
     method has a default that fits a model without a rule, without a safe mode and without a stored
@@ -140,10 +140,16 @@ class EngineModel(ABC):
         """
 
     def warm_up(self) -> None:  # noqa: B027  # a default: nothing to load
-        """Load the libraries that the first training needs; called in a thread of its own."""
+        """Load the libraries that the first training needs; called in a thread of its own.
+
+        The default does nothing.
+        """
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default
-        """Compute in advance, and keep, what a training on traces (n, C, T) begins with."""
+        """Compute in advance, and keep, what a training on these traces (n, C, T) begins with.
+
+        `numbers` are the labels' sequence numbers. The default does nothing.
+        """
 
     @abstractmethod
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
@@ -153,7 +159,9 @@ class EngineModel(ABC):
         """
 
     def decide_one(self, x: Floats, part: int, conditions: DecisionConditions) -> Verdict:
-        """Decide on one trace by `predict_one`, see `Decider.forward`.
+        """Decide on one trace: check faults and limits, ask `predict_one`, toss the audit coin.
+
+        The result has the form of `Decider.forward`. What `predict_one` raises is raised here.
 
         Parameters
         ----------
@@ -161,11 +169,13 @@ class EngineModel(ABC):
         part : int
             Hash of its part's number; 0 for an unknown part.
         conditions : DecisionConditions
-            The decider is kept and used again while they stay equal.
+            Force limits, sensor limit and audits. The decider for them is kept and used again while
+            they stay equal.
 
         Returns
         -------
         Verdict
+            Its embedding is empty, shape (0, 0).
         """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
@@ -220,7 +230,10 @@ class EngineModel(ABC):
         return False
 
     def with_policy(self, policy: Policy) -> Self:
-        """Return a model with the same references and a new rule of another policy."""
+        """Return a model with the same references and a new rule of another policy.
+
+        The default returns the model itself, which has no rule.
+        """
         return self
 
     def update_rule(  # noqa: B027  # a default: no rule that learns
@@ -291,7 +304,10 @@ class EngineModel(ABC):
         return True
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
-        """Return what an exporter starts from; raises ExportError where nothing can be exported."""
+        """Return what an exporter starts from, with the trace contract `trace`, or the model's own.
+
+        The default always raises ExportError: a baseline stays in Python.
+        """
         raise ExportError(
             f"{self.name} is a baseline and stays in Python; "
             "only dengine's own model can be exported."
@@ -312,7 +328,11 @@ class PythonPredictor(nn.Module):
         self.model = model
 
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
-        """Return what the model predicts for one trace (C, T), as `Predicted`."""
+        """Predict one trace (C, T) by the model's `predict_one`; `part` is the hash of its part.
+
+        Returns positions of action and reason, lower, upper, n_success, n_failure, and an embedding
+        that is always empty, shape (0, 0).
+        """
         prediction = self.model.predict_one(x.numpy(), part)
         action = ACTIONS.index(prediction.action)
         reason = REASONS.index(prediction.reason)
@@ -328,7 +348,8 @@ class PythonPredictor(nn.Module):
 def as_engine_model(model: Model) -> EngineModel:
     """Return a model as the engine drives it: an `EngineModel` as it is, a baseline adapted.
 
-    Raises SettingError for an object that lacks a method of `Model`.
+    The baseline is not copied. Raises SettingError for a class, and for an object that lacks a
+    method of `Model`.
     """
     if isinstance(model, EngineModel):
         return model
@@ -364,10 +385,11 @@ class BaselineAdapter(EngineModel):
         return self
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """Return the baseline's decision on one trace (channels, samples), with its evidence.
+        """Return the baseline's decision on one trace (channels, samples), with bound and counts.
 
-        `hash_` has no effect, because a baseline knows nothing of parts. Raises ValueError for
-        counts that are no whole numbers.
+        The reason is UNCERTAIN for VERIFY, otherwise CERTAIN; there is no embedding. `hash_` has no
+        effect, because a baseline knows nothing of parts. Raises ValueError for an unknown action
+        and for counts that are not whole numbers from 0 to 2**63 - 1.
         """
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)

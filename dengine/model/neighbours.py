@@ -5,7 +5,9 @@ spans K spaces, fold k's references live in space k, a query is embedded in all 
 are summed.
 
 The engine and the exporters ask a `Decider` around `Predictor`, a module of the fitted parts that
-compiles to TorchScript. Compiled deciders are copied from templates, because scripting takes long.
+compiles to TorchScript. Compiled deciders are copied from templates (`template_of`, `compiled`),
+because scripting takes long. `near_repeats` counts traces that look like a part inserted again, for
+a note in the retrain's report.
 """
 
 import copy
@@ -105,7 +107,7 @@ class Predictor(nn.Module):
 
         `part` is the hash of its part, whose references have no vote; 0 excludes none. Returns
         positions of action and reason, lower, upper, n_success, n_failure, and the scaled embedding
-        (K, d). A novel trace is verified without counting.
+        (K, d). A novel trace is verified without counting: the bound is (0, 1), the counts are 0.
         """
         z = self.embed(x)
         if self.novelty(x):
@@ -133,9 +135,11 @@ _COMPILED: dict[Any, Any] = {}
 
 
 def template_of(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
-    """Return the compiled and warm decider of this structure; compile it if there is none yet.
+    """Return the compiled decider of this structure, and compile it if there is none yet.
 
-    It is shared: `compiled` copies it.
+    A new one decides three times on a ramp of `trace_shape` (C, T), so that later calls are fast,
+    and is kept in the process; of more than `KINDS` the oldest is dropped. It is shared, so do not
+    change it: `compiled` copies it. Compiling takes tens of milliseconds.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
@@ -151,16 +155,21 @@ def template_of(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
 
 
 def structure_of(eager: nn.Module) -> tuple[Any, ...]:
-    """Return everything that scripting compiles into a module, as a key to compare by.
+    """Return everything that scripting compiles into a module, as a hashable key to compare by.
 
-    That is classes, attributes and shapes, but not the tensors' values. The classes themselves are
-    part of it, not their names: a notebook cell that is run again defines another class.
+    That is classes, attributes and shapes of all submodules, but not the tensors' values. The
+    classes themselves are part of it, not their names: a notebook cell that is run again defines
+    another class.
     """
     return tuple((name, *_own_structure(module)) for name, module in eager.named_modules())
 
 
 def _own_structure(module: nn.Module) -> tuple[Any, ...]:
-    """Return the class, the compiled attributes and the tensors' shapes of one module."""
+    """Return the class, the compiled attributes and the tensors' shapes of one module, as a tuple.
+
+    Submodules are left out. Attributes are (name, text or function) by name, tensors (name, shape);
+    the shapes in a `ForceLimitsGate` are None, because limits may change in number.
+    """
     attributes = sorted(
         (name, _as_key(value))
         for name, value in vars(module).items()
@@ -185,9 +194,10 @@ def _as_key(value: object) -> object:
 
 
 def _compiles(*modules: nn.Module) -> bool:
-    """Return whether TorchScript compiles these modules as their code is now; log where not.
+    """Return whether no module's code was changed since TorchScript compiled it; else warn.
 
-    It keeps what it compiled first. A class whose code was changed since then runs in Python.
+    TorchScript keeps what it compiled first, so a class whose code was changed must run in Python.
+    Code that was never compiled counts as unchanged. The warning is logged and names the classes.
     """
     changed = [type(module).__name__ for module in modules if is_code_changed(module)]
     if changed:
@@ -200,12 +210,18 @@ def _compiles(*modules: nn.Module) -> bool:
 
 
 def _tensors_of(module: nn.Module, recurse: bool = False) -> list[tuple[str, Tensor]]:
-    """Return a module's parameters and buffers by name; with `recurse` its submodules' as well."""
+    """Return a module's parameters and buffers as (name, tensor), parameters first.
+
+    With `recurse` those of its submodules as well.
+    """
     return [*module.named_parameters(recurse=recurse), *module.named_buffers(recurse=recurse)]
 
 
 def compiled(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
-    """Return a compiled decider that shares the tensors of an eager one."""
+    """Return a compiled decider that shares the tensors of an eager one.
+
+    It is a copy of the template for `trace_shape` (C, T); a template that is missing is compiled.
+    """
     module = copy.deepcopy(template_of(eager, trace_shape))
     for name, tensor in _tensors_of(eager, recurse=True):
         *path, leaf = name.split(".")
@@ -291,7 +307,11 @@ class ModelPrediction(EngineModel):
         return f"{reducer} under {classifier}, {self.folds} folds, {type(self.rule).__name__}"
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with this model's classifier settings, folds and novelty."""
+        """Return the recipe with this model's own settings in place of its.
+
+        These are radius, alpha, lower bound and interval of the classifier, folds (2 at least) and
+        novelty. The recipe's reducer stays.
+        """
         classifier = self.classifier
         policy = replace(
             recipe.policy,
@@ -324,13 +344,15 @@ class ModelPrediction(EngineModel):
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
         """Train the reducer from scratch, and make every trace a reference.
 
+        Scales and novelty gate are computed anew as well. The rule stays as it is.
+
         Parameters
         ----------
         X : array, shape (n, samples) or (n, channels, samples)
         y : array of int, shape (n,)
             1 is success, 0 is failure.
         hashes : array of int64, shape (n,), optional
-            `folds.trace_hash` of each trace; None: of its content.
+            `folds.trace_hash` of each trace, which gives its fold; None: of its content.
 
         Returns
         -------
@@ -357,6 +379,8 @@ class ModelPrediction(EngineModel):
     ) -> Self:
         """Train the reducer, from its last training where it can, and make every trace a reference.
 
+        It replaces `index`, `scale`, `gate` and `trace_shape` and drops the decider. Of more traces
+        than the classifier's capacity the last become references. The rule stays as it is.
         Parameters and result as of `EngineModel.train`.
         """
         X = clip_extremes(X)
@@ -385,8 +409,9 @@ class ModelPrediction(EngineModel):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
-        Before the first training, a template of the decider is compiled as well: the first retrain
-        has no time for that.
+        Before the first training, a template of the decider is compiled meanwhile: the first
+        retrain has no time for that. The call returns when both are done, and raises what the
+        reducer raised.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -399,7 +424,10 @@ class ModelPrediction(EngineModel):
             computing.result()
 
     def _compile_template(self, encoder: Any, trace_shape: tuple[int, ...]) -> None:
-        """Compile the decider's template for traces of this shape (C, T), with empty references."""
+        """Compile a decider for traces of this shape (C, T), with empty references, and drop it.
+
+        Its template stays in the process, for `compiled`. Nothing in the model changes.
+        """
         channels, samples = trace_shape
         gate = NoveltyGate(channels, samples)
         gate.disabled = not self.novelty
@@ -414,7 +442,8 @@ class ModelPrediction(EngineModel):
         """Take over the rule of the previous model, stale or not, and build the decider.
 
         It is built for the conditions under which the previous model decided. A decider that was
-        built with that rule for these is kept.
+        built with that rule for these is kept. Nothing happens if the previous model is no
+        `ModelPrediction`.
         """
         if not isinstance(previous, ModelPrediction):
             return
@@ -430,6 +459,8 @@ class ModelPrediction(EngineModel):
     def build_decider(self, conditions: DecisionConditions | None) -> Decider:
         """Build a decider that shares the references and the rule of this model.
 
+        It is returned, not kept; `decider` keeps one.
+
         Parameters
         ----------
         conditions : DecisionConditions or None
@@ -438,7 +469,9 @@ class ModelPrediction(EngineModel):
         Returns
         -------
         Decider
-            Compiled if encoder and rule can be compiled.
+            Compiled if encoder and rule can be compiled; otherwise Python asks the parts, of which
+            those that can be are compiled. A warning is logged if the code of a part was changed
+            after it was compiled.
 
         Raises
         ------
@@ -477,9 +510,11 @@ class ModelPrediction(EngineModel):
         return self.decider(self._conditions).predictor
 
     def decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Return the decider for these conditions; it is built where they are others than before.
+        """Return the decider for these conditions, and keep it.
 
-        Raises ValueError if nothing was fitted.
+        It is built anew if there is none, or if the conditions differ from those of the last call.
+        None stands for no force limits, no sensor limit and no audits. Raises ValueError if nothing
+        was fitted.
         """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
@@ -490,7 +525,9 @@ class ModelPrediction(EngineModel):
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
         """Make one labelled trace, shape (samples,) or (channels, samples), a reference.
 
-        `y` is 1 for success, 0 for failure. Returns self.
+        `y` is 1 for success, 0 for failure. The content of the trace gives its fold and part. The
+        reducer is not trained, and a full index drops its oldest reference. Returns self; raises
+        ValueError if nothing was fitted.
         """
         X = as_traces(np.asarray(x)[None])
         hash_ = int(content_hash(X)[0])
@@ -509,7 +546,9 @@ class ModelPrediction(EngineModel):
     ) -> Floats:
         """Add one labelled trace (channels, samples) to the index, in the space of its fold.
 
-        Returns its point (d,).
+        The hash of its part, `hash_`, gives the fold. The reference is `point` as it is, else the
+        row of `embedding` for that space, else computed. A full index drops its oldest reference.
+        Returns the point, float32 (d,), scaled.
         """
         if point is None:
             point = self._reference_point(x, hash_, embedding)
@@ -519,7 +558,7 @@ class ModelPrediction(EngineModel):
         return point
 
     def _reference_point(self, x: Floats, hash_: int, embedding: Embedding | None) -> Floats:
-        """Return the scaled point (d,) of a trace in the space of its fold.
+        """Return the scaled point of a trace (C, T) in the space of its fold, float32 (d,).
 
         It is taken from `embedding` (K, d), or computed where that is None.
         """
@@ -548,9 +587,11 @@ class ModelPrediction(EngineModel):
         predicted: int = 0,
         inclusion_probability: float = 1.0,
     ) -> None:
-        """Update the rule in place with the outcome of one part.
+        """Update the rule in place with the outcome of one part and the novelty of its trace.
 
-        An update that fails leaves `rule_is_stale` set.
+        The rule's `observe` is called first, then its `update`; arguments as of
+        `EngineModel.update_rule`. The compiled decider decides by the new state at once. If either
+        raises, `rule_is_stale` is set and the exception goes on to the caller.
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
@@ -579,7 +620,11 @@ class ModelPrediction(EngineModel):
         return self.rule.learns()
 
     def with_policy(self, policy: Policy) -> Self:
-        """Return a model under another policy, to be compiled anew around the same references."""
+        """Return a model under another policy, to be compiled anew around the same references.
+
+        Its rule has learned nothing and is not stale. This model does not change, but both share
+        the references.
+        """
         settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         model = copy.copy(self)
         model.classifier = clone(self.classifier).set_params(**settings)
@@ -593,10 +638,10 @@ class ModelPrediction(EngineModel):
         return SAFE_MODES[self.rule.safe_mode()]
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """Predict one trace (channels, samples).
+        """Predict one trace (channels, samples) without force limits, fault checks and audits.
 
         References of the part with this hash have no vote; 0 excludes none. Raises RuntimeError
-        where the rule is stale.
+        where the rule is stale, ValueError where nothing was fitted.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -608,9 +653,10 @@ class ModelPrediction(EngineModel):
         )
 
     def decide_one(self, x: Floats, part: int, conditions: DecisionConditions) -> Verdict:
-        """Decide on one trace by the compiled decider; arguments as of `EngineModel.decide_one`.
+        """Decide on one trace by the decider for these conditions; it is built if it is not there.
 
-        Raises RuntimeError where the rule is stale and the trace has no fault.
+        Arguments and result as of `EngineModel.decide_one`, but the embedding is the scaled one,
+        (K, d). Raises RuntimeError where the rule is stale and the trace has no fault.
         """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
@@ -630,9 +676,10 @@ class ModelPrediction(EngineModel):
         return [self.predict_one(x) for x in as_traces(X)]
 
     def count(self, X: ArrayLike) -> Counts:
-        """Count the labels in the neighbourhood of each trace, summed over the K spaces.
+        """Count the labels in the neighbourhood of each trace of X, summed over the K spaces.
 
-        Returns (n_success, n_failure), each an array of int64, shape (n,).
+        X has the shape (n, samples) or (n, channels, samples). Returns (n_success, n_failure), each
+        an array of int64, shape (n,); 0 for a novel trace. No part is excluded.
         """
         predictions = self.predict_many(X)
         n_success = np.array([prediction.n_success for prediction in predictions], dtype=np.int64)
@@ -640,7 +687,11 @@ class ModelPrediction(EngineModel):
         return n_success, n_failure
 
     def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (lower, upper), each of shape (n,): the bounds of each success probability."""
+        """Return (lower, upper), each float64 (n,): the bounds of each trace's success probability.
+
+        X has the shape (n, samples) or (n, channels, samples). The bound is (0, 1) for a novel
+        trace.
+        """
         predictions = self.predict_many(X)
         lower = np.array([prediction.lower for prediction in predictions])
         upper = np.array([prediction.upper for prediction in predictions])
@@ -651,7 +702,11 @@ class ModelPrediction(EngineModel):
         return np.array([prediction.action for prediction in self.predict_many(X)], dtype=object)
 
     def successor(self) -> "ModelPrediction":
-        """Return a model to train next, starting from this one; only the rule is shared."""
+        """Return a model to train next, with a copy of this one's reducer to start from.
+
+        Rule, references, scale and gate are this model's own objects. Training replaces the last
+        three in the successor only, so this model goes on deciding; `prepare` takes over the rule.
+        """
         model = copy.copy(self)
         model.spaces = copy.deepcopy(self.spaces)
         model._decider = None
@@ -666,7 +721,8 @@ class ModelPrediction(EngineModel):
         """Return the state as arrays by name.
 
         References and scale are always there; "reducer.", "rule." and "novelty." begin the names of
-        what these parts have. A stale rule is left out.
+        what these parts have. An enabled novelty gate is there, a disabled one not. Of a stale rule
+        only `rule_is_stale` is there.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()
@@ -682,7 +738,9 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        Raises StoreError for a reducer of that name that has another kind of state.
+        References, scale, rule and gate are restored, and the reducer if its state is there; the
+        decider is dropped. A state of a stale rule leaves the rule as it is. Raises StoreError for
+        a reducer of that name that has another kind of state, and for arrays of other sizes.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
@@ -705,9 +763,10 @@ class ModelPrediction(EngineModel):
         return not arrays_with_prefix(state, "reducer.")
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
-        """Return what an exporter starts from, by its own contract where `trace` is None.
+        """Return what an exporter starts from: this model and a trace contract.
 
-        Raises ExportError before the first training.
+        That is `trace`, or where it is None the shape of the traces it was trained on. Raises
+        ExportError before the first training.
         """
         if "trace_shape" not in vars(self):
             raise ExportError(
@@ -768,7 +827,10 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 
 
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
-    """Return a note for the retrain's report where many traces nearly repeat; "" where few do."""
+    """Return a note for the retrain's report where many traces nearly repeat; "" where few do.
+
+    Many are more than `SUSPICIOUS` by `near_repeats`, whose arguments it takes.
+    """
     n_repeats = near_repeats(traces, parts)
     if n_repeats <= SUSPICIOUS:
         return ""
