@@ -4,7 +4,8 @@
 >>> load_dataset("recorded.npz", samples=400)  # X (n, T) or (n, C, T), y (n,)
 >>> load_dataset("cell_3/", channel="FZ_Base,FX_Base")  # a CSV file for each insertion
 
-`load_dataset` reads them into one `Dataset`; `importing.import_labelled` puts them into a store.
+`load_dataset` reads them into one `Dataset`, `make_dataset` makes one of arrays;
+`importing.import_labelled` puts them into a store.
 """
 
 from .dataset import Dataset, Fault, make_dataset

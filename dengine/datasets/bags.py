@@ -75,7 +75,7 @@ class Messages(NamedTuple):
 
 
 def is_stream(path: Path) -> bool:
-    """Return whether a path is an MCAP file, or a folder that rosbag2 wrote."""
+    """Return whether a path is an MCAP file, or a folder with MCAP files or a rosbag2 database."""
     if not path.is_dir():
         return path.is_file() and path.suffix.lower() == SUFFIX
     has_files = any(path.glob(f"*{SUFFIX}"))
@@ -102,9 +102,10 @@ def _open_reader(path: Path) -> "Iterator[McapReader]":
 
 
 def _find_topics(files: Sequence[Path]) -> dict[str, str]:
-    """Return the name of the message type of each topic.
+    """Return the topics of the files, each with the name of its message type.
 
-    Raises DataError if a file has no summary, or is too large for the memory.
+    Only the summaries are read. Raises DataError if a file has none, or is too large for the
+    memory.
     """
     topics: dict[str, str] = {}
     for path in files:
@@ -123,9 +124,11 @@ def _find_topics(files: Sequence[Path]) -> dict[str, str]:
 
 
 def _read_messages(files: Sequence[Path], wrench: str, topics: Sequence[str]) -> Messages:
-    """Read all messages of the wrench and of other topics, in the order of the log.
+    """Read all messages of the wrench's topic and of other topics, in the order of the log.
 
     Times are the stamps of the wrench if all of its messages have one, else those of the log.
+    Raises DataError if there are fewer than two wrenches, or another topic's messages have no field
+    `data`.
     """
     others: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in topics}
     stamped = []
@@ -171,11 +174,15 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
     options : LoadOptions
         A trigger and labels must be stated.
 
+    Returns
+    -------
+    Dataset
+
     Raises
     ------
     DataError
-        If options are missing or name topics that are not there, a file is damaged, or no
-        insertion is found.
+        If options are missing or name topics that are not there, a file is damaged, or no insertion
+        is found.
     """
     channels = options.channels or ("FZ",)
     for channel in channels:
@@ -233,9 +240,10 @@ def _cut_dataset(
     name: str,
     options: LoadOptions,
 ) -> Dataset:
-    """Cut a stream into insertions by its trigger, and return them with their labels.
+    """Cut a stream into insertions by its trigger, and return them with their labels as a data set.
 
-    Raises DataError if the trigger never starts.
+    Insertions are named NAME/1, NAME/2, ... By default each lasts two seconds. Those with missing
+    messages become faults. Raises DataError if the trigger never starts.
     """
     active = trigger.active({signal: messages.signal(signal) for signal in trigger.signals})
     values = messages.wrench[:, [axis_of(channel) for channel in channels]]
@@ -320,7 +328,7 @@ def _usual_step(times: Times) -> float:
 
 
 def _place_messages(times: Times, step: float) -> NDArray[np.int64]:
-    """Return the place of each message in steps, shape (n,).
+    """Return the place of each message on a grid of steps, shape (n,).
 
     A late message keeps its own place; a lost one leaves its place empty. After a lost message all
     others are later by a step, for good; after a late one they are not. So the least lateness of
@@ -345,7 +353,8 @@ def _cut_stream(
 ) -> Iterator[RecordedInsertion]:
     """Cut a stream where its trigger starts, and yield each insertion with its trace, or its fault.
 
-    An insertion with missing messages, or times that turn back, has a fault.
+    An insertion with missing messages, or times that turn back, has a fault. While one lasts, the
+    trigger starts no other.
 
     Parameters
     ----------

@@ -73,9 +73,9 @@ class Clock(NamedTuple):
 
 
 def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
-    """Return the numbers of a column, shape (n,), and the index of each cell that is no number.
+    """Return the numbers of a column, shape (n,), and the index label of each cell that is none.
 
-    Empty cells become NaN.
+    These and empty cells are NaN; empty cells are not listed.
     """
     import pandas as pd
 
@@ -93,7 +93,7 @@ def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
 
 
 def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
-    """Return the position of the clock's column; None if none is known.
+    """Return the position of the clock's column, by its name or else its values; None without one.
 
     time : its name, if the user stated it; UnreadableError if there is no such column.
     """
@@ -111,20 +111,26 @@ def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
 
 
 def rising_columns(frame: pd.DataFrame) -> list[int]:
-    """Return the positions of columns that rise steadily: a clock, or the tool's path."""
+    """Return the positions of columns that rise steadily, by their first 200 rows.
+
+    Such a column may be a clock, or the tool's path.
+    """
     head = frame.iloc[:HEAD]
     return [i for i in range(frame.shape[1]) if is_rising(floats(head.iloc[:, i])[0])]
 
 
 def _rising_share(cells: pd.Series) -> float:
-    """Return the share of a column's steps that rise, of numbers or times."""
+    """Return the share of a column's steps that rise, of numbers or times; 0 without steps."""
     times, wrong = floats(cells)
     steps = np.diff(_parse_timestamps(cells)[0] if 2 * len(wrong) >= len(cells) else times)
     return float((steps > 0).mean()) if len(steps) else 0.0
 
 
 def is_rising(times: NDArray[np.float64]) -> bool:
-    """Return whether numbers rise steadily: 90 % of the steps are within half of their median."""
+    """Return whether numbers rise steadily: all steps, of which 90 % are about equal.
+
+    About equal are those within half of their median. False for fewer than three numbers.
+    """
     steps = np.diff(times)
     if len(steps) < 2 or not (steps > 0).all():
         return False
@@ -135,8 +141,8 @@ def is_rising(times: NDArray[np.float64]) -> bool:
 def _is_clock(cells: pd.Series, name: str) -> bool:
     """Return whether a column is a clock by its values.
 
-    It is if it holds times as text that rise, times since an epoch, or if it has no name and rises
-    steadily by steps other than 1.
+    It is if it holds times as text that rise, or rising times since an epoch, or if it has no name
+    and rises steadily by steps other than 1. False for fewer than three rows.
     """
     times, wrong = floats(cells)
     if len(cells) < 3:
@@ -152,9 +158,10 @@ def _is_clock(cells: pd.Series, name: str) -> bool:
 
 
 def _epoch_unit(times: NDArray[np.float64]) -> float | None:
-    """Return the seconds in one of numbers that count since an epoch; None if they do not.
+    """Return the seconds in one count if numbers count since an epoch; None if they do not.
 
-    They do if they then are dates from 2000 to 2100, which at most one epoch makes of a number.
+    They do if the first one then is a date from 2000 to 2100, which at most one epoch makes of a
+    number.
     """
     earliest, latest = PLAUSIBLE_DATES
     for unit, before_1970 in EPOCHS:
@@ -203,7 +210,7 @@ def clock_of(
     Returns
     -------
     Clock or None
-        None if no clock is known.
+        None if no clock is known, or there are fewer than two rows.
 
     Raises
     ------
@@ -346,7 +353,8 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
 def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tuple[float, str]:
     """Return the seconds in one count of a clock, and a note for the user if that was assumed.
 
-    Its name or the row of units states them; else they follow from its values.
+    Its name or the row of units states them; else they follow from its values. Raises
+    UnreadableError for counts that are too large for a duration and give no plausible date.
     """
     stated = _stated_unit(name, unit)
     if stated is not None:

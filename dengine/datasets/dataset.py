@@ -196,7 +196,11 @@ class Dataset:
         return pd.concat([pd.DataFrame(columns), samples], axis=1)
 
     def cut(self, samples: int) -> "Dataset":
-        """Return the first `samples` samples of every trace: an earlier moment to decide at."""
+        """Return a data set of the first `samples` samples of every trace, to decide earlier.
+
+        Raises DataError if the traces are shorter, or were resampled, so that their first samples
+        are not the first of the recordings.
+        """
         have = self.X.shape[-1]
         expect_data(1 <= samples <= have, f"1 to {have} samples of {self.name}", samples)
         can_cut = samples == have or self.fit != "resample"
@@ -215,7 +219,7 @@ def make_dataset(
     cause: Any = None,
     **about: Any,
 ) -> Dataset:
-    """Make a `Dataset` of arrays.
+    """Check arrays and make a `Dataset` of them.
 
     Parameters
     ----------
@@ -390,9 +394,10 @@ class RecordingCollector:
         return f"{text} ({', '.join(words)})" if words else text
 
     def add(self, source: str, read: Callable[[], Recording], line: int = 0) -> None:
-        """Add the recording that `read` returns, or a fault if it raises.
+        """Call `read` and add the recording that it returns, or a fault if it raises.
 
-        A recording without a label yet is only counted. `line` of the source, if it is known.
+        Only OSError, TraceError and UnreadableError become faults. A recording without a label yet
+        is only counted. `line` is that of the source, for the fault, if it is known.
         """
         try:
             self.recordings.append(read())
@@ -513,8 +518,9 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
 def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) -> str:
     """Convert the recordings, channel by channel, and return the unit of all, or one for each.
 
-    It is the unit that the user stated, else the one of most recordings. A recording whose unit
-    cannot be converted, or that states none although others do, becomes a fault.
+    It is the unit that the user stated, else the one of most recordings, else a guess by the
+    channels' names. A recording whose unit cannot be converted, or that states none although others
+    do, becomes a fault. The collector is changed, and gets a note for each conversion.
     """
     recordings = collector.recordings
     n = max((len(recording.units) for recording in recordings), default=0)
@@ -695,15 +701,17 @@ def choose_fit(lengths: NDArray[np.int64], fit: str | None, samples: int | None)
 
 
 def refit(data: Dataset, options: LoadOptions, *, has_unit: bool = True) -> Dataset:
-    """Bring a data set whose traces have one length to the channels, unit, rate and length stated.
+    """Return a data set with the channels, unit, rate and length that the options state.
+
+    The given one is not changed. A stated rate replaces the old one without interpolation.
 
     Parameters
     ----------
     data : Dataset
     options : LoadOptions
     has_unit : bool, default True
-        Whether `data.unit` is known: it is then converted to a stated unit. False: the stated
-        unit is that of the samples as they are.
+        Whether `data.unit` is known: it is then converted to a stated unit. False: the stated unit
+        is that of the samples as they are.
 
     Raises
     ------
@@ -733,7 +741,7 @@ def refit(data: Dataset, options: LoadOptions, *, has_unit: bool = True) -> Data
 
 
 def _select_channels(data: Dataset, channels: tuple[str, ...]) -> Dataset:
-    """Return a data set with these of its channels, and their units."""
+    """Return a data set with the channels of these names alone, in this order, and their units."""
     places = [data.channels.index(name) for name in channels]
     X = data.X[:, places[0]] if len(places) == 1 else data.X[:, places]
     all_units = split_unit(data.unit, data.X.shape[1])
@@ -776,7 +784,7 @@ def _fit_array(x: NDArray[np.float32], samples: int, fit: str) -> NDArray[np.flo
 
 
 def _fit_text(samples: int, fit: str) -> str:
-    """Return which lengths can be fitted to `samples`, for an error."""
+    """Return a text for an error: which lengths `fit` brings to `samples` samples."""
     if fit == "cut":
         return f"at least {samples} samples"
     return f"{(samples + 1) // 2} to {2 * samples} samples, to {fit} them to {samples}"

@@ -50,11 +50,11 @@ RATE_TOLERANCE = 0.02  # relative error of rates that are measured from timestam
 
 
 def stored_form(store: "StoreLike", source: Any) -> dict[str, Any]:
-    """Return the `samples` and `fit` by which recordings get the form of those in a store.
+    """Return the options `samples` and `fit` by which recordings get the form of those in a store.
 
     Without them files that are added would change the median length to which all are padded: all
-    would come out changed, and count again. Empty for a new store, and for other sources than
-    folders and tables.
+    would come out changed, and count again. The dict is empty for a new store, and for other
+    sources than folders and tables. The store is read, and closed if it was given by its address.
     """
     if not isinstance(source, str | os.PathLike):
         return {}
@@ -137,7 +137,7 @@ def import_labelled(
     on_traces: Callable[[int], None] | None = None,
     allow_import: bool = False,
 ) -> ImportReport:
-    """Put every labelled trace of a data set into a store, in order.
+    """Put every labelled trace of a data set into a store, in order; nothing is trained.
 
     Chunks of them are stored all or none: an import that was interrupted continues where it
     stopped. The same file twice counts no label twice.
@@ -145,7 +145,7 @@ def import_labelled(
     Parameters
     ----------
     store : path, URL or store
-        A new store or a used one.
+        A new store, which is created, or a used one. A store object stays open.
     dataset : object
         Anything `load_dataset` takes.
     recipe, seed : optional
@@ -191,6 +191,9 @@ def import_parts(
 ) -> ImportReport:
     """Put parts with their decisions into a store, in chunks that are stored all or none.
 
+    A decision whose id has a label in the store stays as it is, and its label here is counted as
+    repeated or contradicted. A trace with a fault is stored, but never trains.
+
     Parameters
     ----------
     store : SqlStore
@@ -207,7 +210,7 @@ def import_parts(
     Returns
     -------
     ImportReport
-        It counts labels.
+        It counts labels; `resumed` is True.
     """
     gate = TraceGate(trace_spec)
     counts = Counter[str]()

@@ -172,12 +172,12 @@ def label_of(word: Any, words: LabelMap = NO_WORDS) -> int:
 
 
 def _letters(text: str) -> str:
-    """Return a text in lower case, without marks between its letters: `n.i.O.` as `nio`."""
+    """Return a text in lower case without anything but letters and digits: `n.i.O.` as `nio`."""
     return re.sub(r"[\W_]", "", text).lower()
 
 
 def _label_of_match(match: re.Match[str]) -> int:
-    """Return the label of a match of `WORD`; a not before the word reverses it."""
+    """Return the label, 1 or 0, of a match of `WORD` or `IN_CELL`; a not before it reverses it."""
     groups = match.groupdict()
     word = _letters(groups["word"] or groups["digit"])
     return int(MEANING[word] != bool(groups["not"]))
@@ -186,7 +186,8 @@ def _label_of_match(match: re.Match[str]) -> int:
 def parse_label_map(label_map: Mapping[str, Any] | str | None) -> dict[str, bool]:
     """Parse the user's own label words: "i.O.=good,n.i.O.=bad", or a dict of words and labels.
 
-    Returns each word in lower case, and whether it is good. Raises DataError for another form.
+    Returns each word in lower case, and whether it is good; an empty dict for None. Raises
+    DataError for another form.
     """
     wanted = "word=good or word=bad, with commas between"
     if isinstance(label_map, Mapping):
@@ -296,7 +297,7 @@ class LabelColumn:
     def label_of_cells(self, cells: Iterable[Any]) -> int:
         """Return the label that all cells mean; those of a part that is not checked do not count.
 
-        Raises UnreadableError if they differ, and as `label_of`.
+        Raises UnlabelledError if all are empty, UnreadableError if they differ, and as `label_of`.
         """
         texts = list(dict.fromkeys(str(cell).strip() for cell in cells))
         stated = self.stated(texts)
@@ -316,7 +317,10 @@ class LabelColumn:
 
 
 def _read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
-    """Return the cells of a column of a file."""
+    """Read a file and return the cells of one of its columns as texts.
+
+    Raises UnreadableError if the file or the column cannot be read.
+    """
     # Without stated columns the label needs no number format.
     frame = read_table(path, options if options.columns else None).frame
     return list(map(str, frame.iloc[:, column_place(column, list(frame.columns))]))
@@ -331,6 +335,7 @@ def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOption
     label_column = LabelColumn(column, options.words, notes)
 
     def find(name: str) -> LabelAndPart:
+        """Return the label that all cells of a recording's column mean, and no part's number."""
         return label_column.label_of_cells(_read_cells(paths[name], column, options)), None
 
     advice = f"column {column} has none; name another column (label)"
@@ -460,7 +465,8 @@ def _remove_label(name: str, words: LabelMap) -> str:
 def _components(name: str) -> list[tuple[str, int]]:
     """Return the parts of a path with their positions in it.
 
-    The file's name without suffix comes first, then the folders from the nearest on.
+    The file's name comes first, without suffix and without what a file manager adds to a copy, then
+    the folders from the nearest on.
     """
     *folders, file = name.split("/")
     starts = [sum(len(folder) + 1 for folder in folders[:i]) for i in range(len(folders))]
@@ -484,7 +490,11 @@ def _found_labels(name: str, words: LabelMap) -> list[_FoundLabel]:
 
 
 def _labels_in_file(file: str, start: int, words: LabelMap) -> list[_FoundLabel]:
-    """Return the labels in a file's name without suffix, which begins at `start` of the path."""
+    """Return the labels in a file's name without suffix, which begins at `start` of the path.
+
+    The word at its end decides. Words in its middle are listed too, but only to find
+    contradictions. Numbers are labels only if they are in `words`, the user's label map.
+    """
     digit = re.search(r"(?:^|(?<=[_\- ]))\d+$", file)
     numbers = []
     if digit and digit[0] in words:
@@ -581,7 +591,7 @@ def labels_in_file(
     part : str
         Column of parts' numbers.
     names : sequence of str
-        Names of all recordings.
+        Names of all recordings. A row of the file that names none of them is a fault of the source.
     words : mapping of str to bool
         As in `label_of`.
 
@@ -599,6 +609,7 @@ def labels_in_file(
         rows_by_file[row.words[0]].append(row)
 
     def is_end(row: _LabelRow, name_words: tuple[str, ...]) -> bool:
+        """Return whether two paths agree as far as both go, from the file on."""
         return all(a == b for a, b in zip(row.words, name_words, strict=False))
 
     name_words = {name: _path_words(name) for name in names}
@@ -749,7 +760,7 @@ def collect_recordings(
         Reads the trace at a place.
     source : LabelSource
     collector : RecordingCollector
-        Gets the recordings, and faults of those that cannot be read.
+        Gets the recordings, the faults of those that cannot be read, and the notes of the source.
 
     Raises
     ------

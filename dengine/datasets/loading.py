@@ -166,7 +166,7 @@ def load_dataset(
 
 
 def _why_unused(options: Sequence[str]) -> str:
-    """Return why a source does not take these options, for an error."""
+    """Return the reason, for an error, why a source does not take the first of these options."""
     if {"trigger", "topic"} & set(options):
         return "only one long recording is cut"
     if "time" in options:
@@ -182,7 +182,8 @@ def _find_reader(
     """Find the reader of a source.
 
     Returns what to call the source in errors, the names of the optional options that apply to it,
-    and a function that reads it.
+    and a function that reads it. Nothing but headers is read here. Raises DataError for a source of
+    an unknown kind.
     """
     if isinstance(source, Dataset):
         return "a Dataset", (), partial(refit, source, options)
@@ -203,9 +204,11 @@ def _find_reader(
 def _find_file_reader(
     path: Path, options: LoadOptions
 ) -> tuple[Sequence[str], Callable[[], Dataset]]:
-    """Find the reader of a file or folder, as `_find_reader`.
+    """Find the reader of a file or folder by its suffix and its content.
 
-    It is a bag, a folder with a recording in each file, or tables or archives of many.
+    It reads a bag, a folder with a recording in each file, a store, or tables or archives of many
+    recordings. Returns the optional options that apply, and a function that reads it. Raises
+    DataError if it is none of these.
     """
     name = path.resolve().name if path.is_dir() else path.stem
     if is_stream(path):
@@ -466,7 +469,7 @@ def _from_arrays(
 
 
 def _index_as_column(frame: Any) -> Any:
-    """Return a DataFrame whose index is a column, if the index may be a clock."""
+    """Return a DataFrame with its index as a column if it holds numbers or times: maybe a clock."""
     return frame.reset_index() if frame.index.dtype.kind in "fMm" else frame
 
 

@@ -85,9 +85,10 @@ def _proves(mark: str, text: str) -> bool:
 
 
 def _looks_grouped(text: str, mark: str) -> bool:
-    """Return whether a mark groups the thousands of a column.
+    """Return whether a mark seems to group the thousands in a column's cells, one on each line.
 
-    It does if all numbers of four digits and more have it, and smaller ones do not.
+    It does if all numbers of four digits and more have it, at least 44 of them, smaller ones do not
+    have it, and no cell proves it to be the decimal mark.
     """
     if mark not in text or PROOFS[mark].search(text):
         return False
@@ -97,7 +98,7 @@ def _looks_grouped(text: str, mark: str) -> bool:
 
 
 def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None:
-    """Find the decimal mark of a file.
+    """Find the decimal mark of a file by its cells.
 
     Parameters
     ----------

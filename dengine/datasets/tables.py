@@ -105,9 +105,9 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
 
 
 def hold_many(named: Mapping[str, Path], options: LoadOptions) -> bool:
-    """Return whether each file of a folder holds many insertions, as tables do.
+    """Return whether each file of a folder is a table of many insertions, and not one recording.
 
-    False if each text file is one recording.
+    Parquet and .npz files are such tables; of text files the first one's header and the names tell.
     """
     path = next(iter(named.values()))
     if path.suffix.lower() not in TEXTS:
@@ -148,6 +148,11 @@ def read_folder(
     name : str
         Name of the data set.
     options : LoadOptions
+
+    Returns
+    -------
+    Dataset
+        In the natural order of the names without their labels.
 
     Raises
     ------
@@ -227,7 +232,7 @@ def _label_source(
 
 
 def _has_label_column(named: Mapping[str, Path], options: LoadOptions) -> bool:
-    """Return whether a column of the files has labels, and the first file one label in it."""
+    """Return whether the files have a column of labels, in which the first file has a label."""
     with suppress(DataError):
         _, column = _label_source(named, options)
         if column is not None:
@@ -253,7 +258,10 @@ def _count_labels(names: Iterable[str], source: labels.LabelSource) -> Counter[A
 
 
 def _look_like_labels(counts: Counter[Any]) -> bool:
-    """Return whether most are labels, or words so few that a user can state their meaning."""
+    """Return whether counts of `_count_labels` are those of labels: most names have one.
+
+    Known labels count, and words so few that a user can state their meaning.
+    """
     words = set(+counts) - {None, ""}
     is_few = words <= {0, 1} or 2 <= len(words) <= MAX_LABEL_WORDS
     return counts.total() > 2 * counts[None] and is_few
@@ -310,7 +318,7 @@ def _label_advice(named: Mapping[str, Path], options: LoadOptions) -> str | None
 
 
 def _common_decimal_mark(paths: Sequence[Path], options: LoadOptions) -> str | None:
-    """Return the decimal mark that the files of a folder prove; None if it is none, or several."""
+    """Return the one decimal mark that all files of a folder prove; None if none or several do."""
     marks = set[str]()
     for path in paths:
         with suppress(UnreadableError, OSError):
@@ -329,7 +337,7 @@ def _unread_files_note(folder: Path, named: Mapping[str, Path], options: LoadOpt
 
 
 def _first_rows(path: Path, options: LoadOptions) -> list[list[str]]:
-    """Return the header and the first rows of a text file.
+    """Return the header and the first rows of a text file, up to 100 lines.
 
     One empty row if they cannot be read: the error comes when the whole file is read.
     """
@@ -342,7 +350,7 @@ def _first_rows(path: Path, options: LoadOptions) -> list[list[str]]:
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Return a sort key by which numbers in names are ordered by their size."""
+    """Return a sort key by which names are ordered in lower case, and their numbers by size."""
     words = re.split(r"(\d+)", name.lower())
     return [(0, int(word), "") if word.isdecimal() else (1, 0, word) for word in words if word]
 
@@ -350,9 +358,9 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 def _usual_channels(
     paths: Iterable[Path], options: LoadOptions, label: str | None = None
 ) -> tuple[str, ...]:
-    """Return the force if a file has it or none has channels, else the only channel of most files.
+    """Return `FZ_Base` if a file has it or none has channels, else the only channel of most files.
 
-    Raises DataError if these have several.
+    Raises DataError if most files have several channels.
 
     label : the column of labels, which is no channel.
     """
@@ -427,7 +435,10 @@ def _number_rows(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def from_frame(frame: pd.DataFrame, options: LoadOptions) -> Dataset:
-    """Make a data set of a DataFrame, a wide or a long table; its rows count from 1 in faults."""
+    """Make a data set of a DataFrame, a wide or a long table; its rows count from 1 in faults.
+
+    Raises DataError as `_from_tables`.
+    """
     return _from_tables({"row": _number_rows(frame)}, options, RecordingCollector("data", ()))
 
 
@@ -465,7 +476,7 @@ def _from_tables(
 
 
 def _check_columns(frame: pd.DataFrame, source: str) -> None:
-    """Raise DataError for a column that holds lists, or occurs twice."""
+    """Raise DataError if a column of a table holds lists, or two columns have one name."""
     for name in frame.columns:
         is_single = (frame.columns == name).sum() == 1 and len(frame) > 0
         if is_single and isinstance(frame[name].iloc[0], list | tuple | np.ndarray):
@@ -496,7 +507,9 @@ def _add_wide_rows(
     """Add each row of a wide table to a collector as a recording.
 
     An empty cell before others is NaN, which the engine finds. A row whose last cells are empty is
-    a shorter trace. A row with text among its samples, or without a label, is a fault.
+    a shorter trace. A row with text among its samples, or with an unknown label, is a fault; one
+    with an empty label is counted. Raises DataError if the columns of labels, parts or samples are
+    not found.
     """
     label_column = _label_column(frame, options)
     if options.part != "part" and options.part not in frame:
@@ -526,10 +539,10 @@ def _add_wide_rows(
 
 
 def _concatenate_long(tables: Mapping[str, pd.DataFrame], options: LoadOptions) -> pd.DataFrame:
-    """Concatenate long tables.
+    """Return long tables as one, in their order.
 
-    The same part's number in two files means two parts: the file's name is then put before it.
-    Exception: a part that ends one file and begins the next is one part.
+    The same part's number in two files means two parts: both get their file's name before the
+    number. But a part that ends one file and begins the next is one part.
     """
     import pandas as pd
 
@@ -599,6 +612,7 @@ def _from_long(
     label_cells = labels.LabelColumn(label or "", options.words, collector.notes)
 
     def find(part: str) -> labels.LabelAndPart:
+        """Return the label of a part in its rows, and None: `part` is its number already."""
         return label_cells.label_of_cells(rows_of_part[part][label]), None
 
     label_source = labels.LabelSource(find, "name the column of labels (label)")
@@ -627,7 +641,7 @@ def _check_single_station(rows_of_part: Mapping[str, pd.DataFrame], columns: Seq
 
 
 def _are_stations(rows: pd.DataFrame, name: str) -> bool:
-    """Return whether the values of a column stand for recordings that overlap in time."""
+    """Return whether the values of a column stand for several recordings that overlap in time."""
     times = rows[SECONDS_COLUMN].to_numpy()
     runs = [run for _, run in rows.groupby(name)[SECONDS_COLUMN]]
     all_steps = [np.diff(run.to_numpy()) for run in runs]

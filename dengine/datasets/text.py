@@ -143,7 +143,7 @@ def _find_delimiter(lines: Sequence[str]) -> str:
     """Return the delimiter that splits lines best.
 
     It gives the most cells that are numbers or times, the same number of cells in each line, and a
-    header with as many.
+    header with as many. If none does, "," is returned.
     """
     sample = [units.COMMENT_MARK.sub("", line) for line in lines[-SAMPLED_LINES:]]
     top = [units.COMMENT_MARK.sub("", line) for line in lines[:-1][:100]]
@@ -184,7 +184,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _without_trailing_empty(row: list[str]) -> list[str]:
-    """A row without the empty cells at its end."""
+    """Return a row without the empty cells at its end."""
     n = len(row)
     while n and not row[n - 1]:
         n -= 1
@@ -258,7 +258,7 @@ def _pad_units(units_row: list[str], n: int) -> list[str]:
 
 
 def _columns_advice(rows: list[list[str]]) -> str:
-    """Return advice on how to name the columns of a file without a header."""
+    """Return advice, for an error, on how to name the columns of a file without a header."""
     sample = [row for row in rows[:200] if len(row) == len(rows[0])]
     try:
         first = [float(row[0].replace(",", ".")) for row in sample]
@@ -273,7 +273,8 @@ def _columns_advice(rows: list[list[str]]) -> str:
 def decode(content: bytes) -> tuple[str, str]:
     """Return the text of a file, and the name of its encoding.
 
-    UTF-8, UTF-16 by its mark or its zeros, else Windows-1252 or Latin-1.
+    UTF-16 is known by its mark or its zeros; else UTF-8, Windows-1252 and Latin-1 are tried in this
+    order, of which the last reads anything.
     """
     head = content[:400]
     encodings = ["utf-8-sig", "Windows-1252"]
@@ -294,7 +295,7 @@ def read_table(
     notes: Counter[str] | None = None,
     decimal: str | None = None,
 ) -> TextTable:
-    """Read a text file as a table.
+    """Read a text file as a table of texts.
 
     Parameters
     ----------
@@ -380,7 +381,7 @@ def read_recording(
     notes: Counter[str],
     decimal: str | None = None,
 ) -> TimedTrace:
-    """Read the channels of a file that holds one recording.
+    """Read the channels of a file that holds one recording, in the order of `channels`.
 
     `notes` and `decimal` are as in `read_table`. Raises UnreadableError, with the line, for a cell
     or row that cannot be read.

@@ -82,9 +82,9 @@ class Trigger:
     ----------
     kind : {"bit", "register", "contact", "motion"}
         bit: bit `number` of a word is set, counted from 0. register: the signal has the value
-        `number`, or any but zero if that is None. contact: the force is at least `number` newtons
-        above what the sensor shows in free motion. motion: the tool moves faster than `number`
-        metres a second; the signal is a vector.
+        `number`, or any but zero if that is None. contact: the force is at least `number` newtons,
+        in either direction, as recorded. motion: the tool moves faster than `number` metres a
+        second; the signal is a vector.
     number : float or None
     signal : str
         Name of the signal.
@@ -183,7 +183,9 @@ class StartFinder:
         self._last_off = 0.0
 
     def feed(self, time: float, active: bool) -> Start | None:
-        """Take the next sample, and return the start of an insertion if this sample shows one.
+        """Take the next sample; return the start of an insertion if it shows one, else None.
+
+        The trigger must be on at this sample, and have been off for `quiet_s` before.
 
         If samples are missing just before it, the insertion may have begun in any of them, so the
         place of no sample in its trace is known: `Start.seen` is False.
@@ -216,6 +218,11 @@ def place(
         Places in the trace.
     step : float
         Seconds from one place to the next.
+
+    Returns
+    -------
+    Placed
+        Samples before or behind the trace are left out; of several at one place the first stays.
     """
     trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
     at = np.rint((np.asarray(times, dtype=np.float64) - start) / step).astype(np.int64)

@@ -106,7 +106,7 @@ def parse(unit: str) -> tuple[str, float] | None:
 
 
 def spelling(unit: str) -> str:
-    """Return a unit as it is usually spelled: kN for KN; the same text if it is none.
+    """Return a unit as it is usually spelled: kN for KN; the same text if it is no unit.
 
     A unit of one letter, and one that two units could be, as mn of mN and MN, is not changed.
     """
@@ -154,9 +154,11 @@ def split(name: str) -> tuple[str, str]:
 
 
 def find_columns(name: str, columns: Sequence[str]) -> list[int]:
-    """Return where columns have a name: as it is written, else in any case, else without unit.
+    """Return the positions of the columns that have a name.
 
-    The list is empty if no column has it, and longer than one if several have.
+    Columns that are written so come first; only without any those in another case, and without
+    these those that are alike without their units. The list is empty if no column has it, and
+    longer than one if several have.
     """
     bare = split(name)[0].lower()
     for is_same in (
