@@ -89,7 +89,7 @@ def load_past_version(
     """Load a model version from the store as it was when a decision was made.
 
     Its references and its rule include the labels that had come by then. Later corrections are not
-    applied. Nothing is written.
+    applied.
 
     Parameters
     ----------
@@ -220,8 +220,8 @@ def _restore_thresholds(
 def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     """Return the decision rule as it is now: the stored rule, updated with all outcomes since.
 
-    If outcomes were corrected or a check is overdue, it is rebuilt from all outcomes. Nothing is
-    written.
+    If outcomes were corrected or a check is overdue, it is rebuilt from all outcomes. The stored
+    rule does not change.
 
     Parameters
     ----------
@@ -623,7 +623,7 @@ def _explain_saturated(
 def _explain_not_finite(
     decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
 ) -> str:
-    """Return the rest of the sentence on a trace with NaN or infinity: how many samples are."""
+    """Return the rest of the sentence on a trace with NaN or infinity, with their number."""
     n = int((~np.isfinite(trace)).sum())
     return (
         f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded "
@@ -687,7 +687,8 @@ def _bound_sentences(
     """Yield the sentences on a decision's evidence, its bounds, and what it would have needed.
 
     The last is said of the action that the model decided on; for an uncertain decision of the
-    action that needed fewer labels.
+    action that needed fewer labels. If nothing could pass, it says so instead. For a model that
+    decides by its own method there is one sentence, with its counts and bounds.
     """
     n = decision.n_success + decision.n_failure
     interval = f"{decision.lower:.3f} to {decision.upper:.3f}"
@@ -872,7 +873,8 @@ class Explanation:
 def find_decision_id(store: SqlStore, part: str) -> str:
     """Return the id of the decision on a part.
 
-    If a part was decided on again after rejects, the rejects do not count.
+    If a part was decided on again after rejects, the rejects do not count. Only the newest 20
+    decisions on the part are looked at.
 
     Parameters
     ----------
@@ -995,9 +997,11 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
 def _find_neighbourhood(
     item: StoredDecision, version: PastVersion | None, recipe: Recipe
 ) -> Neighbourhood | None:
-    """Return the distances of a decision's trace to a version's references, and its counts.
+    """Measure the distances from a decision's embedding to the references of a version.
 
-    None if the trace was not embedded, or the version is not kept.
+    Return them with the successes and failures within the radius, counted again. References of the
+    decision's own part are infinitely far. None if the trace was not embedded, or the version is
+    not kept.
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:

@@ -245,8 +245,8 @@ class Status:
         """What somebody should look at, in a sentence, of several the most urgent; "" if nothing.
 
         In this order: the store, safe mode, bad accepts, good rejects, dropped retrains, shadow
-        mode's errors, novel traces, parts outside limits, errors of the model. Only the newest
-        decisions count.
+        mode's errors, novel traces, parts outside limits, errors of the model. Of the decisions
+        only the newest count.
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -314,7 +314,7 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
 
 
 def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:
-    """Read the status of an engine from its store; nothing is written.
+    """Read the status of an engine from its store.
 
     Parameters
     ----------
@@ -434,8 +434,8 @@ def _estimate_error(
 ) -> ErrorEstimate:
     """Return the estimate if `n_wrong` of `n_known` parts were decided wrongly.
 
-    Its bounds are the two-sided Wilson interval at error level `alpha`, 0 and 1 without known
-    parts. `n` is the number of all parts, by default `n_known`.
+    Its bounds are the two-sided Wilson interval at error level `alpha`; without known parts they
+    are 0 and 1, and its basis is "". `n` is the number of all parts, by default `n_known`.
     """
     low, high = wilson_interval(n_known - n_wrong, n_wrong, alpha)
     lower = 1.0 - high

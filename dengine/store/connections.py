@@ -649,7 +649,10 @@ class Database:
     def insert_corrections(
         self, connection: sa.Connection, rows: Sequence[Mapping[str, Any]]
     ) -> None:
-        """Insert rows of corrections, each with the number of the newest label as `newest_seq`."""
+        """Insert rows of corrections in a write transaction, each with the next number.
+
+        Each also gets the number of the newest label so far, as `newest_seq`.
+        """
         newest = self.scope.next_number(connection, LABEL.c.seq) - 1
         self.insert(
             connection, CORRECTION.c.number, [{**row, "newest_seq": newest} for row in rows]
@@ -705,7 +708,7 @@ class Database:
     def _insert_records(
         self, connection: sa.Connection, records: Sequence[Record]
     ) -> list[tuple[str, int]]:
-        """Insert the decisions, labels and events that are not stored yet.
+        """Insert the decisions, labels and events that are not stored yet; this does not commit.
 
         Return (decision id, number) of each label, new or stored before with the same value. A
         record that contradicts a stored one becomes an event of kind "dead letter". A line stop of

@@ -287,7 +287,10 @@ class Journal:
         self._file.close()
 
     def _header(self) -> bytes:
-        """Return the header in bytes: MAGIC, and in JSON owner, drained offset, newest entry."""
+        """Return the header, HEADER bytes: MAGIC, then JSON, padded with zeros.
+
+        The JSON has this process as the owner, `drained_to` and `newest_entry`.
+        """
         fields = {
             "owner": describe_process()[:80],
             "drained": self.drained_to,

@@ -353,7 +353,7 @@ class Outbox:
         return os.getpid() == self._pid and not self._closed
 
     def check_usable(self) -> None:
-        """Raise a StoreError if it is closed, was opened for reading, or is in a forked process."""
+        """Raise a StoreError if the outbox is closed, was opened for reading, or was forked."""
         if os.getpid() != self._pid:
             raise forked_error(self._pid, "the engine")
         if self._closed:
@@ -393,9 +393,10 @@ class Outbox:
         Returns
         -------
         StoredDecision
-            The same with its number; unchanged, with number 0, if it could not be recorded, since
-            the disk hangs and MAX_UNWRITTEN records wait. If the id already has a decision in
-            memory, that one, and nothing is recorded.
+            The same with its number. If the id already has a decision in memory, that one, and
+            nothing is recorded. If MAX_UNWRITTEN records wait since the disk hangs, `item` as it
+            came, with number 0: it is not recorded, and `find_decision` raises StoreError for its
+            id.
         """
         id_ = item.decision.id
         with self._changed:
@@ -434,9 +435,10 @@ class Outbox:
         return item
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
-        """Record labels of decisions without waiting; each gets the present time.
+        """Record labels of decisions without waiting; the labels that are passed are not changed.
 
-        `pop_label_numbers` later returns the numbers that they get in the store.
+        Each gets the present time, and the hash and the time of its decision. `pop_label_numbers`
+        later returns the numbers that they get in the store.
 
         Parameters
         ----------
@@ -543,13 +545,15 @@ class Outbox:
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
         """Return a decision with its label, from memory, the journal or the store.
 
-        The store is asked only if the id may be there, and only for `limit` seconds.
+        A decision is found as soon as it is recorded. The store is asked only if the id may be
+        there, and only for `limit` seconds.
 
         Parameters
         ----------
         decision_id : str
         unsynced : bool, default False
-            Include a label that is recorded and not yet on disk.
+            Include a label that is recorded and not yet on disk; else the decision comes without
+            it.
 
         Returns
         -------
@@ -743,10 +747,9 @@ class Outbox:
     def submit(self, call: Callable[[], T]) -> Future[T]:
         """Have the store's thread run a call, and return without waiting for it.
 
-        Records that are on disk by then are drained before, if the store takes them.
-
-        Without a journal there is no such thread: the call runs here, before this returns, and what
-        it raises is raised here.
+        Records that are on disk by then are drained before, if the store takes them. Without a
+        journal there is no such thread: the call runs here, before this returns, and what it raises
+        is raised here.
 
         Returns
         -------

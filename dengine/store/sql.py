@@ -340,8 +340,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     ) -> Sequence[Any]:
         """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
 
-        The query has this limit and order. Of a product, labels are first selected by number, or
-        all would be sorted.
+        The query itself has this limit, order and condition. Of a product only labels with high
+        numbers are read at first, or all would be sorted; if these are too few, the query runs over
+        all.
         """
         if self.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)
@@ -464,9 +465,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         since_version : int, default 0
             Only of decisions by this version or a later one.
         overdue_to : int, default 0
-            Number of the newest decision whose check is overdue; 0: no overdue checks. Overdue
-            checks are inserted where the running engine updated the rule with them; every later
-            label stores that position.
+            Up to this decision number a check without a label is overdue; 0: none is. An overdue
+            check adds none, one or two outcomes (`overdue_outcomes`), whatever `seq` is. They are
+            inserted where the running engine updated the rule with them; every later label stores
+            that position.
 
         Returns
         -------
@@ -541,10 +543,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         ]
 
     def overdue_to(self, within: int, since_version: int = 0) -> int:
-        """Return the number of the newest decision whose check is overdue, if it has no label.
+        """Return the number of the newest decision that is old enough for its check to be overdue.
 
-        It is counted back from the newest decision, or is the number that a label recorded, if that
-        is larger. It is 0 if no check is overdue.
+        A decision with this or a lower number that asked for a check and has no label is overdue.
+        The number is that of the newest decision minus `within`, or the one that a label recorded,
+        if that is larger; 0 if nothing can be overdue yet.
 
         Parameters
         ----------
@@ -553,6 +556,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         since_version : int, default 0
             The first version since `within` is in force; if the newest decision is by an earlier
             one, only what the labels recorded counts.
+
+        Returns
+        -------
+        int
         """
         newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(
             DECISION.c.cell_id == self.cell_id
@@ -609,9 +616,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Returns
         -------
         dict
-            decisions, quarantined, labels, corrected, forgotten: numbers; actions, reasons,
-            sources: dicts of numbers by value, 0 included. Forgotten labels are not among the
-            labels and sources.
+            decisions, quarantined, labels: numbers; corrected, forgotten: numbers of decisions
+            whose label was corrected or forgotten; actions, reasons, sources: dicts of numbers by
+            value, 0 included. Forgotten labels are not among labels and sources.
         """
         tally = self.tally()
         actions = tally.by("action")
@@ -1053,8 +1060,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def past_labels(self, after: int, upto: int | None = None) -> list[PastLabel]:
         """Return this cell's labels as they were recorded, oldest first.
 
-        A label that is not as it was stored is left out, and an event with its decision's id is
-        written to the store.
+        Labels of quarantined traces are included. A label that is not as it was stored is left out,
+        and an event with its decision's id is written to the store.
 
         Parameters
         ----------

@@ -128,7 +128,7 @@ class DecisionGroup:
 
     @property
     def label(self) -> str:
-        """The label in a word: good, bad, forgotten, overdue or none.
+        """The corrected label in a word: good, bad, forgotten, overdue or none.
 
         "overdue": a check was asked for, has brought no label, and so many decisions followed that
         it is too late. "none": no label, for another reason.

@@ -176,9 +176,10 @@ class UrCell(AbstractContextManager["UrCell"]):
     def _execute_order(self, verb: Verb) -> ResultCode:
         """Send an order, wait at most `order_timeout` seconds for its result, and return that.
 
-        What was received before is discarded. After INSERT, also wait for the end of the trace, and
-        set `last` to it, or to None if no insertion was seen. Raise CellError if the robot does not
-        answer in time, fails, or its program stops.
+        What was received before is discarded. Meanwhile the order is written again after a
+        reconnection. After INSERT, also wait for the end of the trace, and set `last` to it, or to
+        None if no insertion was seen. Raise CellError if the robot does not answer in time, fails,
+        or its program stops.
         """
         self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1

@@ -302,7 +302,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             return self._session
 
     def write(self, values: Values | None) -> None:
-        """Write inputs now, or once there is a connection again; return at once.
+        """Write inputs now, or once there is a connection again; a lost connection raises nothing.
 
         Parameters
         ----------
