@@ -55,7 +55,7 @@ def read_key(path: str | os.PathLike[str], error: type[DengineError]) -> bytes:
 def check_size(size: float, source: object) -> None:
     """Raise DataError if arrays would need too much memory.
 
-    The limit is `MAX_BYTES`, or half of the machine's memory if that is less.
+    The limit is 8 GB (`MAX_BYTES`), or half of the machine's memory if that is less.
 
     Parameters
     ----------
@@ -82,6 +82,8 @@ def read_errors(
     also: tuple[type[Exception], ...] = (),
 ) -> AbstractContextManager[None]:
     """Return a context manager that raises DataError instead of what a library raises on bad files.
+
+    It catches OSError, ValueError, MemoryError and others that damaged files were seen to raise.
 
     Parameters
     ----------

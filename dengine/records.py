@@ -371,7 +371,10 @@ def is_name(value: Any) -> bool:
 
 
 def as_id(value: Any) -> str:
-    """Return the id of a decision; raise ReportError for what cannot be one."""
+    """Check that a value can be the id of a decision, and return it.
+
+    Raises ReportError for anything but a text of 1 to 200 printable characters.
+    """
     wanted = f"the id of a decision, a text of 1 to {LONGEST} characters that print"
     do = "report the `Decision.id` that `decide` returned"
     expect(is_name(value), wanted, value, do, ReportError)

@@ -1,7 +1,7 @@
 """The contract of a reducer, as checks that its author can run.
 
     from dengine.testing import check_reducer
-    check_reducer(MyReducer()) # an AssertionError names the clause that is broken
+    check_reducer(MyReducer())  # an AssertionError names the clause that is broken
 
 `REDUCER_CHECKS` holds the clauses one by one, for pytest's parametrize. Each takes a reducer, works
 on clones of it, returns None and raises AssertionError if its clause is broken. Any transformer of

@@ -152,7 +152,8 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
         The length to return.
     fit : int
         Position in `FITS` of "cut", "pad" or "resample". The first two keep each sample's time from
-        the start; resample stretches the whole trace by linear interpolation.
+        the start: both drop what is too much at the end, and pad repeats the last sample. resample
+        stretches the whole trace by linear interpolation.
 
     Returns
     -------
@@ -363,8 +364,18 @@ class TraceGate(nn.Module):
 
     @torch.jit.export
     def check(self, x: Tensor, limit: float) -> tuple[int, int]:
-        """Check a trace as `forward` does, with `limit` in place of the sensor's range of the
-        `TraceSpec`.
+        """Check a trace as `forward` does, with `limit` as the sensor's range.
+
+        Parameters
+        ----------
+        x : Tensor of float32, shape (C, T)
+        limit : float
+            In place of `trace_spec.limit`; infinity checks none.
+
+        Returns
+        -------
+        reason, content_hash : int
+            As of `forward`.
         """
         lowest, highest = torch.aminmax(x)
         low = float(lowest.item())  # NaN if there is one anywhere in the trace
@@ -488,6 +499,8 @@ def _spec_advice(trace: Any) -> str:
 
 def infer_trace_spec(x: NDArray[np.float32], trace: Any) -> tuple[TraceSpec, bool]:
     """Infer the `TraceSpec` of all traces from the first one: its shape and column names.
+
+    All else, such as the rate, has the defaults of `TraceSpec`.
 
     Parameters
     ----------

@@ -114,7 +114,10 @@ _OUT = (
 @options.n_jobs_option(-1, "Number of processes; -1: one for each core.")
 @options.force_option
 def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bool) -> None:
-    """Simulate insertions and write their forces and labels."""
+    """Simulate insertions and write their forces and labels to an .npz file.
+
+    A file that exists is replaced only with --force. The number of successes is printed.
+    """
     from ..files import check_output
 
     options.require_modules("the simulated cell", "sim", "mujoco")

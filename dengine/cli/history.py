@@ -86,10 +86,11 @@ _SINCE = "Only decisions since then: 30m, 12h, 7d ago, or 2026-03-01T14:30, in U
 def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
-    STORE is the file or URL of an engine's store. In the table good and bad are the labels that
-    were counted, bound is the interval of the success rate that follows from them, v is the version
-    of the model, and label is what the part turned out to be. `dengine explain` tells more about
-    one decision.
+    STORE is the file or URL of an engine's store. The options choose which decisions; --events adds
+    the retrains and events between them. In the table good and bad are the labels that were
+    counted, bound is the interval of the success rate that follows from them, v is the version of
+    the model, and label is what the part turned out to be. `dengine explain` tells more about one
+    decision.
     """
     from ..history.status import history as read_history
     from ..history.status import read_retrains_and_events
@@ -245,7 +246,7 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     """Yield (title, text) rows of an explanation.
 
     They say when and by which version it was decided, the part, why, what was found when it was
-    computed again, and how the trace lies to the envelope.
+    computed again, and how much of the trace leaves the envelope of successes.
     """
     decision = explanation.decision.decision
     version = decision.model_version

@@ -622,7 +622,10 @@ force_option = click.option(
 
 
 def _out_option(kind: click.Path, text: str) -> Option:
-    """Return `--out` and `--force`, handed on as one `Out`, or None if `--out` is not given."""
+    """Return a decorator that adds `--out` and `--force`.
+
+    They are handed on as one `Out`, the verb's argument `out`, which is None without `--out`.
+    """
     options = {"out": click.option("--out", type=kind, help=text), "force": force_option}
     return bundle_options(
         "out", lambda out, force: None if out is None else Out(out, force), options

@@ -68,8 +68,8 @@ def _change_and_print(
 ) -> None:
     """Open the store's engine, let `change` change it, and print what changed.
 
-    The engine is closed before that is printed. The JSON document also has the policy and the
-    certificate after the change.
+    `change` returns a `Changed`, which says so in words. The engine is closed before that is
+    printed. The JSON document also has the policy and the certificate after the change.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
@@ -96,7 +96,8 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
 
     The part is named by its number, if one decision was made on it, or by that decision's id. An
     accepted part that was bad is a line stop; a rejected one that was examined afterwards is an
-    inspection, and the engine trains on its label. A wrong label is put right by `dengine correct`.
+    inspection, and the engine trains on its label. The same label again changes nothing. A wrong
+    label is put right by `dengine correct`.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -202,7 +203,7 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 @verb("dengine retrain engine.db")
 @store_options
 def retrain(store: str, author: str, allow_import: bool) -> None:
-    """Train now, on the store's labels as they count.
+    """Train now, on the store's labels as they count, and record an event.
 
     A candidate that fails its gate is dropped and recorded, the previous version stays in use, and
     the exit code is 1.

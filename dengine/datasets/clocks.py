@@ -239,9 +239,10 @@ def clock_of(
 
 
 def _join_seconds(frame: pd.DataFrame, name: str) -> NDArray[np.float64] | None:
-    """Return the seconds of a ROS stamp in two columns, `stamp.secs` and `stamp.nsecs`.
+    """Return the seconds since the first row of a ROS stamp in two columns.
 
-    None if the column `name` is not one of two such columns.
+    Such are `stamp.secs` and `stamp.nsecs`. None if the column `name` is not one of two such
+    columns, or a cell of them is no number.
     """
     match = re.fullmatch(r"(.*?)(n?(?:ano)?)(secs?)", name)
     if match is None:
@@ -385,7 +386,8 @@ def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tupl
 def _stated_unit(name: str, unit: str) -> float | None:
     """Return the seconds in one unit of a clock, as the row of units or its name states it.
 
-    In a name the unit stands in brackets, behind a slash or at the end; None if there is none.
+    A number before the unit counts: 0.01 for [10 ms]. In a name the unit stands in brackets, behind
+    a slash or at the end; None if there is none.
     """
     for text in (f"({unit.strip('[](){} ')})" if unit else "", name):
         match = STATED_UNIT.search(text.strip().lower())

@@ -585,7 +585,8 @@ def _bring_to_one_rate(
 
     Recordings at another rate than most become faults. With `fit="resample"` all are interpolated
     at one rate instead: if they last equally long, they are stretched to one length, else padded,
-    so that equal sample numbers mean equal times. The rate is None if no recording has a clock.
+    so that equal sample numbers mean equal times. A recording without a clock is taken to have the
+    rate of the others. If none has one, the rate is the stated one or None.
     """
     rates = np.array([recording.rate_hz or np.nan for recording in collector.recordings])
     clocked = rates[~np.isnan(rates)]

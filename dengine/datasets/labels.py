@@ -285,7 +285,11 @@ class LabelColumn:
         self.is_inverted = means_bad(name) and FLAGS.keys().isdisjoint(words)
 
     def label_of(self, cell: Any) -> int:
-        """Return the label that a cell means; raise as the function `label_of`."""
+        """Return the label that a cell means; raise as the function `label_of`.
+
+        If the column's name means the bad outcome, true, yes and 1 give 0 and false, no and 0 give
+        1, and a note is made.
+        """
         text = str(cell).strip().lower()
         flag = FLAGS.get(text.removesuffix(".0").removesuffix("."))
         if flag is None or text in self.words or not self.is_inverted:
@@ -760,7 +764,8 @@ def collect_recordings(
         Reads the trace at a place.
     source : LabelSource
     collector : RecordingCollector
-        Gets the recordings, the faults of those that cannot be read, and the notes of the source.
+        Gets the recordings, the faults of those that cannot be read, the notes of the source, and
+        words in names that may be labels of unknown meaning.
 
     Raises
     ------

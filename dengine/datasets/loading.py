@@ -317,7 +317,9 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
 def _read_archives(
     named: Files, options: LoadOptions, every: bool = False
 ) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Return the arrays of archives that are used, or `every` one, and the names of all.
+    """Return the arrays of archives that the options and `ARRAYS` name, and the names of all.
+
+    With `every` all arrays are returned.
 
     Archives of one form are concatenated; those that hold different arrays are read as one. Raises
     DataError if they are neither, or hold Python objects.

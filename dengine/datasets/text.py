@@ -130,7 +130,10 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
 
 
 def _split_line(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line, without quotes and blanks around them."""
+    """Return the cells of a line, without quotes and blanks around them.
+
+    The delimiter " " means any blanks, and "" a line that is one cell.
+    """
     if delimiter == "":
         return [line.strip().strip("\"'")]
     if delimiter == " ":

@@ -200,6 +200,8 @@ def cost_curve(
 ) -> CostCurve:
     """Compute what a part costs under every alpha and LB, and under the guarantee of costs.
 
+    The data set is replayed `repeats` times under each of these policies.
+
     Parameters
     ----------
     dataset : object

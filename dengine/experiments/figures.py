@@ -279,10 +279,10 @@ def window_curves(
     Returns
     -------
     curves : dict of str to array, shape (n,)
-        In percent. certain : of all cycles in the window, the mean over the replays. certain_low,
-        certain_high : its 10th and 90th percentile over the replays. precision, false_positive : of
-        the accepted parts in the windows of all replays together. false_negative : of the rejected
-        parts.
+        In percent. certain : decisions without a check, of all cycles in the window, the mean over
+        the replays. certain_low, certain_high : its 10th and 90th percentile over the replays.
+        precision, false_positive : good and bad ones of the accepted parts in the windows of all
+        replays together. false_negative : good ones of the rejected parts.
     """
     certain = sliding_mean(np.stack([r.accepted | r.rejected for r in replays]), window)
 
@@ -313,8 +313,9 @@ def curves(
 ) -> Figure:
     """Draw the paper's curve, with a colour for each recipe.
 
-    Above: the share of certain decisions and their precision. Below: the errors, as shares of what
-    was decided alike, because the tolerance 100 - LB is a share of the accepted parts.
+    Above: the share of certain decisions, those without a check, and their precision. Below: the
+    errors, as shares of what was decided alike, because the tolerance 100 - LB is a share of the
+    accepted parts.
 
     Parameters
     ----------

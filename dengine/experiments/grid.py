@@ -87,6 +87,9 @@ class KeptReplays:
     def path(self, task: Task) -> Path:
         """Return the path of a task's replay in the folder, whether or not it is there.
 
+        Its name is a hash of all that the decisions depend on: data, settings, source and
+        libraries.
+
         Raises
         ------
         SettingError

@@ -119,9 +119,10 @@ def _finding(holds: bool, claim: str, measured: str) -> str:
 def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
     """Yield the lines of the findings about one recipe and interval, from the rows of its grid.
 
-    The findings: whether the certain predictions vary with alpha and LB, whether the mean share of
-    false positives stays below 1 - LB, and, for Wilson, whether a lower alpha delays the first
-    certain prediction. Baselines get the second one alone.
+    The findings: whether the number of certain predictions varies with alpha and LB, as the paper
+    says of Wilson and denies of the binomial interval, whether the mean share of false positives
+    stays below 1 - LB, and, for Wilson, whether a lower alpha delays the first certain prediction.
+    Baselines get the second one alone.
     """
     who = f"{recipe}, {interval}"
     is_ours = recipe.split(" ")[0] not in BASELINES

@@ -288,9 +288,10 @@ class Replay:
         Returns
         -------
         counts : dict
-            first_cycle and last_cycle, counted from 1; verified_share, NaN without cycles; the
-            names in `COUNTED` and stops; parts_per_hour, the good parts passed on, None without a
-            clock.
+            first_cycle and last_cycle, counted from 1. verified_share, NaN without cycles. Numbers
+            of cycles: verified, accepted, rejected, false_positive, false_negative, novel,
+            safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts passed on,
+            None without a clock.
         """
         begin, end, _ = part.indices(len(self))
         counts = {name: int(getattr(self, name)[part].sum()) for name in COUNTED}
@@ -324,9 +325,10 @@ class Replay:
         Returns
         -------
         row : dict
-            Among others first_certain, the cycle of the first decision without a check, counted
-            from 1; dropped, the reason of the last retrain that was dropped, or ""; saved_s and
-            net_s, see `Costs.saved`.
+            Among others certain, the number of decisions without a check; first_certain, the cycle
+            of the first of them, counted from 1; dropped, the reason of the last retrain that was
+            dropped, or ""; saved_s, the seconds of the checks that were left out, and net_s, less
+            what the errors cost, see `Costs`.
         """
         nan = float("nan")
         policy = self.recipe.policy
@@ -396,8 +398,9 @@ class ObservedCycle(NamedTuple):
 def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[ObservedCycle]:
     """Let the engine drive a cell, and yield each cycle as it ends.
 
-    The truth is the cell's attribute `truth` if it has one, else the label that was reported. The
-    clock is its attribute `clock`, None without one. The cell may end before `cycles`.
+    The truth is the cell's attribute `truth` if it has one, else the label that was reported, NaN
+    without any. The clock is its attribute `clock`, None without one. The cell may end before
+    `cycles`.
     """
     for cycle in engine.run(cell, cycles):
         truth = getattr(cell, "truth", cycle.success)

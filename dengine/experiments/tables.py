@@ -62,7 +62,9 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
 
 
 def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, Any]]:
-    """Return a row for each combination of the columns in `CONDITION`, in the frame's order.
+    """Pool the replays that have the same recipe, interval, alpha, LB, guarantee and feedback.
+
+    Returns a row for each combination of these columns (`CONDITION`), in the frame's order.
 
     Parameters
     ----------
@@ -77,11 +79,13 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, 
     rows : list of dict
         Beside `CONDITION`, `replays` and `cycles`:
 
-        - The names in `COUNTS`: means per replay. `total_*`: their sums. `certain_sd` and
-          `false_positive_sd`: standard deviations over the replays, NaN for one replay.
+        - certain, accepted, rejected, false_positive and the other `COUNTS`: means per replay.
+          `total_*`: their sums. `certain_sd` and `false_positive_sd`: standard deviations over the
+          replays, NaN for one replay.
         - precision, npv : over the sums of all replays. The mean of their ratios would weigh a
           replay that accepted three parts as much as one that accepted 300.
-        - The names in `AGGREGATED`, combined as it says.
+        - Times of retrains and decisions, the first certain cycle and savings: median, largest or
+          mean, as `AGGREGATED` says.
         - error_lower, error_upper : 95 % interval of the share of bad ones among the accepted
           parts.
         - promise_kept : whether the pooled precision is at least LB; None where fewer than `ENOUGH`
