@@ -306,8 +306,8 @@ class Certificate:
         """The claim about accepted parts in English: "Of 1,203 parts ..., at most 3.5 % were bad".
 
         It names the confidence and the tolerance. Where nothing can be claimed it says so, and why.
-        With prices, and a bound below 1, a second sentence says what not checking saved at least,
-        rounded down, or "nothing for certain".
+        With prices, and a bound below 1, a second sentence says what the parts without a check
+        saved at least, rounded down, or "nothing for certain"; there is none if all were checked.
         """
         unknown = (
             "silence is no success: set audit_rate, or stops='all' where every bad part stops the "

@@ -50,10 +50,16 @@ def reducer_class(name: str) -> type:
     name : str
         A name in `REDUCERS`, or `module:Class`.
 
+    Returns
+    -------
+    type
+        A `Reducer`, or for `module:Class` any class with `fit`, `transform` and `get_params`.
+
     Raises
     ------
     SettingError
-        If there is no such class, or it is no scikit-learn transformer.
+        If there is no such class, its module cannot be imported, or it is no scikit-learn
+        transformer.
     """
     expected = f"a reducer among {', '.join(_NAMED)}, or module:Class of your own"
     expect(name in _NAMED or ":" in name, expected, name)
@@ -66,14 +72,14 @@ def reducer_class(name: str) -> type:
 
 
 def make_reducer(name: str, **params: Any) -> Any:
-    """Make a reducer.
+    """Make a reducer, which is not fitted yet.
 
     Parameters
     ----------
     name : str
         A name in `REDUCERS`, or `module:Class`.
     **params
-        Parameters of its class.
+        Parameters of its class. Types and ranges are checked for names in `REDUCERS` only.
 
     Returns
     -------
@@ -82,7 +88,8 @@ def make_reducer(name: str, **params: Any) -> Any:
     Raises
     ------
     SettingError
-        If the name or a parameter is unknown, or a value is of another type or out of range.
+        If the name or a parameter is unknown, or a value is of another type than its default or out
+        of range.
     """
     cls = reducer_class(name)
     allowed = signature(cls).parameters
@@ -97,9 +104,11 @@ def make_reducer(name: str, **params: Any) -> Any:
 
 
 def _check_parameter(default: Any, key: str, value: Any) -> None:
-    """Raise SettingError for a parameter of another type than its default, or out of range.
+    """Raise SettingError unless a reducer's parameter `key` may have this value.
 
-    Otherwise every retrain would fail.
+    A value must have the type of the default; `folds` lies between 2 and 1000, another integer
+    within 32 bits, and a float is not NaN. Any value will do if the default is neither bool, str,
+    int nor float, such as None. Otherwise every retrain would fail.
     """
     types = {bool: "true or false", str: "a text", int: "an integer", float: "a number"}
     expected = types.get(type(default))
@@ -120,10 +129,15 @@ def class_default(reducer: Any, name: str) -> Any:
     Parameters
     ----------
     reducer : str, type or estimator
-        A name, a class or an object. A class without the attribute, such as another scikit-learn
-        transformer, has the value of `Reducer`.
+        A name in `REDUCERS` or `module:Class`, a class, or an object.
     name : str
-        The attribute.
+        The attribute, which `Reducer` must have.
+
+    Returns
+    -------
+    object
+        The value of `Reducer` if the class has no such attribute, as another scikit-learn
+        transformer.
     """
     cls = reducer_class(reducer) if isinstance(reducer, str) else reducer
     return getattr(cls, name, getattr(__getattr__("Reducer"), name))

@@ -10,6 +10,9 @@ wraps one that needs no labels in `LabelFree`, and one that uses labels in `Cros
 An embedding has K spaces. A label may be counted for a query only in a space that was fitted
 without that label. So references of fold k live in space k, which is fitted without the labels of
 fold k. A reducer that uses no labels has one space.
+
+The file also holds `StopRule` and `FitReport`, what a training is given and gives back, and the
+checks of labels, folds and seeds that reducers share.
 """
 
 import time
@@ -67,9 +70,11 @@ class StopRule:
     late: bool = False
 
     def exhausted(self, step: int, least: int = 0) -> bool:
-        """Return whether step number `step`, counted from 0, may not begin any more; set `late`.
+        """Return whether step number `step`, counted from 0, may not begin any more.
 
-        The first `least` steps are taken even after the deadline.
+        That is so if `max_steps` were taken, or if the deadline has passed and `least` steps were
+        taken. It sets `late`, to True if the deadline is the reason; if `max_steps` is, `late`
+        stays as it is.
         """
         if self.max_steps is not None and step >= self.max_steps:
             return True
@@ -150,6 +155,11 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         Returns
         -------
         array of float32, shape (n, d)
+
+        Raises
+        ------
+        NotFittedError, ValueError, TraceError
+            As of `check_traces`.
         """
         traces = self.check_traces(X)
         return np.concatenate(
@@ -206,9 +216,9 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """Import what the first training needs. An engine calls it in a thread when it starts."""
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute now what the next `train` needs from traces X (n, C, T), without their labels.
+        """Compute now, and keep, what the next `train` needs from traces X (n, C, T), labels aside.
 
-        numbers : of the labels, as in `train`.
+        `numbers` are those of the labels, as in `train`. The default does nothing.
         """
 
     def embed(self, X: Floats) -> Floats:
@@ -234,7 +244,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         return None
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore what `get_state` returned; the parameters must be the same."""
+        """Restore what `get_state` returned and return self; the parameters must be the same.
+
+        The default raises NotImplementedError.
+        """
         raise NotImplementedError(
             f"{type(self).__name__} gives no state, so it is restored by a refit."
         )
@@ -245,20 +258,29 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         return FitReport()
 
     def check_traces(self, X: Any, *, reset: bool = False) -> Floats:
-        """Check traces and return them as float32 (n, C, T).
+        """Check traces and return them as float32 (n, C, T); traces (n, T) get C = 1.
 
         Parameters
         ----------
         X : array or DataFrame, shape (n, T) or (n, C, T)
         reset : bool, default False
-            Whether these traces set the shape that later ones must have, as in `fit`.
+            Whether these traces set the shape that later ones must have, as in `fit`:
+            `trace_shape_` and scikit-learn's `n_features_in_`. At least one trace is then needed.
+
+        Returns
+        -------
+        array of float32, shape (n, C, T)
+            Writeable, and the caller's own memory where X already has that form.
 
         Raises
         ------
+        NotFittedError
+            Without `reset`, before a fit.
         ValueError
-            If a value is not finite.
+            If a value is not finite or not a number, if a table has other columns than in `fit`,
+            and with `reset` if there is no trace.
         TraceError
-            If the shape is another than in `fit`.
+            If the shape is another than in `fit`, or none of traces.
         """
         if not reset:
             check_is_fitted(self)
@@ -325,7 +347,9 @@ def points_in_fold_space(Z: Floats, folds: Ints) -> Floats:
 def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
     """Return the scale of each space: the root mean square radius of its fold's points.
 
-    Outliers are left out, since a single one would draw all other points together.
+    The radius is the distance from their mean. Outliers are left out, since a single one would draw
+    all other points together. These are points more than 50 times as far from the median as the
+    median point, unless they are more than 5 % of a fold's points and more than one.
 
     Parameters
     ----------
@@ -358,7 +382,8 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
 def binary_labels(y: Any, n: int, name: str) -> Ints:
     """Return labels of two classes as int64 (n,): 1 for the larger class, 0 for the other.
 
-    Labels of 0 and 1 stay as they are, also if only one of them occurs.
+    Labels of 0 and 1 stay as they are, also if only one of them occurs. Another lone class becomes
+    1.
 
     Parameters
     ----------
@@ -368,10 +393,15 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     name : str
         Of the reducer, for the message of an error.
 
+    Returns
+    -------
+    array of int64, shape (n,)
+
     Raises
     ------
     SettingError
-        If there are no labels, more than two classes, or another number than n.
+        If there are no labels, more than two classes, continuous or not finite ones, or another
+        number than n.
     """
     if y is None:
         raise SettingError(
@@ -397,9 +427,9 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
 
 
 def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
-    """Return the folds (n,) of traces (n, C, T): those given, or by the traces' content.
+    """Return the folds of traces (n, C, T), int64 (n,): those given, or by the traces' content.
 
-    Raises SettingError unless there is one from 0 to n_folds - 1 for each trace.
+    Raises SettingError if folds are given, but not one from 0 to n_folds - 1 for each trace.
     """
     if folds is None:
         return content_fold(traces, n_folds)
@@ -410,7 +440,11 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
 
 
 def single_class_error(fold: int, n: int, classes: int) -> SettingError:
-    """Return the error for a fold outside of which n traces have fewer than two classes."""
+    """Return, without raising it, the error for a fold outside of which labels have a single class.
+
+    `n` is the number of traces outside of it, `classes` of their classes. With no trace there the
+    message blames the sensor or the unit, as all traces are the same; else it asks for more labels.
+    """
     problem = f"{n} traces of {classes} class; collect more labels before the first fit."
     if n == 0:
         problem = (
@@ -423,7 +457,8 @@ def single_class_error(fold: int, n: int, classes: int) -> SettingError:
 def seed_of(random_state: Any) -> int | None:
     """Return scikit-learn's `random_state` as a seed for NumPy and torch; None for None.
 
-    Raises SettingError unless it is None, an integer or a RandomState.
+    A RandomState draws the seed, so it gives another one at each call. Raises SettingError unless
+    `random_state` is None, an integer or a RandomState.
     """
     if random_state is None:
         return None
@@ -445,8 +480,9 @@ def as_reducer(transformer: Any, folds: int) -> Reducer:
     """Return a transformer as a `Reducer`.
 
     A `Reducer` that cross-fits by itself, or uses no labels, is returned as it is. Another
-    transformer that uses labels is wrapped in `CrossFitted` with `folds` clones. One that uses no
-    labels is wrapped in `LabelFree` and never gets any, so its single space has seen no label.
+    transformer that uses labels is wrapped in `CrossFitted`, which fits `folds` clones. One that
+    uses no labels is wrapped in `LabelFree` and never gets any, so its single space has seen no
+    label. Nothing is fitted here.
     """
     if isinstance(transformer, Reducer) and (
         transformer.n_spaces > 1 or not transformer.uses_labels
@@ -489,7 +525,10 @@ class LabelFree(_Wrapping):
     """
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit a clone of the transformer on traces X; labels are ignored."""
+        """Fit a clone of the transformer, `reducer_`, on traces X; labels are ignored.
+
+        X has the shape (n, T) or (n, C, T). Returns self. `dim_` becomes the number of coordinates.
+        """
         traces = self.check_traces(X, reset=True)
         self.reducer_ = clone(self.reducer).fit(self.as_input(traces))
         self.dim_ = as_points(self.reducer_.transform(self.as_input(traces[:1]))).shape[1]
@@ -521,20 +560,25 @@ class CrossFitted(_Wrapping):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Fit the clones.
+        """Fit clone k on the traces outside fold k, for every k; this replaces `clones_`.
 
         Parameters
         ----------
         X : array of float, shape (n, T) or (n, C, T)
         y : array, shape (n,)
-            Labels of two classes.
+            Labels of two classes, of which the larger is given to the clones as 1, the other as 0.
         folds : array of int64, shape (n,), optional
-            Fold of each trace. None: by its content.
+            Fold of each trace, 0 to K - 1. None: by its content.
+
+        Returns
+        -------
+        self
 
         Raises
         ------
         SettingError
-            If the traces outside a fold have a single class.
+            If K is below 2, the labels are missing or not of two classes, or the traces outside a
+            fold have a single class.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)

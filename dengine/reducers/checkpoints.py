@@ -22,7 +22,8 @@ SEPARATE = re.compile(r"^(networks\.networks\.)\d+\.")  # names of parameters in
 def save_checkpoint(members: Members, path: str | Path) -> None:
     """Write the weights of a single member to a file, which is replaced if it exists.
 
-    Raises SettingError for more than one member.
+    The file is written as a whole or not at all. Raises SettingError for more than one member,
+    OutputError if the file cannot be written.
     """
     expect(members.count == 1, "a single member", members.count)
     content = BytesIO()  # torch's own writer aborts the process on a full disk
@@ -31,12 +32,15 @@ def save_checkpoint(members: Members, path: str | Path) -> None:
 
 
 def load_checkpoint(members: Members, path: str | Path) -> None:
-    """Set the weights of every member to those of a checkpoint; only tensors are read, no code.
+    """Set the weights of every member, in place, to those of a checkpoint of a single member.
+
+    Only tensors are read; no code of the file runs. Buffers, such as the statistics of batch
+    normalisation, are set as well.
 
     Raises
     ------
     SettingError
-        If the file cannot be read, or is of another network.
+        If the file cannot be read, or is of another network; the members are unchanged then.
     """
     unreadable = OSError, RuntimeError, ValueError, EOFError, UnpicklingError
     with instead(SettingError, f"The checkpoint {path} cannot be read", *unreadable):

@@ -76,7 +76,12 @@ class ConvNetwork(nn.Module):
         self.hidden_dropout = nn.Dropout(0.2)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Preprocessed traces (B, members * channels, L) -> (B, members * features)."""
+        """Preprocessed traces (B, members * channels, L) -> features (B, members * features).
+
+        The convolutions' outputs are pooled, as mean and maximum of each region and of the whole
+        trace, and pass the hidden layer with a ReLU. In training mode dropout makes the result
+        random.
+        """
         h = self.convolutions(x)  # (B, members * C * 2 * width, P)
         mean = F.avg_pool1d(h, self.window, self.stride)  # (B, ..., regions)
         maximum = F.max_pool1d(h, self.window, self.stride)  # (B, ..., regions)
@@ -91,7 +96,11 @@ class ConvNetwork(nn.Module):
 def conv_layers(
     groups: int, inputs: int, outputs: int, kernel: int, stride: int
 ) -> list[nn.Module]:
-    """Return a convolution, batch normalisation and ReLU, with channels counted per group."""
+    """Return a list of three layers: convolution, batch normalisation and ReLU.
+
+    `inputs` and `outputs` are channels of each group. The convolution has no bias and pads kernel
+    // 2 zeros at both ends.
+    """
     convolution = nn.Conv1d(
         groups * inputs,
         groups * outputs,

@@ -131,7 +131,11 @@ class Encoder(nn.Module):
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:
-        """Preprocessed traces of each member (B, K, C', L) -> (B, K, dim)."""
+        """Preprocessed traces of each member (B, K, C', L) -> embedding (B, K, dim).
+
+        The first coordinate is the probability of success; the second, if `dim` is 2, is the
+        difference of the two units, times 0.1.
+        """
         units = self.members.units(x)
         probability = self.members.logits(units).sigmoid()
         if self.dim == 1:
@@ -141,11 +145,12 @@ class Encoder(nn.Module):
 
 
 def fold_batch_norms(module: nn.Module) -> nn.Module:
-    """Fold each batch normalisation in a `Sequential` into the convolution before it.
+    """Return the module with each batch normalisation in a `Sequential` folded into a convolution.
 
-    The module, which must be in evaluation mode, is changed; a `Sequential` is returned as a new
-    one. Folding is done once, before anything is compiled, so that the engine and an exported file
-    compute with the same numbers.
+    That is the `Conv1d` right before it; others stay. The module must be in evaluation mode. Its
+    children are replaced in place; a `Sequential` itself is returned as a new one. Folding is done
+    once, before anything is compiled, so that the engine and an exported file compute with the same
+    numbers.
     """
     for name, child in module.named_children():
         setattr(module, name, fold_batch_norms(child))
@@ -163,7 +168,8 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
 def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:
     """Return the number of features of each member, by embedding two traces of zeros.
 
-    Raises SettingError if the output does not have the shape (B, K, features).
+    Leaves the networks in training mode. Raises SettingError if their output does not have the
+    shape (B, K, features).
     """
     networks.eval()
     with torch.no_grad():

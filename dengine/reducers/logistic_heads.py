@@ -68,7 +68,11 @@ class RidgeProblem:
 
     @classmethod
     def of(cls, g: Tensor, y: Tensor, outside: Tensor, l2: float) -> Self:
-        """Return the problem of features (n, W), labels (n,) and masks (K, n)."""
+        """Return the problem of features g (n, W), labels y (n,) and masks `outside` (K, n).
+
+        Head k is trained by the rows that its mask selects. A column of ones is appended to the
+        features. `l2` is the ridge of every weight but the bias, whose ridge is `BIAS_RIDGE`.
+        """
         g32 = torch.cat([g, torch.ones(len(g), 1)], 1)
         ridge = torch.full((len(outside), g32.size(1)), l2, dtype=torch.float64)
         ridge[:, -1] = BIAS_RIDGE
@@ -85,7 +89,11 @@ class RidgeProblem:
         return (self.mask * (p - self.y)) @ self.g + self.ridge * w
 
     def cholesky_of_hessian(self, k: int, p: Tensor) -> Tensor:
-        """Factor the Hessian of head k, which predicts p (n,): (W + 1, W + 1)."""
+        """Return the lower Cholesky factor of head k's Hessian, float64 (W + 1, W + 1).
+
+        `p` (n,) are the head's probabilities, at which the Hessian is taken. The product of
+        features is computed in float32, since a Newton step need not be exact.
+        """
         curvature = (self.mask[k] * p * (1.0 - p)).float()
         product = (self.g32 * curvature[:, None]).T @ self.g32  # a step need not be exact
         factor: Tensor = torch.linalg.cholesky(product.double() + torch.diag(self.ridge[k]))
@@ -104,10 +112,10 @@ def fit_heads(
 ) -> HeadsFit:
     """Fit K ridge logistic regressions by Newton's method with a line search.
 
-    Each minimises the sum of its log losses plus ``l2 / 2 * |w| ** 2``, the bias nearly free.
-    That is convex, so it ends at the same weights wherever it starts. A head whose
-    leave-one-out loss is above that of its base rate predicts the base rate. Each head decides this
-    alone: a common decision would let the labels of fold k choose head k.
+    Each minimises the sum of its log losses plus ``l2 / 2 * |w| ** 2``, the bias nearly free. That
+    is convex, so it ends at the same weights wherever it starts, unless the steps are limited. A
+    head whose leave-one-out loss is above that of its base rate predicts the base rate. Each head
+    decides this alone: a common decision would let the labels of fold k choose head k.
 
     Parameters
     ----------
@@ -116,21 +124,22 @@ def fit_heads(
     y : Tensor of int64, shape (n,)
         Labels, 1 or 0.
     outside : Tensor of bool, shape (K, n)
-        Which rows train head k.
+        Which rows train head k. Each head needs rows of both classes.
     w : Tensor of float64, shape (K, W + 1)
-        Where the heads start, the bias last.
+        Where the heads start, the bias last; it is not changed.
     l2 : float
         Ridge.
     max_iter : int
         Largest number of steps.
     stop : StopRule, optional
-        Asked before each step after the first `min_steps`.
+        Asked before each step after the first `min_steps`. None: until all heads have converged.
     min_steps : int, default 0
         Steps that are taken even after the deadline.
 
     Returns
     -------
     HeadsFit
+        Weights, leave-one-out logits, heads at their base rate and number of steps.
     """
     problem = RidgeProblem.of(g, y, outside, l2)
     # Every head takes part in every product, whether it has converged or not: a product of another

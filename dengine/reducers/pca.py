@@ -1,4 +1,7 @@
-"""PCA: the simplest reducer without labels; it is fitted in closed form, and exported."""
+"""`PcaReducer`, the simplest reducer without labels, and `PcaEncoder`, the module that it exports.
+
+It is fitted in closed form on all traces at every training.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -46,6 +49,10 @@ class PcaReducer(Reducer):
         y : ignored
             Labels are not used.
 
+        Returns
+        -------
+        self
+
         Raises
         ------
         SettingError
@@ -73,7 +80,11 @@ class PcaReducer(Reducer):
         return PcaEncoder(torch.from_numpy(self.mean_), torch.from_numpy(self.components_))
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return arrays from which `set_state` restores the reducer bit for bit."""
+        """Return arrays from which `set_state` restores the reducer bit for bit.
+
+        They are "mean" (C * T,), "components" (n_components, C * T) and "shape", (C, T); not
+        copies. Raises NotFittedError before `fit`.
+        """
         check_is_fitted(self, "components_")
         return {
             "mean": self.mean_,
@@ -82,7 +93,7 @@ class PcaReducer(Reducer):
         }
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore what `get_state` returned; the parameters must be the same."""
+        """Restore what `get_state` returned, and return self; the parameters must be the same."""
         self.mean_ = np.array(state["mean"])
         self.components_ = np.array(state["components"])
         self.n_features_in_ = len(self.mean_)

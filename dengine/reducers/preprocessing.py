@@ -46,7 +46,10 @@ class Preprocessor(nn.Module):
 
     @torch.jit.unused
     def learn(self, traces: Tensor) -> None:
-        """Set mean and scales of each channel from the first 256 of the traces (n, C, T)."""
+        """Set mean and scale of each channel, and the scale of its differences, in place.
+
+        They are read from the first 256 of the traces (n, C, T), after averaging.
+        """
         averaged = self.average_samples(traces[:STATISTICS_TRACES]).double()
         self.mean.copy_(averaged.mean((0, 2))[:, None])
         self.scale.copy_(1.0 / (averaged.std((0, 2), correction=0)[:, None] + FLOOR))
@@ -54,7 +57,12 @@ class Preprocessor(nn.Module):
         self.difference_scale.copy_(1.0 / (differences.std((0, 2), correction=0)[:, None] + FLOOR))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> (B, 2 * C, L)."""
+        """Raw traces (B, C, T) -> averaged, standardised, with differences: (B, 2 * C, L).
+
+        Channel 2 c + 1 holds the differences of channel 2 c in time, of which the first is 0. All
+        values are clipped at ±8. Samples that do not fill a mean are left out at the start of the
+        trace.
+        """
         x = self.standardise(self.average_samples(x))
         differences = (x[:, :, 1:] - x[:, :, :-1]) * self.difference_scale
         differences = differences.clamp(-self.clip, self.clip)
@@ -75,6 +83,7 @@ def averaging(traces: Tensor, min_frames: int = MIN_FRAMES) -> int:
     Parameters
     ----------
     traces : Tensor of float32, shape (n, C, T)
+        At least one; of many, about 256 that are evenly spaced are read.
     min_frames : int, default 200
         Smallest number of samples of an averaged trace.
 
@@ -82,7 +91,7 @@ def averaging(traces: Tensor, min_frames: int = MIN_FRAMES) -> int:
     -------
     int
         The largest number that leaves so many samples and 80 % of the variance of each channel; 1
-        where an oscillation would be lost.
+        if there is none, because the traces are short or oscillate.
     """
     traces = traces[:: 1 + (len(traces) - 1) // STATISTICS_TRACES]
     samples = traces.size(2)

@@ -112,7 +112,11 @@ class FeatureEmbedding(nn.Module):
         return self.embed_features(self.encoder(x))
 
     def embed_features(self, f: Tensor) -> Tensor:
-        """(B, P) scaled features -> (B, K, d)."""
+        """Scaled features (B, P) -> embedding (B, K, d).
+
+        The first axis is the probability of success by head k, from 0 to 1; the second, if d is 2,
+        is a sigmoid of a principal component, from 0 to 0.04, the same in every space.
+        """
         columns = torch.addmm(self.bias, f, self.weight)
         products = pairwise_products(columns.narrow(1, self.n_scores, self.n_leading))
         scores = torch.addmm(columns.narrow(1, 0, self.n_scores), products, self.product_weight)
@@ -157,9 +161,14 @@ class Tower(NamedTuple):
         variance : float
             Of all components together.
         weights : Tensor of float32, shape (p, K)
-            Weights of the heads on the features.
+            Weights of the given heads on the features.
         mean_logits : Tensor of float32, shape (K,)
-            Mean logit of each head on these features.
+            Mean logit of each given head on these features, which becomes the bias.
+
+        Returns
+        -------
+        Tower
+            With the largest components first; axes of components that are no more than noise are 0.
         """
         centred = f - f.mean(0)
         # In float32, in half the time: components are told from noise to 1e-6.
@@ -189,15 +198,16 @@ def weigh_towers(
 ) -> tuple[list[Tensor], Tensor]:
     """Weigh the logits of towers to one logit for each head, tower by tower.
 
-    The shares of a tower, and of the mean of those before it, have the smallest log loss on the
-    rows outside fold k, so that labels of fold k do not reach head k.
+    The shares of a tower, and of the mean of those before it, are the candidates, eleven from 0 to
+    1, with the smallest log loss on the rows outside fold k, so that labels of fold k do not reach
+    head k.
 
     Parameters
     ----------
     left_out : list of Tensor of float64, shape (K, n)
         Leave-one-out logits of each tower.
     penalties : list of float
-        Nats that the whole logit of a tower must save in all.
+        Nats that the whole logit of a tower must save in all; that of the first tower is not read.
     y : Tensor of int64, shape (n,)
         Labels.
     outside : Tensor of bool, shape (K, n)
@@ -208,7 +218,7 @@ def weigh_towers(
     shares : list of Tensor of float32, shape (K,)
         Share of each tower; they sum to 1.
     losses : Tensor of float64, shape (K,)
-        Leave-one-out log loss of each head with these shares.
+        Leave-one-out log loss of each head with these shares, in nats per row.
     """
     n_heads = len(outside)
     n_rows = outside.sum(1)
@@ -291,7 +301,7 @@ class RocketReducer(Reducer):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Draw the kernels anew and fit the heads.
+        """Draw the kernels anew and fit the heads; earlier fits are forgotten.
 
         Parameters
         ----------
@@ -300,6 +310,10 @@ class RocketReducer(Reducer):
             Labels of two classes, the larger one for success.
         folds : array of int64, shape (n,), optional
             Permanent folds. None: by the traces' content.
+
+        Returns
+        -------
+        self
 
         Raises
         ------
@@ -323,7 +337,9 @@ class RocketReducer(Reducer):
     ) -> Floats:
         """Fit the heads from their present weights; the kernels stay those of the first training.
 
-        See `Reducer.train`. SettingError for fewer than 20 traces.
+        Parameters and result as of `Reducer.train`. Features of traces with known `numbers` are
+        taken from the cache of the last call. Of more than 4000 traces the heads read 4000. Raises
+        SettingError for fewer than 20 traces, and if the traces outside a fold have a single class.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
@@ -335,10 +351,11 @@ class RocketReducer(Reducer):
             return points_in_fold_space(points.numpy(), folds)
 
     def untrained_module(self, X: Floats) -> FeatureEmbedding:
-        """Return the module that answers, for traces (n, C, T); their kernels are drawn at once.
+        """Return the module that answers, for traces (n, C, T); draw its kernels if there are none.
 
-        With fewer than `MIN_TRACES` traces it is the module of a clone, since the first training
-        will draw the kernels from more traces.
+        With fewer than `MIN_TRACES` traces, and none drawn yet, it is the module of a clone, since
+        the first training will draw the kernels from more traces. Otherwise it is the module that
+        later trainings change in place.
         """
         is_started = "net_" in vars(self)
         reducer: Self = self if len(X) >= MIN_TRACES or is_started else clone(self)
@@ -346,12 +363,19 @@ class RocketReducer(Reducer):
         return reducer.net_
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute the features of traces (n, C, T), which would take the first retrain too long."""
+        """Compute the features of traces (n, C, T), and cache them for the next `train`.
+
+        They are found again by `numbers`; without these nothing is cached. The first call with
+        enough traces draws the kernels. It does nothing with fewer than `MIN_TRACES` traces.
+        """
         if len(X) >= MIN_TRACES:
             self.raw_features(self._check_and_start(X), numbers)
 
     def _check_and_start(self, X: Floats) -> Floats:
-        """Check traces and return them as (n, C, T); the first ones set scales and kernels."""
+        """Check traces and return them as (n, C, T).
+
+        The first ones set the shape, the scales and the kernels.
+        """
         if "net_" not in vars(self):
             self._start(self.check_traces(X, reset=True))
         return self.check_traces(X)
@@ -359,7 +383,8 @@ class RocketReducer(Reducer):
     def _start(self, traces: Floats) -> None:
         """Build the module and set channel scales and kernels from traces (n, C, T).
 
-        No label is read. Earlier fits are forgotten.
+        No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its
+        range.
         """
         x = torch.from_numpy(traces)
         self.average_ = averaging(x)
@@ -367,7 +392,11 @@ class RocketReducer(Reducer):
         self.net_.encoder.learn(x, np.random.default_rng(seed_of(self.random_state)))
 
     def _build(self, channels: int, samples: int) -> None:
-        """Check the parameters, and set an empty module and an empty state for such traces."""
+        """Set an empty module, `net_`, and an empty state for traces of this shape.
+
+        The number of samples that are averaged, `average_`, must be set. Raises SettingError for a
+        parameter out of its range.
+        """
         self.check()
         encoder = RocketEncoder(
             channels,
@@ -396,7 +425,10 @@ class RocketReducer(Reducer):
     ) -> None:
         """Fit head k of each tower on rows outside fold k, weigh the towers, and let them answer.
 
-        raw (n, P) are raw features. The heads start from their present weights.
+        raw (n, P) are raw features. The heads start from their present weights. Principal
+        components are computed anew at the first fit, at every twentieth, and when the traces are
+        half as many again. It writes to `net_` and sets `towers_`, `n_iter_`, `holdout_losses_`,
+        `n_fits_` and `note_`. Raises SettingError if the rows outside a fold have a single class.
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -438,7 +470,11 @@ class RocketReducer(Reducer):
         self.note_ = note if useless else ""
 
     def _set_heads(self, towers: list[Tower], shares: list[Tensor]) -> None:
-        """Write the heads of all towers to the module, each times its share (K,) of the logit."""
+        """Write the heads of all towers to `net_`: their weights and biases, each times a share.
+
+        `shares` has a tensor (K,) for each tower, its share of the logit. The heads that were there
+        are overwritten.
+        """
         net = self.net_
         logit_columns = slice(0, net.n_scores, self.n_components)
         net.bias[logit_columns] = 0.0
@@ -461,8 +497,9 @@ class RocketReducer(Reducer):
     def _compute_components(self, raw: Tensor) -> None:
         """Set feature scales, principal components and second axis anew from raw features (n, P).
 
-        The heads become the nearest ones on the new components; those of the products begin anew,
-        since they are products of other components now.
+        At most about 1000 rows, evenly spaced, are read. The heads in `towers_` become the nearest
+        ones on the new components; those of the products begin at 0, since they are products of
+        other components now. The heads in `net_` are not written.
         """
         net = self.net_
         encoder = net.encoder
@@ -500,9 +537,10 @@ class RocketReducer(Reducer):
             self._set_second_axis(f[:, columns], first.axes[:, 0])
 
     def _set_second_axis(self, f: Tensor, axis: Tensor) -> None:
-        """Write a component's axis (p,) on tower 1's features (n, p) to the module as second axis.
+        """Write a component's axis (p,) on tower 1's features (n, p) to `net_` as second axis.
 
-        Within the sigmoid one deviation is 2, and its sign is that of the last axis.
+        It is centred; within the sigmoid one standard deviation is 2, and the sign is the one that
+        is nearer to the second axis before.
         """
         net = self.net_
         columns = net.encoder.towers[0]
@@ -514,8 +552,8 @@ class RocketReducer(Reducer):
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """Return the raw features (n, P) of traces (n, C, T), from the cache where they are in it.
 
-        The cache then holds the traces of these numbers and no others. Without numbers it is
-        neither read nor written.
+        `numbers` (n,), increasing, identify the traces. The cache then holds the traces of these
+        numbers and no others. Without numbers it is neither read nor written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
@@ -565,7 +603,10 @@ class RocketReducer(Reducer):
         return FitReport(self.n_iter_, self.note_)
 
     def embed(self, X: ArrayLike) -> Floats:
-        """Embed traces (n, C, T) in every space; return float32 (n, K, d)."""
+        """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
+
+        Raises NotFittedError before a fit, TraceError for traces of another shape.
+        """
         traces = self.check_traces(X)
         with torch.inference_mode():
             points: Floats = apply_in_chunks(self.net_, torch.from_numpy(traces)).numpy()
@@ -580,7 +621,11 @@ class RocketReducer(Reducer):
         return self.net_
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return arrays from which `set_state` restores the reducer bit for bit."""
+        """Return arrays from which `set_state` restores the reducer bit for bit, by name.
+
+        They are shape, counters, losses, the towers and, after "net.", the module's tensors. The
+        cache of features is not among them. Raises NotFittedError before a fit.
+        """
         check_is_fitted(self, "net_")
         counts = [self.average_, self.n_fits_, self.n_component_traces_, self.n_iter_]
         state = {
@@ -595,7 +640,11 @@ class RocketReducer(Reducer):
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore what `get_state` returned; the parameters must be the same."""
+        """Restore what `get_state` returned, and return self; the parameters must be the same.
+
+        The cache of features is empty and `note_` is "" afterwards. Raises StoreError if the sizes
+        are not those of the parameters.
+        """
         channels, samples = (int(value) for value in state["shape"])
         average, n_fits, n_component_traces, n_iter = (int(value) for value in state["counts"])
         self.trace_shape_ = (channels, samples)
@@ -646,7 +695,10 @@ def sample_rows(n: int, numbers: Ints | None) -> Ints:
 
 
 def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
-    """Raise SettingError unless the labels (n,) of each mask (K, n) have both classes."""
+    """Raise SettingError unless the labels (n,) within each mask have both classes.
+
+    The masks are the rows of a bool array (K, n), one for each head.
+    """
     for k, mask in enumerate(masks):
         n_classes = len(np.unique(labels[mask]))
         if n_classes < 2:

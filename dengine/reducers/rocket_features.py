@@ -151,7 +151,10 @@ class RocketEncoder(nn.Module):
         return self.scale_features(self.raw_features(x))
 
     def raw_features(self, x: Tensor) -> Tensor:
-        """(B, C, T) raw traces -> (B, P) features that are not scaled yet."""
+        """Raw traces (B, C, T) -> features (B, P) that are not scaled yet.
+
+        Those of tower 1 come first.
+        """
         values = self.read_taps(self.average_samples(x))
         n_dense = self.n_dense_taps
         batch = x.size(0)
@@ -169,7 +172,11 @@ class RocketEncoder(nn.Module):
         return scaled.clamp_(-self.feature_clip, self.feature_clip)
 
     def average_samples(self, x: Tensor) -> Tensor:
-        """(B, C, T) raw traces -> (B, C, L) averaged, with channels of one scale."""
+        """Raw traces (B, C, T) -> averaged traces (B, C, L), with channels of one scale.
+
+        Samples that do not fill a mean are left out at the start of a trace. The values are cut at
+        ±1e6.
+        """
         if self.average > 1:
             x = x[..., self.skipped :] if self.skipped > 0 else x
             # In half the time of a mean over an axis.
@@ -178,9 +185,10 @@ class RocketEncoder(nn.Module):
         return torch.addcmul(self.shift, x, self.scale).clamp_(-1e6, 1e6)
 
     def read_taps(self, x: Tensor) -> Tensor:
-        """Read the value at each tap of averaged traces (B, C, L): (C, taps, B).
+        """Read the value at each tap from averaged traces (B, C, L): (C, taps, B).
 
-        The batch is the last axis, so that reading a tap copies a row of it.
+        A tap reads a frame of the trace, a difference of two successive frames, or a 0 beyond the
+        ends, as `taps` says. The batch is the last axis, so that reading a tap copies a row of it.
         """
         batch = x.size(0)
         differences = x[:, :, 1:] - x[:, :, :-1]
@@ -192,7 +200,7 @@ class RocketEncoder(nn.Module):
     def as_windows(self, values: Tensor, n: int) -> Tensor:
         """Arrange values (C, n * 9 * P, B) of n dilations as windows (n, C * 9, P * B).
 
-        A window is what a kernel sees at a place, so that a convolution is a product.
+        A column is what a kernel sees at a place of a trace, so that a convolution is a product.
         """
         channels = values.size(0)
         taps = self.kernel_size
@@ -203,9 +211,11 @@ class RocketEncoder(nn.Module):
         return by_dilation.reshape(n, channels * taps, columns)
 
     def ramp_features(self, windows: Tensor, batch: int) -> Tensor:
-        """Compute tower 1 from windows (D, C * 9, P * B): (B, D * F * R).
+        """Compute tower 1 from windows (D, C * 9, P * B) of `batch` = B traces: (B, D * F * R).
 
-        A feature is how far a kernel is above its threshold, in the mean over a region.
+        A kernel's answer at a place goes through a ramp from 0 to 1 around its threshold. A feature
+        is the mean of that over a region, plus twice the mean over the whole trace. Dilations are
+        the slowest axis, regions the fastest.
         """
         h = torch.baddbmm(self.threshold, self.kernel, windows).clamp_(0.0, 1.0)  # (D, F, P * B)
         if batch == 1:  # one product whose columns are the regions takes four times as long
@@ -217,11 +227,11 @@ class RocketEncoder(nn.Module):
         return h.reshape(self.n_dilations * self.n_kernels * self.n_regions, batch).t()
 
     def competition_features(self, windows: Tensor, batch: int) -> Tensor:
-        """Compute tower 2 from windows (2D, C * 9, Q * B): (B, 4D * G * 8).
+        """Compute tower 2 from windows (2D, C * 9, Q * B) of `batch` = B traces: (B, 4D * G * 8).
 
         A feature is the root of the share of places where a kernel answers most of its group; the
-        second half is of those where it answers least. `learn_filters` has divided the kernels by
-        `COMPETITION_WIDTH`, so that a kernel counts in part within a distance of 1.
+        second half of them is of those where it answers least. `learn_filters` has divided the
+        kernels by `COMPETITION_WIDTH`, so that a kernel counts in part within a distance of 1.
         """
         n_groups = 2 * self.n_dilations * self.n_groups
         size = self.group_size
@@ -238,9 +248,10 @@ class RocketEncoder(nn.Module):
         return sums.mul_(1.0 / self.n_sparse_places).sqrt_().t()
 
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
-        """Set the scales of the channels and the filters from traces (n, C, T).
+        """Set the scales of the channels and the filters, in place, from traces X (n, C, T).
 
-        It is done once, so that the features of a trace never change.
+        `rng` draws the traces that are read, 256 for the scales and 64 for the filters, and the
+        kernels. It is done once, so that the features of a trace never change.
         """
         if len(X) > SCALE_TRACES:
             X = X[torch.from_numpy(rng.permutation(len(X))[:SCALE_TRACES])]
@@ -257,6 +268,8 @@ class RocketEncoder(nn.Module):
         """Draw the kernels, and set thresholds and widths of ramps from what they give on traces.
 
         x : Tensor of float32, shape (n, C, T), with scaled channels.
+
+        It writes the buffers `kernel`, `threshold` and, if there are groups, `competing_kernel`.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)
@@ -285,9 +298,10 @@ class RocketEncoder(nn.Module):
                 self.competing_kernel[d] = kernels / width
 
     def learn_feature_scales(self, raw: Tensor) -> None:
-        """Set the mean and deviation by which features are scaled, from raw ones (n, P).
+        """Set `gain` and `offset`, by which features are standardised, from raw features (n, P).
 
-        The features of the second tower share one deviation.
+        The features of the second tower share one deviation. A feature that hardly varies is scaled
+        by a small floor.
         """
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         for tower in self.towers[1:]:  # of shares, those that vary more tell more
@@ -315,10 +329,11 @@ class ChunkedFeatures(nn.Module):
 
 
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
-    """Compute the raw features of traces (n, C, T): (n, P).
+    """Compute the raw features of traces (n, C, T): float32 (n, P).
 
-    A trace has the same features to the bit whatever other traces are with it, since every chunk
-    is full; the last one is filled up with zeros. From `PARALLEL_TRACES` on two threads compute.
+    A trace has the same features to the bit whatever other traces are with it, since every chunk is
+    full; the last one is filled up with zeros. From `PARALLEL_TRACES` on the encoder is compiled
+    and two threads compute; the call returns when all is done.
     """
     x = torch.from_numpy(traces)
     n = len(traces)
@@ -356,9 +371,10 @@ def dilation_steps(samples: int, n: int) -> list[int]:
 
 
 def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
-    """Return the frame that each tap reads, int64 (D, 9, P), for P places in a trace.
+    """Return the frame that each tap of a kernel reads, int64 (D, 9, P), for P places in a trace.
 
-    A tap beyond the ends of the trace reads position ``2 * frames - 1``, where a zero stands.
+    `dilations` is the largest D; D is smaller for short traces. A tap beyond the ends of the trace
+    reads position ``2 * frames - 1``, where a zero stands.
     """
     steps = np.array(dilation_steps(frames, dilations), dtype=np.int64)
     middle = ((np.arange(places) + 0.5) / places * frames).astype(np.int64)
@@ -367,10 +383,10 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
 
 
 def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw n kernels from `choices` (N, 9), and the channels that each reads: (n, C * 9).
+    """Draw n kernels from `choices` (N, 9), and the channels that each reads: float32 (n, C * 9).
 
     No kernel is drawn twice before all were drawn. A kernel reads between one and all channels,
-    and has unit size.
+    equally weighted, and has unit size; its weights on the other channels are 0.
     """
     drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)
     kernels = choices[torch.from_numpy(drawn)]

@@ -180,7 +180,7 @@ class TorchReducer(Reducer):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Train `fit_steps` steps from initial weights.
+        """Train `fit_steps` steps from initial weights; earlier trainings are forgotten.
 
         Parameters
         ----------
@@ -190,10 +190,15 @@ class TorchReducer(Reducer):
         folds : array of int64, shape (n,), optional
             Permanent folds. None: by the traces' content.
 
+        Returns
+        -------
+        self
+
         Raises
         ------
         SettingError
-            If a parameter is out of its range, or fewer than two traces lie outside a fold.
+            If a parameter is out of its range, the checkpoint cannot be used, or fewer than two
+            traces lie outside a fold.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -210,9 +215,10 @@ class TorchReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Take `n_steps_due` steps from the present weights; see `Reducer.train`.
+        """Take `n_steps_due` steps from the present weights, or from initial ones the first time.
 
-        SettingError for fewer than 20 traces in the first training.
+        Parameters and result as of `Reducer.train`; `numbers` is not read. Raises SettingError for
+        fewer than 20 traces in the first training.
         """
         if "members_" not in vars(self):
             do = "verify more parts first"
@@ -237,6 +243,7 @@ class TorchReducer(Reducer):
         """Build preprocessor and members anew for traces (n, C, T); no label is read.
 
         The channels' scales are read from the traces, the weights from the checkpoint, if any.
+        Earlier trainings are forgotten. Raises SettingError as of `fit`.
         """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
@@ -246,7 +253,12 @@ class TorchReducer(Reducer):
             self.averaged_members_.load_state_dict(self.members_.state_dict())
 
     def _build(self, channels: int, samples: int, average: int) -> None:
-        """Check the parameters, and set initial weights and an empty state for such traces."""
+        """Set initial weights and an empty state for traces of this shape; no trace is read.
+
+        `average` is the number of samples that are averaged to one. The seed is drawn here; torch's
+        global generator keeps its state. Raises SettingError for a parameter out of its range or
+        fewer than 2 samples.
+        """
         self.check()
         if samples < 2:
             got = f"{samples} (n_features = {channels * samples})"
@@ -268,9 +280,10 @@ class TorchReducer(Reducer):
     def _train(
         self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule, steps: int
     ) -> Tensor:
-        """Train on traces (n, C, T) and let the averaged members answer.
+        """Take `steps` steps on traces (n, C, T), and let the averaged members answer.
 
-        Returns the preprocessed traces (n, C', L).
+        It replaces `encoder_` and sets `n_steps_left_`: 0 if `stop` limits the steps, else those
+        that are missing to complete training. Returns the preprocessed traces (n, C', L).
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -285,17 +298,25 @@ class TorchReducer(Reducer):
     def fit_loop(self, x: Tensor, y: Tensor, folds: Ints, stop: StopRule, steps: int) -> None:
         """Take AdamW steps, member k on the rows outside fold k.
 
+        It changes the members and their averages in place, keeps the optimiser's moments, and sets
+        `n_steps_`, `n_new_steps_` and `loss_`. The answering `encoder_` stays as it is.
+
         Parameters
         ----------
         x : Tensor of float32, shape (n, C', L)
             Preprocessed traces.
         y : Tensor of float32, shape (n,)
-            Labels.
+            Labels, 1 or 0.
         folds : array of int64, shape (n,)
         stop : StopRule
             Asked before each step.
         steps : int
             Largest number of steps.
+
+        Raises
+        ------
+        SettingError
+            If fewer than two rows lie outside a fold.
         """
         optimizer = self.make_optimizer()
         augmentation = Augmentation(self.shift, self.gain, self.noise, self.mixup)
@@ -314,7 +335,11 @@ class TorchReducer(Reducer):
         self.loss_ = float(np.mean(losses)) if losses else float("nan")
 
     def train_step(self, optimizer: torch.optim.Optimizer, x: Tensor, y: Tensor) -> float:
-        """Take one step on x (B, K, C', L) and y (B, K); return the mean loss of the members."""
+        """Take one step on x (B, K, C', L) and y (B, K); return the mean loss, in nats.
+
+        The averaged weights move as well, and `n_steps_` grows by 1. The loss is that before the
+        step, the mean over batch and members.
+        """
         logits = self.members_(x)  # (B, K)
         loss = F.binary_cross_entropy_with_logits(logits, y)
         optimizer.zero_grad()
@@ -326,7 +351,7 @@ class TorchReducer(Reducer):
         return float(loss.detach())
 
     def make_optimizer(self) -> torch.optim.Optimizer:
-        """Return AdamW with the moments that the last training left.
+        """Return a new AdamW for the members, with the moments that the last training left.
 
         Weights decay; biases and the parameters of batch normalisation do not.
         """
@@ -346,7 +371,11 @@ class TorchReducer(Reducer):
 
     @torch.no_grad()
     def average_weights(self) -> None:
-        """Move the averaged members towards the trained ones, further in the first steps."""
+        """Move the averaged members' parameters, in place, towards the trained ones.
+
+        They keep the share `weight_averaging`, in the first steps a smaller one. Statistics of
+        batch normalisation are not averaged.
+        """
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
         averages = self.averaged_members_.parameters()
         for average, current in zip(averages, self.members_.parameters(), strict=True):
@@ -354,9 +383,10 @@ class TorchReducer(Reducer):
 
     @torch.no_grad()
     def estimate_statistics(self, x: Tensor) -> None:
-        """Estimate the statistics of batch normalisation that fit the averaged weights.
+        """Set the averaged members' statistics of batch normalisation from traces x (n, C', L).
 
-        x : preprocessed traces (n, C', L), of which 256 at most are used.
+        At most 256 of these preprocessed traces, drawn at random but the same for the same n, are
+        used. The averaged members are in evaluation mode afterwards.
         """
         members = self.averaged_members_.eval()
         norms = [module for module in members.modules() if isinstance(module, nn.BatchNorm1d)]
@@ -377,7 +407,7 @@ class TorchReducer(Reducer):
 
     @torch.inference_mode()
     def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
-        """Embed preprocessed traces (n, C', L): (n, d), row i in space ``folds[i]``.
+        """Embed preprocessed traces (n, C', L): float32 (n, d), row i in space ``folds[i]``.
 
         Each member computes the rows of its fold alone, a fifth of what `embed` would take.
         """
@@ -399,7 +429,10 @@ class TorchReducer(Reducer):
 
     @torch.inference_mode()
     def embed(self, X: Floats) -> Floats:
-        """Embed traces (n, C, T) in every space; return float32 (n, K, d)."""
+        """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
+
+        Raises NotFittedError before a fit, TraceError for traces of another shape.
+        """
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
         chunks = torch.split(traces, CHUNK)
@@ -409,7 +442,11 @@ class TorchReducer(Reducer):
         warm_optimizer()
 
     def untrained_module(self, X: Floats) -> Encoder | None:
-        """Return the module that training on X (n, C, T) would change; see `Reducer`."""
+        """Return a module like the one that training on X (n, C, T) leads to; see `Reducer`.
+
+        After a training it is the present one; before, that of a clone with initial weights. None
+        if TorchScript cannot compile the network.
+        """
         if "encoder_" in vars(self):
             return self.module()
         untrained: Self = clone(self)
@@ -423,7 +460,11 @@ class TorchReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last fit: its steps, and a note for the operator."""
+        """Return the report of the last training: its steps, steps that are missing, and a note.
+
+        The note names loss and steps so far, "" if no step was taken and none is missing. Raises
+        NotFittedError before a fit.
+        """
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
         left = f"{self.n_steps_left_} steps to go" if self.n_steps_left_ else ""
@@ -431,7 +472,11 @@ class TorchReducer(Reducer):
         return FitReport(self.n_new_steps_, note, self.n_steps_left_)
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return arrays from which `set_state` restores the reducer bit for bit."""
+        """Return arrays from which `set_state` restores the reducer bit for bit, by name.
+
+        They are shape, counters, loss, and tensors of preprocessor, members, averaged members and
+        optimiser, so that training can go on. Raises NotFittedError before a fit.
+        """
         check_is_fitted(self, "encoder_")
         counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
         counts += [self.n_steps_left_, self.n_new_steps_]
@@ -453,7 +498,10 @@ class TorchReducer(Reducer):
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore what `get_state` returned; the parameters must be the same."""
+        """Restore what `get_state` returned, and return self; the parameters must be the same.
+
+        Raises StoreError if the sizes are not those of the parameters.
+        """
         channels, samples = (int(value) for value in state["shape"])
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
         self.trace_shape_ = (channels, samples)
@@ -493,7 +541,7 @@ class TorchReducer(Reducer):
 def draw_batches(
     folds: Ints, n_folds: int, batch_size: int, steps: int, rng: np.random.Generator
 ) -> Iterator[Tensor]:
-    """Draw the rows of each step and member, in shuffled passes over the rows of the member.
+    """Yield the rows of each step and member, in shuffled passes over the rows of the member.
 
     Parameters
     ----------
@@ -506,11 +554,12 @@ def draw_batches(
     Yields
     ------
     Tensor of int64, shape (B, K)
+        Column k holds rows of member k.
 
     Raises
     ------
     SettingError
-        If fewer than two rows lie outside a fold.
+        At the first batch, if fewer than two rows lie outside a fold.
     """
     pools = [np.flatnonzero(folds != k) for k in range(n_folds)]
     smallest = min(map(len, pools))
@@ -555,7 +604,9 @@ def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:
 def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
     """Return whether TorchScript compiles a network; log a warning if it does not.
 
-    A user's network may hold Python that TorchScript does not support.
+    A user's network may hold Python that TorchScript does not support. Two members of it are built
+    and compiled to find out, once for each network and shape; torch's global generator keeps its
+    state.
     """
     with torch.random.fork_rng(devices=[]):
         members = Members(network, channels, samples, 2).eval()

@@ -110,7 +110,11 @@ class UmapEncoder(nn.Module):
 
     @torch.jit.export
     def embed_frames(self, frames: Tensor) -> Tensor:
-        """Embed frames: (B, F) -> (B, dim)."""
+        """Embed frames (B, F) among the references: (B, dim).
+
+        A trace lies at the mean of the points of its `n_neighbors` nearest references, weighted by
+        their membership strengths.
+        """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T
         nearest = half_squared.topk(self.n_neighbors, 1, False, True)[1]
@@ -120,7 +124,11 @@ class UmapEncoder(nn.Module):
         return weighted.sum(1) / strengths.sum(1, keepdim=True)
 
     def strengths(self, distances: Tensor) -> Tensor:
-        """Distances (B, n_neighbors) -> membership strengths (B, n_neighbors), from 0 to 1."""
+        """Distances to the nearest references (B, n_neighbors) -> membership strengths, same shape.
+
+        A strength lies between 0 and 1 and is 1 for the nearest; those of a row sum to about
+        ``log2(n_neighbors)``.
+        """
         beyond = distances - distances.amin(1, keepdim=True)
         beyond = beyond / (beyond.mean(1, keepdim=True) + 1e-12)
         totals = torch.exp(-beyond.unsqueeze(2) * self.rates).sum(1)  # (B, rates), falling
@@ -203,6 +211,10 @@ class UmapReducer(Reducer):
         y : ignored
             Labels are not used.
 
+        Returns
+        -------
+        self
+
         Raises
         ------
         SettingError
@@ -222,7 +234,12 @@ class UmapReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Lay traces out, from the last layout if it can; return it, (n, d)."""
+        """Lay traces out, from the last layout if it can, and make them the encoder's references.
+
+        Parameters as of `Reducer.train`; labels and folds are not read. The layout starts anew
+        without `numbers`, or if fewer than half of the traces were in the last training. Returns
+        the layout, float32 (n, n_components). Raises SettingError as of `fit`.
+        """
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
         if numbers is None or not self._has_searched_any(numbers):
@@ -231,7 +248,12 @@ class UmapReducer(Reducer):
         return as_points(self.embedding_.numpy())
 
     def n_epochs_due(self, n_traces: int) -> int:
-        """Return the number of epochs that the next training takes on `n_traces` traces."""
+        """Return the number of epochs that the next training takes on `n_traces` traces.
+
+        That is `n_epochs` if it was given. Otherwise it is those that are missing to the first 200,
+        or, if none are, 240,000 / n_traces but at least 60; and in any case no more than 200 or
+        400,000 / n_traces.
+        """
         if self.n_epochs is not None:
             return self.n_epochs
         largest = min(MAX_EPOCHS, max(1, MAX_WORK // n_traces))
@@ -239,9 +261,10 @@ class UmapReducer(Reducer):
         return min(wanted, largest)
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Search the neighbours of traces X (n, C, T), so that the next training need not do it.
+        """Search the neighbours of traces X (n, C, T), and keep them for the next training.
 
         It does nothing without the numbers of the traces' labels, by which they are found again.
+        Before the first training it sets shape, seed and frames. Raises SettingError as of `fit`.
         """
         if numbers is None:
             return
@@ -259,7 +282,8 @@ class UmapReducer(Reducer):
     def _has_searched_any(self, numbers: Ints) -> bool:
         """Return whether any of these labels' traces was in the last search of neighbours.
 
-        If none was, training starts anew.
+        The last search is that of `precompute`, else that of the last training. If none was,
+        training starts anew.
         """
         if "neighbors_" not in vars(self):
             return False
@@ -267,7 +291,10 @@ class UmapReducer(Reducer):
         return bool(np.isin(numbers, neighbors.numbers).any())
 
     def _start(self, traces: Floats) -> None:
-        """Forget all trainings, draw the seed, and fit the frames to traces (n, C, T)."""
+        """Forget all trainings, draw the seed, and fit the frames to traces (n, C, T).
+
+        Of many traces about 256, evenly spaced, are read.
+        """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)
         self.make_frames_.learn(torch.from_numpy(sample))
@@ -289,7 +316,8 @@ class UmapReducer(Reducer):
     ) -> None:
         """Train on traces (n, C, T) with their labels' numbers, and let the new layout answer.
 
-        n_epochs : epochs to take. None: as many as are due.
+        `n_epochs` are taken; None: as many as are due. Without numbers all traces are new. It
+        updates neighbours, points, encoder and the counters of epochs.
         """
         if numbers is None:
             numbers = np.arange(-len(traces), 0)  # numbers that no label has
@@ -313,10 +341,11 @@ class UmapReducer(Reducer):
         graph: csr_matrix,
         rng: np.random.Generator,
     ) -> Tensor:
-        """Return the points (n, n_components) at which a layout starts.
+        """Return the points (n, n_components), float32, at which a layout starts.
 
-        These are the last embedding, with new traces where the encoder puts them, if at least half
-        of the traces were in it. Otherwise it is a spectral start, which sets `n_epochs_` to 0.
+        These are the last embedding, with new traces where the encoder puts them and a little
+        noise, if at least half of the traces were in it. Otherwise it is a spectral start, which
+        sets `n_epochs_` to 0.
         """
         last_rows = self.neighbors_.rows_of(neighbors.numbers)
         is_old = last_rows >= 0
@@ -332,7 +361,10 @@ class UmapReducer(Reducer):
         return points
 
     def _set_references(self, neighbors: Neighbors, points: Tensor) -> None:
-        """Make these traces and their points (n, n_components) the references of the encoder."""
+        """Make these traces and their points (n, n_components) the references of a new encoder.
+
+        It replaces `neighbors_`, `embedding_` and `encoder_`, and drops what `precompute` found.
+        """
         self.neighbors_ = neighbors
         self.precomputed_neighbors_ = None
         self.embedding_ = points
@@ -346,7 +378,10 @@ class UmapReducer(Reducer):
         return torch.cat([self.encoder_(chunk) for chunk in torch.split(traces, CHUNK)]).numpy()
 
     def untrained_module(self, X: Floats) -> UmapEncoder:
-        """Return the module that training on X (n, C, T) would change; see `Reducer`."""
+        """Return a module like the one that training on X (n, C, T) leads to; see `Reducer`.
+
+        After a training it is the present encoder; before, a new one whose references are all 0.
+        """
         if self._is_fitted:
             return self.encoder_
         n = max(len(X), self.n_neighbors + 1)
@@ -369,14 +404,23 @@ class UmapReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last fit: its steps, and a note for the operator."""
+        """Return the report of the last training: its epochs, and those that are missing.
+
+        The note names epochs of the first layout that are missing, "" if none are. Raises
+        NotFittedError before a fit.
+        """
         check_is_fitted(self, "encoder_")
         left = self.n_steps_left_
         note = f"{left} epochs of the first layout to go" if left else ""
         return FitReport(self.n_new_steps_, note, left)
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return arrays from which `set_state` restores the reducer bit for bit."""
+        """Return arrays from which `set_state` restores the reducer bit for bit, by name.
+
+        They are shape, counters, and of the last training numbers, frames, neighbours, distances
+        and points. Neighbours that `precompute` found are not among them. Raises NotFittedError
+        before a fit.
+        """
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]
         counts += [self.n_epochs_, self.n_steps_, self.n_new_steps_]
@@ -394,7 +438,10 @@ class UmapReducer(Reducer):
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore what `get_state` returned; the parameters must be the same."""
+        """Restore what `get_state` returned, and return self; the parameters must be the same.
+
+        Raises StoreError if the frames are of another size.
+        """
         channels, samples = (int(value) for value in state["shape"])
         self.trace_shape_ = (channels, samples)
         self.n_features_in_ = channels * samples
@@ -415,7 +462,10 @@ class UmapReducer(Reducer):
         return self
 
     def check(self, n_traces: int) -> None:
-        """Raise SettingError for a parameter out of its range, or too few traces."""
+        """Raise SettingError for a parameter out of its range, or too few traces.
+
+        There must be more traces than `n_neighbors` and than `n_components`.
+        """
         expect(is_whole(self.n_components, 1, 100), "n_components from 1 to 100", self.n_components)
         expect(is_whole(self.n_neighbors, 2, 1000), "n_neighbors from 2 to 1000", self.n_neighbors)
         is_distance = is_number(self.min_dist) and 0.0 <= self.min_dist <= 1.0

@@ -108,7 +108,10 @@ class Neighbors:
 
     @classmethod
     def empty(cls, n_features: int, k: int) -> Self:
-        """Return an object without traces, whose `update` finds k neighbours of each."""
+        """Return an object without traces, whose `update` finds k neighbours of each.
+
+        `n_features` is F, the length of a trace's frames.
+        """
         return cls(
             numbers=np.zeros(0, dtype=np.int64),
             frames=torch.zeros(0, n_features),
@@ -122,19 +125,25 @@ class Neighbors:
         return torch.from_numpy(np.where(np.isin(numbers, self.numbers), row, -1))
 
     def update(self, traces: Floats, numbers: Ints, make_frames: Frames) -> "Neighbors":
-        """Return a new object with the neighbours among these traces.
+        """Return a new object with the neighbours among these traces; this one does not change.
 
         Neighbours are searched of the traces that are new, of those that lost a neighbour, and of
         those to which a new trace is nearer than their farthest neighbour. All others are copied.
+        If more than half of the traces are new, all are searched.
 
         Parameters
         ----------
         traces : array of float32, shape (n, C, T)
             More than k.
         numbers : array of int64, shape (n,)
-            Increasing; the same number is the same trace as before.
+            Increasing; the same number is the same trace as before. Traces whose number is missing
+            here have left.
         make_frames : Frames
             The module that computed `frames`.
+
+        Returns
+        -------
+        Neighbors
         """
         n = len(numbers)
         k = self.indices.size(1)
@@ -278,7 +287,8 @@ def membership_strengths(distances: Tensor, n_neighbors: int) -> Tensor:
 def fuzzy_simplicial_set(indices: Tensor, strengths: Tensor) -> csr_matrix:
     """Unite the neighbourhoods of all traces to one symmetric graph.
 
-    An edge has the strength ``p + q - p * q``, where p and q are the strengths in both directions.
+    An edge has the strength ``p + q - p * q``, where p and q are the strengths in both directions,
+    0 where there is none.
 
     Parameters
     ----------
@@ -290,6 +300,7 @@ def fuzzy_simplicial_set(indices: Tensor, strengths: Tensor) -> csr_matrix:
     Returns
     -------
     csr_matrix of float32, shape (n, n)
+        From 0 to 1.
 
     References
     ----------

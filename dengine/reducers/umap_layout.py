@@ -88,9 +88,10 @@ def leading_eigenvectors(
     n: int,
     rng: np.random.Generator,
 ) -> NDArray[np.float64] | None:
-    """Compute n eigenvectors of D^(-1/2) A D^(-1/2) after the first, where A is the graph.
+    """Compute n eigenvectors of D^(-1/2) A D^(-1/2), where A is the graph and D its degrees.
 
-    Returns an array (n_traces, n), or None if the solver does not converge. `rng` draws its start.
+    The first, whose eigenvalue is largest, is left out. Returns float64 (n_traces, n), the next
+    ones by increasing eigenvalue, or None if the solver does not converge. `rng` draws its start.
     """
     root = np.sqrt(np.asarray(graph.sum(1), dtype=np.float64)).ravel()
     coordinates = graph.tocoo()
@@ -166,7 +167,10 @@ class Edges:
 
     @classmethod
     def of(cls, graph: csr_matrix) -> Self:
-        """Return the edges of a symmetric graph."""
+        """Return the edges of a symmetric graph, whose row i lists the edges with head i.
+
+        Strengths are divided by the largest one.
+        """
         counts = torch.from_numpy(np.diff(graph.indptr).astype(np.int64))
         strength = torch.from_numpy(graph.data.astype(np.float32))
         return cls(
@@ -186,7 +190,8 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
     """Compute the pull of each point towards its neighbours.
 
     The gradient of the cross entropy along an edge is ``-4 a b d^(2b - 2) / (1 + a d^(2b))`` times
-    the offset, since umap-learn moves both ends of an edge and holds each edge twice.
+    the edge's strength and the offset, since umap-learn moves both ends of an edge and holds each
+    edge twice.
 
     Parameters
     ----------
@@ -200,6 +205,7 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
     Returns
     -------
     pull : Tensor of float32, shape (d, n)
+        Direction and size of the move; the points are not moved here.
     stiffness : Tensor of float32, shape (n,)
         Sum of the coefficients of all offsets.
 
@@ -249,7 +255,8 @@ def negative_samples(
 def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
     """Compute the mean push of each point away from its negative samples.
 
-    The gradient is ``2 b / ((0.001 + d^2) (1 + a d^(2b)))`` times the offset, clipped to 4.
+    The gradient is ``2 b / ((0.001 + d^2) (1 + a d^(2b)))`` times the offset, each coordinate cut
+    to ±4.
 
     Parameters
     ----------
@@ -263,6 +270,7 @@ def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
     Returns
     -------
     Tensor of float32, shape (d, n)
+        Direction and size of the move; the points are not moved here.
 
     References
     ----------
@@ -305,15 +313,15 @@ def optimize_layout(
     Parameters
     ----------
     points : Tensor of float32, shape (n, d)
-        Where they start.
+        Where they start; this tensor is not changed.
     graph : csr_matrix of float32, shape (n, n)
         The fuzzy simplicial set.
     min_dist : float
         Distance up to which neighbours are drawn together.
     n_epochs : int
-        Epochs to take.
+        Epochs to take. The learning rate falls from 1 to 0 over them.
     stop : StopRule
-        Asked before each epoch.
+        Asked before each epoch. After its deadline at most ten more are taken.
     generator : torch.Generator
         Draws the negative samples.
 

@@ -1,4 +1,4 @@
-"""UMAP by the library umap-learn, to compare with `dengine.reducers.umap`."""
+"""`UmapLearnReducer`: UMAP by the library umap-learn, to compare with `dengine.reducers.umap`."""
 
 import warnings
 from collections.abc import Iterator
@@ -52,7 +52,7 @@ class UmapLearnReducer(Reducer):
     random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit on traces; labels are ignored.
+        """Fit on traces, which takes seconds; labels are ignored.
 
         Parameters
         ----------
@@ -60,6 +60,10 @@ class UmapLearnReducer(Reducer):
             Traces.
         y : ignored
             Labels are not used.
+
+        Returns
+        -------
+        self
 
         Raises
         ------
@@ -93,7 +97,10 @@ class UmapLearnReducer(Reducer):
         return self._transform_batch(self.check_traces(X))
 
     def embed(self, X: Floats) -> Floats:
-        """Embed traces (n, C, T) in every space; return float32 (n, K, d)."""
+        """Embed traces (n, C, T) one by one; return float32 (n, 1, d), in the only space.
+
+        Raises NotFittedError before `fit`, and ValueError for n = 0.
+        """
         check_is_fitted(self, "umap_")
         traces = self.check_traces(X)
         points = [self._transform_batch(traces[i : i + 1]) for i in range(len(traces))]
@@ -107,10 +114,12 @@ class UmapLearnReducer(Reducer):
 
 @contextmanager
 def shielded() -> Iterator[None]:
-    """Keep umap-learn's warnings and its number of threads out of the process.
+    """Context manager that keeps umap-learn's warnings and thread count out of the process.
 
-    At its first kernel numba sets OpenMP's number of threads for the whole process, torch's too.
-    Other work then takes up to forty times as long.
+    Warnings of umap and of scikit-learn's manifolds are ignored within the block; at its end
+    torch's number of threads is set back, also after an exception. At its first kernel numba sets
+    OpenMP's number of threads for the whole process, torch's too. Other work then takes up to forty
+    times as long.
     """
     threads = torch.get_num_threads()
     with warnings.catch_warnings():
