@@ -44,7 +44,7 @@ class Candidate:
         None where the training was dropped: then only the report is stored.
     report : RetrainReport
     trained_on : TrainedOn or None
-        Set by `accept`.
+        Set by `complete_report`.
     storing : Future or None
         The commit of the version, once it has begun; it returns the version's number in the store.
     """
@@ -95,7 +95,7 @@ class Candidate:
         self._patience -= 1
         return self._patience <= 0
 
-    def accept(self, version: int, corrected_to: int) -> RetrainReport:
+    def complete_report(self, version: int, corrected_to: int) -> RetrainReport:
         """Complete the report, and mark the version as accepted if the training gave a model.
 
         The report gets the seconds of work so far. With a model it also gets `version` as its
@@ -125,7 +125,7 @@ class Candidate:
             return False
         return storing.running() or time.monotonic() < self._store_until
 
-    def number(self, version: int) -> None:
+    def set_version(self, version: int) -> None:
         """Set the report's version to the number that the store gave; 0 changes nothing.
 
         The two differ where a peer's version was stored first.

@@ -217,12 +217,12 @@ class EngineCore:
         """Decide as `decide` without an id, but only where nothing has to be waited for; else
         return None.
 
-        None changes nothing. It is returned where the outbox is locked, before the first trace,
-        while settings are unsaved or the rule must be rebuilt, and where the model is a baseline,
-        uses classes of the user's, or is not compiled. The decision is recorded in memory and goes
-        to the disk later. Any thread may call it while no other uses the engine; else it raises
-        StoreError. It leaves swapping versions and announcing safe mode to `process_retrains`.
-        Other errors as of `decide`.
+        When it returns None, nothing has changed. That is so where the outbox is locked, before the
+        first trace, while settings are unsaved or the rule must be rebuilt, and where the model is
+        a baseline, uses classes of the user's, or is not compiled. The decision is recorded in
+        memory and goes to the disk later. Any thread may call it while no other uses the engine;
+        else it raises StoreError. It leaves swapping versions and announcing safe mode to
+        `process_retrains`. Other errors as of `decide`.
         """
         self.outbox.check_usable()
         with self.outbox.try_lock() as is_free, self.exclusive:
@@ -245,11 +245,12 @@ class EngineCore:
         """Record VERIFY, `Reason.LATE`, for a caller that gave up waiting, without asking the
         model.
 
-        Returns the recorded decision, after waiting for the disk within the store's time limit; an
-        id that has a decision already gets that one. It may be called in any thread, also during
-        another call. With a store in memory, before the first trace, and where the id cannot be
-        looked up, a VERIFY is returned that is not recorded; in the first two cases `decide` must
-        record it, with `timed_out`. Errors as of `DataEngine.decide`.
+        A fault of the trace, or of the store, is the reason instead. Returns the recorded decision
+        once it is on disk, or when the store's time limit is over; an id that has a decision
+        already gets that one. It may be called in any thread, also during another call. With a
+        store in memory, before the first trace, and where the id cannot be looked up, a VERIFY is
+        returned that is not recorded; in the first two cases `decide` must record it, with
+        `timed_out`. Errors as of `DataEngine.decide`.
         """
         self.outbox.check_usable()
         id_ = as_id(decision_id)

@@ -101,7 +101,7 @@ class Corrections:
         Raises
         ------
         ReportError
-            For an unknown decision, and for one without a label.
+            For an unknown decision, one without a label, and what is no label.
         StoreError
             Where the store does not answer.
         """
@@ -110,7 +110,7 @@ class Corrections:
         id_ = stored.decision.id
         if stored.success is label:
             text = f"Decision {id_} counts as a {LABEL_TEXTS[label]} already"
-            return self._unchanged("correct", text)
+            return self._as_unchanged("correct", text)
         before = "forgotten" if stored.success is None else f"a {LABEL_TEXTS[stored.success]}"
         text = f"decision {id_} counts as a {LABEL_TEXTS[label]}, was {before}"
         data = {"decisions": {id_: {"was": stored.success, "now": label}}}
@@ -153,7 +153,7 @@ class Corrections:
         }
         if not labels:
             ids = [stored.decision.id for stored in decisions]
-            return self._unchanged("forget", f"{_labels_are(ids)} forgotten already")
+            return self._as_unchanged("forget", f"{_labels_are(ids)} forgotten already")
         text = f"{_labels_are(list(labels))} forgotten" + (f": {reason}" if reason else "")
         changes = {id_: {"was": label, "now": None} for id_, label in labels.items()}
         data = {"decisions": changes, "reason": reason}
@@ -190,16 +190,16 @@ class Corrections:
             raise SettingError(
                 f"Expected the number of a version, got {version!r}; `store.retrains()` lists them."
             )
-        self._make_ready()
+        self._bring_up_to_date()
         before = self._core.live.version
         if version == before and version > 0:
-            return self._unchanged("rollback", f"Version {version} answers already")
+            return self._as_unchanged("rollback", f"Version {version} answers already")
         new = self._core.live.next_version
         text = f"version {version} answers again, as version {new} after {before}"
         data = {"to": int(version), "was": before, "now": new}
         event = Change("rollback", text, data, author)
         self._core.learner.roll_back(int(version), event)
-        return self._done(event)
+        return self._finish_change(event)
 
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on.
@@ -247,11 +247,11 @@ class Corrections:
         new_values = policy.to_values()
         changes = {name: value for name, value in new_values.items() if value != old_values[name]}
         if not changes:
-            return self._unchanged("policy", "The policy is in force already")
+            return self._as_unchanged("policy", "The policy is in force already")
         is_baseline = present.model is not None  # it keeps its rule
         if is_baseline:
             _check_baseline_settings(changes)
-        self._make_ready()
+        self._bring_up_to_date()
         # An audit counts by its inclusion probability, so the pooled evidence must be of one audit
         # rate.
         is_sorting = policy.guarantee in SORTING_GUARANTEES
@@ -277,16 +277,16 @@ class Corrections:
         self._core.learner.set_policy(policy if starts_anew else None, evidence, event)
         self._core.settings.change(settings)
         self._core.feedback.begin_policy()
-        return self._done(event, "the rule of the new policy has no safe mode")
+        return self._finish_change(event, "the rule of the new policy has no safe mode")
 
-    def _make_ready(self) -> None:
+    def _bring_up_to_date(self) -> None:
         """Finish what is under way: a retrain, labels on their way to the store, news of peers.
 
         A correction comes after everything that was known before it. Raises StoreError where the
         engine is closed or the store does not answer.
         """
         self._core.outbox.check_usable()
-        self._core.learner.make_ready()
+        self._core.learner.bring_up_to_date()
 
     def _find_labelled(self, decision_ids: Sequence[Any]) -> list[StoredDecision]:
         """Finish what is under way, then return the decisions of these ids, in their order.
@@ -294,7 +294,7 @@ class Corrections:
         A decision whose label was forgotten has `success` None. Raises ReportError for an unknown
         id, and for a decision that never had a label.
         """
-        self._make_ready()
+        self._bring_up_to_date()
         decisions = []
         for id_ in decision_ids:
             stored = self._store.get_decision(id_) if isinstance(id_, str) else None
@@ -314,9 +314,9 @@ class Corrections:
         for id_ in change.decisions:
             self._core.outbox.evict_decision(id_)
         self._core.learner.apply_corrections()
-        return self._done(change)
+        return self._finish_change(change)
 
-    def _done(
+    def _finish_change(
         self, change: Change, reason_ended: str = "the corrected outcomes keep the tolerance"
     ) -> Changed:
         """Announce a safe mode that the change began or ended, and return what the change did.
@@ -328,7 +328,7 @@ class Corrections:
         self._core.feedback.announce_safe_mode(reason_ended)
         return Changed(change.kind, _sentence(f"{change.text}."), number, self._core.live.version)
 
-    def _unchanged(self, kind: str, text: str) -> Changed:
+    def _as_unchanged(self, kind: str, text: str) -> Changed:
         """Return a `Changed` for a request that was fulfilled already; no event is recorded."""
         return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._core.live.version)
 

@@ -48,7 +48,9 @@ class DecisionMaker:
         self._count = count(1)
 
     def infer_trace_spec(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
-        """Infer the trace contract from a first trace, and decide by it while no contract is set.
+        """Infer the trace contract from a first trace.
+
+        It is also kept, so that this trace can be decided before a contract is set.
 
         Parameters
         ----------
@@ -60,8 +62,7 @@ class DecisionMaker:
         Returns
         -------
         TraceSpec or None
-            None if the trace has a fault: then only this trace is decided by it, and the next one
-            sets the contract.
+            None if the trace has a fault, so that a later one must set the contract.
 
         Raises
         ------

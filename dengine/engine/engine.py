@@ -76,9 +76,9 @@ WARM_UP = 100  # cycles of a loop, after which the objects that are there are ta
 def frozen_objects() -> Iterator[None]:
     """Let Python's garbage collector ignore, until the block ends, all objects that exist now.
 
-    A collection goes through 280,000 objects of imported libraries in 150 ms and finds nothing, so
-    none is made before the block either. It affects the whole process: use it in the one that owns
-    the loop.
+    A collection of them would go through 280,000 objects of imported libraries in 150 ms and free
+    nothing; the block does not begin with one either. It affects the whole process: use it in the
+    one that owns the loop.
     """
     gc.freeze()
     try:
@@ -262,7 +262,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         allow_import: bool | Collection[str] = False,
         **options: Any,
     ) -> Self:
-        """Go on with a used store: the same version and the same decisions, bit for bit.
+        """Open a used store, and go on with the same version and the same decisions, bit for bit.
 
         Parameters
         ----------
@@ -314,7 +314,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         allow_import: bool = False,
         **settings: Any,
     ) -> Self:
-        """Go on with a used store, or start on a new one; a program calls it at every start.
+        """Open a used store and go on, or start on a new one; a program calls it at every start.
 
         Parameters
         ----------

@@ -145,9 +145,9 @@ class Feedback:
         """Count accepted parts without an outcome as confirmed, or as unobserved; the next trace
         has come.
 
-        With `stops="all"` each is a success: rule and references learn it, and its label,
-        CONFIRMED, waits in memory; `MOST_CONFIRMED` of them are handed to the outbox. With "some"
-        the parts are only counted, and nothing is learned.
+        With `stops="all"` each is a success: rule and references learn it at once, and its label,
+        CONFIRMED, waits in memory; when `MOST_CONFIRMED` labels wait, all are handed to the outbox.
+        With "some" the parts are only counted, and nothing is learned.
         """
         if not self._unreported:
             return
@@ -279,8 +279,10 @@ class Feedback:
                 self._labels.add(stored.trace, int(success), stored.content_hash, seq)
 
     def _count_overdue(self) -> None:
-        """Update the rule with checks that were not reported within `label_within` decisions, as
-        errors.
+        """Make the rule count as wrong each decision whose check is overdue.
+
+        It is if nothing was reported of it while `label_within` later decisions were recorded. Each
+        decision is counted once.
         """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within
@@ -288,7 +290,7 @@ class Feedback:
         while pending and next(iter(pending.values())).number <= overdue_to:
             _, stored = pending.popitem(last=False)
             self._live.count_overdue(stored.decision)
-        self._live.examined_to(overdue_to)
+        self._live.mark_examined_to(overdue_to)
 
     def take_remedy(self) -> Remedy | None:
         """Return what must be put right, once; None where there is nothing."""

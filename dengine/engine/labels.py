@@ -76,7 +76,7 @@ class CellLabels:
         """
         self.new_labels += n_labels
 
-    def complete(self, model: EngineModel) -> None:
+    def add_missing_references(self, model: EngineModel) -> None:
         """Do nothing: a trained version has every label of the window, and there are no others."""
 
     def get_state(self) -> State:
@@ -166,7 +166,7 @@ class ProductLabels:
             self.admit(trace, label, hash_, seq)
 
     def admit(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
-        """Add the product's next label to the window and count it as new.
+        """Add the product's next label to the window, and count it as new unless a retrain had it.
 
         A peer's label also becomes a reference of the answering model, unless that has it already.
         """
@@ -196,7 +196,7 @@ class ProductLabels:
     def give_back(self, n_labels: int) -> None:
         """Do nothing after a dropped retrain: the next one is the turn of whichever cell is due."""
 
-    def complete(self, model: EngineModel) -> None:
+    def add_missing_references(self, model: EngineModel) -> None:
         """Add this cell's labels that wait for peers' labels to a version that it trained, as
         references.
         """

@@ -237,7 +237,7 @@ class Learner:
         retrain was taken. Nothing happens, and None is returned, where the store is away. Returns
         the report of a retrain in this thread; None where none was due or it runs in the executor.
         """
-        is_due = self._is_due(recipe.retrain_every)
+        is_due = self._is_due_after_news(recipe.retrain_every)
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
         n_labels = max(self.labels.new_labels, len(self._window))
         has_enough = n_labels >= self.live.newest.min_traces
@@ -352,7 +352,7 @@ class Learner:
             candidate.begin_storing(self._begin_storing(candidate), self._outbox.limit)
         if candidate.storing is None or (not to_the_end and candidate.may_go_on_storing()):
             return False
-        candidate.number(self._outbox.wait_for_result(candidate.storing))
+        candidate.set_version(self._outbox.wait_for_result(candidate.storing))
         return True
 
     def _begin_storing(self, candidate: Candidate) -> Future[int]:
@@ -361,7 +361,7 @@ class Learner:
 
         Returns a future of the version's number. Without a model only the report is stored.
         """
-        report = candidate.accept(self.live.next_version, self.live.corrected_to)
+        report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
         state = None
         if candidate.model is not None and candidate.trained_on is not None:
@@ -393,7 +393,7 @@ class Learner:
             # An update of the rule may have failed since the candidate took it over.
             GuardedModel(candidate.model).prepare(self.live.newest)
             self.live.swap_in(candidate.model, candidate.report.version, candidate.trained_on)
-            self.labels.complete(candidate.model)
+            self.labels.add_missing_references(candidate.model)
 
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
         """Drop a candidate that could not be stored, and keep a report that says so.
@@ -424,7 +424,7 @@ class Learner:
 
     # News of a product
 
-    def _is_due(self, retrain_every: int) -> bool:
+    def _is_due_after_news(self, retrain_every: int) -> bool:
         """Return whether a retrain is due by the number of new labels.
 
         Where cells share a product, their news is taken in first, and a peer's version that came
@@ -480,7 +480,7 @@ class Learner:
 
     # What people put right
 
-    def make_ready(self) -> None:
+    def bring_up_to_date(self) -> None:
         """Finish every retrain, label and news that is under way, before a person's change.
 
         Raises StoreError where that cannot be.

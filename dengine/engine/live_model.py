@@ -224,7 +224,7 @@ class LiveModel:
             self.overdue.add(decision.id)
             GuardedModel(self.newest).update_rule(*outcome[1:])
 
-    def examined_to(self, number: int) -> None:
+    def mark_examined_to(self, number: int) -> None:
         """Note that decisions up to this number were examined for overdue checks."""
         self.overdue_to = max(number, self.overdue_to)
 

@@ -41,7 +41,7 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on the traces of a stored version, with the labels that these had then.
 
     The traces are checked against the ledger. Returns False, with the model untrained, where one is
-    damaged or missing; a label that was forgotten then is none of them.
+    damaged or missing. A label that was forgotten by then is left out, and is not missing.
     """
     store = outbox.store
     first = int(trained_on.seq[0])
@@ -121,8 +121,8 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     """Change the reference of a corrected label: relabel it, remove it or add it again.
 
     Returns False where the model cannot change that reference, so that it must be trained again.
-    True where there is nothing to change: a baseline, a quarantined part, or a trace that is
-    damaged.
+    Otherwise True, also where there is nothing to change: for a baseline, a quarantined part, or a
+    damaged trace that would have to be added again.
     """
     if not model.keeps_references:
         return True

@@ -368,8 +368,9 @@ def fill_from_peers(
     """Return a copy of the settings for a new engine, with what is open taken from a peer.
 
     A peer is another cell of the store's product. Taken are its seed (0 without a peer), and its
-    recipe if `request` names neither reducer, recipe nor model. Raises ImportRefusedError where
-    that recipe names a class that may not be imported.
+    recipe if `request` names neither reducer, recipe nor model. A peer that was given an object
+    without a name has no recipe to take. Raises ImportRefusedError where the recipe names a class
+    that may not be imported.
     """
     peer = next(iter(store.peers_settings().values()), {})
     filled = dict(request)

@@ -146,7 +146,7 @@ class TrainedOn:
     counts_from: int
 
     def to_state(self) -> dict[str, NDArray[Any]]:
-        """Return the fields as arrays by name, for the store."""
+        """Return the fields as arrays by name, for the store; `from_state` reads them."""
         return {
             "trained_on": self.seq,
             "trained_as": np.array(self.corrected_to),

@@ -267,14 +267,14 @@ def _response_type(
     It has the record's fields with their types as in JSON, except those in `without`, and the
     fields of `more`, types by name. Its description is `about` and the record's docstring.
     """
-    members = _members(record) if record else {}
+    members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
     docs = [about, (getdoc(record) or "") if record else ""]
     doc = "\n\n".join(filter(None, docs))
     return msgspec.defstruct(name, (types | more).items(), namespace={"__doc__": doc}, kw_only=True)
 
 
-def _members(record: type) -> Json:
+def _json_field_types(record: type) -> Json:
     """Return the types of a record's fields in JSON, under the names that `to_jsonable` gives them.
 
     Fields that are marked "apart" in their metadata are left out; one marked "flat" gives its own
@@ -284,7 +284,7 @@ def _members(record: type) -> Json:
     members: Json = {}
     for field_ in fields(record):
         if "flat" in field_.metadata:
-            members |= _members(hints[field_.name])
+            members |= _json_field_types(hints[field_.name])
         elif "apart" not in field_.metadata:
             members[field_.name] = _json_type(hints[field_.name])
     return members

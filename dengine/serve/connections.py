@@ -185,7 +185,9 @@ class Connection(AutoHTTPProtocol):
         self.transport.close()
 
     def _start_timer(self) -> None:
-        """Close the connection with 408 after the pool's `head_seconds`, unless a timer runs."""
+        """Start a timer that answers 408 and closes after the pool's `head_seconds`, unless one
+        runs.
+        """
         if self._timer is None:
             seconds = self._pool.head_seconds
             detail = f"Expected the request's head within {seconds:g} s."

@@ -237,7 +237,10 @@ class HttpApi:
         author: Author = "",
         reason: Annotated[str, Meta(description="For the event log.")] = "",
     ) -> Json:
-        """Leave labels out of training and of all counts. /correct takes one in again."""
+        """Leave labels out of training and of all counts. /correct takes one in again.
+
+        If one id is unknown, or has no label, none is forgotten.
+        """
         line = " ".join(reason.split())
         return await self._change(
             author, lambda engine, by: engine.forget(*ids, author=by, reason=line)

@@ -222,9 +222,9 @@ class RobotCalls:
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
         """Decide on the insertion since `begin`, and return the struct of `decide`.
 
-        It waits up to `RECORD_SECONDS` for the recording. A part that has a decision gets it again.
-        Without a recording the result is verify, with an id "" and the reason "not_recorded";
-        nothing is recorded then.
+        It waits up to `RECORD_SECONDS` for the recording, which one call uses up. A part that has a
+        decision gets it again. Without a recording the result is verify, with an id "" and the
+        reason "not_recorded"; nothing is recorded then.
 
         Parameters
         ----------
@@ -324,6 +324,11 @@ class RobotCalls:
             newest decisions, 1 without any. version: of the model. safe_mode, alarm: why, or "".
             shadow: whether every part is verified. waiting: requests in the queue. late, busy:
             decisions past the deadline, and requests refused.
+
+        Raises
+        ------
+        BusyError, StoreError
+            If the queue is full, or the store cannot be read.
         """
         service = self._service
         status = await service.status()

@@ -140,7 +140,7 @@ def serve(
     own_names = () if is_loopback(host) else (host, socket.gethostname())
     access = Access(tokens, (*own_names, *allow_hosts), largest, rate=rate)
     with (
-        bound(host, port) as listening,
+        listening_socket(host, port) as listening,
         log_lines_to(sys.stderr),
         RetrainingProcess() as executor,
         recorder() as opened_recorder,
@@ -178,7 +178,11 @@ def serve(
 
 
 def uvicorn_options(connections: int = CONNECTIONS) -> dict[str, Any]:
-    """Return the options of `uvicorn.Config`: limits of connections, and no logs of its own."""
+    """Return the options of `uvicorn.Config` by name: limits of connections, and no logs of its
+    own.
+
+    `connections` is the most connections that may be open at once.
+    """
     return {
         "http": ConnectionPool(connections).new_connection,
         "timeout_keep_alive": KEEP_ALIVE,
@@ -262,7 +266,7 @@ def quick_switches() -> Iterator[None]:
 
 
 @contextmanager
-def bound(host: str, port: int) -> Iterator[socket.socket]:
+def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
     """Open a listening TCP socket, and close it when the block ends; port 0 takes a free one.
 
     Raises SettingError if it cannot be opened.

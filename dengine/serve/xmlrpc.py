@@ -85,7 +85,10 @@ def routes(service: CellService, recorder: Recorder | None = None) -> list[Route
     calls = RobotCalls(service, recorder).table()
 
     async def rpc(request: Request) -> Response:
-        """Respond to an XML-RPC call; 415 for another media type or a compressed body."""
+        """Respond to an XML-RPC call with a value or a fault as XML.
+
+        Another media type or a compressed body gets 415.
+        """
         if media_type(request) not in ("text/xml", "application/xml"):
             text = "Expected an XML-RPC call, Content-Type: text/xml.\n"
             return PlainTextResponse(text, 415)

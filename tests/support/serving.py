@@ -47,14 +47,14 @@ def served(app: Any, port: int = 0, connections: int = 100, **limits: Any) -> It
     import uvicorn
 
     from dengine.serve.connections import ConnectionPool
-    from dengine.serve.server import bound, uvicorn_options
+    from dengine.serve.server import listening_socket, uvicorn_options
 
     options = {
         "http": ConnectionPool(connections, **limits).new_connection,
         "timeout_graceful_shutdown": 1,
     }
     server = uvicorn.Server(uvicorn.Config(app, **uvicorn_options() | options))
-    with bound("127.0.0.1", port) as listening:
+    with listening_socket("127.0.0.1", port) as listening:
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()
         while thread.is_alive() and not server.started:
