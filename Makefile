@@ -6,7 +6,7 @@ VENV ?= .venv
 PIP_FLAGS ?=
 PIP = $(VENV)/bin/python -m pip install --quiet --progress-bar off --disable-pip-version-check --constraint constraints.txt $(PIP_FLAGS)
 RUN = $(VENV)/bin/dengine
-PYTEST = $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadgroup --no-loadscope-reorder
+PYTEST = $(VENV)/bin/python -m pytest --numprocesses 3 --dist loadgroup --no-loadscope-reorder
 OUT ?= out
 AUDIT = $(VENV)/audit
 # At least so many packages must have been audited; the run-time dependencies alone are more.

@@ -50,8 +50,12 @@ GROUPS |= dict.fromkeys(("test_estimators", "test_reducers", "test_umap"), "umap
 # `make test` leaves out what is slow: these folders, and the cases of other tests that have these names.
 SLOW = REPO / "tests" / "slow"
 SLOW_CASES = ("umap-learn", "postgres", "minirocket")
-# What is slow and yet run before each merge; single tests are marked where they stand.
+# What is slow and yet run before each merge: tests that start many processes, a browser or a compiler.
+# Single tests are marked where they stand.
 MERGE = (
+    "test_without_posix",
+    "test_serve_process",
+    "test_page",
     "test_cpp",
     "test_c_interface",
     "test_onnx_program",
@@ -68,7 +72,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         stem, case = item.path.stem, item.callspec.id if hasattr(item, "callspec") else ""
         item.add_marker(pytest.mark.xdist_group(GROUPS.get(stem, stem)))
-        if stem in MERGE or "postgres" in case:
+        runs_before_merge = stem in MERGE and item.get_closest_marker("slow") is None
+        if runs_before_merge or "postgres" in case:
             item.add_marker("merge")
         if (
             item.get_closest_marker("merge")

@@ -35,6 +35,7 @@ LESS = {  # so that an example takes seconds; its own options are all read
     "replay": "--repeats 1 --cycles 150",
     "run": "--cycles 6",
     "simulate": "--n 4",
+    "train": "--data small.npz",
 }
 OWN_REDUCERS = """
 import os, signal
@@ -150,13 +151,16 @@ def test_the_example_of_serve_listens_and_ends_when_it_is_told_to(tmp_path: Path
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "serve"])
 def test_every_help_ends_in_a_command_that_works(
-    verb: str, folder: Path, tmp_path: Path, monkeypatch
+    verb: str, folder: Path, tmp_path: Path, monkeypatch, make_data
 ) -> None:
     if verb == "simulate":
         pytest.importorskip("mujoco")
     for file in () if verb in ("run", "train") else folder.iterdir():  # these two make their own
         shutil.copy(file, tmp_path)
     monkeypatch.chdir(tmp_path)
+    if verb == "train":
+        parts = make_data(60)
+        np.savez(tmp_path / "small.npz", X=parts.X, y=parts.y)
     program, named, *words = example_of(verb)
     assert (program, named) == ("dengine", verb)
     succeed(named, *words, *LESS.get(verb, "").split())

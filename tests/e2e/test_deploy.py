@@ -98,6 +98,7 @@ def test_the_container_runs_as_nobody_special_and_what_it_starts_is_an_option_ea
     assert str(given["port"]) in steps("EXPOSE")
 
 
+@pytest.mark.merge
 def test_what_the_container_starts_is_healthy_asks_for_the_token_and_ends_in_order(
     tmp_path: Path,
 ) -> None:

@@ -228,7 +228,7 @@ def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(
     data = make_data(120, samples=SAMPLES, failures=0.4)
     with (
         FakeController(RobotProgram(data, confirm=confirm), speed=None) as fake,
-        cell_of(fake) as cell,
+        cell_of(fake, timeout=WAIT) as cell,  # a busy machine may be silent for seconds
     ):
         assert isinstance(cell, Cell)
         live = decisions(cell, 120)

@@ -74,6 +74,7 @@ def test_an_exported_file_takes_every_decision_that_it_took(
     assert_same(STORIES[name].ask(exported(name)), kept(name))
 
 
+@pytest.mark.merge  # it compiles the program
 @pytest.mark.parametrize("name", EXPORTED)
 def test_the_cell_program_takes_the_same_decisions(
     name: str, exported, programs: Path, tmp_path: Path

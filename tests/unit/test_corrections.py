@@ -276,7 +276,7 @@ def step(engine: DataEngine, data: Dataset, kind: str, value) -> None:
 
 
 @pytest.mark.parametrize("recipe", [RECIPE, POOLED], ids=["local", "pooled"])
-@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
 @given(steps=STEPS)
 def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(
     recipe, steps, make_data, tmp_path_factory
