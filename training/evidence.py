@@ -1,49 +1,48 @@
-"""The paper's 18 cells, every reducer and baseline on eight sets, what each promise costs: `make evidence`.
+"""Play the replays behind the results: every reducer and baseline on eight sets of parts.
 
-    make evidence SCREW=screw_driving.npz            # as training/make_screw_driving.py writes it; left out without
-    python training/evidence.py --only conv --n-jobs 2      # what is not asked for stays as it was
+    make evidence SCREW=screw_driving.npz     # SCREW: as training/make_screw_driving.py writes it
+    python training/evidence.py --only conv --n-jobs 2     # methods left out keep their rows
+    python training/evidence.py --cluster tcp://host:8786  # on the workers of a dask cluster
+    python training/evidence.py --tables-only --out out    # only write the page again
 
-Shuffle by shuffle, so that what is finished can be compared; finished replays are kept in --keep, so that a killed run goes
-on. After each shuffle it writes into OUT/evidence: replays.csv (one row per replay, with the commit of the dengine
-that played it), differences.csv, curves.png, and tables.md. The rows of a condition that another commit plays again are
-replaced.
+Beside the methods (`METHODS`) it plays the paper's 18 combinations of interval, alpha and LB, and
+variants of conv that show what each promise costs. It says first what is left to do and how long
+that takes. Finished replays are kept in --keep, so that an interrupted run continues.
 
-Recorded sets are shuffled by the seed; of a made one each seed draws new parts, which come in their order. Everybody sees
-the same parts in the same order: differences are paired, to conv's replay of the same seed, with Student's interval.
+Replays are played shuffle by shuffle. After each shuffle it writes into OUT/evidence: replays.csv
+(one row per replay, with the commit of dengine that played it), and from it the tables and figures
+of `evidence_page`. The seed of a shuffle sets the order of a recorded set, and generates the parts
+of the others, so all methods see the same parts in the same order.
 """
 
-import os
-import platform
+import argparse
 import subprocess
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import joblib
 import numpy as np
 import pandas as pd
 import torch
 from common import options
-from matplotlib.figure import Figure
-from scipy.signal import lfilter
-from scipy.stats import t as student
+from evidence_page import CONDITION, LABELS_PER_POINT, METHODS, POLICIES, VARIANTS, write_results
+from evidence_sets import GENERATORS, SETS, load_set
 
 import dengine
-from dengine import Dataset, Replay, load_dataset
-from dengine.experiments.figures import RECIPES, blank, finish, save
+from dengine import Dataset, Replay
 from dengine.experiments.grid import KeptReplays, Task, iterate_replays
-from dengine.experiments.paper import ALPHAS, LOWER_BOUNDS, findings, paper_table
+from dengine.experiments.paper import ALPHAS, INTERVALS, LOWER_BOUNDS
 from dengine.experiments.replay import Contender
 from dengine.experiments.tables import write_csv
-from dengine.files import write_output
 from dengine.reducers import ConvReducer
 from dengine.reducers.base import StopRule
 
-CELLS = ((0.1, 0.9), (0.05, 0.95))  # alpha, LB
-# Seconds of a core that a replay takes.
+# Seconds of a core that a replay takes, for the estimate at the start.
 SECONDS = {
     "conv": 10,
     "rocket": 2,
@@ -55,19 +54,15 @@ SECONDS = {
     "gp": 24,
     "minirocket": 20,
 }
-SLOW = {"gp": 10, "minirocket": 10, "umap-learn": 5}  # shuffles
-SHUFFLES = dict.fromkeys(SECONDS, 30) | SLOW
-GRIDS = {
-    ("conv", "wilson"): 30,
-    ("conv", "binomial"): 30,
-    ("umap", "wilson"): 30,
-    ("umap", "binomial"): 30,
-}
-PROMISES = 10  # shuffles of each
-LABELS = 50  # from one point of a learning curve to the next
-PARTS, SAMPLES = 1000, 400  # of a made set
-CONDITION = ["set", "recipe", "interval", "alpha", "lower_bound"]
-KEPT = [
+# How many shuffles are played; slow methods have fewer.
+N_SHUFFLES = dict.fromkeys(METHODS, 30) | {"gp": 10, "minirocket": 10, "umap-learn": 5}
+N_GRID_SHUFFLES = 30  # of the paper's combinations
+GRID_METHODS = ("conv", "umap")
+N_VARIANT_SHUFFLES = 10
+VARIANT_SETS = ("insertion", "screw driving")
+PROMISES = "promises"  # the word for the variants of conv in --only
+# Columns of `Replay.summary` that replays.csv has beside `CONDITION`.
+SUMMARY = [
     "seed",
     "cycles",
     "certain",
@@ -77,433 +72,311 @@ KEPT = [
     "false_positive",
     "false_negative",
     "net_s",
+    "retrain_p50_s",
+    "retrain_max_s",
 ]
-KEPT += ["retrain_p50_s", "retrain_max_s"]
-MEASURES = {
-    "certain": "Certain decisions",
-    "false_positive": "Bad parts accepted",
-    "net_s": "Net seconds saved",
-}
-
-
-def oscillation(rng: np.random.Generator) -> Dataset:
-    """Noise of an engine: one of two resonances, a seventh apart, under white noise."""
-    good = rng.random(PARTS) < 0.6
-    X = rng.normal(0.0, 0.6, (PARTS, SAMPLES))
-    for i, angle in enumerate(
-        2.0 * np.pi * np.where(good, 0.1, 0.115) * rng.normal(1.0, 0.03, PARTS)
-    ):
-        ringing = lfilter(
-            [1.0], [1.0, -1.94 * np.cos(angle), 0.97**2], rng.normal(size=SAMPLES + 200)
-        )[200:]
-        X[i] += ringing / ringing.std()
-    return of(X, good)
-
-
-def contact(rng: np.random.Generator, age: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Forces (PARTS, SAMPLES) that rise from contact on and fall where a part snaps in, as bad ones hardly do; labels.
-
-    age : (PARTS,) from 0 to 1: friction and stiffness grow, contact comes sooner, the snap becomes less.
-    """
-    good, time = rng.random(PARTS) < 0.65, np.linspace(0.0, 1.0, SAMPLES)
-    fall = rng.normal(np.where(good, 1.5, 0.2) * (1.0 - 0.4 * age), 0.3)[:, None]
-    begin = (rng.normal(0.3, 0.04, PARTS) - 0.12 * age)[:, None]
-    force = (3.0 + age[:, None]) * np.clip(time - begin, 0.0, None) + 0.8 * age[:, None]
-    force -= fall / (1.0 + np.exp(-(time - begin - rng.normal(0.4, 0.05, (PARTS, 1))) / 0.01))
-    wander = np.cumsum(rng.normal(0.0, 0.02, force.shape), axis=1)
-    return force + wander + rng.normal(0.0, 0.1, force.shape), good
-
-
-def drift(rng: np.random.Generator) -> Dataset:
-    """The tool wears from the first part to the last."""
-    return of(*contact(rng, np.linspace(0.0, 1.0, PARTS)))
-
-
-def variant(rng: np.random.Generator) -> Dataset:
-    """Half way another part comes."""
-    return of(*contact(rng, (np.arange(PARTS) >= PARTS // 2).astype(float)))
-
-
-def two_channels(rng: np.random.Generator) -> Dataset:
-    """Force and torque: a part is good that snaps in by both."""
-    (force, snapped), (torque, turned) = (contact(rng, np.zeros(PARTS)) for _ in range(2))
-    return of(np.stack([force, torque], axis=1), snapped & turned)
-
-
-def opposite(rng: np.random.Generator) -> Dataset:
-    """Made to be hard for conv, whose heads are linear: two products in turn, what is good of one is bad of the other."""
-    product, high = rng.random(PARTS) < 0.5, rng.random(PARTS) < 0.5
-    time = np.linspace(0.0, 1.0, SAMPLES)
-    levels = [
-        (np.where(chosen, 1.0, -1.0) + rng.normal(0.0, 0.3, PARTS))[:, None]
-        for chosen in (product, high)
-    ]
-    X = levels[0] * (time < 0.1) + levels[1] * (time > 0.9) + rng.normal(0.0, 0.3, (PARTS, SAMPLES))
-    return of(X, (product == high) ^ (rng.random(PARTS) < 0.02))
-
-
-def of(X: np.ndarray, good: np.ndarray) -> Dataset:
-    """A made set."""
-    return Dataset(X.astype(np.float32), good.astype(np.int8), name="made")
-
-
-MADE = {
-    made.__name__.replace("_", " "): made
-    for made in (oscillation, drift, variant, two_channels, opposite)
-}
-SETS = ("insertion", "insertion 1.2 s", "screw driving", *MADE)
-
-
-@cache
-def recorded(name: str, screw: Path | None) -> Dataset:
-    """A set that is not made here."""
-    if name == "screw driving":
-        return load_dataset(screw, 400)
-    data = load_dataset("insertion")
-    return data.cut(round(1.2 * data.spec.rate_hz)) if "1.2 s" in name else data
 
 
 class DishonestReducer(ConvReducer):
-    """conv with members that are trained on the labels of every fold, which are then counted: for comparison only."""
+    """conv with members that all learn from the labels of every fold, which are then counted.
+
+    For comparison only: it shows what honest counting costs.
+    """
 
     def fit_loop(
         self, x: torch.Tensor, y: torch.Tensor, folds: np.ndarray, stop: StopRule, steps: int
     ) -> None:
+        """Train every member on all labels, by hiding from it which fold they are in."""
         super().fit_loop(x, y, np.full_like(folds, -1), stop, steps)
 
 
-def promises() -> list[Contender]:
-    """What is promised beyond the paper's rule, one after the other."""
-    paper = Contender.load("conv").recipe
-    known, pooled = (
-        paper.with_policy(stops="all"),
-        paper.with_policy(stops="all", guarantee="pooled"),
+def make_variants() -> list[Contender]:
+    """Return the `VARIANTS` of conv at the first of `POLICIES`."""
+    local = Contender.load("conv").recipe
+    every_stop = local.with_policy(stops="all")
+    pooled = local.with_policy(stops="all", guarantee="pooled")
+    recipes = (
+        replace(local, novelty=0.0),
+        every_stop,
+        replace(every_stop, reducer=DishonestReducer(), params={}),
+        pooled,
+        pooled.with_policy(audit_rate=0.02),
+        pooled.with_policy(audit_rate=0.1),
     )
-    found = {
-        "no novelty": replace(paper, novelty=0.0),
-        "every stop known": known,
-        "every stop known, dishonest": replace(known, reducer=DishonestReducer(), params={}),
-        "pooled": pooled,
-        "pooled, 2 % audits": pooled.with_policy(audit_rate=0.02),
-        "pooled, 10 % audits": pooled.with_policy(audit_rate=0.1),
-    }
-    return [Contender(f"conv, {name}", recipe) for name, recipe in found.items()]
-
-
-def conditions(name: str, nth: int, cells: int) -> Iterator[Contender]:
-    """All that the nth shuffle of a set is played with, each once."""
-    asked = [
-        (who, "wilson", *cell)
-        for (who, most), cell in product(SHUFFLES.items(), CELLS[:cells])
-        if nth < most
+    alpha, lower_bound = POLICIES[0]
+    return [
+        Contender(name, recipe.with_policy(alpha=alpha, lower_bound=lower_bound))
+        for name, recipe in zip(VARIANTS, recipes, strict=True)
     ]
-    if name == "insertion" and cells == len(CELLS):
-        grid = list(product(ALPHAS, LOWER_BOUNDS))
-        asked += [(*who, *cell) for (who, most), cell in product(GRIDS.items(), grid) if nth < most]
-    for who, interval, alpha, bound in dict.fromkeys(asked):
-        yield Contender.load(who).with_policy(interval=interval, alpha=alpha, lower_bound=bound)
-    if name in ("insertion", "screw driving") and nth < PROMISES:
-        yield from (one.with_policy(alpha=0.1, lower_bound=0.9) for one in promises())
 
 
-def row_of(name: str, replay: Replay, commit: str) -> dict[str, Any]:
-    """What is kept of a replay. bought : the cycles, from 1, at which every LABELS-th label was there."""
-    row = {"set": name} | replay.summary()
-    cycles = np.flatnonzero(replay.verified)[LABELS - 1 :: LABELS] + 1
-    return {key: row[key] for key in CONDITION + KEPT} | {
-        "bought": " ".join(map(str, cycles)),
-        "commit": commit,
-    }
+class Condition(NamedTuple):
+    """A method with a policy."""
 
+    method: str
+    interval: str
+    alpha: float
+    lower_bound: float
 
-def merged(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
-    """Old rows beside new ones, which come in the place of all of another commit that have their condition."""
-    again = old.merge(
-        new[[*CONDITION, "commit"]].drop_duplicates(),
-        on=CONDITION,
-        how="left",
-        suffixes=("", "_new"),
-    )
-    other = (again["commit_new"].notna() & (again["commit_new"] != again["commit"])).to_numpy()
-    rows = pd.concat([old[~other], new]).drop_duplicates([*CONDITION, "seed"], keep="last")
-    order = {name: i for i, name in enumerate([*SETS, *SHUFFLES])}
-    return rows.sort_values(
-        [*CONDITION, "seed"], key=lambda of: of.map(order) if of.name in ("set", "recipe") else of
-    )
-
-
-def differences(frame: pd.DataFrame) -> pd.DataFrame:
-    """A row a set, policy and contender: means, and what is more than conv's of the same seed, with its 95 % interval."""
-    rows, beside = [], ["set", "interval", "alpha", "lower_bound"]
-    for key, cell in frame.groupby(beside, sort=False):
-        for who, own in cell.groupby("recipe", sort=False):
-            pairs = own.merge(cell[cell["recipe"] == "conv"], on="seed", suffixes=("", "_conv"))
-            row = dict(zip(beside, key, strict=True)) | {
-                "recipe": who,
-                "commit": own["commit"].iloc[0],
-            }
-            row |= {
-                "replays": len(own),
-                "cycles": own["cycles"].mean(),
-                "accepted": own["accepted"].mean(),
-            }
-            for name in MEASURES:
-                more, n = pairs[name] - pairs[f"{name}_conv"], len(pairs)
-                half = student.ppf(0.975, n - 1) * more.std() / np.sqrt(n) if n > 1 else np.nan
-                row |= {name: own[name].mean(), f"{name}_more": more.mean() if n else np.nan}
-                row |= {
-                    f"{name}_low": row[f"{name}_more"] - half,
-                    f"{name}_high": row[f"{name}_more"] + half,
-                }
-            rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def learning_curve(frame: pd.DataFrame) -> pd.Series:
-    """By labels bought, the share that was certain from there to the next LABELS; as far as every replay bought so many."""
-    cycles = pd.DataFrame(
-        [np.diff([0, *map(int, text.split())]) for text in frame["bought"].fillna("")]
-    ).mean(skipna=False)
-    return pd.Series((1.0 - LABELS / cycles).to_numpy(), index=LABELS * cycles.index).dropna()
-
-
-def picture(frame: pd.DataFrame) -> Figure:
-    """A panel a set: learning curves at the first of CELLS."""
-    figure = blank(11.0, 8.0, "Certain share of the parts by labels bought; alpha 0.1, LB 90 %")
-    panels = dict(zip(SETS, figure.subplots(3, 3, sharey=True).ravel(), strict=False))
-    looks = dict(zip(SHUFFLES, product(("-", "--"), RECIPES), strict=False))
-    rows = frame.query(
-        "interval == 'wilson' and alpha == 0.1 and lower_bound == 0.9 and recipe in @looks"
-    )
-    for (name, who), own in rows.groupby(["set", "recipe"], sort=False):
-        curve = 100.0 * learning_curve(own)
-        panels[name].plot(
-            curve.index, curve, looks[who][0], marker=".", color=looks[who][1], label=who
+    def contender(self) -> Contender:
+        """Return who plays the replay."""
+        return Contender.load(self.method).with_policy(
+            interval=self.interval, alpha=self.alpha, lower_bound=self.lower_bound
         )
-    for name, axes in panels.items():
-        finish(axes, legend=0, ylim=(0, 100), title=name)
-    figure.supxlabel("labels bought")
-    figure.supylabel("certain [%]")
-    figure.axes[-1].set_axis_off()  # the ninth place
-    figure.axes[-1].legend(
-        *panels["insertion"].get_legend_handles_labels(), loc="center", frameon=False
-    )
-    return figure
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table, and an empty one."""
-    return [f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rows)] + [""]
+class Shuffle(NamedTuple):
+    """The parts of a set for one seed, and the replays of them.
+
+    Attributes
+    ----------
+    seed : int
+    set_name : str
+    data : Dataset
+    tasks : list of Task
+    """
+
+    seed: int
+    set_name: str
+    data: Dataset
+    tasks: list[Task]
 
 
-def more(row: pd.Series, name: str) -> str:
-    """What is more than conv's, with its interval."""
-    ends = (
-        f" ({row[f'{name}_low']:.0f} to {row[f'{name}_high']:.0f})"
-        if np.isfinite(row[f"{name}_low"])
-        else ""
-    )
-    return f"{row[f'{name}_more']:+.0f}{ends}" if np.isfinite(row[f"{name}_more"]) else "-"
+@dataclass(frozen=True)
+class Plan:
+    """What is played.
 
+    Parameters
+    ----------
+    seeds : range
+        One shuffle of each set for each seed.
+    sets : list of str
+        Names in `SETS`.
+    methods : list of str
+        Names in `METHODS`, or "promises" for the variants of conv.
+    n_policies : int
+        How many of the `POLICIES`. Only with all of them the paper's combinations are played.
+    max_cycles : int
+        Longest replay.
+    screw_driving : Path or None
+        File of the set `screw driving`.
+    """
 
-def compared(told: pd.DataFrame) -> list[str]:
-    """For each policy: conv and the others on each set, where conv loses, and ranks over the sets."""
-    lines, known = [], [who for who in SHUFFLES if who in set(told["recipe"])]
-    for alpha, bound in CELLS:
-        cell = told.query(
-            "alpha == @alpha and lower_bound == @bound and interval == 'wilson' and recipe in @known"
-        )
-        for name, title in MEASURES.items():
-            said = cell.assign(
-                said=[
-                    f"{r[name]:.0f}" if r["recipe"] == "conv" else more(r, name)
-                    for _, r in cell.iterrows()
+    seeds: range
+    sets: list[str]
+    methods: list[str]
+    n_policies: int
+    max_cycles: int
+    screw_driving: Path | None
+
+    def iterate_shuffles(self) -> Iterator[Shuffle]:
+        """Load or generate each set for each seed, and yield it with its replays."""
+        for index, seed in enumerate(self.seeds):
+            for set_name in self.sets:
+                data = load_set(set_name, seed, self.screw_driving)
+                cycles = None if self.max_cycles >= len(data) else self.max_cycles
+                is_shuffled = set_name not in GENERATORS
+                tasks = [
+                    Task(contender, seed, cycles, is_shuffled)
+                    for contender in self.contenders(set_name, index)
                 ]
-            )
-            wide = said.pivot_table("said", "set", "recipe", aggfunc="first").reindex(
-                index=cell["set"].unique(), columns=known
-            )
-            lines += [
-                f"**{title}, alpha {alpha:g}, LB {100 * bound:g} %**: conv's mean, and what others have more",
-                "",
-            ]
-            lines += table(
-                ["set", *known], [[key, *map(str, row.fillna("-"))] for key, row in wide.iterrows()]
-            )
-        worse = cell.query("certain_low > 0 or net_s_low > 0")
-        said = [
-            [r["set"], r["recipe"], *(more(r, name) for name in MEASURES)]
-            for _, r in worse.iterrows()
+                yield Shuffle(seed, set_name, data, tasks)
+
+    def contenders(self, set_name: str, index: int) -> list[Contender]:
+        """Return all that play the shuffle of this index, from 0, of a set."""
+        conditions = [
+            Condition(method, "wilson", *policy)
+            for method, policy in product(METHODS, POLICIES[: self.n_policies])
+            if index < N_SHUFFLES[method]
         ]
-        lines += [
-            "Where conv loses, in certain decisions or in net seconds, beyond chance; how much more others have:",
-            "",
+        has_all_policies = self.n_policies == len(POLICIES)
+        if set_name == "insertion" and has_all_policies and index < N_GRID_SHUFFLES:
+            grid = product(GRID_METHODS, INTERVALS, ALPHAS, LOWER_BOUNDS)
+            conditions += [Condition(*settings) for settings in grid]
+        contenders = [
+            condition.contender()
+            for condition in dict.fromkeys(conditions)  # some are in the grid too
+            if condition.method in self.methods
         ]
-        lines += table(
-            ["set", "who", "certain", "bad accepted", "net seconds"], said or [["nowhere", *"----"]]
-        )
-        full = cell[cell.groupby("set")["recipe"].transform("size") == len(known)]
-        ranks = (
-            full.groupby("set")[["net_s", "certain"]]
-            .rank(ascending=False)
-            .groupby(full["recipe"])
-            .mean()
-        )
-        head = [
-            f"mean rank over {full['set'].nunique()} sets",
-            "by net seconds",
-            "by certain decisions",
-        ]
-        lines += table(
-            head,
-            [
-                [who, *(f"{rank:.1f}" for rank in row)]
-                for who, row in ranks.sort_values("net_s").iterrows()
-            ],
-        )
-    return lines
+        has_variants = set_name in VARIANT_SETS and index < N_VARIANT_SHUFFLES
+        if has_variants and PROMISES in self.methods:
+            contenders += make_variants()
+        return contenders
 
 
-def paper(frame: pd.DataFrame) -> list[str]:
-    """The paper's two tables for each of the two reducers, and its findings."""
-    lines, rows = [], frame[(frame["set"] == "insertion") & frame["recipe"].isin(["conv", "umap"])]
-    for who, interval in product(("umap", "conv"), ("wilson", "binomial")):
-        own = rows[(rows["recipe"] == who) & (rows["interval"] == interval)]
-        if len(own):
-            lines += [f"**{who}, {interval}**", "", paper_table(own, who, interval), ""]
-    return [*lines, *(f"- {line}" for line in findings(rows)), ""]
+def replay_row(set_name: str, replay: Replay, commit: str) -> dict[str, Any]:
+    """Return a replay's row of replays.csv.
+
+    Its column `bought` has the cycles, from 1, at which every `LABELS_PER_POINT`-th label was
+    there, as text.
+    """
+    summary = {"set": set_name} | replay.summary()
+    cycles = np.flatnonzero(replay.verified)[LABELS_PER_POINT - 1 :: LABELS_PER_POINT] + 1
+    row = {column: summary[column] for column in [*CONDITION, *SUMMARY]}
+    return row | {"bought": " ".join(map(str, cycles)), "commit": commit}
 
 
-def cost_of_promises(told: pd.DataFrame) -> list[str]:
-    """The paper's rule with conv, and its variants."""
-    sets = set(told.loc[told["recipe"] == "conv, pooled", "set"])
-    rows = told.query("alpha == 0.1 and lower_bound == 0.9 and interval == 'wilson'")
-    rows = rows.assign(bad=100.0 * rows["false_positive"] / rows["accepted"])
-    rows = rows[rows["recipe"].str.startswith("conv") & rows["set"].isin(sets)]
-    said = [
-        [
-            r["set"],
-            r["recipe"],
-            f"{r['certain']:.0f}",
-            more(r, "certain"),
-            f"{r['bad']:.1f} %",
-            more(r, "net_s"),
-        ]
-        for _, r in rows.iterrows()
-    ]
-    return table(["set", "", "certain", "more", "bad of the accepted", "net seconds, more"], said)
+def merge_replays(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
+    """Return the old rows with the new ones, sorted.
+
+    If a condition was played again by another commit, all its old rows are left out, so that no
+    mean is over two commits. Of two rows of one seed the new one stays.
+    """
+    replayed = new[[*CONDITION, "commit"]].drop_duplicates()
+    matched = old.merge(replayed, on=CONDITION, how="left", suffixes=("", "_new"))
+    is_replaced = matched["commit_new"].notna() & (matched["commit_new"] != matched["commit"])
+    rows = pd.concat([old[~is_replaced.to_numpy()], new])
+    rows = rows.drop_duplicates([*CONDITION, "seed"], keep="last")
+    positions = {name: i for i, name in enumerate([*SETS, *METHODS])}
+
+    def sort_key(column: pd.Series) -> pd.Series:
+        return column.map(positions) if column.name in ("set", "recipe") else column
+
+    return rows.sort_values([*CONDITION, "seed"], key=sort_key)
 
 
-def write(frame: pd.DataFrame, out: Path) -> None:
-    """Write the CSV files, the picture and the tables into the folder `evidence` of out."""
-    told, folder = differences(frame), out / "evidence"
-    write_csv(frame, folder / "replays.csv", force=True)
-    write_csv(told.round(3), folder / "differences.csv", force=True)
-    save(picture(frame), folder / "curves.png", dpi=80, force=True)
-    sides = (
-        told.groupby(["recipe", "commit"], sort=False)["replays"].agg(["min", "max"]).reset_index()
-    )
-    rows = [[r["recipe"], r["commit"], f"{r['min']} to {r['max']}"] for _, r in sides.iterrows()]
-    seeds = f"seeds {frame['seed'].min()} to {frame['seed'].max()}"
-    sections = {
-        "Machine": [f"Last on {datetime.now(UTC):%d %B %Y}, {seeds}.", "", *machine()],
-        "Replays": table(["method", "commit", "shuffles of a condition"], rows),
-        "Reducers and baselines": compared(told),
-        "The paper's cells": paper(frame),
-        "What each promise costs": cost_of_promises(told),
-    }
-    page = "\n".join(
-        line for title, lines in sections.items() for line in (f"## {title}", "", *lines, "")
-    )
-    write_output(folder / "tables.md", page.encode(), force=True)
+def read_replays(path: Path) -> pd.DataFrame:
+    """Return the rows of replays.csv; none if the file is missing."""
+    if not path.exists():
+        return pd.DataFrame(columns=[*CONDITION, "seed", "commit"])
+    return pd.read_csv(path, dtype={"bought": str, "commit": str})
 
 
-def machine() -> list[str]:
-    """Processor and cores; Python and torch: as lines of a page."""
-    known = Path("/proc/cpuinfo")
-    lines = known.read_text(encoding="utf-8").splitlines() if known.exists() else []
-    names = [line.split(": ")[1] for line in lines if line.startswith("model name")]
-    cores = f"{names[0] if names else platform.processor()}, {os.cpu_count()} cores"
-    return [f"    {cores}", f"    Python {platform.python_version()}, torch {torch.__version__}"]
-
-
-def commit() -> str:
-    """The last one that changed the dengine that is imported; with a + where its files are not as in any."""
+def last_commit() -> str:
+    """Return the last commit that changed the imported dengine, with a + if it differs from it."""
     folder = Path(dengine.__file__).parent
 
-    def git(*words: str) -> str:
-        return subprocess.run(
-            ["git", "-C", folder, *words], capture_output=True, text=True, check=False
-        ).stdout.strip()
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(folder), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
-    return (git("log", "-1", "--format=%h", ".") or "unknown") + (
-        "+" if git("status", "--porcelain", ".") else ""
+    commit = git("log", "-1", "--format=%h", ".") or "unknown"
+    return commit + "+" if git("status", "--porcelain", ".") else commit
+
+
+def print_cost(plan: Plan, keep: Path, n_jobs: int) -> None:
+    """Print how many replays are not kept yet, and how long they take."""
+    remaining = list[str]()
+    for shuffle in plan.iterate_shuffles():
+        kept = KeptReplays(keep, shuffle.data)
+        missing = [task for task in shuffle.tasks if not kept.path(task).is_file()]
+        remaining += [task.contender.name for task in missing]
+    seconds = sum(SECONDS.get(name, SECONDS["conv"]) for name in remaining)
+    n_at_once = joblib.effective_n_jobs(n_jobs)  # on a cluster: its cores
+    hours = seconds / 3600.0 / n_at_once
+    print(
+        f"{len(remaining)} replays are left, about {hours:.1f} hours at {n_at_once} at a time.",
+        flush=True,
     )
 
 
-def main() -> None:
-    """Parse, say the cost, play, write."""
+def play(plan: Plan, folder: Path, keep: Path, n_jobs: int) -> None:
+    """Play all shuffles; after each seed, write the results of all seeds so far."""
+    path = folder / "replays.csv"
+    commit = last_commit()
+    old = read_replays(path)
+    rows = list[dict[str, Any]]()
+    for shuffle in plan.iterate_shuffles():
+        replays = iterate_replays(shuffle.data, shuffle.tasks, n_jobs=n_jobs, keep=keep)
+        rows += [replay_row(shuffle.set_name, played.replay, commit) for played in replays]
+        is_last_set = shuffle.set_name == plan.sets[-1]
+        if is_last_set and rows:
+            merged = merge_replays(old, pd.DataFrame(rows))
+            write_csv(merged, path, force=True)
+            write_results(merged, folder)
+            now = datetime.now(UTC)
+            print(f"{now:%H:%M:%S} seed {shuffle.seed}: {len(rows)} replays", flush=True)
+
+
+@contextmanager
+def use_cluster(address: str | None) -> Iterator[None]:
+    """Let joblib send its work to the workers of a dask cluster; None: stay on this machine.
+
+    A replay whose worker dies is played again by another one. Finished replays are kept on this
+    machine. The workers need the same versions of dengine and its libraries.
+    """
+    if address is None:
+        yield
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise SystemExit(f"--cluster needs dengine[dask]; install it ({error}).") from error
+    try:
+        client = Client(address)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise SystemExit(
+            f"Expected the address of a dask scheduler, as tcp://host:8786, got {address} "
+            f"({error}); start one with: dask scheduler"
+        ) from error
+    with client, joblib.parallel_config("dask", client=client):
+        yield
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Parse the command line; `sets` and `only` of the result are lists."""
     parser = options(__doc__, seeds="100:130", n_jobs=2, keep=Path("out/evidence"), out=Path("out"))
-    parser.add_argument("--screw", help="the screw-driving set, an .npz file")
-    parser.add_argument(
-        "--sets", default=",".join(SETS), help="with commas between; all by default"
-    )
+    parser.add_argument("--screw", type=Path, help="the screw-driving set, an .npz file")
+    parser.add_argument("--sets", default=",".join(SETS), help="names with commas; all by default")
     parser.add_argument(
         "--only",
-        help="reducers and baselines, with commas between; 'promises' for the variants of conv",
+        default=",".join([*METHODS, PROMISES]),
+        help=f"reducers and baselines with commas; '{PROMISES}' for the variants of conv",
     )
     parser.add_argument("--cycles", type=int, default=1503, help="of a replay, at most")
     parser.add_argument(
-        "--cells", type=int, default=len(CELLS), help="1: at (0.1, 90 %%) alone, and no grid"
+        "--cells",
+        type=int,
+        default=len(POLICIES),
+        help="policies: 1 plays (0.1, 90 %%) alone, without the paper's combinations",
     )
-    args = parser.parse_args()
-    names, only = args.sets.split(","), (args.only or f"{','.join(SHUFFLES)},promises").split(",")
-    if unknown := {*names, *only} - {*SETS, *SHUFFLES, "promises"}:
-        parser.error(
-            f"known are {', '.join(SETS)}, and {', '.join(SHUFFLES)}, promises; not {', '.join(sorted(unknown))}"
-        )
-    if "screw driving" in names and args.screw is None:
-        names.remove("screw driving")
+    parser.add_argument(
+        "--cluster", metavar="ADDRESS", help="scheduler of a dask cluster that plays the replays"
+    )
+    parser.add_argument(
+        "--tables-only",
+        action="store_true",
+        help="play nothing: write tables and figures from the replays.csv in OUT/evidence",
+    )
+    arguments = parser.parse_args()
+    arguments.sets = arguments.sets.split(",")
+    arguments.only = arguments.only.split(",")
+    choices = {"--sets": (arguments.sets, SETS), "--only": (arguments.only, [*METHODS, PROMISES])}
+    for option, (names, known_names) in choices.items():
+        if unknown := [name for name in names if name not in known_names]:
+            expected = ", ".join(known_names)
+            parser.error(f"expected names of {expected} for {option}, got {', '.join(unknown)}")
+    return arguments
+
+
+def main() -> None:
+    """Parse the command line, print the cost, play the replays, write the results."""
+    arguments = parse_arguments()
+    folder = arguments.out / "evidence"
+    if arguments.tables_only:
+        replays = read_replays(folder / "replays.csv")
+        if replays.empty:
+            raise SystemExit(f"Expected replays in {folder / 'replays.csv'}, got none; play them.")
+        write_results(replays, folder)
+        print(f"Wrote {folder / 'tables.md'} from {len(replays)} replays.")
+        return
+    if "screw driving" in arguments.sets and arguments.screw is None:
+        arguments.sets.remove("screw driving")
         print(
-            "Without screw driving: make it by training/make_screw_driving.py from its public source, and give SCREW=FILE."
+            "Without screw driving: make it by training/make_screw_driving.py from its public "
+            "source, and give SCREW=FILE."
         )
-    left = list[str]()
-    for (nth, seed), name in product(enumerate(args.seeds), names):
-        data, tasks = asked(nth, seed, name, args, only)
-        kept = KeptReplays(args.keep, data)
-        left += [task.contender.name for task in tasks if not kept.path(task).is_file()]
-    hours = sum(SECONDS.get(who, SECONDS["conv"]) for who in left) / 3600.0 / max(1, args.n_jobs)
-    print(
-        f"{len(left)} replays are left, about {hours:.1f} hours at {args.n_jobs} at a time.",
-        flush=True,
+    plan = Plan(
+        seeds=arguments.seeds,
+        sets=arguments.sets,
+        methods=arguments.only,
+        n_policies=arguments.cells,
+        max_cycles=arguments.cycles,
+        screw_driving=arguments.screw,
     )
-    path, here, rows = args.out / "evidence" / "replays.csv", commit(), list[dict[str, Any]]()
-    old = (
-        pd.read_csv(path, dtype={"bought": str, "commit": str})
-        if path.exists()
-        else pd.DataFrame(columns=[*CONDITION, "seed", "commit"])
-    )
-    for nth, seed in enumerate(args.seeds):
-        for name in names:
-            data, tasks = asked(nth, seed, name, args, only)
-            found = iterate_replays(data, tasks, n_jobs=args.n_jobs, keep=args.keep)
-            rows += [row_of(name, each.replay, here) for each in found]
-        write(merged(old, pd.DataFrame(rows)), args.out)
-        print(f"{datetime.now(UTC):%H:%M:%S} seed {seed}: {len(rows)} replays", flush=True)
-
-
-def asked(
-    nth: int, seed: int, name: str, args: Any, only: Sequence[str]
-) -> tuple[Dataset, list[Task]]:
-    """The parts of one shuffle, and its replays."""
-    data = MADE[name](np.random.default_rng(seed)) if name in MADE else recorded(name, args.screw)
-    cycles = None if args.cycles >= len(data) else args.cycles
-    who = [
-        one
-        for one in conditions(name, nth, args.cells)
-        if ("promises" if one.name.startswith("conv, ") else one.name) in only
-    ]
-    return data, [Task(one, seed, cycles, name not in MADE) for one in who]
+    with use_cluster(arguments.cluster):
+        print_cost(plan, arguments.keep, arguments.n_jobs)
+        play(plan, folder, arguments.keep, arguments.n_jobs)
 
 
 if __name__ == "__main__":

@@ -40,49 +40,43 @@ def load(name: str) -> ModuleType:
 
 
 def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run: Run, tmp_path: Path) -> None:
-    words = [
-        "--seeds",
-        "0:3",
-        "--only",
-        "conv,knn",
-        "--sets",
-        "opposite,screw driving",
-        "--cycles",
-        150,
-        "--n-jobs",
-        1,
-    ]
-    first, second = (
-        run("evidence", *words, "--out", tmp_path, "--keep", tmp_path / "kept") for _ in range(2)
-    )
+    words = ["--seeds=0:3", "--only=conv,knn", "--sets=opposite,screw driving", "--cycles=150"]
+    words += ["--n-jobs=1", f"--out={tmp_path}", f"--keep={tmp_path / 'kept'}"]
+    first = run("evidence", *words)
+    second = run("evidence", *words)
     assert "Without screw driving" in first
     assert "\n12 replays are left" in first
     assert "\n0 replays are left" in second
-    rows, answer = (
-        pd.read_csv(tmp_path / "evidence" / f"{name}.csv") for name in ("replays", "differences")
-    )
-    certain = rows[rows["alpha"] == 0.1].pivot_table("certain", "seed", "recipe")
-    more = answer.query("alpha == 0.1 and recipe == 'knn'").iloc[0]
-    assert more["certain_more"] == pytest.approx(
-        (certain["knn"] - certain["conv"]).mean(), abs=1e-3
-    )
-    assert more["certain_low"] < more["certain_more"] < more["certain_high"]
-    assert "| opposite | " in (tmp_path / "evidence" / "tables.md").read_text(encoding="utf-8")
+
+    folder = tmp_path / "evidence"
+    replays = pd.read_csv(folder / "replays.csv")
+    certain = replays[replays["alpha"] == 0.1].pivot_table("certain", "seed", "recipe")
+    mean_difference = (certain["knn"] - certain["conv"]).mean()
+    differences = pd.read_csv(folder / "differences.csv")
+    row = differences.query("alpha == 0.1 and recipe == 'knn'").iloc[0]
+    assert row["certain_more"] == pytest.approx(mean_difference, abs=1e-3)
+    assert row["certain_low"] < row["certain_more"] < row["certain_high"]
+    page = (folder / "tables.md").read_text(encoding="utf-8")
+    assert "| opposite | 150 | " in page
+
+    for name in ("tables.md", "curves.png", "net_seconds.png", "differences.csv"):
+        (folder / name).unlink()
+    run("evidence", "--tables-only", "--out", tmp_path)
+    assert (folder / "tables.md").read_text(encoding="utf-8") == page
+    assert (folder / "net_seconds.png").stat().st_size > 0
 
 
 def test_a_row_of_the_evidence_gives_way_where_another_commit_plays_its_condition() -> None:
     evidence = load("evidence")
     settings = {"set": "drift", "interval": "wilson", "alpha": 0.1, "lower_bound": 0.9}
-    old = pd.DataFrame(
-        [
-            settings | {"recipe": who, "seed": seed, "commit": "a"}
-            for who in ("pca", "conv")
-            for seed in (1, 2)
-        ]
-    )
+    old_rows = [
+        settings | {"recipe": method, "seed": seed, "commit": "a"}
+        for method in ("pca", "conv")
+        for seed in (1, 2)
+    ]
     new = pd.DataFrame([settings | {"recipe": "conv", "seed": 2, "commit": "b"}])
-    result = evidence.merged(old, new)[["recipe", "seed", "commit"]]
-    assert result.to_numpy().tolist() == [["conv", 2, "b"], ["pca", 1, "a"], ["pca", 2, "a"]]
+    merged = evidence.merge_replays(pd.DataFrame(old_rows), new)[["recipe", "seed", "commit"]]
+    assert merged.to_numpy().tolist() == [["conv", 2, "b"], ["pca", 1, "a"], ["pca", 2, "a"]]
 
 
 def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeated(
