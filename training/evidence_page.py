@@ -256,7 +256,12 @@ def draw_net_seconds(differences: pd.DataFrame) -> Figure:
     for _, row in rows[rows["recipe"].isin(others)].iterrows():
         half = row["net_s_high"] - row["net_s_more"]
         axes = panels.axes[row["set"]]
-        style = {"fmt": "o", "markersize": 4, "capsize": 3, "color": colours[row["recipe"]]}
+        style: dict[str, Any] = {
+            "fmt": "o",
+            "markersize": 4,
+            "capsize": 3,
+            "color": colours[row["recipe"]],
+        }
         axes.errorbar(row["net_s_more"], heights[row["recipe"]], xerr=half, **style)
     for set_name, axes in panels.axes.items():
         axes.axvline(0.0, **LIMIT)
@@ -309,8 +314,8 @@ def introduction_lines() -> list[str]:
         f"dengine; the others are published methods in the same loop: {baselines}. They have rules "
         "of their own, and `knn` has no bound at all: alpha and LB do not change its decisions.",
         "",
-        "**The policies.** alpha is the error level of the interval around the success rate of similar "
-        "parts. LB is the success rate that this interval must reach before a part is accepted.",
+        "**The policies.** alpha is the error level of the interval around the success rate of "
+        "similar parts. LB is the success rate that this interval must reach before a part is accepted.",
         "",
         "**An entry** is a mean over the replays. Below it stands how much more this is than "
         f"`{REFERENCE}` has on the same parts in the same order (the same seed), with the 95 % "
