@@ -105,7 +105,7 @@ class EngineCore:
         Untrained; the first version is trained from it.
     store : SqlStore
     executor : concurrent.futures.Executor, optional
-        Trains while the cell goes on; None trains in line.
+        Trains while the cell goes on; None: train in the calling thread.
     replaying : bool
         End a retrain by steps alone, and wait for the store without a time limit, so that a seed
         repeats exactly.

@@ -1,4 +1,5 @@
-"""`DataEngine`, the public face of dengine: decide, report, retrain, run.
+"""`DataEngine`, the public face of dengine (decide, report, retrain, run), and two blocks that keep
+Python's garbage collector away from decisions.
 
 Source: the paper's section "Data engine".
 
@@ -148,7 +149,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
         windows and shadow count then.
     executor : concurrent.futures.Executor, optional
-        Retrains while the cell goes on; None retrains in line, between cycles.
+        Retrains while the cell goes on; None: retrain in the calling thread, between cycles.
     replaying : bool
         End a retrain by steps alone, never by the clock, so that a seed repeats exactly.
     clock : callable
@@ -430,7 +431,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Returns
         -------
         RetrainReport or None
-            The retrain in line that this label set off, if any.
+            The report of a retrain in this thread that the label set off, if any.
 
         Raises
         ------

@@ -267,8 +267,8 @@ class LiveModel:
     def apply_corrections(self) -> bool:
         """Apply the store's newest corrections to the references of the answering model.
 
-        Returns False where the model cannot take one and must be trained again; True before the
-        first retrain. The rule is left to `rebuild_rule`.
+        Returns False where the model cannot change a reference, as no baseline can, and must be
+        trained again; True before the first retrain. The rule is left to `rebuild_rule`.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None

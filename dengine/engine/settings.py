@@ -387,7 +387,8 @@ def fill_from_peers(
 def check_model_settings(reducer: Any, given: Mapping[str, Any]) -> None:
     """Raise SettingError for settings that have no effect beside a model that is handed in.
 
-    These are radius, folds, reducer, and of a policy all but audit_rate, stops, shadow and windows.
+    `given` holds settings by name. Without effect are radius, folds, reducer, and a policy that
+    differs from the default in more than audit_rate, stops, shadow and windows.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:

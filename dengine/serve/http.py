@@ -340,7 +340,8 @@ class HttpApi:
         ] = "",
         **where: Any,
     ) -> Json:
-        """Return decisions, newest first, and in `older` where the next page begins.
+        """Return decisions without their traces, newest first, and in `older` where the next page
+        begins.
 
         since and until are times in seconds since 1970; the first is included, the last is not.
         predicted is what the model alone would have done. part is a part's number.

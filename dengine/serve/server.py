@@ -267,9 +267,9 @@ def quick_switches() -> Iterator[None]:
 
 @contextmanager
 def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
-    """Open a listening TCP socket, and close it when the block ends; port 0 takes a free one.
+    """Open a listening TCP socket at the host's first address; close it when the block ends.
 
-    Raises SettingError if it cannot be opened.
+    Port 0 takes a free one. Raises SettingError if it cannot be opened.
     """
     with instead(
         SettingError,
