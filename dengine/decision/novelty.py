@@ -4,13 +4,19 @@
     >>> gate(torch.from_numpy(traces[0]))
     False
 
-The features of a trace x (C, T), and the distances that are taken of them:
+The file holds the module `NoveltyGate` and `fit_novelty`, which fits it; `model.neighbours` puts it
+before the count of labels. The features of a trace x (C, T), and the distances that are taken of
+them:
 
-    x -> S segments: minimum, maximum, logarithms of the roughness of samples and of steps  (C, 4*S)
-      -> roughness of the quietest and the loudest brief stretches: gaps, jumps  (P,) = (C*(4*S +
-      3),) -> level (the first two), texture (the third), distortions (products of all), gaps  (P +
-      D,) -> standardised, squared distance to the nearest reference over its limit, of each group
-      (4,)
+    x -> S segments of each channel: minimum, maximum, log roughness of
+         first and of second differences                                  (C, 4*S)
+      -> log roughness of the quietest and the loudest brief stretches:
+         gaps and jumps                                                   (C, 3)
+      -> all of them                                                      (P,) = (C*(4*S + 3),)
+      -> and their products with D discriminants: distortions             (P + D,)
+      -> standardised; squared distance to the nearest reference over
+         its limit, for each group: level (minimum, maximum), texture
+         (first differences), distortions, gaps                           (4,)
 
 The trace is novel if any of the four exceeds 1. The distance is Hotelling's T^2 (1947) from the
 nearest reference and not from the mean, because parts that seat, jam and miss lie in clouds apart

@@ -1,9 +1,12 @@
 """What every exported file has, TorchScript or ONNX: description, checksum and signature.
 
-    dengine export --make-key cell.key dengine export engine.db --out model.ts --key cell.key    #
-    model.ts, model.ts.sha256, model.ts.sig load_exported("model.ts", key="cell.key")
+    dengine export --make-key cell.key
+    dengine export engine.db --out model.ts --key cell.key  # model.ts, .ts.sha256, .ts.sig
+    python -c 'from dengine import load_exported; load_exported("model.ts", key="cell.key")'
 
-`torchscript` and `onnx` write and read their files through the functions here.
+`torchscript` and `onnx` write and read their files through the functions here: `make_key` makes a
+key, `prepare_export` builds the module, `describe` and `write_export` write, `read_checked` and
+`read_metadata` read.
 
 The checksum guards against damage, not against an adversary: whoever can change the file can change
 the sum. The signature says who made the file before a byte of it is run. It is HMAC-SHA256 (FIPS
@@ -80,9 +83,9 @@ def make_key(path: KeyFile) -> Path:
 
 
 def signature(content: bytes, key: KeyFile) -> str:
-    """Return the signature of a content with the secret in a key's file.
+    """Return the signature of a content with the secret in a key's file: "hmac-sha256:HEX".
 
-    Raises ExportError for a file that is too short to be a key.
+    Raises ExportError for a file that cannot be read or is too short to be a key.
     """
     secret = read_key(key, ExportError)
     return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
@@ -101,6 +104,9 @@ def prepare_export(
 ) -> tuple[Exportable, DecisionModule]:
     """Check that an engine or a model can be exported, and build its decision module.
 
+    Nothing is written. The module shares references and rule with the model; it is not compiled
+    yet.
+
     Parameters
     ----------
     engine_or_model : DataEngine or ModelPrediction
@@ -114,13 +120,15 @@ def prepare_export(
     Returns
     -------
     source : Exportable
+        The model with trace contract, audits and force limits.
     module : DecisionModule
 
     Raises
     ------
     ExportError
-        For a baseline, before the first training, for code that was changed or does not compile,
-        and if the rule has missed an outcome.
+        For a baseline, before the first training, for a rule, an interval or a reducer that
+        TorchScript cannot compile, for code that was changed after it was compiled, and if the rule
+        has missed an outcome.
     OutputError
         If `path` must not be written; this is checked first.
     """
@@ -160,7 +168,9 @@ def prepare_export(
 def describe(source: Exportable) -> dict[str, Any]:
     """Return the description that is written into the file, as a dict for JSON.
 
-    It can be read without loading the model, see `read_metadata`.
+    It names schema, versions, time, trace contract, policy, references (number and SHA-256), the
+    order of fields, actions and reasons, audits and seed. It can be read without loading the model,
+    see `read_metadata`.
     """
     model = source.model
     index = model.index
@@ -203,7 +213,7 @@ def write_export(
     key: KeyFile | None = None,
     source: Exportable | None = None,
 ) -> Path:
-    """Write a file, its checksum and, with a key, its signature.
+    """Write a file, its checksum (PATH.sha256) and, with a key, its signature (PATH.sig).
 
     Each is a rename of its own: if a kill comes between, the file is refused as damaged until it is
     exported again. The export is noted in the engine's store first.
@@ -217,7 +227,7 @@ def write_export(
     key : path-like, optional
         File of the key to sign with.
     source : Exportable, optional
-        Its `note` records the checksum.
+        Its `note`, if it has one, records checksum and model version as an event.
 
     Returns
     -------
@@ -228,6 +238,8 @@ def write_export(
     ------
     OutputError
         If a file must not or cannot be written.
+    ExportError
+        If the key cannot be read.
     """
     target = Path(path)
     digest = hashlib.sha256(content).hexdigest()
@@ -273,7 +285,7 @@ def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -
 
 
 def read_checked(path: Path, key: KeyFile | None = None) -> bytes:
-    """Read a file after checking its checksum and, with a key, its signature.
+    """Return the content of a file after checking its checksum and, with a key, its signature.
 
     libtorch itself does not notice flipped bits.
 
@@ -311,7 +323,10 @@ def _first_word(content: bytes) -> str:
 
 
 def _read(path: Path, most: int = -1) -> bytes:
-    """Return a file's content, or its first `most` bytes; ExportError if it cannot be read."""
+    """Return a file's content, or its first `most` bytes; -1 stands for all.
+
+    Raises ExportError if it is missing or cannot be read.
+    """
     try:
         with path.open("rb") as file:
             return file.read(most)
@@ -324,9 +339,10 @@ def _read(path: Path, most: int = -1) -> bytes:
 
 
 def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
-    """Return the description inside the content of a TorchScript file.
+    """Return the description inside the content of a TorchScript file, a zip archive.
 
-    Raises ExportError, which names `path`, if there is none or it has another schema.
+    No code of the file is run. Raises ExportError, which names `path`, if there is none or it has
+    another schema.
     """
     problem = f"{path} is not a dengine export, it holds no {METADATA}"
     with (
@@ -338,7 +354,10 @@ def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
 
 
 def check_schema(metadata: Any, path: Path) -> dict[str, Any]:
-    """Return a description if it has the present schema; ExportError, naming `path`, otherwise."""
+    """Return a description as it is if it has the present schema, `SCHEMA`.
+
+    Raises ExportError, naming `path`, for another schema and for what is no dict.
+    """
     fields = metadata if isinstance(metadata, dict) else {}
     if fields.get("schema") != SCHEMA:
         writer = f"dengine {fields.get('dengine', 'of an unknown version')}"

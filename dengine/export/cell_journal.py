@@ -95,7 +95,9 @@ class CellJournal:
 def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> CellJournal:
     """Read and check the journal of a cell program.
 
-    Rejected parts, and verified ones without a label, are left out.
+    Rejected parts, and verified ones without a label, are left out. From a line whose checksum does
+    not fit on, everything is set aside, which is no error; `set_aside` says so. A warning is logged
+    if FILE.head is missing.
 
     Parameters
     ----------
@@ -110,7 +112,10 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> CellJournal:
     Raises
     ------
     DataError
-        For a file that is no journal of this form, a line that cannot be read, or no labels.
+        For a file that is no journal of this form, a line that cannot be read, a second line of a
+        part, or no accepted and no labelled part.
+    OSError
+        If the file cannot be read.
     """
     *rows, tail = Path(path).read_bytes().split(b"\n")
     head = rows[0].decode("utf-8", errors="replace").split() if rows else []
@@ -167,8 +172,9 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> CellJournal:
 def _missing_at_end(path: str | os.PathLike[str], crcs: list[int]) -> str:
     """Return a sentence if the head of a journal knows of a line that the journal lacks, else "".
 
-    `crcs` are the checksums of the journal's lines. A head that is missing or cannot be read is
-    logged.
+    The head is the file PATH.head: the number of lines and the last checksum. `crcs` are the
+    checksums of the journal's lines. If the head is missing or cannot be read, a warning is logged
+    and "" is returned.
     """
     head = Path(f"{os.fspath(path)}.head")
     risk = "lines may have been removed at its end, or lost with the power."
@@ -183,7 +189,10 @@ def _missing_at_end(path: str | os.PathLike[str], crcs: list[int]) -> str:
 
 
 def _split_words(content: bytes, where: str) -> list[str]:
-    """Return the words of a line; DataError if it is not UTF-8, or neither a part nor a label."""
+    """Return the words of a line between its commas; the first is "part" or "label".
+
+    Raises DataError, naming `where`, if the line is not UTF-8 or begins with another word.
+    """
     wanted = f"Expected UTF-8 in {where}, it is damaged, or no journal"
     with instead(DataError, wanted, UnicodeDecodeError):
         words = content.decode("utf-8").split(",")
@@ -193,7 +202,11 @@ def _split_words(content: bytes, where: str) -> list[str]:
 
 
 def _parse_label(words: list[str], parts: Mapping[str, JournalLine], where: str) -> JournalLine:
-    """Return the part of a label's line with that label; DataError if there is none to label."""
+    """Return the earlier part that a label's line names, as a new `JournalLine` with the label.
+
+    `words` are id and label, 1 or 0; `parts` has the parts so far by id. Raises DataError, naming
+    `where`, if there is no such part, it was rejected, or it has a label.
+    """
     is_valid = len(words) == 2 and words[0] in parts and words[1] in LABELS
     expect_data(is_valid, f"an earlier part's id and a label of 1 or 0 in {where}", ",".join(words))
     line = parts[words[0]]
@@ -203,9 +216,11 @@ def _parse_label(words: list[str], parts: Mapping[str, JournalLine], where: str)
 
 
 def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
-    """Return decision, trace and label of a part's line; DataError for impossible values.
+    """Return decision, trace and label of a part's line, whose first word is left out.
 
-    A rejected part's trace is empty. Version 0 and propensity 1 stand for what the line lacks.
+    A rejected part's trace is empty, (1, 0). The line lacks embedding, model version and
+    propensity; None, 0 and 1 stand for these. Raises DataError, naming `where`, for impossible
+    values.
     """
     padded = [*words[:N_DECISION_WORDS], *[""] * (N_DECISION_WORDS - len(words))]
     id_, label, part, *decided = padded
@@ -246,7 +261,11 @@ def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
 
 
 def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
-    """Return samples as a trace (C, T) of the contract; DataError if they are none."""
+    """Return samples, channel after channel, as a trace of the contract, float32 (C, T).
+
+    Another number of samples is fitted as `spec.fit` says. Raises DataError, naming `where`, for
+    words that are no numbers or of a number that cannot be fitted.
+    """
     n = spec.channels * spec.samples
     can_fit = spec.fit != "strict" and len(words) > 0 and len(words) % spec.channels == 0
     is_valid = len(words) == n or can_fit
@@ -264,7 +283,8 @@ def import_journal(
     """Import what an exported cell learned into the store of its engine.
 
     Each part is imported once, however often its journal is. Rule and certificate count the parts
-    as the engine's own. If a journal lacks a line, what stands before it is imported.
+    as the engine's own. If a journal lacks a line, what stands before it is imported. The store is
+    closed at the end, also one that was passed open.
 
     Parameters
     ----------
@@ -278,7 +298,7 @@ def import_journal(
     Returns
     -------
     ImportReport
-        It counts labels; `set_aside` says what was not imported.
+        It counts labels; `cut` and `set_aside` say what was not imported.
 
     Raises
     ------
@@ -312,9 +332,10 @@ def import_journal(
 def _with_known_outcomes(journal: CellJournal, stops: str) -> list[JournalLine]:
     """Return the lines of a journal, with the outcomes that follow from silence.
 
-    If all line stops are reported, the next decision confirmed an accepted part, unless its stop
-    came late. Nothing is known of the last part. A late label has a line of its own: it brings the
-    stop, and the first line the confirmation.
+    If `stops` is "some", nothing follows, and the lines stay as they are. If it is "all", an
+    accepted part without a label is confirmed as good, because the next part was decided; the
+    pending part at the end is left out. Of an accepted part whose label came late there are two
+    lines, of which one stays: the late one if it is a stop, else the first, confirmed.
     """
     if stops == "some":
         return journal.lines

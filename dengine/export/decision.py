@@ -100,7 +100,8 @@ class DecisionModule(nn.Module):
     def decide(self, trace: Tensor, part: int = 0) -> DecisionFields:
         """Decide on one trace, and make this the pending decision.
 
-        Before that, a pending accept is settled, see `settle`.
+        Before that, a pending accept is settled, see `settle`: it is learned as good or counted as
+        silent. After a faulty trace no decision is pending.
 
         Parameters
         ----------
@@ -113,13 +114,15 @@ class DecisionModule(nn.Module):
         action, reason : int
             Positions in `Action` and `Reason`.
         lower, upper : float
+            Bound on the success probability.
         n_success, n_failure : int
+            Labels within the radius.
         embedding : Tensor of float32, shape (K, d)
 
         Raises
         ------
         ValueError
-            For another shape.
+            For another shape; nothing changes then.
         """
         x = self.as_trace(trace)
         self.settle()
@@ -145,7 +148,11 @@ class DecisionModule(nn.Module):
         upper: float,
         z: Tensor,
     ) -> None:
-        """Make a decision the pending one; `action` is `NONE_PENDING` for a faulty trace."""
+        """Make a decision the pending one; its fields are copied, and an earlier one is forgotten.
+
+        `action` is `NONE_PENDING` for a faulty trace. `part` is 0 for an unknown part, for which
+        the content hash stands. Whether the trace was novel is read from `reason`.
+        """
         self.pending_action = action
         self.pending_predicted = predicted
         self.pending_part = part if part != 0 else content
@@ -157,10 +164,12 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def learn(self, trace: Tensor, success: bool, part: int = 0) -> int:
-        """Learn the outcome of a part; a faulty trace is ignored.
+        """Learn the outcome of a part: update the rule, and make the trace a reference.
 
-        If the trace is not that of the pending decision, it is decided on first, because its bound
-        must be one from before its label was known; the pending decision stays pending.
+        If the trace and its part are those of the pending decision, its bound is used and none is
+        pending afterwards. Otherwise the trace is decided on first, because its bound must be one
+        from before its label was known; the pending decision stays pending. A faulty trace is
+        ignored.
 
         Parameters
         ----------
@@ -173,6 +182,11 @@ class DecisionModule(nn.Module):
         -------
         int
             Number of references.
+
+        Raises
+        ------
+        ValueError
+            For another shape.
         """
         x = self.as_trace(trace)
         fault, content = self.decider.check(x)
@@ -204,8 +218,8 @@ class DecisionModule(nn.Module):
     def settle(self) -> bool:
         """Settle a pending accept: the next part comes, and nothing was reported.
 
-        With `stops_all` the part is learned as good, else it counts as silent. Returns whether it
-        was learned. Other pending decisions stay.
+        With `stops_all` the part is learned as good and becomes a reference, else it counts as
+        silent; none is pending then. Returns whether it was learned. Other pending decisions stay.
         """
         if self.pending_action != 1:
             return False
@@ -227,7 +241,9 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Make an earlier decision, as a journal has it, the pending one again.
 
-        The present pending decision is settled first. A faulty trace leaves none pending.
+        The present pending decision is settled first. The trace (T,) or (C, T) is embedded anew,
+        with the fields of the decision as they are given; `predicted` follows from these. A faulty
+        trace leaves none pending. Raises ValueError for another shape.
         """
         x = self.as_trace(trace)
         self.settle()
@@ -260,7 +276,10 @@ class DecisionModule(nn.Module):
         return n_references
 
     def learn_pending(self, success: bool) -> None:
-        """Learn the outcome of the pending decision; then none is pending."""
+        """Learn the outcome of the pending decision: 1 for success; then none is pending.
+
+        The rule is updated, and the trace becomes a reference.
+        """
         self.learn_outcome(
             self.pending_lower,
             self.pending_upper,
@@ -286,8 +305,10 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Update the rule with an outcome, and make the trace with embedding z (K, d) a reference.
 
-        Its outcome was asked for with probability 1 if the model was not certain, with the audit
-        rate if it was audited, and not at all (0) if it went on.
+        `part` is the hash of the part, which also gives the space of the reference. The rule is
+        told that the outcome was asked for with probability 1 if the model was not certain, with
+        the audit rate if it was audited, and not at all (0) if it went on. The count of silent
+        parts restarts at 0.
         """
         inclusion_probability = 0.0
         if action == 0:
@@ -303,7 +324,8 @@ class DecisionModule(nn.Module):
     def as_trace(self, trace: Tensor) -> Tensor:
         """Return the trace as (C, T) float32 with the number of samples of the contract.
 
-        Raises ValueError for another shape.
+        Another number of samples is fitted as the contract's `fit` says. Raises ValueError for
+        another shape, and for another number of samples if `fit` is "strict".
         """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
         fits = x.size(-1) == self.samples or (self.fit != 0 and x.numel() > 0)

@@ -3,12 +3,13 @@
     >>> export_onnx(engine, "model.onnx")          # model.onnx and model.onnx.sha256
     >>> load_onnx("model.onnx").decide(trace)
 
-An ONNX program of torch.export has neither branches nor state, so `OnnxDecision` repeats what
-`Decider` and `RadiusNeighbours` do with tensors; the interval's formula is shared. `export_onnx`
-checks each file against the model before it keeps it, and `tests/e2e/test_onnx.py` holds the two to
-one another. ONNX cannot carry references that grow or rules that learn, so nothing is learned in
-the cell. It has no hashes either, so there are no audits and no votes of parts that came again, and
-a reference that is asked about itself counts itself.
+The file holds these two functions, `OnnxModel`, which runs a file in Python, and `OnnxDecision`,
+the module that is exported. An ONNX program of torch.export has neither branches nor state, so
+`OnnxDecision` repeats what `Decider` and `RadiusNeighbours` do with tensors; the interval's formula
+is shared. `export_onnx` checks each file against the model before it keeps it, and
+`tests/e2e/test_onnx.py` holds the two to one another. ONNX cannot carry references that grow or
+rules that learn, so nothing is learned in the cell. It has no hashes either, so there are no audits
+and no votes of parts that came again, and a reference that is asked about itself counts itself.
 """
 
 import json
@@ -63,7 +64,10 @@ def export_onnx(
     key: KeyFile | None = None,
     force: bool = False,
 ) -> Path:
-    """Write the decision of an engine, or of a fitted model, as ONNX.
+    """Write the decision of an engine, or of a fitted model, as ONNX, with its checksum beside it.
+
+    The file is kept only if onnxruntime decides on random traces as the model does. An engine's
+    store records the export as an event.
 
     Parameters
     ----------
@@ -115,7 +119,8 @@ def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> "O
     Raises
     ------
     ExportError
-        For a file that must not be used, see `read_checked` and `check_schema`.
+        For a file that must not be used, see `read_checked` and `check_schema`, and if a package
+        for ONNX is missing.
     """
     onnx = _import_package("onnx")
     target = Path(path)
@@ -128,7 +133,11 @@ def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> "O
 
 
 def _refuse_unsupported(source: Exportable) -> None:
-    """Raise ExportError if the decision needs something that ONNX cannot carry."""
+    """Raise ExportError if the decision needs something that ONNX cannot carry.
+
+    That is an audit rate above 0, a rule other than the paper's, parts that came more than once,
+    and force limits.
+    """
     rule = type(source.model.rule)
     n_repeats = int(source.model.index.repeats)
     use_local = "export torchscript, or set guarantee = 'local' and stops = 'some'"
@@ -171,7 +180,10 @@ class OnnxModel:
         self.decide(warm.reshape(self.trace.channels, self.trace.samples))
 
     def decide(self, trace: ArrayLike) -> ExportedDecision:
-        """Decide on one trace, (T,) or (C, T); TraceError for a wrong shape."""
+        """Decide on one trace, (T,) or (C, T), and keep nothing of it.
+
+        Raises TraceError for a wrong shape.
+        """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         action, reason, lower, upper, n_success, n_failure, z = outputs
         return ExportedDecision(
@@ -217,9 +229,10 @@ class OnnxDecision(nn.Module):
         self.register_buffer("labels", torch.from_numpy(labels))
 
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
-        """Decide on one trace (C, T) of float32; returns the tensors named in `FIELDS`.
+        """Decide on one trace (C, T) of float32; return tensors in the order of `FIELDS`.
 
-        They have no dimension, except the embedding (K, d), which is NaN for a faulty trace.
+        They have no dimension, except the embedding (K, d), which is NaN for a faulty trace. A
+        faulty or a novel trace is verified, with the bound (0, 1) and no labels.
         """
         fault = self.fault(trace)
         is_sound = fault == 0
@@ -246,7 +259,11 @@ class OnnxDecision(nn.Module):
         )
 
     def fault(self, trace: Tensor) -> Tensor:
-        """Return the position in `Reason` of a trace's fault, () int64, as `TraceGate` does."""
+        """Return the position in `Reason` of what is wrong with a trace, () int64; 0 if nothing is.
+
+        The first that applies counts: not finite, constant, at the sensor's limit, too large. It is
+        what `TraceGate` computes.
+        """
         low = trace.min()
         high = trace.max()
         is_finite = (trace.abs() < float("inf")).all()
@@ -259,7 +276,8 @@ class OnnxDecision(nn.Module):
     def count(self, distances: Tensor) -> tuple[Tensor, ...]:
         """Return action, lower, upper, n_success and n_failure, as `RadiusNeighbours` does.
 
-        `distances` are the squared distances to the references, (n,).
+        `distances` are the squared distances to the references, (n,). The results are tensors
+        without a dimension, the action 0 verify, 1 accept, 2 reject.
         """
         is_inside = distances <= self.radius * self.radius
         n_success = (is_inside & (self.labels == 1)).to(torch.int64).sum()
@@ -272,10 +290,11 @@ class OnnxDecision(nn.Module):
 
 
 def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
-    """Return the ONNX program of a decision; ExportError if torch makes none.
+    """Return the ONNX program of a decision on traces of this contract, a protobuf `ModelProto`.
 
-    It goes by torch.export, which does not need TorchScript, and silences notices of all packages
-    that it could use and need not.
+    It goes by torch.export, which does not need TorchScript. Meanwhile warnings of Python and of
+    logging are off in the process, because torch names packages that it could use and need not.
+    Raises ExportError if torch makes no program.
     """
     ramp = torch.linspace(-1.0, 1.0, spec.channels * spec.samples)
     example = (ramp.reshape(spec.channels, spec.samples),)
@@ -296,9 +315,10 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
 
 
 def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None:
-    """Compare an ONNX model with the model that answers, on random traces of every size.
+    """Compare an ONNX model with the model that answers, on 64 random traces of every size.
 
-    Raises ExportError if they differ by more than another order of additions explains.
+    Raises ExportError if actions, counts, bounds or embeddings differ by more than another order of
+    additions explains; two references at the radius may fall on either side.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)
@@ -319,7 +339,10 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
 
 
 def _import_package(name: str) -> ModuleType:
-    """Import one of the packages in `NEEDED`; ExportError if any of them is missing."""
+    """Import and return the package `name`, one of those in `NEEDED`.
+
+    Raises ExportError, with what to install, if any of the packages in `NEEDED` is missing.
+    """
     missing = [needed for needed in NEEDED if find_spec(needed) is None]
     if missing:
         raise ExportError(f"ONNX needs {', '.join(missing)}; pip install dengine[onnx].")

@@ -3,9 +3,11 @@
     >>> export_torchscript(engine, "model.ts")     # model.ts and model.ts.sha256
     >>> load_exported("model.ts").decide(trace)    # checked before it is loaded, ready at once
 
-An untrusted `.ts` file is a program: loading it runs what is in it, which can read and write files.
-Load only what you made yourself, or what was signed with a key of yours. The C and C++ sources that
-run an exported file depend on no model, so they come by a verb of their own:
+`load_exported` returns an `ExportedModel`, which decides and learns in Python as the controller
+does. An untrusted `.ts` file is a program: loading it runs what is in it, which can read and write
+files. Load only what you made yourself, or what was signed with a key of yours. The C and C++
+sources that run an exported file depend on no model, so `export_sources` writes them by a verb of
+their own:
 
     dengine export --cpp cell_cpp
     torch_cmake="$(python -c 'import torch; print(torch.utils.cmake_prefix_path)')"
@@ -48,7 +50,7 @@ TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another 
 
 
 def export_sources(folder: str | os.PathLike[str]) -> Path:
-    """Write the C and C++ sources into a folder.
+    """Write the C and C++ sources, and a file VERSION, into a folder, which is made if missing.
 
     Parameters
     ----------
@@ -84,9 +86,10 @@ def export_torchscript(
     key: KeyFile | None = None,
     force: bool = False,
 ) -> Path:
-    """Write the decision of an engine, or of a model, as TorchScript.
+    """Write the decision of an engine, or of a model, as TorchScript, with its checksum beside it.
 
-    An accepted part of unknown outcome stays with the engine: export when none is under way.
+    An accepted part of unknown outcome stays with the engine: export when none is under way. An
+    engine's store records the export as an event.
 
     Parameters
     ----------
@@ -137,7 +140,10 @@ def _content(module: Any, metadata: dict[str, Any]) -> bytes:
 
 
 def golden_trace(spec: TraceSpec) -> NDArray[np.float32]:
-    """Return the trace (C, T) on which a loader checks the embedding that its machine computes."""
+    """Return the trace, float32 (C, T), on which a loader checks the embedding of its machine.
+
+    It is a sine, always the same for a contract, within half of the sensor's limit.
+    """
     n = spec.channels * spec.samples
     x = np.sin(np.arange(n, dtype=np.float32) / 7.0).reshape(spec.channels, spec.samples)
     return np.asarray(x if spec.limit is None else x * np.float32(0.5 * spec.limit))
@@ -183,14 +189,14 @@ class ExportedModel:
     def decide(self, trace: ArrayLike, part: str | int | None = None) -> ExportedDecision:
         """Decide on one trace, which becomes the pending decision.
 
-        If the description says `stops` "all", this also confirms a part that was accepted before it
-        and of which nothing was reported.
+        If the description says `stops` "all", this also learns, as good, a part that was accepted
+        before it and of which nothing was reported.
 
         Parameters
         ----------
         trace : array, shape (T,) or (C, T)
         part : str or int, optional
-            Number of the part.
+            Number of the part, whose own references then do not count.
 
         Returns
         -------
@@ -216,7 +222,9 @@ class ExportedModel:
     def learn(self, trace: ArrayLike, success: bool, part: str | int | None = None) -> int:
         """Learn the outcome of a part, after its `decide` and before the next.
 
-        The trace becomes a reference and the rule is updated. A faulty trace is ignored.
+        The trace becomes a reference, the rule is updated, and `metadata["references"]` follows.
+        The file is not written; see `save`. A faulty trace is ignored. Another trace than that of
+        the last `decide` is decided on first.
 
         Parameters
         ----------
@@ -229,6 +237,13 @@ class ExportedModel:
         -------
         int
             Number of references.
+
+        Raises
+        ------
+        TraceError
+            For a wrong shape.
+        ReportError
+            For a label that is not True, False, 1 or 0.
         """
         with torch.inference_mode():
             x = torch.from_numpy(as_trace(trace, self.trace))
@@ -302,7 +317,10 @@ def load_exported(path: str | os.PathLike[str], *, key: KeyFile | None = None) -
 
 
 def _check_golden(model: ExportedModel, path: Path) -> None:
-    """Warm a model up on its golden trace; ExportError if the embedding is another."""
+    """Warm a model up on its golden trace; raise ExportError if the embedding is another.
+
+    The model decides on the trace and learns it several times, so pass a copy.
+    """
     golden = model.metadata["golden"]
     trace = np.array(golden["trace"], dtype=np.float32)
     expected = np.array(golden["embedding"], dtype=np.float32)
