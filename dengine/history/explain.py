@@ -479,8 +479,8 @@ class Circumstances:
 def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
     """Return a decision's bounds with their thresholds and what more evidence it would have needed.
 
-    Returns None if no bound was computed: for faulty and novel traces, for parts outside an
-    operator's limits, and before the first model; and for a decision that was lost.
+    Returns None if no bound was computed: for every reason but CERTAIN, UNCERTAIN, AUDIT and
+    SAFE_MODE, and for a decision that was lost.
     """
     if decision.reason not in BOUNDED or _was_lost(decision):
         return None

@@ -71,7 +71,8 @@ BUSY_SECONDS = 10.0  # wait for another process that writes to the same SQLite f
 def make_engine(url: str | None) -> sa.Engine:
     """Return a new SQLAlchemy engine for a store's database; it does not connect yet.
 
-    SQLite connections are in WAL mode with synchronous=FULL. PostgreSQL ones use psycopg.
+    In SQLite a commit is synced to the disk, and a store's file is in WAL mode. PostgreSQL
+    connections use psycopg.
 
     Parameters
     ----------
@@ -195,7 +196,7 @@ def _set_pragmas(connection: Any, record: Any) -> None:
 
     The file of a store, or an empty one, is set to WAL mode; another program's file is not changed,
     and a file that cannot be written keeps its mode. The driver then begins no transactions by
-    itself.
+    itself. Raise sqlite3.DatabaseError for a file that is damaged or no database.
     """
     connection.isolation_level = None  # `_begin` starts transactions, not the driver
     try:

@@ -219,9 +219,9 @@ class Journal:
     def save_newest_entry(self, newest: tuple[int, str] | None) -> None:
         """Write the newest ledger entry and `drained_to` to the header, the entry also to the head.
 
-        Nothing is synced: an older header is harmless, since the store ignores a record that it is
-        given twice. Raise StoreError if the header cannot be written; a failure of the head is
-        ignored. None leaves the head as it is.
+        Set `newest_entry`. Nothing is synced: an older header is harmless, since the store ignores
+        a record that it is given twice. Raise StoreError if the header cannot be written; a failure
+        of the head is ignored. None leaves the head as it is.
         """
         self.newest_entry = newest
         with _os_errors(self.path):

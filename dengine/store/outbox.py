@@ -679,8 +679,8 @@ class Outbox:
         Raises
         ------
         StoreError
-            If the store is unavailable, or takes too long. The records stay in the journal, and are
-            drained later.
+            If the store is unavailable, or takes too long; it then counts as unavailable until it
+            responds. The records stay in the journal, and are drained later.
         """
         with self._changed:
             if self.is_drained:

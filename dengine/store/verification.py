@@ -279,7 +279,10 @@ class CellCheck:
         return faults
 
     def _guarded(self, table: str, faults: Iterator[HistoryFault]) -> Iterator[HistoryFault]:
-        """Yield the faults of a check; a database error ends it as one more fault, not raised."""
+        """Yield the faults of a check; a database error ends it as one more fault, not raised.
+
+        After such an error `run` does not look for missing rows.
+        """
         try:
             yield from faults
         except sa.exc.DatabaseError as error:

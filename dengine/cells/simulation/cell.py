@@ -238,8 +238,8 @@ class SimulatedCell:
     def insert(self) -> NDArray[np.float32]:
         """Pick a part, push it into the fixture, and return the force, float32 of shape (1000,).
 
-        It is in newtons, 2 s at 500 Hz. The clock goes on by `cycle_s`. Raise DengineError if the
-        last part still waits for verify, proceed or reject.
+        It is in newtons, 2 s at 500 Hz. `last` is set, and the clock goes on by `cycle_s`. Raise
+        DengineError if the last part still waits for verify, proceed or reject.
         """
         if self._waiting:
             raise DengineError(

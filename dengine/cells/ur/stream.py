@@ -328,7 +328,10 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
                 self.trouble = str(error)
 
     def _read(self) -> None:
-        """Receive packages and reconnect until the stream is closed: the body of the thread."""
+        """Receive packages and reconnect until the stream is closed: the body of the thread.
+
+        Each new connection is counted; without one, `trouble` says why.
+        """
         while self._client is not None:
             client = self._client
             try:
@@ -351,7 +354,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
                         new_client.close()
 
     def _keep(self, row: Row) -> None:
-        """Count a package, buffer it, and wake who waits in `take`.
+        """Count a package and what is missing before it, buffer it, and wake who waits in `take`.
 
         The first package of a new connection also has the inputs written again, if they are at most
         REPEAT_S old. After a restart of the controller they are forgotten instead.
