@@ -213,7 +213,7 @@ def _restore_thresholds(
         return None
     for label in later:
         if not label.quarantined and label.source is not Source.INSPECTION:
-            _update(rule, label)
+            _update_rule(rule, label)
     return float(rule.evidence.thresholds[0]), float(rule.evidence.thresholds[1])
 
 
@@ -245,11 +245,11 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
         rule = rule.clone()
         rule.start_in_safe_mode(began_in)
     for outcome in store.outcomes_since(progress.last_seq, since, progress.overdue_to):
-        _update(rule, outcome)
+        _update_rule(rule, outcome)
     return rule
 
 
-def _update(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
+def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
     """Update a rule, in place, with the outcome of one part."""
     rule.observe(outcome.silent, outcome.novel)
     rule.update(
@@ -969,10 +969,10 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         trace=item.trace,
         spec=circumstances.spec,
         sentences=tuple(_explain_in_words(item, bound, circumstances)),
-        notes=tuple(_notes(item, neighbourhood, bound, circumstances)),
+        notes=tuple(_note_sentences(item, neighbourhood, bound, circumstances)),
         bound=bound,
         novelty=circumstances.novelty,
-        neighbours=tuple(_nearest(store, neighbourhood, version, neighbours)),
+        neighbours=tuple(_find_neighbours(store, neighbourhood, version, neighbours)),
         radius=None if neighbourhood is None else neighbourhood.radius,
         envelope=_find_envelope(store, item, version, circumstances.spec),
         policy=recipe.policy,
@@ -1012,7 +1012,7 @@ def _find_neighbourhood(
     return Neighbourhood(np.sqrt(squared.double().numpy()), recipe.radius, *counts)
 
 
-def _nearest(
+def _find_neighbours(
     store: SqlStore, neighbourhood: Neighbourhood | None, version: PastVersion | None, n: int
 ) -> Iterator[Neighbour]:
     """Yield the `n` nearest references of other parts with their traces, nearest first.
@@ -1058,7 +1058,7 @@ def _find_envelope(
     return None
 
 
-def _notes(
+def _note_sentences(
     item: StoredDecision,
     neighbourhood: Neighbourhood | None,
     bound: Bound | None,

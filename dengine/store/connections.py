@@ -125,13 +125,14 @@ def make_engine(url: str | None) -> sa.Engine:
 
 
 def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
-    """Have an engine call `_connect`, `_set_pragmas` and `_begin` below, and return this engine.
+    """Have an engine open its SQLite connections in this module's way, and return the engine.
 
-    They open its SQLite connections, set them up, and begin their transactions.
+    From then on it calls `_connect_sqlite`, `_set_pragmas` for each new connection, and
+    `_begin_transaction` for each transaction.
     """
-    sa.event.listen(engine, "do_connect", _connect)
+    sa.event.listen(engine, "do_connect", _connect_sqlite)
     sa.event.listen(engine, "connect", _set_pragmas)
-    sa.event.listen(engine, "begin", _begin)
+    sa.event.listen(engine, "begin", _begin_transaction)
     return engine
 
 
@@ -148,7 +149,7 @@ class CopyConnection(sqlite3.Connection):
     """An SQLite connection to a temporary copy of a file; the copy is deleted with it."""
 
 
-def _connect(
+def _connect_sqlite(
     dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]
 ) -> Any:
     """Return a new SQLite connection, for a file that cannot be written one that only reads.
@@ -198,7 +199,7 @@ def _set_pragmas(connection: Any, record: Any) -> None:
     and a file that cannot be written keeps its mode. The driver then begins no transactions by
     itself. Raise sqlite3.DatabaseError for a file that is damaged or no database.
     """
-    connection.isolation_level = None  # `_begin` starts transactions, not the driver
+    connection.isolation_level = None  # `_begin_transaction` starts transactions, not the driver
     try:
         tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
         # Another program's file is left as it is.
@@ -213,7 +214,7 @@ def _set_pragmas(connection: Any, record: Any) -> None:
     connection.execute("PRAGMA synchronous = FULL")
 
 
-def _begin(connection: sa.Connection) -> None:
+def _begin_transaction(connection: sa.Connection) -> None:
     """Begin an SQLite transaction; with the option `dengine_write` it takes the write lock at once.
 
     It then waits for other writers, which a read transaction that becomes a write would not do.

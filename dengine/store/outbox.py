@@ -88,15 +88,15 @@ class BloomFilter:
 
     def add(self, *ids: str) -> None:
         """Add ids."""
-        byte, bit = self._positions(ids)
+        byte, bit = self._bit_positions(ids)
         np.bitwise_or.at(self._bytes, byte, bit)
 
     def may_contain(self, decision_id: str) -> bool:
         """Return False if the id was never added, True if it was or (rarely) if it was not."""
-        byte, bit = self._positions([decision_id])
+        byte, bit = self._bit_positions([decision_id])
         return bool((self._bytes[byte] & bit).all())
 
-    def _positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
+    def _bit_positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the four bits of each id, each as an index of a byte and a byte with one bit set.
 
         Both arrays have four entries per id; the second has dtype uint8.

@@ -330,12 +330,12 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = query if first <= 1 else query.where(LABEL.c.seq >= int(first))
         query = query if last is None else query.where(LABEL.c.seq <= last)
         with self.database.reading() as connection:
-            rows = self._newest(connection, query, limit, last)[::-1]
+            rows = self._read_newest(connection, query, limit, last)[::-1]
             labelled, damaged = self._with_traces(connection, rows, scope)
-        self._note_damage(damaged, "trace")
+        self._put_damage_event(damaged, "trace")
         return labelled
 
-    def _newest(
+    def _read_newest(
         self, connection: sa.Connection, query: sa.Select[Any], limit: int | None, last: int | None
     ) -> Sequence[Any]:
         """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
@@ -384,7 +384,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             )
             version = self._scope.newest_version(connection)
             correction = self._scope.newest(connection, CORRECTION.c.number)
-        self._note_damage(damaged, "trace")
+        self._put_damage_event(damaged, "trace")
         return ProductNews(labelled, version, correction)
 
     def _with_traces(
@@ -436,7 +436,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         )
         return labelled, [rows[i].decision_id for i in np.flatnonzero(~is_kept)]
 
-    def _note_damage(self, damaged: Sequence[str], part: str) -> None:
+    def _put_damage_event(self, damaged: Sequence[str], part: str) -> None:
         """Commit an event that names decisions whose damaged trace or label was left out.
 
         `part` is "trace" or "label". Nothing happens without decisions, or if there is such an
@@ -444,7 +444,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """
         if damaged:
             names = f"decision {listed(damaged)}; see dengine verify"
-            self._note("damaged", f"left out, since the {part} is not as it was stored: {names}")
+            self._put_event_once(
+                "damaged", f"left out, since the {part} is not as it was stored: {names}"
+            )
 
     # Outcomes
 
@@ -521,7 +523,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """
         return [
             row.id
-            for row in self._read(self._unlabelled(Action.ACCEPT, since_version, DECISION.c.id))
+            for row in self._read(
+                self._unlabelled_query(Action.ACCEPT, since_version, DECISION.c.id)
+            )
         ]
 
     def pending_decisions(self, since_version: int = 0) -> list[StoredDecision]:
@@ -539,7 +543,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """
         return [
             read_decision(row)
-            for row in self._read(self._unlabelled(Action.VERIFY, since_version, *DECISION.c))
+            for row in self._read(self._unlabelled_query(Action.VERIFY, since_version, *DECISION.c))
         ]
 
     def overdue_to(self, within: int, since_version: int = 0) -> int:
@@ -576,7 +580,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Return the number of the cell's newest decision; 0 before the first."""
         return self._read(sa.select(n_decisions(self.cell_id)))[0][0] or 0
 
-    def _unlabelled(self, action: Action, since_version: int, *columns: Any) -> sa.Select[Any]:
+    def _unlabelled_query(
+        self, action: Action, since_version: int, *columns: Any
+    ) -> sa.Select[Any]:
         """Return the query for the cell's decisions of an action that have no label, oldest first.
 
         Those of quarantined traces, and those by a version before `since_version`, are left out.
@@ -730,7 +736,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         if row["accepted"]:
             with_state = connection.execute(
-                self._accepted().where(VERSION.c.state.is_not(None))
+                self._accepted_query().where(VERSION.c.state.is_not(None))
             ).all()
             dropped = [
                 stored.retrain
@@ -742,7 +748,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
                 connection.execute(sa.update(VERSION).where(is_dropped).values(state=None))
         return number
 
-    def _accepted(self) -> sa.Select[Any]:
+    def _accepted_query(self) -> sa.Select[Any]:
         """Return the query for the accepted versions of the cell or its product, newest first.
 
         Its columns are retrain, version, and `kept`, whether the state is kept.
@@ -764,13 +770,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             None before the first, and if all are damaged. A peer's version is returned without the
             state of its rule.
         """
-        for i, row in enumerate(self._read(self._accepted())):
+        for i, row in enumerate(self._read(self._accepted_query())):
             if not row.kept and i > 0:
                 continue  # its state was deleted, which the newest's never is
             try:
-                return self._load(row.retrain)
+                return self._load_retrain(row.retrain)
             except VersionError as error:
-                self._note("damaged", f"{error} The accepted version before it answers.")
+                self._put_event_once("damaged", f"{error} The accepted version before it answers.")
         return None
 
     def load_version(self, version: int) -> ModelVersion:
@@ -791,7 +797,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             If it is damaged or its state is not kept; the error names the versions that are.
         """
         retrains = {
-            row.version: row.retrain for row in reversed(self._read(self._accepted())) if row.kept
+            row.version: row.retrain
+            for row in reversed(self._read(self._accepted_query()))
+            if row.kept
         }
         if version not in retrains:
             others = ", ".join(map(str, retrains)) or "none"
@@ -799,9 +807,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
                 f"Expected a held version, got {version}, which is not kept; load one of "
                 f"these: {others}."
             )
-        return self._load(retrains[version])
+        return self._load_retrain(retrains[version])
 
-    def _load(self, retrain: int) -> ModelVersion:
+    def _load_retrain(self, retrain: int) -> ModelVersion:
         """Return the version of a retrain with its arrays.
 
         A peer's version is returned without the state of its rule. Raise VersionError if the state
@@ -872,7 +880,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """
         self.apply_change(Change(kind, text, data, author))
 
-    def _note(self, kind: str, text: str) -> None:
+    def _put_event_once(self, kind: str, text: str) -> None:
         """Commit an event, unless the cell has one with the same kind and text."""
         query = sa.select(EVENT.c.number).where(EVENT.c.cell_id == self.cell_id)
         query = query.where(EVENT.c.kind == as_text(kind), EVENT.c.text == as_text(text))
@@ -947,7 +955,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             """Insert the event and everything that it changes; return the event's number."""
             (number,) = self.database.insert(connection, EVENT.c.number, [to_row(event)])
             if change.decisions:
-                self._correct(connection, change, {"author": author, "event": number, "time": now})
+                self._correct_labels(
+                    connection, change, {"author": author, "event": number, "time": now}
+                )
             if version is not None:
                 stored = self._insert_version(connection, version)
                 if stored != version["version"]:
@@ -962,7 +972,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         return self.database.write(add_rows)
 
-    def _correct(self, connection: sa.Connection, change: Change, event: Mapping[str, Any]) -> None:
+    def _correct_labels(
+        self, connection: sa.Connection, change: Change, event: Mapping[str, Any]
+    ) -> None:
         """Insert a correction for each decision of a change.
 
         `event` has the columns that they share: author, event and time. Raise ReportError for a
@@ -1087,7 +1099,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             for row in rows
             if not is_intact(LABEL.name, dict(zip(names, row, strict=False)))
         }
-        self._note_damage(sorted(damaged), "label")
+        self._put_damage_event(sorted(damaged), "label")
         rows = [row for row in rows if row.decision_id not in damaged]
         return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
 

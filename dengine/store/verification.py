@@ -269,16 +269,22 @@ class CellCheck:
         raised.
         """
         faults = [
-            fault for table in CHAINED for fault in self._guarded(table, self._check_rows(table))
+            fault
+            for table in CHAINED
+            for fault in self._catch_database_errors(table, self._check_rows(table))
         ]
-        faults += self._guarded(LEDGER.name, self._check_ledger())
-        faults += self._guarded(SETTING.name, self._check_settings())
+        faults += self._catch_database_errors(LEDGER.name, self._check_ledger())
+        faults += self._catch_database_errors(SETTING.name, self._check_settings())
         if not self._is_unreadable:  # else everything that cannot be read would be missing
             for table, required in REQUIRED:
-                faults += self._guarded(table.name, self._check_pairs(table, required))
+                faults += self._catch_database_errors(
+                    table.name, self._check_pairs(table, required)
+                )
         return faults
 
-    def _guarded(self, table: str, faults: Iterator[HistoryFault]) -> Iterator[HistoryFault]:
+    def _catch_database_errors(
+        self, table: str, faults: Iterator[HistoryFault]
+    ) -> Iterator[HistoryFault]:
         """Yield the faults of a check; a database error ends it as one more fault, not raised.
 
         After such an error `run` does not look for missing rows.

@@ -141,7 +141,7 @@ def insert_once(
     SettingError
         For a time step or sizes that cannot be simulated.
     """
-    world_rng, sensor_rng, _ = _streams(seed, cycle)
+    world_rng, sensor_rng, _ = _make_generators(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
     pushed = push(conditions, time_step_s)
     # The faults of the sensor have a stream of their own, so that they do not reveal the outcome.
@@ -152,7 +152,7 @@ def insert_once(
     return SimulatedInsertion(
         trace=read_sensor(pushed.force, faults, parameters, sensor_rng),
         success=success,
-        cause="none" if success else _cause(conditions, pushed),
+        cause="none" if success else _find_cause(conditions, pushed),
         height_mm=pushed.height_mm,
         cycle=cycle,
         conditions=conditions,
@@ -160,7 +160,7 @@ def insert_once(
     )
 
 
-def _cause(conditions: Conditions, pushed: Push) -> str:
+def _find_cause(conditions: Conditions, pushed: Push) -> str:
     """Return the cause of a failed insertion, one of `CAUSES` but "none".
 
     It is the fault that was drawn, if it had an effect; else it follows from where the part
@@ -178,7 +178,7 @@ def _cause(conditions: Conditions, pushed: Push) -> str:
     return "stuck" if tip_mm <= STUCK_MM else "wedging"
 
 
-def _streams(
+def _make_generators(
     seed: int, cycle: int
 ) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
     """Return three independent random generators of one cycle: for world, sensor and line.
@@ -258,7 +258,7 @@ class SimulatedCell:
 
         The clock goes on by `verify_s`. Raise DengineError if no part waits.
         """
-        success = self._take("verify").success
+        success = self._take_waiting("verify").success
         self.clock += self.parameters.verify_s
         return success
 
@@ -270,8 +270,10 @@ class SimulatedCell:
         share `confirm_share` is CONFIRMED, the others are UNKNOWN. Raise DengineError if no part
         waits.
         """
-        success = self._take("proceed").success
-        chance = float(_streams(self.seed, self._done - 1)[2].random())  # depends on the part alone
+        success = self._take_waiting("proceed").success
+        chance = float(
+            _make_generators(self.seed, self._done - 1)[2].random()
+        )  # depends on the part alone
         if success:
             return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN
         if chance < self.parameters.silent_share:
@@ -281,9 +283,9 @@ class SimulatedCell:
 
     def reject(self) -> None:
         """Send the part back to the bin without a check. Raise DengineError if no part waits."""
-        self._take("reject")
+        self._take_waiting("reject")
 
-    def _take(self, call: str) -> SimulatedInsertion:
+    def _take_waiting(self, call: str) -> SimulatedInsertion:
         """Return the insertion that waits for a decision; afterwards none waits.
 
         `call` is the method's name, for the DengineError that is raised if none waits.

@@ -1,5 +1,5 @@
 """The physics of one insertion: `push` builds gripper, part and fixture in MuJoCo and pushes once.
-`fixture_xml` writes the model in MuJoCo's XML (MJCF); the result is a `Push` with the true force,
+`cell_xml` writes the model in MuJoCo's XML (MJCF); the result is a `Push` with the true force,
 the part's height and its slip. `insert_once` uses it.
 
 Lengths inside MuJoCo are metres. The rim of the fixture is at z = 0 and its seat at z = -DEPTH_MM.
@@ -92,7 +92,7 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
         "Expected sizes, masses and springs above zero, MuJoCo refuses these",
         ValueError,
     ):
-        model = mujoco.MjModel.from_xml_string(fixture_xml(conditions, time_step_s))
+        model = mujoco.MjModel.from_xml_string(cell_xml(conditions, time_step_s))
     data = mujoco.MjData(model)
     force = _drive(mujoco, model, data, conditions, steps)
     if conditions.fault == "missed_grasp":
@@ -131,7 +131,7 @@ def _drive(
     return force
 
 
-def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
+def cell_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
     """Return the MuJoCo model (MJCF, as text) of the whole cell under these conditions.
 
     It has the fixture, the carriage with its drive, the elastic wrist with the force sensor, and
@@ -152,7 +152,7 @@ def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str
           condim="3"/>
   </default>
   <worldbody>
-    {_fixture(c)}
+    {_fixture_xml(c)}
     <body name="carriage" pos="0 0 {tool_z}" gravcomp="1">
       <joint name="drive" type="slide" axis="0 0 1" damping="20"/>
       <inertial pos="0 0 0" mass="4" diaginertia="0.02 0.02 0.02"/>
@@ -173,7 +173,7 @@ def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str
         <body name="tool" gravcomp="1">
           <inertial pos="0 0 -0.03" mass="0.6" diaginertia="0.0006 0.0006 0.0003"/>
           <site name="sensor"/>
-          {_part(c)}
+          {_part_xml(c)}
         </body>
       </body>
     </body>
@@ -190,7 +190,7 @@ def _damping(stiffness: float, inertia: float, ratio: float = 0.6) -> float:
     return 2 * ratio * math.sqrt(stiffness * inertia)
 
 
-def _part(c: Conditions) -> str:
+def _part_xml(c: Conditions) -> str:
     """Return the MJCF of the part in the gripper, as text; "" if the grasp missed it.
 
     Dry friction holds the part until the push exceeds the grip.
@@ -213,7 +213,7 @@ def _part(c: Conditions) -> str:
           </body>"""
 
 
-def _fixture(c: Conditions) -> str:
+def _fixture_xml(c: Conditions) -> str:
     """Return the MJCF of the fixture, as text: four walls with a 45° chamfer, a floor, debris.
 
     Debris, a soft box on the floor, is there only if its thickness is above 0.
@@ -222,7 +222,7 @@ def _fixture(c: Conditions) -> str:
     depth = DEPTH_MM / 1000
     chamfer = c.chamfer_mm / 1000
     chip = c.debris_mm / 2000
-    parts = [_wall(side, half, chamfer, depth) for side in range(4)]
+    parts = [_wall_xml(side, half, chamfer, depth) for side in range(4)]
     parts.append(f'<geom type="box" size="0.03 0.03 0.005" pos="0 0 {-depth - 0.005}"/>')
     if c.debris_mm > 0:
         position = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + chip}"
@@ -234,7 +234,7 @@ def _fixture(c: Conditions) -> str:
     return "\n".join(parts)
 
 
-def _wall(side: int, half: float, chamfer: float, depth: float) -> str:
+def _wall_xml(side: int, half: float, chamfer: float, depth: float) -> str:
     """Return the MJCF of wall `side` (0 to 3): the wall at +x, turned by quarter turns about z.
 
     It is text with three boxes, the chamfer among them. Half width, chamfer and depth of the hole

@@ -86,7 +86,7 @@ class RobotProgram:
         self.place: tuple[int, int] | None = None
         self.outputs: Values = {RUNTIME: Runtime.PLAYING, ANSWER: 0, PHASE: 0}
         self._inputs: Values = {}
-        self._run = self._cycles()
+        self._run = self._run_program()
 
     def step(self, inputs: Values) -> Values:
         """Run one control cycle with these inputs; return all outputs. Both are values by column.
@@ -102,9 +102,9 @@ class RobotProgram:
 
         Parts that were inserted stay so.
         """
-        self._run = self._cycles()
+        self._run = self._run_program()
 
-    def _cycles(self) -> Iterator[None]:
+    def _run_program(self) -> Iterator[None]:
         """Run the program without an end; each yield ends a control cycle.
 
         At its start it writes the result VOID for an order that it finds. Then it carries out each
@@ -312,7 +312,8 @@ class FakeController(AbstractContextManager["FakeController"]):
         self._begin = self._cycle = 0
         self._until = Counter[str]()  # by kind of trouble: the cycle at which it ends
         self._threads = [
-            threading.Thread(target=loop, daemon=True) for loop in (self._accept, self._run)
+            threading.Thread(target=loop, daemon=True)
+            for loop in (self._accept_loop, self._run_loop)
         ]
         for thread in self._threads[:]:
             thread.start()
@@ -347,17 +348,17 @@ class FakeController(AbstractContextManager["FakeController"]):
             for client in self._clients:
                 client.hang_up()
 
-    def _accept(self) -> None:
+    def _accept_loop(self) -> None:
         """Accept connections, each served by a thread of its own, until the server is closed."""
         with suppress(OSError):  # until it is closed
             while True:
                 sock, _ = self._server.accept()
                 self._threads.append(
-                    threading.Thread(target=self._serve, args=(Client(sock),), daemon=True)
+                    threading.Thread(target=self._serve_client, args=(Client(sock),), daemon=True)
                 )
                 self._threads[-1].start()
 
-    def _serve(self, client: Client) -> None:
+    def _serve_client(self, client: Client) -> None:
         """Carry out a client's requests until it disconnects, or sends something else than RTDE.
 
         It is the body of the client's thread; afterwards the client is forgotten.
@@ -390,7 +391,7 @@ class FakeController(AbstractContextManager["FakeController"]):
             case PackageType.OUTPUTS:
                 (rate,) = struct.unpack_from(">d", payload)
                 client.every = max(int(1 / (CYCLE_S * rate)), 1) if rate > 0 else 1
-                recipe = self._recipe(1, payload[8:], self.refuses, NOT_FOUND)
+                recipe = self._make_recipe(1, payload[8:], self.refuses, NOT_FOUND)
                 client.output = None if NOT_FOUND in recipe.types else recipe
                 response = bytes([1]) + ",".join(recipe.types).encode()
             case PackageType.INPUTS:
@@ -401,7 +402,7 @@ class FakeController(AbstractContextManager["FakeController"]):
                     for recipe in other.inputs.values()
                 ]
                 number = len(client.inputs) + 1
-                recipe = self._recipe(number, payload, {*self.refuses}.union(*others), IN_USE)
+                recipe = self._make_recipe(number, payload, {*self.refuses}.union(*others), IN_USE)
                 if {IN_USE, NOT_FOUND} & set(recipe.types):
                     number = 0
                 else:
@@ -418,7 +419,7 @@ class FakeController(AbstractContextManager["FakeController"]):
         client.socket.sendall(Package(type_, response).to_bytes())
         client.started = type_ is PackageType.START and response == b"\1"
 
-    def _recipe(
+    def _make_recipe(
         self, number: int, names: bytes, refused: Collection[PackageType | str], why: str
     ) -> RtdeRecipe:
         """Return a recipe of the fields in `names`, a text with commas between them.
@@ -432,7 +433,7 @@ class FakeController(AbstractContextManager["FakeController"]):
             tuple(why if name in refused else type_of(name) for name in listed),
         )
 
-    def _run(self) -> None:
+    def _run_loop(self) -> None:
         """Run control cycles until the server is closed: the body of a thread.
 
         They come at the set speed; without one, as fast as the clients read.

@@ -123,7 +123,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
     def arm(self) -> None:
         """Discard what was received so far; record an insertion that begins from now on."""
-        self._forget()
+        self._reset()
         self._armed = self.stream.clear()
 
     def report(self) -> StreamReport:
@@ -189,7 +189,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         ):  # it was restarted
             if self.begun:
                 record = self.cut()
-            self._forget()
+            self._reset()
         self._rows.append(row)
         if self._start is None:
             active = self.trigger.active(
@@ -211,7 +211,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         first = self._first_time()
         rows = self._rows
         armed = self._armed
-        self._forget()
+        self._reset()
         reconnects = (
             0 if start is None else rows[-1].session - (rows[0].session if armed is None else armed)
         )
@@ -233,7 +233,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         """
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         """Discard packages, start and arming, so that the next insertion is looked for."""
         self._finder.forget()
         self._rows = []

@@ -268,7 +268,9 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         self._counts = Counter[str]()
         self._closing = threading.Event()
         self._client = self._connect(time.monotonic() + RELEASE_S)
-        self._thread = threading.Thread(target=self._read, name=f"rtde {self.where}", daemon=True)
+        self._thread = threading.Thread(
+            target=self._read_loop, name=f"rtde {self.where}", daemon=True
+        )
         self._thread.start()
 
     def close(self) -> None:
@@ -327,7 +329,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             except CellError as error:  # the reading thread reconnects and writes them again
                 self.trouble = str(error)
 
-    def _read(self) -> None:
+    def _read_loop(self) -> None:
         """Receive packages and reconnect until the stream is closed: the body of the thread.
 
         Each new connection is counted; without one, `trouble` says why.
@@ -336,7 +338,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             client = self._client
             try:
                 for values in client.rows():
-                    self._keep(Row(values, self._session))
+                    self._count_and_buffer(Row(values, self._session))
             except CellError as error:
                 client.close()
                 with self._news:
@@ -353,7 +355,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
                     if self._closing.is_set():  # `close` did not see this client
                         new_client.close()
 
-    def _keep(self, row: Row) -> None:
+    def _count_and_buffer(self, row: Row) -> None:
         """Count a package and what is missing before it, buffer it, and wake who waits in `take`.
 
         The first package of a new connection also has the inputs written again, if they are at most
