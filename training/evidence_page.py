@@ -315,7 +315,8 @@ def introduction_lines() -> list[str]:
         "of their own, and `knn` has no bound at all: alpha and LB do not change its decisions.",
         "",
         "**The policies.** alpha is the error level of the interval around the success rate of "
-        "similar parts. LB is the success rate that this interval must reach before a part is accepted.",
+        "similar parts. LB is the success rate that its lower end must reach before a part is "
+        "accepted.",
         "",
         "**An entry** is a mean over the replays. Below it stands how much more this is than "
         f"`{REFERENCE}` has on the same parts in the same order (the same seed), with the 95 % "
