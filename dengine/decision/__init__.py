@@ -1,6 +1,6 @@
-"""From a trace to an action: policy, intervals, references, rules, novelty and the decider.
-
-The model and the engine are built on this family; what users import is listed in `__init__.pyi`.
+"""From a trace to an action: policy, intervals, references, rules, novelty and the decider. The
+model and the engine are built on this family; what users import is listed in `__init__.pyi`:
+`Policy`, the intervals, `WilsonRadiusClassifier`, `RadiusIndex` and `DecisionRule`.
 """
 
 import lazy_loader

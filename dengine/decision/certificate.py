@@ -1,4 +1,7 @@
 """The certificate: an anytime-valid upper bound on how many unchecked parts were decided wrongly.
+`certify` computes a `Certificate` from counts of `Outcomes`, by `failure_bound`; its sentences are
+what `dengine status` prints. `Policy.certificate` calls it for the engine. `cusum` designs the
+drift detectors of `members`.
 
     >>> failure_bound(1203, 24, alpha=0.05)     # 1,203 parts, 24 of them bad: 2 % were seen
     0.0349...
@@ -8,15 +11,13 @@ failure probabilities that the parts so far really had. These may differ and dri
 retrained, and its rule may learn from every outcome. The one assumption is that an audit coin falls
 with the stated probability whatever the part is. An audit that is overdue (`Policy.label_within`)
 counts as bad until it is reported, so that a lost one cannot make the bound smaller; a younger one
-is left out. The bound is about parts so far, not about those to come. `Policy.certificate` computes
-it for the engine.
+is left out. The bound is about parts so far, not about those to come.
 
 *Proof.* The evidence is an e-process, the capital of a bettor. It starts at 1, and the same share b
 is bet on every part, that it will be good. With x = 1 for a bad part whose outcome is known, else
 0,
 
-    capital(theta) = product of (1 - b)^x / (1 - b q theta),   q the propensity, theta the
-    tolerance.
+    capital(theta) = product of (1 - b)^x / (1 - b q theta),  q the propensity, theta the tolerance.
 
 Put each part's own failure probability p_i in the place of theta, whatever it is and however it
 depends on the past. Then x has the mean q p_i, so the product M is a martingale that begins at 1,

@@ -1,6 +1,6 @@
-"""The radius-neighbour classifier with a confidence bound: a scikit-learn estimator.
-
-`ModelPrediction` takes one for its settings; on its own it works over any embedding.
+"""The radius-neighbour classifier with a confidence bound: `WilsonRadiusClassifier`, a scikit-learn
+estimator. `ModelPrediction` takes one for its settings (radius, error level, lower bound, interval,
+capacity); on its own it classifies points of any embedding.
 """
 
 from typing import Any, Self

@@ -1,9 +1,11 @@
 """Detects code that was changed after TorchScript compiled it: torch compiles each class once.
+`remember_code` notes the code of a module when `scripting.script` compiles it, and
+`is_code_changed` says later whether it is another. The model then answers in Python, and the export
+refuses.
 
 A notebook cell that is run again defines another class, which is compiled. But if a method, a
 helper's method, a function or a constant of a module is replaced, the class stays the same, and
-torch answers with the code of before. `scripting.script` calls `remember_code` on all that it
-compiles. Where `is_code_changed` then says so, the model answers in Python, and the export refuses.
+torch answers with the code of before.
 """
 
 import sys

@@ -1,13 +1,14 @@
-"""The decision on one trace, in one module: faults, force limits, prediction, audit.
+"""The decision on one trace, in one module: `Decider` checks faults and force limits, asks the
+predictor, and draws audits, under the settings in `DecisionConditions`. `VerifyAll` is the
+predictor for the time without a model. The engine asks a `Decider`, and an exported file contains
+one.
 
     >>> decider = Decider(predictor, DecisionConditions(TraceSpec(1000), audit_rate=0.02), (5, 2))
     >>> fault, content, action, *_ = decider(torch.from_numpy(x), part=0)
 
-The file holds `Decider`, the `DecisionConditions` that it is made for, and the predictor
-`VerifyAll` for the time without a model. The engine asks a `Decider` and adds an id, a model
-version and a time; the exported file contains one. Both therefore decide alike. TorchScript
-compiles it if it can compile the predictor; a predictor that is plain Python is asked through the
-same lines.
+The engine adds an id, a model version and a time to what a `Decider` returns. As exported files
+contain the same module, they decide alike. TorchScript compiles it if it can compile the predictor;
+a predictor that is plain Python is asked through the same lines.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,6 @@
-"""Confidence intervals of a success probability, from counts of successes and failures.
+"""Confidence intervals of a success probability, from counts of successes and failures: Wilson,
+Wald (the paper's "binomial"), Clopper-Pearson and Jeffreys. `INTERVALS` lists them by name for the
+policy, the rules and the exports; `normal_quantile` turns an error level into z.
 
     >>> from dengine import wilson_interval
     >>> wilson_interval(96, 4, alpha=0.05)  # the paper's "Wilson Formula results" (b), first row
@@ -7,7 +9,7 @@
 The public functions take integer arrays and return `(lower, upper)` with `0 <= lower <= n_success /
 n <= upper <= 1`. Each interval is two-sided at error level alpha: z is the 1 - alpha / 2 quantile
 of the normal distribution, and each tail holds alpha / 2. Where nothing was counted, the interval
-is (0, 1). `INTERVALS` lists them by name.
+is (0, 1).
 
 The Wilson and the Wald formula stand here twice, and nowhere else. `wilson_limits` and
 `wald_limits` are written for NumPy arrays and for PyTorch tensors alike (they are given the library

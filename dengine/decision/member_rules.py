@@ -1,7 +1,6 @@
-"""The rules that learn from outcomes: `WatchedRule`, `PooledRule` and `PricedRule`.
-
-All three derive from `MemberRule` and decide by `members.MemberEvidence`, which opens and closes
-levels of the score. `policy.RULES` says which one belongs to which guarantee.
+"""The rules that learn from outcomes: `WatchedRule`, `PooledRule` and `PricedRule`. All three
+derive from `MemberRule` and decide by `members.MemberEvidence`, which opens and closes levels of
+the score. `policy.RULES` says which one belongs to which guarantee.
 """
 
 import torch

@@ -1,8 +1,8 @@
-"""The evidence that a learning rule keeps: outcomes of members, levels and drift detectors.
-
-`MemberEvidence` is a module with one buffer for each quantity. `member_rules` builds the pooled,
-the priced and the watched rule on it; TorchScript compiles it into the exported file, where it goes
-on learning.
+"""The evidence that a learning rule keeps: `MemberEvidence` counts the outcomes of parts, opens and
+closes levels of the score by a bet or an account, and runs the drift detectors that start the safe
+mode. It is a module with one buffer for each quantity. `member_rules` builds the pooled, the priced
+and the watched rule on it; TorchScript compiles it into the exported file, where it goes on
+learning.
 
 *Members* are the parts whose score reached the target level when they were decided, accepted or
 checked. The score for accepting is the lower bound, the score for rejecting 1 - upper bound. Each

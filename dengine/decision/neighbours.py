@@ -1,7 +1,6 @@
-"""The radius-neighbour decision: count references around one embedded trace and ask the rule.
-
-`RadiusNeighbours` joins a `RadiusIndex` and a `DecisionRule` into one module that compiles to
-TorchScript. `WilsonRadiusClassifier` and the model's `Predictor` are built on it.
+"""The radius-neighbour decision: `RadiusNeighbours` counts the labels around one embedded trace in
+a `RadiusIndex` and asks a `DecisionRule` for bound and action. The module compiles to TorchScript.
+`WilsonRadiusClassifier` and the model's `Predictor` are built on it.
 """
 
 import torch

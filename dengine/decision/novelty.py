@@ -1,12 +1,13 @@
-"""The novelty gate: is a trace like those that the model learned from?
+"""The novelty gate: is a trace like those that the model learned from? `fit_novelty` fits a
+`NoveltyGate` to the traces of a training; the gate is a module that compiles to TorchScript and
+returns True for a novel trace. The model asks it before labels are counted, and a novel trace is
+verified.
 
     >>> gate = fit_novelty(traces, margin=1.5)
     >>> gate(torch.from_numpy(traces[0]))
     False
 
-The file holds the module `NoveltyGate` and `fit_novelty`, which fits it; `model.neighbours` puts it
-before the count of labels. The features of a trace x (C, T), and the distances that are taken of
-them:
+The features of a trace x (C, T), and the distances that are taken of them:
 
     x -> S segments of each channel: minimum, maximum, log roughness of
          first and of second differences                                  (C, 4*S)

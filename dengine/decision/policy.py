@@ -1,5 +1,4 @@
 """The user's settings of a decision: error level, lower bound LB, guarantee, audits, force limits.
-
 `Policy` is the frozen record of them. It makes the decision rule, the interval and the certificate
 that follow from them. The recipe, the store's settings and the verb `dengine policy` all hold one.
 """

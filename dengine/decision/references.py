@@ -1,12 +1,13 @@
-"""Labelled reference points, and the counts of labels within a radius of a query.
+"""Labelled reference points, and the counts of labels within a radius of a query: `RadiusIndex`
+holds the points, and `label_agreement` says how much repeated labels of one part are worth. The
+engine's model, the scikit-learn classifier and the exported file count by it.
 
     >>> index = RadiusIndex(dim=2, capacity=10_000)
     >>> index.add(points, labels, spaces)
     >>> n_success, n_failure = index.count(queries, radius=0.3)
 
-The file holds `RadiusIndex` and `label_agreement`, by which repeated parts are weighed. The search
-is brute force in float32. It takes tens of microseconds and compiles to TorchScript, so one
-implementation counts in the engine, in the scikit-learn classifier and in the exported file.
+The search is brute force in float32. It takes tens of microseconds and compiles to TorchScript, so
+one implementation counts in the engine, in the scikit-learn classifier and in the exported file.
 
 Trials must be independent to be counted. A part is known by a hash of its number, or of its trace.
 Its own references have no vote on it, and m references of one part are worth m / (1 + (m - 1) rho)

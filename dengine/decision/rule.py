@@ -1,12 +1,13 @@
-"""The decision rule: label counts around a trace -> confidence bound -> action.
+"""The decision rule: label counts around a trace -> confidence bound -> action. `DecisionRule` is
+the paper's rule and the base class of all others, a user's own included; `action_of` compares a
+bound with two thresholds. `member_rules` holds the rules that learn from outcomes, and
+`Policy.rule` makes the one that a policy asks for.
 
     >>> rule = Policy(alpha=0.1, lower_bound=0.9).rule()
     >>> rule(40, 0)                      # 40 successes, no failure: (1, 0.93..., 1.0), accept
 
-`DecisionRule` is the paper's rule and the base class of all others. It is an `nn.Module` that
-compiles to TorchScript, so the engine, the scikit-learn classifier and the exported file run the
-same lines. `member_rules` holds the rules that learn from outcomes. `Policy.rule` makes the one
-that a policy asks for.
+A rule is an `nn.Module` that compiles to TorchScript, so the engine, the scikit-learn classifier
+and the exported file run the same lines.
 """
 
 from functools import partial

@@ -1,6 +1,6 @@
-"""Compile modules to TorchScript, and copy stored arrays back into modules.
-
-The reducers, the decision rules, the novelty gate and the export use these helpers.
+"""Compile modules to TorchScript (`script`), and copy stored arrays back into modules (`restore`,
+`arrays_with_prefix`). The reducers, the model, the store's history and the export use these
+helpers.
 """
 
 import threading

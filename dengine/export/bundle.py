@@ -1,12 +1,11 @@
 """What every exported file has, TorchScript or ONNX: description, checksum and signature.
+`torchscript` and `onnx` write and read their files through the functions here: `prepare_export`
+checks and builds the module, `describe` and `write_export` write, `read_checked` and
+`read_metadata` read, and `make_key` makes the key that signs.
 
     dengine export --make-key cell.key
     dengine export engine.db --out model.ts --key cell.key  # model.ts, .ts.sha256, .ts.sig
     python -c 'from dengine import load_exported; load_exported("model.ts", key="cell.key")'
-
-`torchscript` and `onnx` write and read their files through the functions here: `make_key` makes a
-key, `prepare_export` builds the module, `describe` and `write_export` write, `read_checked` and
-`read_metadata` read.
 
 The checksum guards against damage, not against an adversary: whoever can change the file can change
 the sum. The signature says who made the file before a byte of it is run. It is HMAC-SHA256 (FIPS

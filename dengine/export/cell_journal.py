@@ -1,4 +1,6 @@
-"""Journals of exported cells: read and check what a cell program wrote, and import it.
+"""Journals of exported cells: `read_journal` reads and checks what a cell program wrote, and
+`import_journal` imports it into the engine's store, each part once, however often. The verb
+`dengine import-labels` calls it.
 
     journal = read_journal("cell.csv", TraceSpec(1000))
     report = import_journal("engine.db", "cell.csv")
@@ -11,8 +13,6 @@ or moved: that line and all after it are set aside. FILE.head beside the journal
 its lines and the last CRC; if it knows of a line that the journal lacks, the journal says so, and a
 missing head is logged. A last line without its end was being written when the program was killed:
 it is left out. Anything else that does not fit is a DataError that names the line.
-
-`dengine import-labels` calls `import_journal`, which imports each part once, however often.
 """
 
 import logging

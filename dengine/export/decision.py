@@ -1,8 +1,7 @@
-"""The module inside an exported file: a `Decider` that also learns from reported outcomes.
-
-It decides as `DataEngine.decide` does, and learns as `DataEngine.report` does between two retrains.
-`bundle.prepare_export` builds it; TorchScript compiles it; `ExportedModel` and the C++ program call
-the methods in `METHODS`.
+"""The module inside an exported file: `DecisionModule`, a `Decider` that also learns from reported
+outcomes. It decides as `DataEngine.decide` does, and learns as `DataEngine.report` does between two
+retrains. `bundle.prepare_export` builds it; TorchScript compiles it; `ExportedModel` and the C++
+program call the methods in `METHODS`.
 """
 
 import torch

@@ -1,15 +1,16 @@
-"""Export to ONNX, for controllers that run onnxruntime.
+"""Export to ONNX, for controllers that run onnxruntime: `export_onnx` writes and checks a file,
+`load_onnx` reads it and returns an `OnnxModel`, which decides in Python. `OnnxDecision` is the
+module that is exported.
 
     >>> export_onnx(engine, "model.onnx")          # model.onnx and model.onnx.sha256
     >>> load_onnx("model.onnx").decide(trace)
 
-The file holds these two functions, `OnnxModel`, which runs a file in Python, and `OnnxDecision`,
-the module that is exported. An ONNX program of torch.export has neither branches nor state, so
-`OnnxDecision` repeats what `Decider` and `RadiusNeighbours` do with tensors; the interval's formula
-is shared. `export_onnx` checks each file against the model before it keeps it, and
-`tests/e2e/test_onnx.py` holds the two to one another. ONNX cannot carry references that grow or
-rules that learn, so nothing is learned in the cell. It has no hashes either, so there are no audits
-and no votes of parts that came again, and a reference that is asked about itself counts itself.
+An ONNX program of torch.export has neither branches nor state, so `OnnxDecision` repeats what
+`Decider` and `RadiusNeighbours` do with tensors; the interval's formula is shared. `export_onnx`
+checks each file against the model before it keeps it, and `tests/e2e/test_onnx.py` holds the two to
+one another. ONNX cannot carry references that grow or rules that learn, so nothing is learned in
+the cell. It has no hashes either, so there are no audits and no votes of parts that came again, and
+a reference that is asked about itself counts itself.
 """
 
 import json

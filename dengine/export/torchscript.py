@@ -1,13 +1,14 @@
 """Export to TorchScript: one file for the cell controller, with a checksum beside it.
+`export_torchscript` writes it, and `load_exported` reads it and returns an `ExportedModel`, which
+decides and learns in Python as the controller does. `export_sources` writes the C and C++ sources
+that run it.
 
     >>> export_torchscript(engine, "model.ts")     # model.ts and model.ts.sha256
     >>> load_exported("model.ts").decide(trace)    # checked before it is loaded, ready at once
 
-`load_exported` returns an `ExportedModel`, which decides and learns in Python as the controller
-does. An untrusted `.ts` file is a program: loading it runs what is in it, which can read and write
-files. Load only what you made yourself, or what was signed with a key of yours. The C and C++
-sources that run an exported file depend on no model, so `export_sources` writes them by a verb of
-their own:
+An untrusted `.ts` file is a program: loading it runs what is in it, which can read and write files.
+Load only what you made yourself, or what was signed with a key of yours. The C and C++ sources that
+run an exported file depend on no model, so they come by a verb of their own:
 
     dengine export --cpp cell_cpp
     torch_cmake="$(python -c 'import torch; print(torch.utils.cmake_prefix_path)')"

@@ -1,8 +1,9 @@
-"""The two contracts of a model: `Model` for baselines, `EngineModel` for the engine.
+"""The two contracts of a model: `Model` for baselines, `EngineModel` for the engine. The file also
+holds `Prediction`, what a model answers; `BaselineAdapter`, by which `as_engine_model` makes an
+`EngineModel` of a baseline; and `Exportable`, what a model hands to an exporter. dengine's own
+`neighbours.ModelPrediction` implements both contracts.
 
-`as_engine_model` makes an `EngineModel` of a baseline by `BaselineAdapter`, and `Exportable` is
-what a model hands to an exporter. dengine's own `neighbours.ModelPrediction` implements both
-contracts. Calls that must not raise into the cell go through `engine.guard.GuardedModel`.
+Calls that must not raise into the cell go through `engine.guard.GuardedModel`.
 """
 
 from __future__ import annotations

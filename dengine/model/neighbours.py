@@ -1,13 +1,15 @@
-"""dengine's own model, `ModelPrediction`: reducer, references and rule, with honest counting.
+"""dengine's own model, `ModelPrediction`: reducer, references and rule, with honest counting. The
+engine trains it and asks it for decisions, the exporters write it to a file. The file also holds
+`Predictor`, the module of the fitted parts; the compiled deciders that a process keeps
+(`template_of`, `compiled`); and `near_repeats`, which notices parts that came twice without a
+number.
 
 A label may be counted for a query only in an embedding that never saw that label. So the reducer
 spans K spaces, fold k's references live in space k, a query is embedded in all K, and its counts
 are summed.
 
 The engine and the exporters ask a `Decider` around `Predictor`, a module of the fitted parts that
-compiles to TorchScript. Compiled deciders are copied from templates (`template_of`, `compiled`),
-because scripting takes long. `near_repeats` counts traces that look like a part inserted again, for
-a note in the retrain's report.
+compiles to TorchScript. Compiled deciders are copied from templates, because scripting takes long.
 """
 
 import copy

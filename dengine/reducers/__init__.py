@@ -1,8 +1,10 @@
-"""Reducers by name. A reducer embeds traces, and each is a scikit-learn transformer.
+"""Reducers by name. A reducer embeds traces, and each is a scikit-learn transformer. `REDUCERS`
+maps a name (conv, umap, umap-learn, pca, rocket) to a function that makes the reducer;
+`make_reducer` also takes the `module:Class` of a user's own and checks the parameters. The model,
+the recipe and the command line make their reducers here.
 
-`REDUCERS` maps a name to a function that makes the reducer, and `make_reducer` also takes the
-`module:Class` of a user's own. A new reducer is a module of this folder and a line in `_NAMED`,
-which also gives it a recipe; its defaults are attributes of its class, see `base.Reducer`.
+A new reducer is a module of this folder and a line in `_NAMED`, which also gives it a recipe; its
+defaults are attributes of its class, see `base.Reducer`.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,7 @@
-"""`Reducer`, the base class of everything that embeds traces, and adapters for scikit-learn's.
+"""`Reducer`, the base class of everything that embeds traces, and the adapters `LabelFree` and
+`CrossFitted` for scikit-learn's transformers, which `as_reducer` chooses. The file also holds
+`StopRule` and `FitReport`, what a training is given and gives back, and the checks of labels, folds
+and seeds that all reducers share.
 
 A reducer of your own is a subclass with `fit` and `transform`; all else has defaults, and
 `dengine.testing.check_reducer` checks it. Any scikit-learn transformer works as well: `as_reducer`
@@ -10,9 +13,6 @@ wraps one that needs no labels in `LabelFree`, and one that uses labels in `Cros
 An embedding has K spaces. A label may be counted for a query only in a space that was fitted
 without that label. So references of fold k live in space k, which is fitted without the labels of
 fold k. A reducer that uses no labels has one space.
-
-The file also holds `StopRule` and `FitReport`, what a training is given and gives back, and the
-checks of labels, folds and seeds that reducers share.
 """
 
 import time

@@ -1,5 +1,4 @@
 """Checkpoints of a network: weights of a single member, from which all members of a reducer start.
-
 `training/train_encoder.py` writes one with `save_checkpoint`; `TorchReducer(checkpoint=...)` reads
 it with `load_checkpoint`. A checkpoint holds tensors alone, so that loading it runs no code.
 """

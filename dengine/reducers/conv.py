@@ -1,4 +1,5 @@
-"""The 1-D convolutional network that embeds traces, and `ConvReducer`, which trains it.
+"""The 1-D convolutional network that embeds traces, `ConvNetwork`, and `ConvReducer`, the reducer
+"conv", which trains it as `TorchReducer` trains any network.
 
     x (B, 2C, L)               preprocessed traces: each signal and its differences in time
     conv 15, stride 4           8 channels per signal

@@ -1,4 +1,6 @@
-"""The module that `TorchReducer` trains and exports: K members of a network, and their embeddings.
+"""The module that `TorchReducer` trains and exports: `Members` are K copies of a network with two
+units and a logit each, and `Encoder` embeds raw traces by them. `fold_batch_norms` simplifies a
+trained network before it is compiled.
 
     x (B, C, T) raw        -> Preprocessor -> (B, C', L)
     K copies of the network                -> (B, K, F) features

@@ -1,7 +1,6 @@
-"""Cross-fitted logistic heads for `RocketReducer`: K ridge regressions that are fitted at once.
-
-Head k is fitted on the rows outside fold k. With the heads come their leave-one-out logits, by
-which `RocketReducer` weighs its towers, without a row having trained the logit that it gets.
+"""Cross-fitted logistic heads for `RocketReducer`: `fit_heads` fits K ridge regressions at once,
+head k on the rows outside fold k. With the heads come their leave-one-out logits, by which
+`RocketReducer` weighs its towers, without a row having trained the logit that it gets.
 
 References
 ----------

@@ -1,6 +1,5 @@
-"""`PcaReducer`, the simplest reducer without labels, and `PcaEncoder`, the module that it exports.
-
-It is fitted in closed form on all traces at every training.
+"""PCA, the simplest reducer without labels: `PcaReducer`, which is fitted in closed form at every
+training, and `PcaEncoder`, the module that it exports.
 """
 
 from collections.abc import Mapping

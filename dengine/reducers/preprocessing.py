@@ -1,6 +1,6 @@
 """What every network reads of a trace: averaged, standardised, with its differences in time.
-
-`TorchReducer` puts `Preprocessor` before its network. `rocket` and `umap` also use `averaging`.
+`TorchReducer` puts the module `Preprocessor` before its network. `averaging` chooses how many
+samples become one; the reducers rocket and umap use it as well.
 """
 
 import torch

@@ -1,4 +1,7 @@
-"""Convolution kernels that are drawn, under cross-fitted logistic heads: no kernel is trained.
+"""Convolution kernels that are drawn, under cross-fitted logistic heads: no kernel is trained. The
+file holds `RocketReducer`, the reducer "rocket"; `FeatureEmbedding`, the module that it exports;
+and `Tower` and `weigh_towers`, by which it joins two kinds of features. The kernels are in
+`rocket_features`, the heads in `logistic_heads`.
 
     >>> reducer = RocketReducer(folds=5).fit(X, y)  # X (n, T) or (n, C, T), y (n,), 1 = success
     >>> reducer.embed(X).shape                      # (n, K, d): every trace in each of K spaces

@@ -1,4 +1,6 @@
-"""The features of `RocketReducer`: convolution kernels that are drawn, not trained.
+"""The features of `RocketReducer`: convolution kernels that are drawn, not trained. `RocketEncoder`
+computes them from raw traces, `compute_raw_features` those of many traces at once; the other
+functions draw the kernels and place them.
 
     x (B, C, T) -> means of a few samples each, channels of one scale            (B, C, L)
     tower 1     -> F kernels of 9 taps at each of D dilations, at P places       (D, F, P * B)

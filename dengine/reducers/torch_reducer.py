@@ -1,4 +1,6 @@
-"""`TorchReducer`: train any PyTorch network on the CPU, a few steps at every retrain.
+"""`TorchReducer`: train any PyTorch network on the CPU, a few steps at every retrain. The file also
+holds `Augmentation`, which changes the traces of a batch, `draw_batches`, and `can_compile`, which
+says whether a network can be exported. `conv` is this class with its own network.
 
     >>> reducer = TorchReducer(network=MyNetwork)  # MyNetwork(channels, samples) is an nn.Module
     >>> DataEngine(reducer=reducer)
@@ -6,7 +8,7 @@
 Member k of the network is trained on the labels outside fold k alone, so that labels of fold k may
 be counted in space k. A retrain goes on from the last one: `fit_loop` takes some AdamW steps on
 augmented batches, at a constant learning rate. An exponential average of the weights answers, with
-the statistics of batch normalisation estimated anew. `conv` is this class with its own network.
+the statistics of batch normalisation estimated anew.
 
 References
 ----------

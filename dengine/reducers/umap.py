@@ -1,4 +1,6 @@
-"""UMAP in PyTorch: without labels, trained on from retrain to retrain, and exportable.
+"""UMAP in PyTorch: without labels, trained on from retrain to retrain, and exportable. The file
+holds `UmapReducer`, the reducer "umap", and `UmapEncoder`, the module that places a new trace among
+its references. The graph of neighbours is in `umap_graph`, the layout in `umap_layout`.
 
 A training takes these steps; each line says what differs from the library umap-learn.
 
@@ -13,8 +15,6 @@ A training takes these steps; each line says what differs from the library umap-
 5. `optimize_layout` moves the points by attraction and repulsion.
 6. `UmapEncoder` puts a new trace at the mean of its nearest references' points, weighted by their
    membership strengths. umap-learn starts there and goes on with stochastic steps.
-
-Steps 1 to 3 are in `umap_graph`, steps 4 and 5 in `umap_layout`.
 
 References
 ----------

@@ -1,7 +1,6 @@
-"""The graph of `UmapReducer`: each trace is joined to its nearest neighbours.
-
-`Frames` shortens traces to vectors, between which distances are measured. `Neighbors` holds the
-exact nearest neighbours of each trace and searches only those that changed since the last training.
+"""The graph of `UmapReducer`: each trace is joined to its nearest neighbours. `Frames` shortens
+traces to vectors, between which distances are measured. `Neighbors` holds the exact nearest
+neighbours of each trace and searches only those that changed since the last training.
 `membership_strengths` weighs the neighbours, and `fuzzy_simplicial_set` unites all neighbourhoods
 to a symmetric graph, which `umap_layout` lays out.
 

@@ -1,7 +1,7 @@
 """The layout of `UmapReducer`: each trace gets a point, near those that it is joined to.
-
 `spectral_start` places the points of a graph by eigenvectors. `optimize_layout` then moves them by
 the `attraction` of neighbours and the `repulsion` of other points, until both are in balance.
+
 umap-learn takes stochastic steps along one edge at a time. Here an epoch is one step of all points
 along the expectation of umap-learn's steps, semi-implicit, so that a learning rate of 1 is stable.
 

@@ -1,4 +1,6 @@
-"""`UmapLearnReducer`: UMAP by the library umap-learn, to compare with `dengine.reducers.umap`."""
+"""UMAP by the library umap-learn, `UmapLearnReducer`, to compare with `dengine.reducers.umap`. It
+fits anew at every training and cannot be exported.
+"""
 
 import warnings
 from collections.abc import Iterator
