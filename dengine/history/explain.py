@@ -334,7 +334,7 @@ def envelope_of(
     ----------
     successes : array of float32, shape (n, C, T)
     trace : array of float32, shape (C, T)
-        It may have NaN and infinite samples, which count as inside.
+        Its NaN and infinite samples are left out.
     rate_hz : float
         Sampling rate.
 

@@ -419,7 +419,8 @@ class Outbox:
         Returns
         -------
         StoredDecision
-            The new decision; or the first one, unchanged, if that is in the journal by now.
+            The new decision; or the first one, unchanged, if that is in the journal or the store
+            by now.
 
         Raises
         ------

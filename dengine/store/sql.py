@@ -131,7 +131,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     Raises
     ------
     StoreError
-        For a setting that is not valid, and as of `Database`.
+        For a setting that is not valid, and as of `Database`. Every method raises it if the
+        database fails.
 
     Notes
     -----
