@@ -42,10 +42,10 @@ BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # never 1: after one bad part its capit
 
 
 def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) -> float:
-    """Return the log capital of the bet that the mean failure probability is below the tolerance.
+    """Return the log capital of a bettor who stakes on a mean failure probability below tolerance.
 
     The capital starts at 1, so the result is 0 for no parts. It falls with each bad part and rises
-    with all others. Six fixed stakes are mixed.
+    with all others. It is a weighted mean of six capitals, each with a fixed stake.
 
     Parameters
     ----------
@@ -403,17 +403,18 @@ def certify(
     Raises
     ------
     SettingError
-        For `stops` or a tolerance out of range.
+        For `stops`, alpha, the audit rate or a tolerance out of range.
 
     Notes
     -----
     Under "all", or if every accepted part was confirmed or stopped the line, all outcomes are
     known, and the bound is about the accepted parts. Otherwise it comes from audits and is about
     all parts that the model would have accepted, let go or audited; it is never below the share
-    known to be bad. Without audits it is 1. Where both ways are possible they share alpha, so that
-    whoever sees now the one and now the other is wrong with probability alpha at most. Rejected
-    parts are known by audits; the share that was found good without being asked for is a floor of
-    that bound. A forgotten or overdue label counts as a wrong decision.
+    known to be bad. Without audits it is 1. Where both ways are possible they share alpha, one
+    tenth for known outcomes and nine for audits, so that whoever sees now the one and now the other
+    is wrong with probability alpha at most. Rejected parts are known by audits, and without these
+    their bound is 1; the share that was found good without being asked for is a floor of that
+    bound. A forgotten or overdue label counts as a wrong decision.
     """
     expect(stops in ("all", "some"), "stops among all, some", stops)
     expect(0.0 < tolerance < 1.0, "0 < tolerance < 1", tolerance, "0.05 tolerates 5 % of errors")

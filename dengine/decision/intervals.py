@@ -316,7 +316,8 @@ def _clip_limits(
 ) -> tuple[Any, Any]:
     """Return limits within [0, 1] that enclose the observed rate, (0, 1) where nothing was counted.
 
-    Rounding alone could push a limit past the rate or out of [0, 1].
+    All are float64 arrays (`xp` is numpy) or tensors (`xp` is torch). Rounding alone could push a
+    limit past the rate or out of [0, 1].
     """
     total = n_success + n_failure
     rate = n_success / xp.where(total > 0.0, total, 1.0)

@@ -253,12 +253,13 @@ class MemberEvidence(nn.Module):
     ) -> None:
         """Count one part of known outcome on one side, then choose the threshold of that side.
 
-        If the score reaches the threshold, the drift detector of the side takes a step first, which
-        may start the safe mode. The levels that the score reaches, and the members if it is one,
-        count the part only if its outcome was asked for (`inclusion_probability` > 0) or all
-        outcomes are known. A member reaches the target level, or the model was certain of it
-        (`predicted` is the side's action). The threshold stays as it is if the part was counted
-        nowhere.
+        Side 0 is accepting, with the lower bound as score; side 1 is rejecting, with 1 - upper
+        bound. `wrong` says whether the side's action would have been wrong. If the score reaches
+        the threshold, the drift detector of the side takes a step first, which may start the safe
+        mode. The levels that the score reaches, and the members if it is one, count the part only
+        if its outcome was asked for (`inclusion_probability` > 0) or all outcomes are known. A
+        member reaches the target level, or the model was certain of it (`predicted` is the side's
+        action). The threshold stays as it is if the part was counted nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
@@ -290,9 +291,10 @@ class MemberEvidence(nn.Module):
     def step_detector(self, detector: int, step: float, times: int) -> None:
         """Add `step` to a CUSUM `times` times; start the safe mode if the sum reaches its limit.
 
-        The sum restarts at 0 where it would fall below. With more than one step, `step` must be
-        negative. Nothing happens if `times` is 0. An alarm during a safe mode starts the safe mode
-        anew, under that of the two reasons that stands first in `SAFE_MODES`.
+        Detector 0 watches accepted parts, 1 rejected parts, 2 novel traces. The sum restarts at 0
+        where it would fall below. With more than one step, `step` must be negative. Nothing happens
+        if `times` is 0. The safe mode's reason is the detector's; an alarm during a safe mode
+        starts it anew, under that of the two reasons that stands first in `SAFE_MODES`.
         """
         if times <= 0:
             return
@@ -321,7 +323,7 @@ class MemberEvidence(nn.Module):
         self.safe_mode.fill_(safe_mode)
 
     def choose_threshold(self, side: int) -> None:
-        """Set the target level and the threshold of one side from the counts.
+        """Set target level and threshold of one side, 0 accept or 1 reject, from the counts.
 
         The target is the lowest level whose parts since the last alarm, and whose newest parts, are
         good enough; if there is none, it is the strictest level. The threshold is the target's

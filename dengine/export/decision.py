@@ -147,10 +147,11 @@ class DecisionModule(nn.Module):
         upper: float,
         z: Tensor,
     ) -> None:
-        """Make a decision the pending one; its fields are copied, and an earlier one is forgotten.
+        """Make this decision the pending one, whose outcome is learned later.
 
-        `action` is `NONE_PENDING` for a faulty trace. `part` is 0 for an unknown part, for which
-        the content hash stands. Whether the trace was novel is read from `reason`.
+        An earlier one is forgotten. The fields are copied. `action` is `NONE_PENDING` for a faulty
+        trace: then none is pending. `part` is 0 for an unknown part, for which the content hash
+        stands. Whether the trace was novel is read from `reason`.
         """
         self.pending_action = action
         self.pending_predicted = predicted
@@ -275,9 +276,9 @@ class DecisionModule(nn.Module):
         return n_references
 
     def learn_pending(self, success: bool) -> None:
-        """Learn the outcome of the pending decision: 1 for success; then none is pending.
+        """Learn the outcome of the pending decision; then none is pending.
 
-        The rule is updated, and the trace becomes a reference.
+        The rule is updated, and the trace becomes a reference: of a success if `success` is True.
         """
         self.learn_outcome(
             self.pending_lower,
@@ -304,10 +305,10 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Update the rule with an outcome, and make the trace with embedding z (K, d) a reference.
 
-        `part` is the hash of the part, which also gives the space of the reference. The rule is
-        told that the outcome was asked for with probability 1 if the model was not certain, with
-        the audit rate if it was audited, and not at all (0) if it went on. The count of silent
-        parts restarts at 0.
+        `part` is the hash of the part, which also gives the space of the reference. The rule gets
+        as inclusion probability 1 if the part was verified because the model was not certain, the
+        audit rate if it was audited, and 0 if it was accepted or rejected. It also gets the number
+        of silent parts, whose count restarts at 0.
         """
         inclusion_probability = 0.0
         if action == 0:

@@ -293,9 +293,9 @@ class OnnxDecision(nn.Module):
 def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
     """Return the ONNX program of a decision on traces of this contract, a protobuf `ModelProto`.
 
-    It goes by torch.export, which does not need TorchScript. Meanwhile warnings of Python and of
-    logging are off in the process, because torch names packages that it could use and need not.
-    Raises ExportError if torch makes no program.
+    It goes by torch.export, which does not need TorchScript. Meanwhile Python's warnings, and log
+    messages up to WARNING, are off in the whole process, because torch names packages that it could
+    use and need not. Raises ExportError if torch makes no program.
     """
     ramp = torch.linspace(-1.0, 1.0, spec.channels * spec.samples)
     example = (ramp.reshape(spec.channels, spec.samples),)

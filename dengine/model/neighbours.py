@@ -286,7 +286,11 @@ class ModelPrediction(EngineModel):
 
     @classmethod
     def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
-        """Return the untrained model that a recipe describes; `seed` is the reducer's."""
+        """Return the untrained model that a recipe describes; `seed` is the reducer's.
+
+        Reducer, radius, folds, novelty, policy and decision rule are the recipe's; its window is
+        the largest number of references.
+        """
         policy = recipe.policy
         classifier = WilsonRadiusClassifier(
             recipe.radius,
@@ -527,9 +531,9 @@ class ModelPrediction(EngineModel):
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
         """Make one labelled trace, shape (samples,) or (channels, samples), a reference.
 
-        `y` is 1 for success, 0 for failure. The content of the trace gives its fold and part. The
-        reducer is not trained, and a full index drops its oldest reference. Returns self; raises
-        ValueError if nothing was fitted.
+        `y` is 1 for success, 0 for failure. The content of the trace gives its fold and stands for
+        its part. The reducer is not trained, and a full index drops its oldest reference. Returns
+        self; raises ValueError if nothing was fitted.
         """
         X = as_traces(np.asarray(x)[None])
         hash_ = int(content_hash(X)[0])
@@ -720,11 +724,11 @@ class ModelPrediction(EngineModel):
         return "" if is_finite else "the embedding of a reference is not finite"
 
     def get_state(self) -> State:
-        """Return the state as arrays by name.
+        """Return the state as arrays by name, which `set_state` takes.
 
-        References and scale are always there; "reducer.", "rule." and "novelty." begin the names of
-        what these parts have. An enabled novelty gate is there, a disabled one not. Of a stale rule
-        only `rule_is_stale` is there.
+        Trace shape, references and scale are always there; "reducer.", "rule." and "novelty." begin
+        the names of what these parts have. An enabled novelty gate is there, a disabled one not. Of
+        a stale rule only `rule_is_stale` is there.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()
@@ -793,8 +797,9 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     """Count the newest traces that nearly repeat a trace of another part.
 
     Labels are counted as independent trials, so a part that is inserted again must be known as such
-    (`part=`). This notices the plain cases where it is not; it changes no decision. A trace with
-    more than `NEIGHBOURS` near repeats is not noticed.
+    (`part=`). This notices the plain cases where it is not; it changes no decision. A near repeat
+    is a nearest trace within `NEAR` of the distance to the tenth nearest, so a trace with more than
+    `NEIGHBOURS` near repeats is not noticed.
 
     Parameters
     ----------

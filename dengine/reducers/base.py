@@ -440,10 +440,11 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
 
 
 def single_class_error(fold: int, n: int, classes: int) -> SettingError:
-    """Return, without raising it, the error for a fold outside of which labels have a single class.
+    """Return, not raise, the error for a fold outside of which all labels are of one class.
 
-    `n` is the number of traces outside of it, `classes` of their classes. With no trace there the
-    message blames the sensor or the unit, as all traces are the same; else it asks for more labels.
+    `n` is the number of traces outside of it, `classes` the number of their classes. With no trace
+    there the message blames the sensor or the unit, as all traces are the same; else it asks for
+    more labels.
     """
     problem = f"{n} traces of {classes} class; collect more labels before the first fit."
     if n == 0:
@@ -579,6 +580,8 @@ class CrossFitted(_Wrapping):
         SettingError
             If K is below 2, the labels are missing or not of two classes, or the traces outside a
             fold have a single class.
+        TraceError, ValueError
+            For X, as of `check_traces`.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)

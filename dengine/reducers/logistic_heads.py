@@ -214,7 +214,7 @@ def base_rate_if_better(
 
 
 def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Tensor:
-    """Approximate the logit of every row by each head that was fitted without the row.
+    """Approximate the logit that each head would give to every row, were it fitted without it.
 
     Parameters
     ----------

@@ -39,7 +39,9 @@ class PcaReducer(Reducer):
     random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit on traces; labels are ignored.
+        """Compute the principal axes of traces (`components_`) and their mean (`mean_`).
+
+        Labels are ignored. A trace is one row, channel after channel.
 
         Parameters
         ----------
@@ -92,7 +94,10 @@ class PcaReducer(Reducer):
         }
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore what `get_state` returned, and return self; the parameters must be the same."""
+        """Restore what `get_state` returned, and return self; the parameters must be the same.
+
+        The arrays are copied.
+        """
         self.mean_ = np.array(state["mean"])
         self.components_ = np.array(state["components"])
         self.n_features_in_ = len(self.mean_)

@@ -189,7 +189,10 @@ class Tower(NamedTuple):
         return torch.addmm(self.centre, f, self.axes)
 
     def heads(self) -> tuple[Tensor, Tensor]:
-        """Return the heads as weights (p, K) and biases (K,) on the features."""
+        """Return the heads as weights (p, K) and biases (K,) on the tower's features, float32.
+
+        They give the same logits as the heads `w` on the components.
+        """
         w = self.w[:, :-1]
         bias = self.w[:, -1]
         weights = (self.axes.double() @ w.T).float()
@@ -384,7 +387,7 @@ class RocketReducer(Reducer):
         return self.check_traces(X)
 
     def _start(self, traces: Floats) -> None:
-        """Build the module and set channel scales and kernels from traces (n, C, T).
+        """Build the module `net_`, and set channel scales and kernels from traces (n, C, T).
 
         No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its
         range.
@@ -426,12 +429,13 @@ class RocketReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> None:
-        """Fit head k of each tower on rows outside fold k, weigh the towers, and let them answer.
+        """Fit head k of each tower on rows outside fold k, weigh the towers, and write to `net_`.
 
         raw (n, P) are raw features. The heads start from their present weights. Principal
         components are computed anew at the first fit, at every twentieth, and when the traces are
-        half as many again. It writes to `net_` and sets `towers_`, `n_iter_`, `holdout_losses_`,
-        `n_fits_` and `note_`. Raises SettingError if the rows outside a fold have a single class.
+        half as many again as at the last time. Of more than 4000 rows 4000 are used. It sets
+        `towers_`, `n_iter_`, `holdout_losses_`, `n_fits_` and `note_`. Raises SettingError if the
+        rows outside a fold have a single class.
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -666,7 +670,11 @@ class RocketReducer(Reducer):
         return self
 
     def check(self) -> None:
-        """Raise SettingError for a parameter out of its range."""
+        """Raise SettingError for a parameter out of its range.
+
+        Sizes are integers of at least 1, except groups (0 to 64); regions are at most 16,
+        n_components 1 or 2, folds at least 2, and l2 is above 0.
+        """
         integers = (
             "n_components",
             "folds",

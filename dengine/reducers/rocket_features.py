@@ -153,9 +153,9 @@ class RocketEncoder(nn.Module):
         return self.scale_features(self.raw_features(x))
 
     def raw_features(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> features (B, P) that are not scaled yet.
+        """Raw traces (B, C, T) -> features (B, P) of both towers, tower 1 first, before scaling.
 
-        Those of tower 1 come first.
+        `scale_features` standardises them.
         """
         values = self.read_taps(self.average_samples(x))
         n_dense = self.n_dense_taps

@@ -282,10 +282,11 @@ class TorchReducer(Reducer):
     def _train(
         self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule, steps: int
     ) -> Tensor:
-        """Take `steps` steps on traces (n, C, T), and let the averaged members answer.
+        """Take `steps` steps on traces (n, C, T), or fewer if `stop` ends them; replace `encoder_`.
 
-        It replaces `encoder_` and sets `n_steps_left_`: 0 if `stop` limits the steps, else those
-        that are missing to complete training. Returns the preprocessed traces (n, C', L).
+        The averaged members, with new statistics of batch normalisation, become `encoder_`. It sets
+        `n_steps_left_`: 0 if `stop` limits the number of steps, else those that are missing to
+        complete training. Returns the preprocessed traces (n, C', L).
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -525,7 +526,12 @@ class TorchReducer(Reducer):
         return self
 
     def check(self) -> None:
-        """Raise SettingError for a parameter out of its range."""
+        """Raise SettingError for a parameter out of its range.
+
+        Folds and batch_size are integers of at least 2, steps and fit_steps of at least 1;
+        n_components is 1 or 2, learning_rate above 0, weight_averaging below 1, and no other is
+        negative.
+        """
         expect(self.n_components in (1, 2), "n_components 1 or 2", self.n_components)
         expect(is_whole(self.folds, 2, 1000), "folds >= 2 where labels are used", self.folds)
         expect(is_whole(self.steps, 1, 10**6), "steps >= 1, an integer", self.steps)

@@ -316,8 +316,9 @@ class UmapReducer(Reducer):
     ) -> None:
         """Train on traces (n, C, T) with their labels' numbers, and let the new layout answer.
 
-        `n_epochs` are taken; None: as many as are due. Without numbers all traces are new. It
-        updates neighbours, points, encoder and the counters of epochs.
+        It finds neighbours, joins them to a graph, and moves the points for `n_epochs` epochs
+        (None: as many as are due) or fewer if `stop` ends them. Without numbers all traces are new.
+        Neighbours, points, encoder and the counters of epochs are replaced.
         """
         if numbers is None:
             numbers = np.arange(-len(traces), 0)  # numbers that no label has
@@ -440,7 +441,7 @@ class UmapReducer(Reducer):
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
-        Raises StoreError if the frames are of another size.
+        What `precompute` found is dropped. Raises StoreError if the frames are of another size.
         """
         channels, samples = (int(value) for value in state["shape"])
         self.trace_shape_ = (channels, samples)

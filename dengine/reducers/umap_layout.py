@@ -44,12 +44,12 @@ def spectral_start(
     n_components: int,
     rng: np.random.Generator,
 ) -> Tensor:
-    """Place traces by eigenvectors of their graph.
+    """Place traces by eigenvectors of their graph, as the start of a layout.
 
     These are the eigenvectors of the normalised Laplacian with the smallest eigenvalues, without
     the first. A graph of several components says nothing of the points within each, so principal
-    components of the frames are used instead; umap-learn places each component by eigenvectors of
-    its own.
+    components of the frames are used instead, as where the solver does not converge; umap-learn
+    places each component by eigenvectors of its own.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def spectral_start(
     Returns
     -------
     Tensor of float32, shape (n, n_components)
-        Centred, with 10 as the largest coordinate, and a little noise.
+        Centred, with 10 as the largest coordinate in size, and a little noise.
 
     References
     ----------
@@ -110,9 +110,10 @@ def leading_eigenvectors(
 
 
 def principal_components(frames: Tensor, n: int) -> NDArray[np.float64]:
-    """Compute the first n principal components of frames (m, F).
+    """Return the first n principal components of frames (m, F), float64 (m, n).
 
-    Returns float64 (m, n), with columns of zeros where there are fewer.
+    The axes are computed from at most about 256 of the frames, evenly spaced. Columns are zeros
+    where there are fewer than n components.
     """
     centred = (frames - frames.mean(0)).double()
     sample = centred[:: 1 + len(centred) // PCA_TRACES]
@@ -127,6 +128,7 @@ def find_ab_params(min_dist: float) -> tuple[float, float]:
     """Fit a and b of the membership strength ``1 / (1 + a * d ** (2 * b))`` of two points.
 
     The curve approximates 1 up to `min_dist` and an exponential decay beyond it, at a spread of 1.
+    The result is cached for each `min_dist`.
 
     Parameters
     ----------
@@ -167,7 +169,7 @@ class Edges:
 
     @classmethod
     def of(cls, graph: csr_matrix) -> Self:
-        """Return the edges of a symmetric graph, whose row i lists the edges with head i.
+        """Return the edges of a symmetric graph (n, n): row i holds the edges with head i.
 
         Strengths are divided by the largest one.
         """
@@ -285,9 +287,9 @@ def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
 def learning_rates(n_epochs: int, stop: StopRule) -> Iterator[float]:
     """Yield the learning rate of each epoch, which falls from 1 towards 0.
 
-    A limit in steps is known in advance, so the rate falls within it. After the deadline ten more
-    epochs at most are taken, over which the rate falls to 0: at a high rate the points would stay
-    scattered by the negative samples of the last epoch.
+    `stop` is asked before each epoch. A limit in steps is known in advance, so the rate falls
+    within it. After the deadline ten more epochs at most are taken, over which the rate falls to 0:
+    at a high rate the points would stay scattered by the negative samples of the last epoch.
     """
     if stop.max_steps is not None:
         n_epochs = min(n_epochs, stop.max_steps)

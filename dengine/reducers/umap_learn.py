@@ -54,7 +54,9 @@ class UmapLearnReducer(Reducer):
     random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit on traces, which takes seconds; labels are ignored.
+        """Fit umap-learn's UMAP on traces, which takes seconds, and keep it as `umap_`.
+
+        Labels are ignored.
 
         Parameters
         ----------
@@ -71,6 +73,8 @@ class UmapLearnReducer(Reducer):
         ------
         SettingError
             If there are no more than `n_neighbors` traces.
+        ImportError
+            If umap-learn is not installed.
         """
         traces = self.check_traces(X, reset=True)
         n = len(traces)
