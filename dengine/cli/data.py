@@ -36,7 +36,9 @@ SIGNIFICANT = 0.01  # p-values below it are called drift
 @options.data_options(argument=True)
 @options.out_option
 def data(source: DataChoice, out: Out | None) -> None:
-    """Describe a data set, and list what is wrong with it; --out draws it too.
+    """Describe a data set, and list what is wrong with it.
+
+    A table counts traces, labels, faults and repeats, and shows drift; --out draws the traces too.
 
     DATA is one of: a folder of CSV files, one for each insertion, with the label in its name or in
     a column; a wide .csv or .parquet file, with a row for each insertion; a long one, with a row
@@ -114,9 +116,10 @@ _OUT = (
 @options.n_jobs_option(-1, "Number of processes; -1: one for each core.")
 @options.force_option
 def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bool) -> None:
-    """Simulate insertions and write their forces and labels to an .npz file.
+    """Simulate insertions and write their forces and labels.
 
-    A file that exists is replaced only with --force. The number of successes is printed.
+    They go into an .npz file; one that exists is replaced only with --force. The number of
+    successes is printed.
     """
     from ..files import check_output
 

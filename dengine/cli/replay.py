@@ -341,7 +341,7 @@ def _replay_and_print(
     for name, group in by_name.items():
         retrains = [retrain for replay in group for retrain in replay.retrains]
         parts.append(f"{name}: {tables.retrain_line(retrains)}")
-    parts += [*finding_lines, _costs_line(len(replays), costs)]
+    parts += [*finding_lines, _duration_line(len(replays), costs)]
     print_result(
         record, *parts, out=out, make_files=lambda: dict(_replay_files(frame, replays, title))
     )
@@ -349,7 +349,7 @@ def _replay_and_print(
         exit_interrupted(f"{interrupted}; the table shows those.")
 
 
-def _costs_line(n_replays: int, costs: Mapping[str, float]) -> str:
+def _duration_line(n_replays: int, costs: Mapping[str, float]) -> str:
     """Return a sentence that says how many replays were played, in what time."""
     seconds = format_value("seconds", costs["seconds"])
     core_seconds = format_value("core_seconds", costs["core_seconds"])

@@ -28,7 +28,7 @@ LABELS = {"good": True, "bad": False}
 MOST_FAULTS = 20  # that are shown
 
 
-def _login() -> str:
+def _login_name() -> str:
     """Return the user's login name, "" if the system has none."""
     try:
         return getpass.getuser()
@@ -50,7 +50,7 @@ interval_option = click.option(
 )
 author_option = click.option(
     "--author",
-    default=_login,
+    default=_login_name,
     help="Who makes the change, for the record.  [default: the login name]",
 )
 
@@ -203,10 +203,10 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 @verb("dengine retrain engine.db")
 @store_options
 def retrain(store: str, author: str, allow_import: bool) -> None:
-    """Train now, on the store's labels as they count, and record an event.
+    """Train now, on the store's labels as they count.
 
-    A candidate that fails its gate is dropped and recorded, the previous version stays in use, and
-    the exit code is 1.
+    An event records it. A candidate that fails its gate is dropped, the previous version stays in
+    use, and the exit code is 1.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line

@@ -347,22 +347,22 @@ def _expected_cost(replays: Sequence[Replay], costs: Costs) -> float:
     return costs.check - saved / len(replays[0])
 
 
-def cost_per_part(replay: Replay, costs: Costs, part: slice = slice(None)) -> float:
+def cost_per_part(replay: Replay, costs: Costs, cycles: slice = slice(None)) -> float:
     """Return the mean cost per part over some cycles of a replay: checks and wrong decisions.
 
     Parameters
     ----------
     replay : Replay
     costs : Costs
-    part : slice, default all
-        The cycles; at least one.
+    cycles : slice, default all
+        The cycles by their position, from 0; at least one.
 
     Returns
     -------
     cost : float
         In the unit of `costs`.
     """
-    counts = replay.stretch(part)
+    counts = replay.stretch(cycles)
     n_certain = counts["accepted"] + counts["rejected"]
     saved = costs.saved(n_certain, counts["false_positive"], counts["false_negative"])
     n_cycles = counts["last_cycle"] - counts["first_cycle"] + 1

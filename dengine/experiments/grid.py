@@ -97,8 +97,11 @@ class KeptReplays:
         """
         contender = task.contender
         reducer = contender.recipe.reducer
-        parts = [reducer_class(reducer)] if isinstance(reducer, str) else _parts_of(reducer)
-        sources = [_source_of(part) for part in parts]
+        if isinstance(reducer, str):
+            code = [reducer_class(reducer)]
+        else:
+            code = _classes_and_functions(reducer)
+        sources = [_source_of(item) for item in code]
         settings = (
             task.seed,
             task.cycles,
@@ -175,15 +178,15 @@ def _digest_of_source() -> str:
 
 
 @cache  # a file that changes while a grid is played is not what was imported
-def _source_of(part: Any) -> str:
+def _source_of(class_or_function: Any) -> str:
     """Return the text of the source file of a class or function; "" if it has none that is text."""
     try:
-        return Path(getsourcefile(part) or "").read_text(encoding="utf-8")
+        return Path(getsourcefile(class_or_function) or "").read_text(encoding="utf-8")
     except (OSError, TypeError, UnicodeDecodeError):
         return ""
 
 
-def _parts_of(reducer: Any) -> list[Any]:
+def _classes_and_functions(reducer: Any) -> list[Any]:
     """Return what a transformer's code consists of, without repeats.
 
     These are its class, those of the estimators among its parameters, and the functions there.

@@ -277,13 +277,13 @@ class Replay:
         edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
         return [self.stretch(slice(begin, end)) for begin, end in pairwise(edges)]
 
-    def stretch(self, part: slice = slice(None)) -> dict[str, Any]:
+    def stretch(self, cycles: slice = slice(None)) -> dict[str, Any]:
         """Count decisions, errors and stops over some of the cycles.
 
         Parameters
         ----------
-        part : slice, default all
-            Of the cycles.
+        cycles : slice, default all
+            Those that count, by their position from 0.
 
         Returns
         -------
@@ -293,8 +293,8 @@ class Replay:
             safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts passed on,
             None without a clock.
         """
-        begin, end, _ = part.indices(len(self))
-        counts = {name: int(getattr(self, name)[part].sum()) for name in COUNTED}
+        begin, end, _ = cycles.indices(len(self))
+        counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
         share = float("nan")
         rate = None
         if end > begin:
@@ -302,13 +302,13 @@ class Replay:
             if self.clock_s is not None:
                 seconds = np.diff(self.clock_s, prepend=0.0)[begin:end].sum()
                 if seconds > 0:
-                    rate = float(3600.0 * self.finished[part].sum() / seconds)
+                    rate = float(3600.0 * self.finished[cycles].sum() / seconds)
         return {
             "first_cycle": begin + 1,
             "last_cycle": end,
             "verified_share": share,
             **counts,
-            "stops": int(self.stopped[part].sum()),
+            "stops": int(self.stopped[cycles].sum()),
             "parts_per_hour": rate,
         }
 
