@@ -132,6 +132,8 @@ def newest_of(
 def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
     """Return a cell's product, or None; enter a new cell into the product that is named.
 
+    An entered cell gets a new row in `setting`; the product is locked, and nothing is committed.
+
     Parameters
     ----------
     connection : sqlalchemy.Connection

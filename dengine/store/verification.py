@@ -125,8 +125,9 @@ def verify_history(
 ) -> HistoryReport:
     """Check every row of a store's history; nothing is written, and engines may run meanwhile.
 
-    A row that was changed, added or removed is returned as a fault, not raised. Takes about 80
-    bytes of memory per row.
+    What is wrong is returned as faults, not raised: a row that was changed, added or removed, a
+    damaged SQLite file, a ledger entry that a cell's journal names and the store lacks, and an
+    `expect` that no entry has. Takes about 80 bytes of memory per row.
 
     Parameters
     ----------
