@@ -436,7 +436,7 @@ _SAMPLES = (
 _CHANNELS = "FZ_Base, or several with commas between.  [default: FZ_Base, or the only one]"
 _LABEL = (
     "For a folder a regular expression whose group is the label, as in '_(OK|NOK)_', or a column "
-    "of its files; for a table its column, for .npz its array.  "
+    "of its files; for a table its column, for .npz its array; of --labels the column.  "
     "[default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
 )
 _LABELS = (

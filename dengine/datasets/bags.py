@@ -206,7 +206,7 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
     wanted = f"a topic of a wrench in {path}, named where there are several (topic='...')"
     expect_data(len(wrenches) == 1, wanted, listed(wrenches or types) or "none")
     topics = [signal for signal in trigger.signals if axis_of(signal) < 0]
-    topics += [options.label] if options.label else []
+    topics += [options.label] if options.label and options.labels is None else []
     for topic in topics:
         if topic not in types:
             actual = listed(types) or "none"
@@ -258,7 +258,9 @@ def _cut_dataset(
     insertions = {f"{name}/{i}": cut for i, cut in enumerate(cuts, start=1)}
     names = list(insertions)
     if options.labels is not None:
-        source = labels.labels_in_file(options.labels, options.part, names, options.words)
+        source = labels.labels_in_file(
+            options.labels, options.part, names, options.words, options.label
+        )
     else:
         source = _labels_in_topic(options, messages, cuts, names)
 
@@ -293,15 +295,15 @@ def _labels_in_topic(
         if n_begun:
             words.setdefault(names[n_begun - 1], word)
 
-    def find(name: str) -> labels.LabelAndPart:
+    def find(name: str) -> labels.SourcedLabel:
         """Return the label of an insertion."""
         if name not in words:
             wanted = f"a message of {topic} before the next insertion begins"
             raise UnreadableError(f"Expected {wanted}, found none")
-        return label_messages.label_of(words[name]), None
+        return label_messages.find([words[name]])
 
     advice = f"give the topic that tells them, {topic} does not, or a file of labels"
-    return labels.LabelSource(find, advice, notes=notes)
+    return labels.LabelSource(find, advice, f"topic {topic}", notes=notes)
 
 
 class RecordedInsertion(NamedTuple):

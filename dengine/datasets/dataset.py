@@ -297,9 +297,6 @@ class LoadOptions:
     thousands: str | None = None
 
     def __post_init__(self) -> None:
-        if self.label is not None and self.labels is not None:
-            wanted = "a pattern of the labels (label) or a file of them (labels)"
-            raise DataError(f"Expected {wanted}, got both; leave one out.")
         expect_data(self.fit in (None, *FITS), f"fit to be one of {', '.join(FITS)}", self.fit)
         expect_data(self.rate_hz is None or self.rate_hz > 0, "a rate above 0 Hz", self.rate_hz)
         expect_data(self.samples is None or self.samples >= 1, "1 or more samples", self.samples)

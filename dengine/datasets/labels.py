@@ -16,6 +16,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -104,8 +105,11 @@ FEW_NAMES = 5  # in fewer names each word may be a label
 
 LabelMap = Mapping[str, bool]
 NO_WORDS: LabelMap = {}
-LabelAndPart = tuple[int, str | None]
-NO_NOTES: Mapping[str, int] = {}
+MEANINGS = ("bad", "good")  # of the labels 0 and 1
+
+
+class SeveralLabelsError(UnreadableError):
+    """A recording whose labels contradict each other, in one place or in two."""
 
 
 class NoLabelError(UnreadableError):
@@ -120,27 +124,55 @@ class NoLabelError(UnreadableError):
         self.words = tuple(words)
 
 
-class LabelSource(NamedTuple):
+class SourcedLabel(NamedTuple):
+    """The label of a recording, and where it stands.
+
+    label : int
+        1 for success, 0 for failure.
+    text : str
+        What says so, for an error: "its name says good (OK)".
+    part : str or None
+        Number of the part, if it stands there too.
+    """
+
+    label: int
+    text: str
+    part: str | None = None
+
+
+def _sourced(label: int, place: str, word: str, part: str | None = None) -> SourcedLabel:
+    """Return a label with the text that a place says it by a word."""
+    return SourcedLabel(label, f"{place} says {MEANINGS[label]} ({word})", part)
+
+
+@dataclass(frozen=True)
+class LabelSource:
     """Where the labels of recordings come from.
 
     find : callable
-        Returns the label and the part's number of a recording by its name, the path seen from the
-        folder. Raises UnreadableError if it has none.
+        Returns the label of a recording by its name, the path seen from the folder. Raises
+        UnreadableError if it has none.
     advice : str
         What to do if most recordings have no label.
+    place : str
+        What the source is called in errors and notes.
     faults : sequence of Fault
         What is wrong in the file of labels.
-    notes : mapping of str to int
+    notes : Counter
         What users should know, and how many times; `find` adds to it.
+    trust : str
+        What to do if another source contradicts a file of labels.
     without_label : callable
         Returns a name without the label in it, by which recordings are put in order.
     """
 
-    find: Callable[[str], LabelAndPart]
+    find: Callable[[str], SourcedLabel]
     advice: str
+    place: str
     faults: Sequence[Fault] = ()
     without_label: Callable[[str], str] = str
-    notes: Mapping[str, int] = NO_NOTES
+    notes: Counter[str] = field(default_factory=Counter)
+    trust: str = ""
 
 
 def label_of(word: Any, words: LabelMap = NO_WORDS) -> int:
@@ -224,20 +256,21 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
     advice = f"{where}, or list the files and their labels in a CSV file (labels)"
     if pattern is None:
         find_label = partial(_find_label, words=words)
-        return LabelSource(find_label, advice, without_label=partial(_remove_label, words=words))
+        remove_label = partial(_remove_label, words=words)
+        return LabelSource(find_label, advice, "its name", without_label=remove_label)
     message = f"Expected a regular expression for the label, got {pattern!r}"
     with instead(DataError, message, re.error):
         expression = re.compile(pattern)
     wanted = "one group in the label's pattern, as in '_(OK|NOK)_'"
     expect_data(expression.groups == 1, wanted, pattern)
 
-    def find(name: str) -> LabelAndPart:
+    def find(name: str) -> SourcedLabel:
         """Return the label that the pattern finds in a path."""
         match = expression.search(name)
         if match is None or match[1] is None:
             wanted = f"a label where the pattern {pattern} finds it"
             raise UnreadableError(f"Expected {wanted}, found none")
-        return label_of(match[1], words), None
+        return _sourced(label_of(match[1], words), "its path", match[1])
 
     def without_label(name: str) -> str:
         """Return a path without what the pattern finds in it."""
@@ -246,7 +279,7 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
             return name
         return name[: match.start(1)] + name[match.end(1) :]
 
-    return LabelSource(find, advice, without_label=without_label)
+    return LabelSource(find, advice, "its path", without_label=without_label)
 
 
 def means_bad(column: str) -> bool:
@@ -260,6 +293,23 @@ def means_bad(column: str) -> bool:
     if "".join(words) in BAD_COLUMNS:
         return True
     return bool(words) and words[-1] in BAD_COLUMNS and set(NEGATIONS).isdisjoint(words)
+
+
+def is_verdict(column: str, cells: Sequence[Any], words: LabelMap) -> bool:
+    """Return whether cells of a column are all one verdict, as OK or n.i.O.
+
+    A number, yes or true is one only in a column whose name says of what, as `failed` or `ok`.
+    """
+    with suppress(UnreadableError):
+        LabelColumn(column, words, Counter()).find(cells)
+        has_flags = any(_flag_of(cell) is not None for cell in cells)
+        return not has_flags or means_bad(column) or column.lower() == "ok"
+    return False
+
+
+def _flag_of(cell: Any) -> bool | None:
+    """Return whether a cell is true, yes or 1, or false, no or 0; None for anything else."""
+    return FLAGS.get(str(cell).strip().lower().removesuffix(".0").removesuffix("."))
 
 
 class LabelColumn:
@@ -291,33 +341,31 @@ class LabelColumn:
         1, and a note is made.
         """
         text = str(cell).strip().lower()
-        flag = FLAGS.get(text.removesuffix(".0").removesuffix("."))
+        flag = _flag_of(cell)
         if flag is None or text in self.words or not self.is_inverted:
             return label_of(cell, self.words)
         note = f"Column {self.name} tells what is bad, by its name: true, yes or 1 in it is bad"
         self.notes[note] = 1
         return int(not flag)
 
-    def label_of_cells(self, cells: Iterable[Any]) -> int:
+    def find(self, cells: Iterable[Any], place: str = "") -> SourcedLabel:
         """Return the label that all cells mean; those of a part that is not checked do not count.
 
-        Raises UnlabelledError if all are empty, UnreadableError if they differ, and as `label_of`.
+        Raises UnlabelledError if all are empty, SeveralLabelsError if they differ, and as
+        `label_of`. `place` is what the column is called in errors, by default column NAME.
         """
+        place = place or f"column {self.name}"
         texts = list(dict.fromkeys(str(cell).strip() for cell in cells))
-        stated = self.stated(texts)
+        unchecked = set(UNCHECKED) - set(self.words)
+        stated = [text for text in texts if text.lower() not in unchecked]
         if len(stated) < 2:
-            return self.label_of(next(filter(None, stated or texts), ""))
+            word = next(filter(None, stated or texts), "")
+            return _sourced(self.label_of(word), place, word)
         with suppress(UnknownWordError):
             labels = {self.label_of(text) for text in stated}
             if len(labels) == 1:
-                return labels.pop()
-        raise UnreadableError(f"Expected one label in column {self.name}, got {listed(stated)}")
-
-    def stated(self, cells: Iterable[Any]) -> list[str]:
-        """Return the different texts of cells that may be labels: no empty ones, no `UNCHECKED`."""
-        unchecked = set(UNCHECKED) - set(self.words)
-        texts = dict.fromkeys(map(str, cells))
-        return [text for text in texts if text.strip().lower() not in unchecked]
+                return _sourced(labels.pop(), place, listed(stated))
+        raise SeveralLabelsError(f"Expected one label in {place}, got {listed(stated)}")
 
 
 def _read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
@@ -335,54 +383,124 @@ def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOption
 
     paths : the files of the recordings, by name.
     """
-    notes = Counter({f"The labels are those in column {column} of each file": 1})
-    label_column = LabelColumn(column, options.words, notes)
-
-    def find(name: str) -> LabelAndPart:
-        """Return the label that all cells of a recording's column mean, and no part's number."""
-        return label_column.label_of_cells(_read_cells(paths[name], column, options)), None
-
-    advice = f"column {column} has none; name another column (label)"
-    return LabelSource(find, advice, notes=notes)
-
-
-def labels_in_names_and_column(
-    paths: Mapping[str, Path], column: str, options: LoadOptions
-) -> LabelSource:
-    """Return a source of labels in paths, and in a column where a path tells none.
-
-    A recording whose path and column contradict each other is a fault. Parameters as in
-    `labels_in_column`.
-    """
-    in_names = labels_in_names(None, options.words)
     notes = Counter[str]()
     label_column = LabelColumn(column, options.words, notes)
+    place = f"its column {column}"
 
-    def find(name: str) -> LabelAndPart:
-        """Return the label of a path or of its column."""
+    def find(name: str) -> SourcedLabel:
+        """Return the label that all cells of a recording's column mean."""
+        return label_column.find(_read_cells(paths[name], column, options), place)
+
+    advice = f"column {column} has none; name another column (label)"
+    return LabelSource(find, advice, place, notes=notes)
+
+
+def labels_that_agree(
+    first: LabelSource, others: Sequence[LabelSource], do: str, *, fills_in: bool = False
+) -> LabelSource:
+    """Return a source of the labels of `first`, which other sources must not contradict.
+
+    A recording whose labels contradict each other is a fault that names both places.
+
+    Parameters
+    ----------
+    first : LabelSource
+    others : sequence of LabelSource
+    do : str
+        What to do about a contradiction, for the error.
+    fills_in : bool, default False
+        Whether the others tell the labels that the first source does not.
+    """
+    notes = Counter[str]()
+
+    def find(name: str) -> SourcedLabel:
+        """Return the label of a recording, compared with all sources."""
+        finders = {source.place: partial(source.find, name) for source in (first, *others)}
         try:
-            in_name = _find_word(name, options.words)
-        except (NoLabelError, UnlabelledError):
-            label = label_column.label_of_cells(_read_cells(paths[name], column, options))
-            notes[f"Its name tells no label: that in column {column} is taken"] += 1
-            return label, None
-        label = in_name.label
-        cells: list[str] = []
-        with suppress(OSError, UnreadableError):
-            cells = _read_cells(paths[name], column, options)
-            label = label_column.label_of_cells(cells)
-        if label != in_name.label:
-            place = "folder" if in_name.start <= name.rfind("/") else "name"
-            meaning = ("bad", "good")
-            actual = (
-                f"its {place} says {meaning[in_name.label]} ({in_name.text}), its column {column}"
-                f" says {meaning[label]} ({listed(label_column.stated(cells))})"
-            )
-            do = f"name the one to trust: label={column!r}, or a pattern of the path (label)"
-            raise UnreadableError(f"Expected one label, {actual}; {do}")
-        return label, None
+            return agreed_label(finders, do, notes, fills_in=fills_in)
+        finally:
+            for source in (first, *others):
+                notes.update(source.notes - notes)
 
-    return in_names._replace(find=find, notes=notes)
+    return replace(first, find=find, notes=notes)
+
+
+def agreed_label(
+    finders: Mapping[str, Callable[[], SourcedLabel]],
+    do: str,
+    notes: Counter[str],
+    *,
+    fills_in: bool = False,
+) -> SourcedLabel:
+    """Return the label that the first place tells, after comparing it with all other places.
+
+    Parameters
+    ----------
+    finders : mapping of str to callable
+        Returns the label, by the place where it stands. Errors are those of `LabelSource.find`.
+    do, fills_in
+        As in `labels_that_agree`.
+    notes : Counter
+        Counts the recordings of which one place tells no label; it is added to.
+
+    Raises
+    ------
+    SeveralLabelsError
+        If labels contradict each other.
+    UnknownWordError
+        If a place has a word of unknown meaning, which may contradict the others.
+    UnreadableError
+        The error of the first place, or with `fills_in` of the last one, if it tells no label.
+    """
+    label: SourcedLabel | None = None
+    label_place = ""
+    places_without = list[str]()
+    last_error = UnreadableError("Expected a label, found none")
+    for place, find in finders.items():
+        try:
+            other = _find_beside(label, find, place, do)
+        except (NoLabelError, UnlabelledError) as error:
+            if label is None and not fills_in:
+                raise
+            if label is None or isinstance(error, UnlabelledError):
+                places_without.append(place)
+            last_error = error
+            continue
+        if label is None:
+            label = other
+            label_place = place
+        if label.label != other.label:
+            raise SeveralLabelsError(f"Expected one label, {label.text}, {other.text}; {do}")
+    if label is None:
+        raise last_error
+    for place in places_without:
+        text = f"{place[0].upper()}{place[1:]} tells no label: that of {label_place} is taken"
+        notes[text] += 1
+    return label
+
+
+def _find_beside(
+    label: SourcedLabel | None, find: Callable[[], SourcedLabel], place: str, do: str
+) -> SourcedLabel:
+    """Return the label that a place tells beside one that is known, or None.
+
+    The known one is returned if the place cannot be read. Other errors are raised, with advice.
+    """
+    try:
+        return find()
+    except (NoLabelError, UnlabelledError):
+        raise
+    except UnknownWordError as error:
+        if label is not None:
+            error.args = (f"{error} in {place}, where {label.text}; say what it means, or {do}",)
+        raise
+    except SeveralLabelsError as error:
+        error.args = (f"{error}; {do}",)
+        raise
+    except (UnreadableError, OSError):
+        if label is None:
+            raise
+        return label
 
 
 class _FoundLabel(NamedTuple):
@@ -407,9 +525,11 @@ class _FoundLabel(NamedTuple):
     is_user_word: bool = False
 
 
-def _find_label(name: str, words: LabelMap) -> LabelAndPart:
-    """Return the label in a path, and None for the part's number; raise as `_find_word`."""
-    return _find_word(name, words).label, None
+def _find_label(name: str, words: LabelMap) -> SourcedLabel:
+    """Return the label in a path; raise as `_find_word`."""
+    word = _find_word(name, words)
+    place = "its folder" if word.start <= name.rfind("/") else "its name"
+    return _sourced(word.label, place, word.text)
 
 
 def _find_word(name: str, words: LabelMap) -> _FoundLabel:
@@ -580,7 +700,11 @@ class _LabelRow(NamedTuple):
 
 
 def labels_in_file(
-    path: str | os.PathLike[str], part: str, names: Sequence[str], words: LabelMap = NO_WORDS
+    path: str | os.PathLike[str],
+    part: str,
+    names: Sequence[str],
+    words: LabelMap = NO_WORDS,
+    column: str | None = None,
 ) -> LabelSource:
     """Return a source of labels in a CSV file with a column of files and one of labels.
 
@@ -598,6 +722,8 @@ def labels_in_file(
         Names of all recordings. A row of the file that names none of them is a fault of the source.
     words : mapping of str to bool
         As in `label_of`.
+    column : str, optional
+        Column of labels, if the user stated it.
 
     Raises
     ------
@@ -605,7 +731,7 @@ def labels_in_file(
         If the file cannot be read as one of labels.
     """
     source = Path(path).name
-    rows, faults, column = _read_label_rows(path, part, names)
+    rows, faults, column = _read_label_rows(path, part, column, names)
     notes = Counter[str]()
     label_column = LabelColumn(column, words, notes)
     rows_by_file = defaultdict[str, list[_LabelRow]](list)
@@ -627,7 +753,7 @@ def labels_in_file(
             message = f"Expected the name of a recording, found no file {row.file}"
             faults.append(Fault(source, row.line, message))
 
-    def find(name: str) -> LabelAndPart:
+    def find(name: str) -> SourcedLabel:
         """Return the label and the part in the row that names a recording most exactly."""
         if not matches[name]:
             raise UnreadableError(f"Expected a row of {source} that names it, found none")
@@ -638,24 +764,34 @@ def labels_in_file(
             message = f"Expected its folder in {where}, which names {n_names[row]} recordings"
             raise UnreadableError(message)
         try:
-            return label_column.label_of(row.label), row.part
+            return _sourced(label_column.label_of(row.label), where, row.label, row.part)
         except UnknownWordError as error:
             error.args = (f"{error} in {where}",)
             raise
 
     files = ", ".join(row.file for row in rows[:3]) or "no files"
     do = "call its columns file and label, and the files as they are"
-    return LabelSource(find, f"{source} names {files}: {do}", faults, notes=notes)
+    advice = f"{source} names {files}: {do}"
+    return LabelSource(
+        find, advice, source, faults, notes=notes, trust=listing_to_trust(source, column)
+    )
 
 
-def read_ordered_labels(path: str | os.PathLike[str], part: str) -> tuple[list[str], str]:
+def listing_to_trust(file: str, column: str) -> str:
+    """Return what to do, for an error, if another source contradicts a file of labels."""
+    return f"name the column to trust, label={column!r} of {file}, or leave it out (labels)"
+
+
+def read_ordered_labels(
+    path: str | os.PathLike[str], part: str, column: str | None = None
+) -> tuple[list[str], str]:
     """Return the label words of a file that lists the traces of an array in their order.
 
-    The name of their column comes second.
+    The name of their column comes second; `column` is that name, if the user stated it.
 
     Raises DataError if the file cannot be read, or its rows are numbered in another order.
     """
-    rows, faults, column = _read_label_rows(path, part)
+    rows, faults, column = _read_label_rows(path, part, column)
     numbers = [int(row.file) for row in rows if row.file.isdecimal()]
     in_order = not numbers or numbers == list(range(numbers[0], numbers[0] + len(rows)))
     if faults or not in_order:
@@ -665,7 +801,7 @@ def read_ordered_labels(path: str | os.PathLike[str], part: str) -> tuple[list[s
 
 
 def _read_label_rows(
-    path: str | os.PathLike[str], part: str, names: Sequence[str] = ()
+    path: str | os.PathLike[str], part: str, column: str | None = None, names: Sequence[str] = ()
 ) -> tuple[list[_LabelRow], list[Fault], str]:
     """Return the rows of a file of labels, one for each file, and the faults of its other lines.
 
@@ -688,7 +824,7 @@ def _read_label_rows(
         for i in range(len(header))
         if any(_path_words(row[i])[0] in files for row in cells.values())
     ]
-    of_file, of_label = _label_file_columns(header, path, with_names)
+    of_file, of_label = _label_file_columns(header, path, with_names, column)
     if part != "part" and part not in header:
         wanted = f"a column {part} of parts' numbers in {path}"
         raise DataError(f"Expected {wanted}, got {', '.join(header)}.")
@@ -722,16 +858,23 @@ def column_among(header: Sequence[str], names: Sequence[str]) -> int | None:
 
 
 def _label_file_columns(
-    header: Sequence[str], path: str | os.PathLike[str], with_names: Sequence[int]
+    header: Sequence[str],
+    path: str | os.PathLike[str],
+    with_names: Sequence[int],
+    column: str | None = None,
 ) -> tuple[int, int]:
     """Return the positions of the column of files and of the column of labels.
 
     They are found by their names; of two columns that have other names, files come first. The only
     column whose name means the bad outcome has the labels if none is called so. Raises DataError if
-    one is not found. with_names : the columns in which recordings are named.
+    one is not found. with_names : the columns in which recordings are named. column : the one of
+    labels, if the user stated it.
     """
     of_file = column_among(header, FILE_COLUMNS)
-    of_label = column_among(header, LABEL_COLUMNS)
+    of_label = column_among(header, LABEL_COLUMNS if column is None else (column.lower(),))
+    if column is not None and of_label is None:
+        wanted = f"a column {column} of labels in {path}"
+        raise DataError(f"Expected {wanted}, got {', '.join(header)}; leave it out (label).")
     if of_file is None and len(with_names) == 1:
         of_file = with_names[0]
     if len(header) == 2:
@@ -773,19 +916,22 @@ def collect_recordings(
         If most recordings have no label, and the words of their names are no likely ones.
     """
     unlabelled = dict[str, Sequence[str]]()
+    n_contradictions = 0
     collector.faults.extend(source.faults)
 
     def read_labelled(name: str, place: Any) -> Recording:
         """Return a recording with its label; note its name if it has none."""
+        nonlocal n_contradictions
         try:
-            label, part = source.find(name)
+            label = source.find(name)
         except (UnknownWordError, UnlabelledError):
             raise
         except UnreadableError as error:
             unlabelled[name] = getattr(error, "words", ())
+            n_contradictions += isinstance(error, SeveralLabelsError)
             raise
         timed = read(place)
-        return Recording(timed.trace, label, name, part, timed.rate_hz, timed.units)
+        return Recording(timed.trace, label.label, name, label.part, timed.rate_hz, timed.units)
 
     for name, place in places.items():
         collector.add(name, partial(read_labelled, name, place))
@@ -795,8 +941,10 @@ def collect_recordings(
     collector.unknown_words.update(words)
     if len(unlabelled) - len(words) > len(places) / 2:
         why = next(fault for fault in reversed(collector.faults) if fault.source in unlabelled)
-        actual = f"{len(unlabelled)} of {len(places)} have none, as {why}"
-        raise DataError(f"Expected a label for each recording, {actual}; {source.advice}.")
+        actual = f"{len(unlabelled)} of {len(places)} have none, as {why}; {source.advice}"
+        if n_contradictions > len(unlabelled) / 2:
+            actual = f"{n_contradictions} of {len(places)} have labels that differ, as {why}"
+        raise DataError(f"Expected a label for each recording, {actual}.")
     return collector
 
 

@@ -6,6 +6,7 @@ arrays in memory the functions below.
 
 import os
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -38,7 +39,13 @@ from .dataset import (
     refit,
     split_names,
 )
-from .labels import LabelColumn, label_of, parse_label_map, read_ordered_labels
+from .labels import (
+    LabelColumn,
+    label_of,
+    listing_to_trust,
+    parse_label_map,
+    read_ordered_labels,
+)
 from .tables import FORCE, find_recordings, from_frame, hold_many, read_folder, read_tables
 from .text import SUFFIXES as TEXTS
 from .triggers import Trigger
@@ -97,8 +104,9 @@ def load_dataset(
         the name of a column of the files. None: True/False, OK/NOK, pass/fail, good/bad,
         success/failure or i.O./n.i.O. at the end of the file's name except for numbers, or of a
         folder's; else a column with the name of a label. For a table the name of the column, for an
-        .npz file of the array. If the name means the bad outcome, as `failed`, true, yes and 1 are
-        bad.
+        .npz file of the array; with `labels` the column of that file. If the name means the bad
+        outcome, as `failed`, true, yes and 1 are bad. A label that is not stated so must not
+        contradict another one, of a name, a column or the file of `labels`.
     labels : path, optional
         For a folder, a CSV file with a column of file names and one of labels; for a long table, of
         parts and labels; for an .npz file, of labels with a row for each trace.
@@ -286,7 +294,10 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
     label = label_column = options.label or "y"
     arrays, all_names = _read_archives(named, options)
     if options.labels is not None:
-        label_words, label_column = read_ordered_labels(options.labels, options.part)
+        label = "y"
+        label_words, label_column = read_ordered_labels(options.labels, options.part, options.label)
+        if label in arrays and options.label is None:
+            _check_same_labels(arrays[label], label_words, label_column, options)
         arrays[label] = np.array(label_words)
     channels = () if "X" in arrays else options.channels
     traces = channels or ("X",)
@@ -383,6 +394,29 @@ def _parts_first(x: NDArray[Any], labels: NDArray[Any] | None) -> NDArray[Any]:
     if len(x) != len(labels) and x.shape.count(len(labels)) == 1:
         x = np.moveaxis(x, x.shape.index(len(labels)), 0)
     return x.swapaxes(1, 2) if x.ndim == 3 and x.shape[1] > x.shape[2] else x
+
+
+def _check_same_labels(
+    stored: NDArray[Any], words: Sequence[str], column: str, options: LoadOptions
+) -> None:
+    """Raise DataError if the labels of an archive contradict those of a file of labels.
+
+    stored, words : the labels, one for each trace. column : of the file.
+    """
+    file = Path(str(options.labels)).name
+    columns = (
+        LabelColumn("y", options.words, Counter()),
+        LabelColumn(column, options.words, Counter()),
+    )
+    rows = []
+    for row, cells in enumerate(zip(stored.tolist(), words, strict=False), start=1):
+        with suppress(UnreadableError):
+            if columns[0].label_of(cells[0]) != columns[1].label_of(cells[1]):
+                rows.append(row)
+    if rows:
+        wanted = f"the labels of {file} to be those of y"
+        do = listing_to_trust(file, column)
+        raise DataError(f"Expected {wanted}, traces {listed(rows)} have others; {do}.")
 
 
 def _missing_arrays(named: Files, options: LoadOptions) -> str:

@@ -162,8 +162,8 @@ def read_folder(
     if options.labels is None and options.part != "part":
         wanted = f"a file of labels with a column {options.part}"
         raise DataError(f"Expected {wanted}: a folder's names tell no parts' numbers.")
-    source, label_column = _label_source(named, options)
-    channels = options.channels or _usual_channels(named.values(), options, label_column)
+    source, label_columns = _label_source(named, options)
+    channels = options.channels or _usual_channels(named.values(), options, label_columns)
     collector = RecordingCollector(name, channels)
     in_order = sorted(named, key=lambda name: natural_key(source.without_label(name)))
     collector.ordered = sorted(named, key=natural_key) == in_order
@@ -200,43 +200,97 @@ def read_folder(
 
 def _label_source(
     named: Mapping[str, Path], options: LoadOptions
-) -> tuple[labels.LabelSource, str | None]:
-    """Return the source of a folder's labels, and the column of its files that has them, or None.
+) -> tuple[labels.LabelSource, list[str]]:
+    """Return the source of a folder's labels, and the columns of its files that tell labels.
 
-    A column is taken if the user names it, or if it has the name of a label and labels in it. If
-    files' names state labels too, the column tells those of the other files, and must not
-    contradict.
+    The source is the file of labels, the names, or a column, in this order, or what the user
+    states. What the user does not state is compared with all others: they must not contradict each
+    other. Columns tell the labels of files whose names do not.
     """
+    in_names = labels.labels_in_names(None, options.words)
     if options.labels is not None:
-        names = list(named)
-        source = labels.labels_in_file(options.labels, options.part, names, options.words)
-        return source, None
-    header = _first_rows(next(iter(named.values())), options)[0]
-    if options.label in header:
-        return labels.labels_in_column(named, options.label, options), options.label
-    in_names = labels.labels_in_names(options.label, options.words)
+        listing = labels.labels_in_file(
+            options.labels, options.part, list(named), options.words, options.label
+        )
+        columns = _verdict_columns(named, options)
+        if options.label is not None:
+            return listing, columns
+        sources = [labels.labels_in_column(named, column, options) for column in columns]
+        return labels.labels_that_agree(listing, [in_names, *sources], listing.trust), columns
+    if options.label in _first_rows(next(iter(named.values())), options)[0]:
+        source = labels.labels_in_column(named, options.label, options)
+        source.notes[f"The labels are those in column {options.label} of each file"] = 1
+        return source, [options.label]
     if options.label is not None:
-        return in_names, None
-    usual = [name for name in labels.LABEL_COLUMNS if name not in labels.SIGNAL_COLUMNS]
-    place = labels.column_among(header, usual)
-    if place is None:
-        return in_names, None
-    column = header[place]
-    in_column = labels.labels_in_column(named, column, options)
+        return labels.labels_in_names(options.label, options.words), []
+    columns = _verdict_columns(named, options)
     if set(_count_labels(named, in_names)) <= {None, ""}:
-        return in_column, column
-    counts = _count_labels(list(named)[:: max(len(named) // TRIED, 1)], in_column)
-    if not counts[0] + counts[1]:
-        return in_names, None
-    return labels.labels_in_names_and_column(named, column, options), column
+        columns = columns or _usual_label_columns(named, options)[:1]
+        sources = [labels.labels_in_column(named, column, options) for column in columns]
+        if not sources:
+            return in_names, []
+        sources[0].notes[f"The labels are those in column {columns[0]} of each file"] = 1
+        do = f"name the one to trust: label={columns[0]!r}"
+        return labels.labels_that_agree(sources[0], sources[1:], do), columns
+    if not columns:
+        return in_names, []
+    sources = [labels.labels_in_column(named, column, options) for column in columns]
+    do = f"name the one to trust: label={columns[0]!r}, or a pattern of the path (label)"
+    return labels.labels_that_agree(in_names, sources, do, fills_in=True), columns
+
+
+def _usual_label_columns(named: Mapping[str, Path], options: LoadOptions) -> list[str]:
+    """Return the columns of the first file that have the name of a label and are no signal's."""
+    header = _first_rows(next(iter(named.values())), options)[0]
+    usual = [name for name in labels.LABEL_COLUMNS if name not in labels.SIGNAL_COLUMNS]
+    places = (labels.column_among(header, [name]) for name in usual)
+    return [header[place] for place in places if place is not None]
+
+
+def _verdict_columns(named: Mapping[str, Path], options: LoadOptions) -> list[str]:
+    """Return the columns of a folder's files that tell labels.
+
+    They have the name of a label and labels in them, or any name and one verdict in the first rows
+    of each file, good in some and bad in others. A number or yes is a verdict if the column's name
+    says of what.
+    """
+    sample = list(named)[:: max(len(named) // TRIED, 1)]
+    usual = _usual_label_columns(named, options)
+    counts = {
+        name: _count_labels(sample, labels.labels_in_column(named, name, options)) for name in usual
+    }
+    columns = [name for name in usual if counts[name][0] + counts[name][1]]
+    header, *rows = _first_rows(next(iter(named.values())), options)
+    by_column: dict[str, set[int]] = {
+        name: set()
+        for i, name in enumerate(header)
+        if name not in usual and labels.is_verdict(name, _column_cells(rows, i), options.words)
+    }
+    for path in named.values() if by_column else ():
+        header, *rows = _first_rows(path, options)
+        for name in [name for name in by_column if name in header]:
+            column = labels.LabelColumn(name, options.words, Counter())
+            try:
+                found = column.find(_column_cells(rows, header.index(name)))
+                by_column[name].add(found.label)
+            except UnlabelledError:
+                continue
+            except UnreadableError:
+                del by_column[name]
+    return columns + [name for name, found in by_column.items() if found == {0, 1}]
+
+
+def _column_cells(rows: Iterable[Sequence[str]], i: int) -> list[str]:
+    """Return the cells of a column, of those rows that have it."""
+    return [row[i] for row in rows if i < len(row)]
 
 
 def _has_label_column(named: Mapping[str, Path], options: LoadOptions) -> bool:
     """Return whether the files have a column of labels, in which the first file has a label."""
     with suppress(DataError):
-        _, column = _label_source(named, options)
-        if column is not None:
-            source = labels.labels_in_column(named, column, options)
+        _, columns = _label_source(named, options)
+        if columns:
+            source = labels.labels_in_column(named, columns[0], options)
             return _count_labels([next(iter(named))], source)[None] == 0
     return False
 
@@ -249,7 +303,7 @@ def _count_labels(names: Iterable[str], source: labels.LabelSource) -> Counter[A
     counts = Counter[Any]()
     for name in names:
         try:
-            counts[source.find(name)[0]] += 1
+            counts[source.find(name).label] += 1
         except UnknownWordError as error:
             counts[error.word] += 1
         except (UnreadableError, OSError) as error:
@@ -356,18 +410,18 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def _usual_channels(
-    paths: Iterable[Path], options: LoadOptions, label: str | None = None
+    paths: Iterable[Path], options: LoadOptions, label_columns: Sequence[str]
 ) -> tuple[str, ...]:
     """Return `FZ_Base` if a file has it or none has channels, else the only channel of most files.
 
     Raises DataError if most files have several channels.
 
-    label : the column of labels, which is no channel.
+    label_columns : the columns that tell labels, which are no channels.
     """
     headers = []
     for path in paths:
         channels = _channels_of_header(_first_rows(path, options), options)
-        headers.append(tuple(name for name in channels if name != label))
+        headers.append(tuple(name for name in channels if name not in label_columns))
     names = {name.lower() for header in headers for name in header}
     if not names or FORCE.lower() in names:
         return (FORCE,)
@@ -512,29 +566,38 @@ def _add_wide_rows(
     not found.
     """
     label_column = _label_column(frame, options)
+    label_columns = [label_column, *_compared_columns(frame, label_column, options)]
     if options.part != "part" and options.part not in frame:
         wanted = f"a column {options.part} of parts' numbers"
         raise DataError(f"Expected {wanted}, found {listed(frame.columns)}.")
-    others = [name for name in frame.columns if name not in (label_column, options.part)]
+    others = [name for name in frame.columns if name not in (*label_columns, options.part)]
     columns = _sample_columns(others, options)
     all_columns = [name for names in columns.values() for name in names]
     values, wrong = parse_numbers(frame[all_columns])
     traces = values.reshape(len(frame), len(columns), -1)
     collector.channels = tuple(filter(None, columns))
-    label_cells = labels.LabelColumn(label_column, options.words, collector.notes)
+    label_cells = [
+        labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
+    ]
+    do = f"name the column to trust: label={label_column!r}"
     parts = [""] * len(frame)
     if options.part in frame:
         parts = frame[options.part].astype(object).fillna("").tolist()
 
-    def read(line: int, trace: NDArray[np.float32], word: Any, part: Any) -> Recording:
+    def read(line: int, trace: NDArray[np.float32], words: Sequence[Any], part: Any) -> Recording:
         """Return a row as a recording; raise UnreadableError for a bad cell or label."""
         if line in wrong:
             raise UnreadableError(wrong[line])
         number = str(part).removesuffix(".0").strip() or None
-        label = label_cells.label_of(word)
+        finders = {
+            f"column {column.name}": partial(column.find, [word])
+            for column, word in zip(label_cells, words, strict=True)
+        }
+        label = labels.agreed_label(finders, do, collector.notes).label
         return Recording(_without_trailing_nan(trace), label, f"{source}, line {line}", number)
 
-    for row in zip(frame.index, traces, frame[label_column].tolist(), parts, strict=True):
+    words = zip(*(frame[name].tolist() for name in label_columns), strict=True)
+    for row in zip(frame.index, traces, words, parts, strict=True):
         collector.add(source, partial(read, *row), row[0])
 
 
@@ -585,15 +648,16 @@ def _from_long(
             advice = f"; name {names}" if names else ""
             raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
     label = None if options.labels is not None else _label_column(frame, options)
-    frame = _pivot_signals(frame, [options.part, time, *([label] if label else [])], options)
-    others = [name for name in frame.columns if name not in (options.part, time, label)]
+    label_columns = [*([label] if label else []), *_compared_columns(frame, label, options)]
+    frame = _pivot_signals(frame, [options.part, time, *label_columns], options)
+    others = [name for name in frame.columns if name not in (options.part, time, *label_columns)]
     numeric = [name for name in others if not floats(frame[name])[1]]
     collector.channels = _choose_channels(numeric, options)
     seconds, *_ = seconds_of(frame[time], time, column_units.get(time, ""))
     with_seconds = frame.assign(**{SECONDS_COLUMN: seconds})
     groups = with_seconds.groupby(options.part, sort=False)
     rows_of_part = {str(part): rows for part, rows in groups}
-    no_stations = {options.part, time, label, *collector.channels}
+    no_stations = {options.part, time, *label_columns, *collector.channels}
     _check_single_station(rows_of_part, [name for name in others if name not in no_stations])
     rows_of_part, order_note = _order_by_time(rows_of_part, holds_dates(frame[time]))
     collector.notes.update(order_note)
@@ -609,18 +673,60 @@ def _from_long(
         channel_units = (column_units.get(name) or units.split(name)[1] for name in channels)
         return timed._replace(units=tuple(channel_units))
 
-    label_cells = labels.LabelColumn(label or "", options.words, collector.notes)
-
-    def find(part: str) -> labels.LabelAndPart:
-        """Return the label of a part in its rows, and None: `part` is its number already."""
-        return label_cells.label_of_cells(rows_of_part[part][label]), None
-
-    label_source = labels.LabelSource(find, "name the column of labels (label)")
+    sources = [_labels_of_parts(rows_of_part, name, options) for name in label_columns]
     if options.labels is not None:
         parts = list(rows_of_part)
-        label_source = labels.labels_in_file(options.labels, "part", parts, options.words)
+        listing = labels.labels_in_file(options.labels, "part", parts, options.words, options.label)
+        sources.insert(0, listing)
+        do = listing.trust
+    else:
+        do = f"name the column to trust: label={label!r}"
+    label_source = labels.labels_that_agree(sources[0], sources[1:], do)
     labels.collect_recordings(rows_of_part, read, label_source, collector)
     return as_dataset(collector, options)
+
+
+def _labels_of_parts(
+    rows_of_part: Mapping[str, pd.DataFrame], name: str, options: LoadOptions
+) -> labels.LabelSource:
+    """Return a source of labels in a column of a long table."""
+    notes = Counter[str]()
+    column = labels.LabelColumn(name, options.words, notes)
+
+    def find(part: str) -> labels.SourcedLabel:
+        return column.find(rows_of_part[part][name])
+
+    advice = "name the column of labels (label)"
+    return labels.LabelSource(find, advice, f"column {name}", notes=notes)
+
+
+def _compared_columns(frame: pd.DataFrame, label: str | None, options: LoadOptions) -> list[str]:
+    """Return the other columns of a table that have the name of a label and nothing but labels.
+
+    None are compared if the user names the column of labels.
+
+    label : the column of labels; None for a file of them.
+    """
+    if options.label is not None:
+        return []
+    columns = []
+    for name in frame.columns:
+        is_usual = (
+            name.lower() in labels.LABEL_COLUMNS and name.lower() not in labels.SIGNAL_COLUMNS
+        )
+        if name == label or not is_usual:
+            continue
+        column = labels.LabelColumn(name, options.words, Counter())
+        found = Counter[int]()
+        for cell in frame[name].unique().tolist():
+            with suppress(UnlabelledError):
+                try:
+                    found[column.label_of(cell)] += 1
+                except UnknownWordError:
+                    found[-1] += 1
+        if found and -1 not in found:
+            columns.append(name)
+    return columns
 
 
 def _check_single_station(rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str]) -> None:

@@ -216,8 +216,8 @@ CONTRADICTIONS = (
 @pytest.mark.parametrize("form", LABEL_FORMS)
 def test_a_label_is_read_from_a_name_or_its_folder_as_people_write_them(form: str) -> None:
     good, bad = LABEL_FORMS[form]
-    assert [name for name in good if labels_in_names().find(name) != (1, None)] == []
-    assert [name for name in bad if labels_in_names().find(name) != (0, None)] == []
+    assert [name for name in good if labels_in_names().find(name).label != 1] == []
+    assert [name for name in bad if labels_in_names().find(name).label != 0] == []
 
 
 @pytest.mark.parametrize("name", NO_LABELS.split(", "))
@@ -345,7 +345,11 @@ NAMES_AND_COLUMNS: dict[str, tuple[str, int | None, str]] = {
     "1_OK.csv": ("OK", 1, ""),
     "2_NOK.csv": ("nok", 0, ""),
     "3_OK.csv": ("pending", 1, ""),
-    "4_OK.csv": ("rework", 1, ""),
+    "4_OK.csv": (
+        "rework",
+        None,
+        "got 'rework' in its column verdict, where its name says good (OK); say what it means, or",
+    ),
     "5.csv": ("OK", 1, ""),
     "6.csv": ("NOK", 0, ""),
     "8_OK.csv": ("OK", 1, ""),
@@ -370,7 +374,8 @@ def test_a_name_and_a_column_that_contradict_each_other_are_a_fault_that_names_b
         assert labels.get(name) == label, name
         assert message in faults.get(name, ""), name
         assert (label is None) == ("to trust: label='verdict'" in faults.get(name, "")), name
-    assert "Its name tells no label: that in column verdict is taken (2 times)." in data.notes
+    assert "Its name tells no label: that of its column verdict is taken (2 times)." in data.notes
+    assert "Its column verdict tells no label: that of its name is taken." in data.notes
 
 
 @pytest.mark.parametrize(
@@ -394,7 +399,7 @@ def test_a_column_without_labels_is_a_channel_beside_names_that_state_them(tmp_p
 def test_a_number_is_a_label_of_a_name_where_somebody_says_so_and_never_against_a_word() -> None:
     source_of_labels = labels_in_names(None, {"1": True, "0": False})
     assert [
-        source_of_labels.find(name)[0]
+        source_of_labels.find(name).label
         for name in ("run_1.csv", "part_003/run_0.csv", "1/7.csv", "0/a.csv", "x-1.csv")
     ] == [
         1,
@@ -403,7 +408,7 @@ def test_a_number_is_a_label_of_a_name_where_somebody_says_so_and_never_against_
         0,
         1,
     ]
-    assert source_of_labels.find("part_0001_OK_1.csv") == (1, None)
+    assert source_of_labels.find("part_0001_OK_1.csv").label == 1
     with pytest.raises(DataError, match="contradict"):
         source_of_labels.find("part_0001_NOK_1.csv")
     with pytest.raises(DataError, match="at the end of the name"):
@@ -642,7 +647,10 @@ def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(
             r"4 of 4 have none.*labels\.csv names OK, NOK: call its columns file and label",
         ),
         ({"labels": True, "part": "workpiece"}, "Expected a column workpiece of parts' numbers in"),
-        ({"labels": True, "label": "_(OK)_"}, "got both; leave one out"),
+        (
+            {"labels": True, "label": "_(OK)_"},
+            r"a column _\(OK\)_ of labels in .*, got a, b; leave it out \(label\)",
+        ),
         ({"part": "workpiece"}, "Expected a file of labels with a column workpiece"),
     ],
 )
@@ -889,3 +897,103 @@ def test_a_column_labels_what_a_name_calls_pending(few: Path, small: Dataset) ->
         frame.assign(verdict=words(small)[number]).to_csv(path, index=False)
     data = load_dataset(few)
     np.testing.assert_array_equal(data.y, small.y[:4])
+
+
+def write_listing(folder: Path, words: list[str]) -> Path:
+    """Four recordings whose names say good, bad, good, bad, and a listing of other words."""
+    for i in range(4):
+        write_csv(folder / "cell" / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", np.arange(30.0))
+    rows = [f"{i}_{'NOK' if i % 2 else 'OK'},{word}" for i, word in enumerate(words)]
+    (folder / "list.csv").write_text("\n".join(["file,final", *rows]) + "\n")
+    return folder / "list.csv"
+
+
+def test_a_listing_that_contradicts_a_name_is_a_fault_that_says_how_to_choose(
+    tmp_path: Path,
+) -> None:
+    path = write_listing(tmp_path, ["OK", "OK", "pending", "NOK"])
+    data = load_dataset(tmp_path / "cell", labels=path)
+    assert (data.y.tolist(), data.unlabelled) == ([1, 0], 1)
+    text = "list.csv, line 3 says good (OK), its name says bad (NOK); name the column to trust"
+    assert [(f.source, text in f.message) for f in data.faults] == [("1_NOK.csv", True)]
+    assert "label='final' of list.csv, or leave it out (labels)" in data.faults[0].message
+    trusted = load_dataset(tmp_path / "cell", labels=path, label="final")
+    assert (trusted.y.tolist(), trusted.faults) == ([1, 1, 0], ())
+    assert load_dataset(tmp_path / "cell").y.tolist() == [1, 0, 1, 0]
+    write_listing(tmp_path, ["NOK", "OK", "NOK", "OK"])
+    with pytest.raises(DataError, match=r"4 of 4 have labels that differ, as .*label='final'"):
+        load_dataset(tmp_path / "cell", labels=path)
+
+
+def test_a_listing_that_contradicts_a_column_is_a_fault_too(tmp_path: Path) -> None:
+    path = write_listing(tmp_path, ["OK", "NOK", "NOK", "NOK"])
+    for i, file in enumerate(sorted((tmp_path / "cell").iterdir())):
+        verdict = "OK" if i % 2 == 0 else "NOK"
+        pd.read_csv(file).assign(verdict=verdict).to_csv(file.with_name(f"{i}.csv"), index=False)
+        file.unlink()
+    path.write_text(path.read_text().replace("_NOK,", ",").replace("_OK,", ","))
+    data = load_dataset(tmp_path / "cell", labels=path)
+    assert (data.y.tolist(), [f.source for f in data.faults]) == ([1, 0, 0], ["2.csv"])
+    assert "line 4 says bad (NOK), its column verdict says good (OK)" in data.faults[0].message
+    assert load_dataset(tmp_path / "cell", labels=path, label="final").y.tolist() == [1, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("column", "good", "bad"),
+    [("Endkontrolle", "i.O.", "n.i.O."), ("failed", 0, 1), ("Ausschuss", "nein", "ja")],
+)
+def test_a_verdict_in_any_column_is_compared_with_the_names(
+    column: str, good: object, bad: object, tmp_path: Path
+) -> None:
+    verdicts = [good, bad, bad, bad]
+    for i, verdict in enumerate(verdicts):
+        path = write_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", np.arange(30.0), ("F",))
+        pd.read_csv(path).assign(**{column: verdict}).to_csv(path, index=False)
+    data = load_dataset(tmp_path)
+    assert (data.y.tolist(), data.channels) == ([1, 0, 0], ("F",))
+    assert [f.source for f in data.faults] == ["2_OK.csv"]
+    assert f"its column {column} says bad ({bad}); name the one to trust" in data.faults[0].message
+    assert load_dataset(tmp_path, label=column, channel="F").y.tolist() == [1, 0, 0, 0]
+
+
+def test_a_column_that_is_no_verdict_does_not_contradict_names(tmp_path: Path) -> None:
+    for i in range(4):
+        path = write_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", np.arange(30.0), ("F",))
+        frame = pd.read_csv(path).assign(sensor="OK", status=i % 3 // 2, yes=["no", "yes"][i // 2])
+        frame.to_csv(path, index=False)
+    data = load_dataset(tmp_path, channel="F")
+    assert (data.y.tolist(), data.faults) == ([1, 0, 1, 0], ())
+
+
+def test_two_columns_of_a_table_that_contradict_each_other_are_a_fault(small: Dataset) -> None:
+    verdicts = words(small).astype(object)
+    verdicts[3] = "NOK" if small.y[3] else "OK"
+    verdicts[5] = "pending"
+    data = load_dataset(wide(small).assign(verdict=verdicts))
+    assert (len(data), [f.line for f in data.faults]) == (23, [4])
+    assert "name the column to trust: label='label'" in data.faults[0].message
+    assert "Column verdict tells no label: that of column label is taken." in data.notes
+    assert len(load_dataset(wide(small).assign(verdict=verdicts), label="label")) == 24
+    table = long_table(small, lambda i: 10.0 * i)
+    table["verdict"] = np.repeat(verdicts, 50)
+    data = load_dataset(table, time="time")
+    assert (len(data), [f.source for f in data.faults]) == (23, ["4"])
+    assert len(load_dataset(table, time="time", label="label", channel="FZ")) == 24
+
+
+def test_a_listing_that_contradicts_a_table_or_an_archive_is_named(
+    small: Dataset, tmp_path: Path
+) -> None:
+    verdicts = words(small).astype(object)
+    verdicts[3] = "NOK" if small.y[3] else "OK"
+    listing = tmp_path / "l.csv"
+    pd.DataFrame({"file": range(1, 25), "final": verdicts}).to_csv(listing, index=False)
+    np.savez(tmp_path / "x.npz", X=small.X, y=small.y)
+    with pytest.raises(DataError, match="traces 4 have others; name the column to trust, label='f"):
+        load_dataset(tmp_path / "x.npz", labels=listing)
+    assert len(load_dataset(tmp_path / "x.npz", labels=listing, label="final")) == 24
+    long_table(small, lambda i: 10.0 * i).to_csv(tmp_path / "long.csv", index=False)
+    data = load_dataset(tmp_path / "long.csv", time="time", labels=listing)
+    assert (len(data), [f.source for f in data.faults]) == (23, ["4"])
+    stated = load_dataset(tmp_path / "long.csv", time="time", labels=listing, label="final")
+    assert len(stated) == 24
