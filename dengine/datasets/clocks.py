@@ -438,6 +438,66 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     return float(f"{rate:.4g}")
 
 
+def check_rows(clock: Clock, lines: pd.Index) -> None:
+    """Check by a clock that rows are complete and in order, also where another rate is stated.
+
+    A clock may be coarse, late for some rows, or start anew where its counter is full.
+
+    Parameters
+    ----------
+    clock, lines
+        As in `rate_of`.
+
+    Raises
+    ------
+    UnreadableError
+        If the clock goes back, or rows are missing in a gap.
+    """
+    known = np.flatnonzero(~np.isnan(clock.seconds))
+    steps = np.diff(clock.seconds[known])
+    forward = steps[steps > 0]
+    if len(forward) < 2:
+        return
+    usual = float(np.median(forward))
+    for i in np.flatnonzero(steps < -MAX_GAP * usual).tolist():
+        if not _is_counter_full(usual - steps[i], usual):
+            wanted = f"a later time in column {clock.name} than that of the row before"
+            actual = f"{-steps[i]:.3g} s earlier"
+            do = f"time={clock.name!r} puts rows in the order of their times, if they differ"
+            raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", lines[known[i + 1]])
+    gaps = np.flatnonzero(steps > MAX_GAP * usual)
+    # After a late row others come sooner, so that none are missing.
+    missing = float(forward.sum()) - len(forward) * usual
+    if len(gaps) and missing > (MAX_GAP - 1) * usual:
+        message = f"Expected a step of {usual:.3g} s in time, got a gap of {steps[gaps[0]]:.3g} s"
+        raise UnreadableError(message, lines[known[gaps[0] + 1]])
+
+
+def _is_counter_full(seconds: float, step: float) -> bool:
+    """Return whether a counter of 16 or 32 bits, or a time of day, starts anew after so long."""
+    periods = [2.0**bits * unit for bits in (16, 32) for unit, _ in EPOCHS]
+    return any(abs(seconds - period) < 1.5 * step for period in (*periods, DAY))
+
+
+def in_order_of_time(
+    rows: pd.DataFrame, clock: Clock, time: str | None
+) -> tuple[NDArray[np.int64], Clock]:
+    """Return the positions of rows in the order of their times, and the clock in that order.
+
+    They stay as they are unless the user names the clock or it holds dates, and if two times are
+    equal or one is not known.
+
+    time : the clock's column, if the user stated it.
+    """
+    order = np.argsort(clock.seconds, kind="stable")
+    seconds = clock.seconds[order]
+    place = list(map(str, rows.columns)).index(clock.name)
+    is_trusted = time is not None or holds_dates(rows.iloc[:, place])
+    if not is_trusted or not (np.diff(seconds) > 0).all():
+        return np.arange(len(rows)), clock
+    return order, clock._replace(seconds=seconds - seconds[0])
+
+
 def resample_evenly(values: NDArray[np.float32], clock: Clock) -> NDArray[np.float32]:
     """Interpolate samples (C, T) at even times between the first and the last of a clock.
 

@@ -23,9 +23,12 @@ from . import units
 from .clocks import (
     EMPTY_CELLS,
     TIMESTAMP,
+    check_rows,
     clock_of,
     floats,
+    in_order_of_time,
     is_rising,
+    place_of_clock,
     rate_of,
     resample_evenly,
     rising_columns,
@@ -45,6 +48,7 @@ SAMPLED_LINES = 30  # from the end, by which the delimiter is found
 SAMPLED_CELLS = 40  # of each of these lines
 # A word between blanks; a unit in brackets belongs to the name before it.
 WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')
+SUMMARY_SHARE = 10  # samples for each row of a summary below them, at least
 COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 # A cell of a row of units, beside the units that `units.parse` knows.
@@ -396,9 +400,32 @@ def read_recording(
         raise UnreadableError(table.faults[0].message, table.faults[0].line)
     if table.frame.empty:
         raise UnreadableError("Expected samples below the header, found none", table.line)
+    rows = _without_summary(table.frame, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
-    timed = rows_to_trace(table.frame, places, options, notes, table.units)
+    timed = rows_to_trace(rows, places, options, notes, table.units)
     return timed._replace(units=channel_units)
+
+
+def _without_summary(
+    frame: pd.DataFrame, options: LoadOptions, notes: Counter[str]
+) -> pd.DataFrame:
+    """Return a recording without the last rows that have no time, as Max;48.2 below samples.
+
+    They are a few rows below many that all have a time; a note says so.
+    """
+    place = None
+    with suppress(UnreadableError):
+        place = place_of_clock(frame, options.time)
+    if place is None:
+        return frame
+    cells = frame.iloc[:, place].astype(str)
+    has_time = [is_numeral(cell) or TIMESTAMP.fullmatch(cell) is not None for cell in cells]
+    n_last = next((n for n, is_time in enumerate(reversed(has_time)) if is_time), 0)
+    n_samples = len(frame) - n_last
+    if not 0 < n_last <= n_samples / SUMMARY_SHARE or not all(has_time[:n_samples]):
+        return frame
+    notes[f"The last {n_last} rows have no time: they are no samples, and left out"] += 1
+    return frame.iloc[:n_samples]
 
 
 def rows_to_trace(
@@ -437,16 +464,23 @@ def rows_to_trace(
     if wrong:
         raise UnreadableError(wrong[min(wrong)], min(wrong))
     trace = np.ascontiguousarray(values.T)
+    try:
+        clock = clock_of(rows, options.time, units_row)
+    except UnreadableError:
+        if options.rate_hz is None:
+            raise
+        return TimedTrace(trace)  # a stated rate needs no clock
+    if clock is not None:
+        order, clock = in_order_of_time(rows, clock, options.time)
+        if (order != np.arange(len(rows))).any():
+            notes["Rows are put in the order of their times"] += 1
+            trace = np.ascontiguousarray(trace[:, order])
+            rows = rows.iloc[order]
+        check_rows(clock, rows.index)
     if options.rate_hz is not None:
         return TimedTrace(trace)
-    clock = clock_of(rows, options.time, units_row)
     if clock is None:
-        for i in rising_columns(rows):
-            if i not in places:
-                name = str(rows.columns[i])
-                rises = f"column {name} rises steadily: time={name!r} if it is one"
-                notes[f"No clock is known; {rises}"] += 1
-                break
+        _offer_clock(rows, places, notes)
         return TimedTrace(trace)
     rate = rate_of(clock, rows.index)
     if clock.note:
@@ -454,6 +488,14 @@ def rows_to_trace(
     if options.fit == "resample":
         trace = resample_evenly(trace, clock)
     return TimedTrace(trace, rate)
+
+
+def _offer_clock(rows: pd.DataFrame, places: Sequence[int], notes: Counter[str]) -> None:
+    """Note that a column that rises steadily and is no channel may be the clock."""
+    names = [str(rows.columns[i]) for i in rising_columns(rows) if i not in places]
+    for name in names[:1]:
+        rises = f"column {name} rises steadily: time={name!r} if it is one"
+        notes[f"No clock is known; {rises}"] += 1
 
 
 def column_place(name: str, header: Sequence[str], line: int = 1) -> int:

@@ -997,3 +997,59 @@ def test_a_listing_that_contradicts_a_table_or_an_archive_is_named(
     assert (len(data), [f.source for f in data.faults]) == (23, ["4"])
     stated = load_dataset(tmp_path / "long.csv", time="time", labels=listing, label="final")
     assert len(stated) == 24
+
+
+@pytest.mark.parametrize("rate_hz", [None, 250.0])
+def test_a_part_that_was_made_twice_at_other_times_is_not_joined(
+    rate_hz: float | None, small: Dataset
+) -> None:
+    stations = [
+        long_table(small, lambda i, late=late: 10.0 * i + late).assign(station=number)
+        for number, late in enumerate((0.0, 1000.0), start=1)
+    ]
+    with pytest.raises(DataError, match=r"1, line .*: Expected a step of 0.004 s in time, got a g"):
+        load_dataset(pd.concat(stations), time="time", channel="FZ", rate_hz=rate_hz)
+
+
+def test_a_stated_rate_hides_neither_lost_rows_nor_their_order(few: Path, small: Dataset) -> None:
+    def write_times(name: str, rows: np.ndarray, times: np.ndarray) -> None:
+        frame = pd.DataFrame({"time [ms]": times, "FZ_Base": small.X[0][rows]})
+        frame.to_csv(few / name, index=False)
+
+    rows = np.arange(50)
+    kept = np.r_[:20, 30:50]
+    rotated = np.r_[35:50, :35]
+    write_times("lost_OK.csv", kept, 4 * kept)
+    write_times("rotated_OK.csv", rotated, 4 * rotated)
+    write_times("coarse_OK.csv", rows, 1000 * (rows // 25))
+    write_times(
+        "burst_OK.csv", rows, np.where((rows > 20) & (rows < 40), 159 + rows / 40, 4 * rows)
+    )
+    write_times("full_OK.csv", rows, (2**32 - 60 + 4 * rows) % 2**32)
+    data = load_dataset(few, rate_hz=250.0)
+    faults = {fault.source: fault.message for fault in data.faults}
+    assert set(faults) == {"lost_OK.csv", "rotated_OK.csv"}
+    assert "Expected a step of 0.004 s in time, got a gap of 0.044 s" in faults["lost_OK.csv"]
+    assert "got 0.196 s earlier; time='time [ms]' puts rows in" in faults["rotated_OK.csv"]
+    for path in few.iterdir():
+        if path.name != "rotated_OK.csv":
+            path.unlink()
+    for stated in (None, 250.0):
+        data = load_dataset(few, time="time [ms]", rate_hz=stated)
+        np.testing.assert_array_equal(data.X, small.X[:1])
+        assert (data.rate_hz, data.notes[0]) == (250.0, "Rows are put in the order of their times.")
+
+
+@pytest.mark.parametrize("rate_hz", [None, 500.0])
+@pytest.mark.parametrize("summary", [["Max,48.2", "Min,1.3", "", "Mittel,9"], [",48.2", ",1.3"]])
+def test_a_summary_below_the_samples_is_no_sample(
+    summary: list[str], rate_hz: float | None, few: Path, small: Dataset
+) -> None:
+    for path in few.iterdir():
+        path.write_text(path.read_text("utf-8") + "\n".join(summary) + "\n")
+    data = load_dataset(few, rate_hz=rate_hz)
+    np.testing.assert_array_equal(data.X, small.X[:4])
+    n = len([row for row in summary if row])
+    assert f"The last {n} rows have no time: they are no samples, and left out (4 times)." in (
+        data.notes
+    )
