@@ -218,7 +218,7 @@ def fit_novelty(
     ]
     for i, (group, n_needed, least) in enumerate(groups):
         points = standard[:, group]
-        limit, reach = _limits(points, same)
+        limit, reach = _usual_distance_and_reach(points, same)
         limit = max(least, margin * max(1.0, n_needed / n_distinct) * limit)
         gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
         gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
@@ -327,7 +327,7 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
     return torch.from_numpy(same), int((~np.tril(same, -1).any(1)).sum())
 
 
-def _limits(points: Tensor, same: Tensor) -> tuple[float, Tensor]:
+def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tensor]:
     """Return (usual squared distance between nearest points, reach of each point (n,)).
 
     `points` is (n, P); `same` (n, n) bool marks pairs whose distance does not count. The usual

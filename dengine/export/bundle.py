@@ -90,7 +90,7 @@ def signature(content: bytes, key: KeyFile) -> str:
     return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
 
 
-def beside(path: str | os.PathLike[str], suffix: str) -> Path:
+def sibling_path(path: str | os.PathLike[str], suffix: str) -> Path:
     """Return the path of a file's checksum (sha256) or signature (sig), PATH.SUFFIX.
 
     `sha256sum --check` reads the former.
@@ -242,23 +242,23 @@ def write_export(
     """
     target = Path(path)
     digest = hashlib.sha256(content).hexdigest()
-    files = {target: content, beside(target, "sha256"): f"{digest}  {target.name}\n".encode()}
+    files = {target: content, sibling_path(target, "sha256"): f"{digest}  {target.name}\n".encode()}
     if key is not None:
         line = f"{signature(content, key)}  {target.name}\n"
-        files[beside(target, "sig")] = line.encode()
+        files[sibling_path(target, "sig")] = line.encode()
     _check_outputs(target, force)
     if source is not None and source.note is not None:
         source.note("export", f"{digest} {target.name}, version {source.model_version}")
     for file, data in files.items():
         write_output(file, data, force)
     if key is None and force:
-        beside(target, "sig").unlink(missing_ok=True)
+        sibling_path(target, "sig").unlink(missing_ok=True)
     return target
 
 
 def _check_outputs(path: str | os.PathLike[str], force: bool) -> None:
     """Raise OutputError unless the file, its checksum and its signature may be written."""
-    for file in (Path(path), beside(path, "sha256"), beside(path, "sig")):
+    for file in (Path(path), sibling_path(path, "sha256"), sibling_path(path, "sig")):
         check_output(file, force)
 
 
@@ -295,7 +295,7 @@ def read_checked(path: Path, key: KeyFile | None = None) -> bytes:
         was not signed with this key.
     """
     _read(path, most=0)  # if both are missing, the error names the file itself
-    expected = _first_word(_read(beside(path, "sha256"), SUM_BYTES))
+    expected = _first_word(_read(sibling_path(path, "sha256"), SUM_BYTES))
     if not SHA256.fullmatch(expected):
         problem = f"{path}.sha256 holds no SHA-256 sum of {path.name}"
         raise ExportError(f"{problem}; copy it again together with {path.name}.")
@@ -306,7 +306,7 @@ def read_checked(path: Path, key: KeyFile | None = None) -> bytes:
         raise ExportError(f"{path} is damaged or truncated: {sums}; copy it again.")
     if key is not None:
         signed = signature(content, key)
-        file = beside(path, "sig")
+        file = sibling_path(path, "sig")
         if not file.exists():
             problem = f"A key was given, and {path} is not signed: {file} is missing"
             raise ExportError(f"{problem}; export it anew with it.")

@@ -195,7 +195,7 @@ def _as_key(value: object) -> object:
     return value if isinstance(value, FunctionType) else repr(value)
 
 
-def _compiles(*modules: nn.Module) -> bool:
+def _is_code_unchanged(*modules: nn.Module) -> bool:
     """Return whether no module's code was changed since TorchScript compiled it; else warn.
 
     TorchScript keeps what it compiled first, so a class whose code was changed must run in Python.
@@ -425,7 +425,7 @@ class ModelPrediction(EngineModel):
             computing = pool.submit(self.spaces.precompute, X, numbers)
             is_untrained = "index" not in vars(self)
             is_scriptable = encoder is not None and self.rule.scriptable
-            if is_untrained and is_scriptable and _compiles(self.rule, encoder):
+            if is_untrained and is_scriptable and _is_code_unchanged(self.rule, encoder):
                 self._compile_template(encoder, X.shape[1:])
             computing.result()
 
@@ -492,8 +492,8 @@ class ModelPrediction(EngineModel):
         channels, samples = self.trace_shape
         conditions = conditions or DecisionConditions(TraceSpec(samples, channels=channels))
         shape = (self.n_spaces, self.index.dim)
-        rule_compiles = self.rule.scriptable and _compiles(self.rule)
-        if encoder is not None and not _compiles(encoder):
+        rule_compiles = self.rule.scriptable and _is_code_unchanged(self.rule)
+        if encoder is not None and not _is_code_unchanged(encoder):
             encoder = None
         if encoder is not None and rule_compiles:
             predictor = Predictor(encoder, scale, self.gate, neighbours)

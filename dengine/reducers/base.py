@@ -69,16 +69,18 @@ class StopRule:
     clock: Callable[[], float] = time.perf_counter
     late: bool = False
 
-    def exhausted(self, step: int, least: int = 0) -> bool:
+    def exhausted(self, step: int, min_steps: int = 0) -> bool:
         """Return whether step number `step`, counted from 0, may not begin any more.
 
-        That is so if `max_steps` were taken, or if the deadline has passed and `least` steps were
-        taken. It sets `late`, to True if the deadline is the reason; if `max_steps` is, `late`
-        stays as it is.
+        That is so once `max_steps` steps were taken, or once the deadline has passed and at least
+        `min_steps` steps were taken. It sets `late` to whether the deadline is the reason; if
+        `max_steps` is, `late` stays as it is.
         """
         if self.max_steps is not None and step >= self.max_steps:
             return True
-        self.late = self.deadline is not None and self.clock() >= self.deadline and step >= least
+        self.late = (
+            self.deadline is not None and self.clock() >= self.deadline and step >= min_steps
+        )
         return self.late
 
 

@@ -66,7 +66,7 @@ class RidgeProblem:
     ridge: Tensor
 
     @classmethod
-    def of(cls, g: Tensor, y: Tensor, outside: Tensor, l2: float) -> Self:
+    def from_features(cls, g: Tensor, y: Tensor, outside: Tensor, l2: float) -> Self:
         """Return the problem of features g (n, W), labels y (n,) and masks `outside` (K, n).
 
         Head k is trained by the rows that its mask selects. A column of ones is appended to the
@@ -140,7 +140,7 @@ def fit_heads(
     HeadsFit
         Weights, leave-one-out logits, heads at their base rate and number of steps.
     """
-    problem = RidgeProblem.of(g, y, outside, l2)
+    problem = RidgeProblem.from_features(g, y, outside, l2)
     # Every head takes part in every product, whether it has converged or not: a product of another
     # shape rounds differently, and would so let the labels of fold k reach head k. For the same
     # reason each head decides alone when its factor is computed anew.

@@ -168,7 +168,7 @@ class Edges:
     counts: Tensor
 
     @classmethod
-    def of(cls, graph: csr_matrix) -> Self:
+    def from_graph(cls, graph: csr_matrix) -> Self:
         """Return the edges of a symmetric graph (n, n): row i holds the edges with head i.
 
         Strengths are divided by the largest one.
@@ -334,7 +334,7 @@ def optimize_layout(
         Epochs that were taken.
     """
     a, b = find_ab_params(min_dist)
-    edges = Edges.of(graph)
+    edges = Edges.from_graph(graph)
     n = len(points)
     count = min(NEGATIVE_SAMPLES, n - 1)
     weight = NEGATIVE_SAMPLE_RATE * edges.sum_by_head(edges.strength.unsqueeze(0))  # (1, n)

@@ -13,7 +13,7 @@ import pytest
 
 from dengine import DataEngine, export_torchscript, load_exported
 from dengine.errors import ExportError, OutputError
-from dengine.export.bundle import beside
+from dengine.export.bundle import sibling_path
 from dengine.files import DATABASES, check_output, write_manifest, write_output
 from tests.support.command_line import dengine
 from tests.support.driving import learn
@@ -83,7 +83,7 @@ def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_pat
 
 def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path: Path) -> None:
     target = tmp_path / "model.ts"
-    for present in (target, beside(target, "sha256")):
+    for present in (target, sibling_path(target, "sha256")):
         present.write_bytes(TEXT)
         done = dengine("export", store, "--out", target)
         assert (done.exit_code, present.read_bytes()) == (1, TEXT)
@@ -93,11 +93,11 @@ def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path
     (tmp_path / ".dengine-0000000000000000.partial").symlink_to(store)
     assert dengine("export", store, "--out", target, "--force").exit_code == 0
     assert (
-        beside(target, "sha256").read_text()
+        sibling_path(target, "sha256").read_text()
         == f"{hashlib.sha256(target.read_bytes()).hexdigest()}  model.ts\n"
     )
     assert load_exported(target).trace.samples == 100
-    beside(target, "sha256").write_text(
+    sibling_path(target, "sha256").write_text(
         "0" * 64 + "  model.ts\n"
     )  # as if killed between the file and its sum
     with pytest.raises(ExportError, match="is damaged or truncated"):
@@ -111,7 +111,7 @@ def test_an_export_onto_its_own_store_is_refused_even_by_force(store: Path, form
     assert (done.exit_code, len(done.output.splitlines())) == (1, 1)
     assert "is a database, as a store is, and was left as it was" in done.output
     assert hashlib.sha256(store.read_bytes()).hexdigest() == before
-    assert not beside(store, "sha256").exists()
+    assert not sibling_path(store, "sha256").exists()
 
 
 FULL = """

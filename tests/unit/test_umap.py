@@ -428,7 +428,7 @@ def test_attraction_is_the_gradient_of_the_cross_entropy(fitted: UmapReducer) ->
     a, b = find_ab_params(0.1)
     neighbors = fitted.neighbors_
     strengths = membership_strengths(neighbors.distances, 15)
-    edges = Edges.of(fuzzy_simplicial_set(neighbors.indices, strengths))
+    edges = Edges.from_graph(fuzzy_simplicial_set(neighbors.indices, strengths))
     places = torch.randn(2, N, generator=torch.Generator().manual_seed(0)).requires_grad_()
     cross_entropy_of_edges(places, edges, a, b).backward()
     pull, stiffness = attraction(places.detach(), edges, a, b)
