@@ -113,7 +113,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return self._add(Z, y)
 
     def count(self, Z: ArrayLike) -> Counts:
-        """Count the labels within the radius.
+        """Count the labels within the radius of each row.
 
         Parameters
         ----------
@@ -132,6 +132,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Returns
         -------
         lower, upper : array of float64, shape (n,)
+            (0, 1) without neighbours.
         """
         lower, upper = self._decisions(Z)[:, 1:3].T
         return lower, upper
@@ -162,7 +163,10 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return np.stack([1.0 - rate, rate], axis=1)
 
     def predict(self, Z: ArrayLike) -> NDArray[Any]:
-        """Return the more frequent class within the radius for each row of Z (n, d), shape (n,)."""
+        """Return the more frequent class within the radius for each row of Z (n, d), shape (n,).
+
+        On a tie, and without neighbours, it is the first of two classes, the failure.
+        """
         rates = self.predict_proba(Z)
         return np.asarray(self.classes_[rates.argmax(axis=1)])
 

@@ -269,7 +269,8 @@ class Policy:
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
         """Return (lower, upper) of the success probability by the policy's interval.
 
-        Parameters and result as of `wilson_interval`.
+        Parameters and result as of `wilson_interval`. The error level is alpha, or under the
+        guarantees "pooled" and "cost", where the interval only sorts parts, 0.5.
         """
         error_level = interval_error_level(self.alpha, self.guarantee)
         return INTERVALS[self.interval](n_success, n_failure, error_level)

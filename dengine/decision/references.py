@@ -415,7 +415,10 @@ class RadiusIndex(nn.Module):
         return True
 
     def estimate_agreement(self) -> None:
-        """Set `agreement` from the points in the index, for all counts from now on."""
+        """Set `agreement` from the points in the index, for all counts from now on.
+
+        Nothing changes if no part came twice; see `label_agreement`.
+        """
         if int(self.repeats) > 0:
             columns = map(self.column, ("points", "labels", "spaces", "parts"))
             self.agreement.fill_(label_agreement(*columns))

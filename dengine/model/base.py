@@ -109,7 +109,10 @@ class EngineModel(ABC):
     _conditions: DecisionConditions | None = None
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with this model's own settings in place of those without effect."""
+        """Return the recipe with this model's own settings in place of those without effect.
+
+        The default returns it unchanged.
+        """
         return recipe
 
     @abstractmethod
@@ -381,7 +384,10 @@ class BaselineAdapter(EngineModel):
         self.description = type(model).__qualname__
 
     def train(self, X: Floats, y: NDArray[Any], *_: object, **__: object) -> Self:
-        """Train the baseline from scratch on a copy of the traces, which it may write to."""
+        """Train the baseline from scratch on a copy of the traces, which it may write to.
+
+        Extreme samples are clipped first. Hashes, `stop` and numbers have no effect. Returns self.
+        """
         self.model.fit(clip_extremes(X).copy(), y)
         return self
 
