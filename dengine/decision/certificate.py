@@ -92,9 +92,9 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
     Returns
     -------
     float
-        From 0 to 1: the largest tolerance that the evidence does not refute, found by bisection and
-        rounded up. It is never less than n_bad / (n propensity), and 1 if the evidence is too
-        little to refute any tolerance, as for n = 0 or propensity = 0.
+        The largest tolerance that the evidence does not refute, found by bisection and rounded up.
+        It lies between n_bad / (n propensity), if that is below 1, and 1. It is 1 if the evidence
+        is too little to refute any tolerance, as for n = 0 or propensity = 0.
 
     Raises
     ------
@@ -366,7 +366,7 @@ class Certificate:
 def _round_up(bound: float) -> str:
     """Return a probability in per cent, rounded up, as in "3.5 %": never less than the bound.
 
-    It has one digit after the point from 1 % on, two from 0.1 % on, and four below.
+    It has at most one digit after the point from 1 % on, two from 0.1 % on, and four below.
     """
     digits = 4
     if bound >= 0.01:
