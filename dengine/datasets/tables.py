@@ -152,7 +152,7 @@ def read_folder(
     Returns
     -------
     Dataset
-        In the natural order of the names without their labels.
+        In the natural order of the names. `ordered` is False if their labels change that order.
 
     Raises
     ------
@@ -562,8 +562,8 @@ def _add_wide_rows(
 
     An empty cell before others is NaN, which the engine finds. A row whose last cells are empty is
     a shorter trace. A row with text among its samples, or with an unknown label, is a fault; one
-    with an empty label is counted. Raises DataError if the columns of labels, parts or samples are
-    not found.
+    without a label yet is only counted. Raises DataError if the columns of labels, parts or samples
+    are not found.
     """
     label_column = _label_column(frame, options)
     label_columns = [label_column, *_compared_columns(frame, label_column, options)]
