@@ -351,8 +351,8 @@ class LabelColumn:
     def find(self, cells: Iterable[Any], place: str = "") -> SourcedLabel:
         """Return the label that all cells mean; those of a part that is not checked do not count.
 
-        Raises UnlabelledError if the part is not checked, SeveralLabelsError if cells differ, and as
-        `label_of`. `place` is what the column is called in errors, by default column NAME.
+        Raises UnlabelledError if the part is not checked, SeveralLabelsError if cells differ, and
+        as `label_of`. `place` is what the column is called in errors, by default column NAME.
         """
         place = place or f"column {self.name}"
         texts = list(dict.fromkeys(str(cell).strip() for cell in cells))

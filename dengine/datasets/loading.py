@@ -462,8 +462,8 @@ def _from_arrays(
 ) -> Dataset:
     """Make a data set of the traces that have a label; a note says how many have none.
 
-    Words are converted to labels. Raises DataError if the meaning of a word is unknown, or if no trace
-    has a label.
+    Words are converted to labels. Raises DataError if the meaning of a word is unknown, or if no
+    trace has a label.
 
     label : the array or column that the labels are from.
     about : further fields of the `Dataset`.
