@@ -22,7 +22,7 @@ PASSWORD = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECA
 QUOTES = ("'", '"')
 OPTIONS = (
     "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic|columns"
-    "|decimal|thousands"
+    "|decimal|thousands|encoding"
 )
 OPTION = re.compile(rf"(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))")
 TRACE_SPEC = re.compile(r"(?:DataEngine\(trace=)?TraceSpec\(([^()]*)\)\)?")

@@ -462,6 +462,9 @@ _THOUSANDS = (
     "What groups thousands in text files, as the point in 1.043,5.  "
     "[default: detected in each file]"
 )
+_ENCODING = (
+    "The encoding of text files that are not UTF-8, as cp932.  [default: Windows-1252, if it fits]"
+)
 _FIT = (
     "What to do with traces of another length.  [default: strict where all have one length, else "
     "pad; live: strict]"
@@ -498,6 +501,7 @@ DATA = TRACE | {
     "columns": click.option("--columns", type=_NAMES, metavar="NAMES", help=_COLUMNS),
     "decimal": click.option("--decimal", metavar="MARK", help=_DECIMAL),
     "thousands": click.option("--thousands", metavar="MARK", help=_THOUSANDS),
+    "encoding": click.option("--encoding", metavar="NAME", help=_ENCODING),
     "time": click.option("--time", metavar="COLUMN", help=_TIME),
     "trigger": click.option("--trigger", metavar="TEXT", help=_TRIGGER),
     "topic": click.option("--topic", metavar="NAME", help=_TOPIC),

@@ -258,9 +258,7 @@ def _cut_dataset(
     insertions = {f"{name}/{i}": cut for i, cut in enumerate(cuts, start=1)}
     names = list(insertions)
     if options.labels is not None:
-        source = labels.labels_in_file(
-            options.labels, options.part, names, options.words, options.label
-        )
+        source = labels.labels_in_file(options.labels, names, options)
     else:
         source = _labels_in_topic(options, messages, cuts, names)
 

@@ -5,6 +5,7 @@ one unit, one rate and one length; what cannot be brought to them is left out as
 up. `LoadOptions` are the options of `load_dataset`.
 """
 
+import codecs
 import os
 import re
 from collections import Counter
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import DataError, TraceError, expect, shortened
+from ..errors import DataError, TraceError, expect, instead, shortened
 from ..records import FITS, TraceSpec
 from ..representation import to_html
 from ..traces import as_traces, can_fit_length, fit_length
@@ -295,6 +296,7 @@ class LoadOptions:
     columns: tuple[str, ...] = ()
     decimal: str | None = None
     thousands: str | None = None
+    encoding: str | None = None
 
     def __post_init__(self) -> None:
         expect_data(self.fit in (None, *FITS), f"fit to be one of {', '.join(FITS)}", self.fit)
@@ -310,6 +312,8 @@ class LoadOptions:
         valid = valid and (not self.thousands or self.thousands != self.decimal)
         wanted = "a mark of thousands, ',', '.', ' ' or an apostrophe, that is not the decimal one"
         expect_data(valid, wanted, self.thousands)
+        with instead(DataError, "Expected the name of an encoding, as 'cp1252'", LookupError):
+            codecs.lookup(self.encoding or "utf-8")
 
 
 def split_names(names: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -374,7 +374,7 @@ def _read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
     Raises UnreadableError if the file or the column cannot be read.
     """
     # Without stated columns the label needs no number format.
-    frame = read_table(path, options if options.columns else None).frame
+    frame = read_table(path, options, as_text=not options.columns).frame
     return list(map(str, frame.iloc[:, column_place(column, list(frame.columns))]))
 
 
@@ -690,40 +690,41 @@ def _last_word(text: str) -> str:
 
 
 class _LabelRow(NamedTuple):
-    """A row of a file of labels; `words` are those of the path in `file`, see `_path_words`."""
+    """The rows of a file of labels that name one recording.
 
-    line: int
+    lines, labels : their lines, and the label in each.
+    words : those of the path in `file`, see `_path_words`.
+    part : number of the part, if there is a column of them.
+    """
+
+    lines: tuple[int, ...]
     words: tuple[str, ...]
     file: str
-    label: str
+    labels: tuple[str, ...]
     part: str | None
+
+    def place_in(self, source: str) -> str:
+        """Return where the rows are in a file of this name, for an error."""
+        return f"{source}, line{'s' if len(self.lines) > 1 else ''} {listed(self.lines)}"
 
 
 def labels_in_file(
-    path: str | os.PathLike[str],
-    part: str,
-    names: Sequence[str],
-    words: LabelMap = NO_WORDS,
-    column: str | None = None,
+    path: str | os.PathLike[str], names: Sequence[str], options: LoadOptions
 ) -> LabelSource:
     """Return a source of labels in a CSV file with a column of files and one of labels.
 
     A row names a recording by its full path, by the end of it, or by a path with more leading
     folders. The suffix may be left out, and case is ignored. A file without a header, whose first
     line names a .csv, has files and labels in this order. A column of files that has another name
-    is found by the names of recordings in it.
+    is found by the names of recordings in it. A recording may have several rows of one label.
 
     Parameters
     ----------
     path : path
-    part : str
-        Column of parts' numbers.
     names : sequence of str
         Names of all recordings. A row of the file that names none of them is a fault of the source.
-    words : mapping of str to bool
-        As in `label_of`.
-    column : str, optional
-        Column of labels, if the user stated it.
+    options : LoadOptions
+        `label` and `part` are columns of the file.
 
     Raises
     ------
@@ -731,9 +732,11 @@ def labels_in_file(
         If the file cannot be read as one of labels.
     """
     source = Path(path).name
-    rows, faults, column = _read_label_rows(path, part, column, names)
+    rows, faults, column = _read_label_rows(path, options, names)
     notes = Counter[str]()
-    label_column = LabelColumn(column, words, notes)
+    if any(len(row.lines) > 1 for row in rows):
+        notes[f"{source} names recordings more than once: their labels must be equal"] = 1
+    label_column = LabelColumn(column, options.words, notes)
     rows_by_file = defaultdict[str, list[_LabelRow]](list)
     for row in rows:
         rows_by_file[row.words[0]].append(row)
@@ -751,7 +754,7 @@ def labels_in_file(
     for row in rows:
         if not n_names[row]:
             message = f"Expected the name of a recording, found no file {row.file}"
-            faults.append(Fault(source, row.line, message))
+            faults.append(Fault(source, row.lines[0], message))
 
     def find(name: str) -> SourcedLabel:
         """Return the label and the part in the row that names a recording most exactly."""
@@ -759,15 +762,11 @@ def labels_in_file(
             raise UnreadableError(f"Expected a row of {source} that names it, found none")
         path_words = name_words[name]
         row = max(matches[name], key=lambda row: (row.words == path_words, len(row.words)))
-        where = f"{source}, line {row.line}"
+        where = row.place_in(source)
         if n_names[row] > 1 and row.words != path_words:
             message = f"Expected its folder in {where}, which names {n_names[row]} recordings"
             raise UnreadableError(message)
-        try:
-            return _sourced(label_column.label_of(row.label), where, row.label, row.part)
-        except UnknownWordError as error:
-            error.args = (f"{error} in {where}",)
-            raise
+        return _label_of_row(row, label_column, where)
 
     files = ", ".join(row.file for row in rows[:3]) or "no files"
     do = "call its columns file and label, and the files as they are"
@@ -777,39 +776,51 @@ def labels_in_file(
     )
 
 
+def _label_of_row(row: _LabelRow, column: LabelColumn, where: str) -> SourcedLabel:
+    """Return the label and the part of rows; the error of an unknown word says where it stands."""
+    try:
+        for word in row.labels:
+            with suppress(UnlabelledError):
+                column.label_of(word)
+    except UnknownWordError as error:
+        error.args = (f"{error} in {where}",)
+        raise
+    return column.find(row.labels, where)._replace(part=row.part)
+
+
 def listing_to_trust(file: str, column: str) -> str:
     """Return what to do, for an error, if another source contradicts a file of labels."""
     return f"name the column to trust, label={column!r} of {file}, or leave it out (labels)"
 
 
 def read_ordered_labels(
-    path: str | os.PathLike[str], part: str, column: str | None = None
+    path: str | os.PathLike[str], options: LoadOptions
 ) -> tuple[list[str], str]:
     """Return the label words of a file that lists the traces of an array in their order.
 
-    The name of their column comes second; `column` is that name, if the user stated it.
-
-    Raises DataError if the file cannot be read, or its rows are numbered in another order.
+    The name of their column comes second. Raises DataError if the file cannot be read, or its rows
+    are numbered in another order.
     """
-    rows, faults, column = _read_label_rows(path, part, column)
+    rows, faults, column = _read_label_rows(path, options)
     numbers = [int(row.file) for row in rows if row.file.isdecimal()]
     in_order = not numbers or numbers == list(range(numbers[0], numbers[0] + len(rows)))
+    in_order = in_order and all(len(row.lines) == 1 for row in rows)
     if faults or not in_order:
         actual = faults[0] if faults else numbers[:9]
         raise DataError(f"Expected a label of each trace in {path}, in their order, got {actual}.")
-    return [row.label for row in rows], column
+    return [row.labels[0] for row in rows], column
 
 
 def _read_label_rows(
-    path: str | os.PathLike[str], part: str, column: str | None = None, names: Sequence[str] = ()
+    path: str | os.PathLike[str], options: LoadOptions, names: Sequence[str] = ()
 ) -> tuple[list[_LabelRow], list[Fault], str]:
-    """Return the rows of a file of labels, one for each file, and the faults of its other lines.
+    """Return the rows of a file of labels, file by file, and the faults of its other lines.
 
     The name of the column of labels comes last. Parameters as in `labels_in_file`. Raises DataError
     if the file or a column cannot be found.
     """
     try:
-        table = read_table(Path(path))
+        table = read_table(Path(path), replace(options, columns=()), as_text=True)
     except (OSError, UnreadableError) as error:
         raise DataError(f"Cannot read the labels in {path}: {error}.") from error
     header = list(table.frame.columns)
@@ -824,7 +835,8 @@ def _read_label_rows(
         for i in range(len(header))
         if any(_path_words(row[i])[0] in files for row in cells.values())
     ]
-    of_file, of_label = _label_file_columns(header, path, with_names, column)
+    of_file, of_label = _label_file_columns(header, path, with_names, options.label)
+    part = options.part
     if part != "part" and part not in header:
         wanted = f"a column {part} of parts' numbers in {path}"
         raise DataError(f"Expected {wanted}, got {', '.join(header)}.")
@@ -832,10 +844,10 @@ def _read_label_rows(
     for line, values in cells.items():
         number = values[header.index(part)] if part in header else ""
         file = values[of_file]
-        row = _LabelRow(line, _path_words(file), file, values[of_label], number or None)
-        if rows.setdefault(row.words, row) is not row:
-            message = f"Expected each file once, {row.file} came before"
-            faults.append(Fault(Path(path).name, line, message))
+        words = _path_words(file)
+        row = rows.get(words, _LabelRow((), words, file, (), number or None))
+        lines = (*row.lines, line)
+        rows[words] = row._replace(lines=lines, labels=(*row.labels, values[of_label]))
     return list(rows.values()), faults, header[of_label]
 
 

@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from ..errors import DataError, instead, listed
 from ..files import is_database, read_archive, read_errors
 from ..records import stored_trace_spec
-from ..traces import as_trace, spec_of
+from ..traces import as_trace, as_traces, spec_of
 from . import units
 from .bags import is_stream, read_bag
 from .clocks import clock_of, rate_of
 from .dataset import (
+    UNKNOWN_RATE,
     Dataset,
     LoadOptions,
     Recording,
@@ -52,9 +53,15 @@ from .triggers import Trigger
 
 BUNDLED = {"insertion": "insertion.npz"}
 ARRAYS = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")  # beside the parts' numbers
-TEXT_FORMAT = ("columns", "decimal", "thousands")  # options about how a text file is written
+TEXT_FORMAT = (
+    "columns",
+    "decimal",
+    "thousands",
+    "encoding",
+)  # options about how a text file is written
 Files = Mapping[str, Path]
 TABLES = (*TEXTS, ".parquet", ".pq")
+MIN_PADDING = 5  # zeros at the end of a trace that are no measurement
 FORMS = ".npz, .csv, .tsv, .txt, .dat, .parquet or .mcap"
 
 
@@ -76,6 +83,8 @@ def load_dataset(
     columns: str | Sequence[str] | None = None,
     decimal: str | None = None,
     thousands: str | None = None,
+    encoding: str | None = None,
+    channels: str | Sequence[str] | None = None,
 ) -> Dataset:
     """Read a data set from recordings as people have them.
 
@@ -133,6 +142,11 @@ def load_dataset(
         Names of the columns of text files without a header, or with another one: "time,fx,fz".
     decimal, thousands : str, optional
         Marks in the numbers of text files, "," or ".". None: the cells of each file prove them.
+    encoding : str, optional
+        Encoding of the text files that are not UTF-8, as "cp932". None: Windows-1252, or an error
+        if that looks wrong.
+    channels : str or sequence of str, optional
+        Another name of `channel`.
 
     Returns
     -------
@@ -146,10 +160,11 @@ def load_dataset(
     DataError
         If nothing can be read, or an option does not apply to the source.
     """
+    expect_data(channel is None or channels is None, "channel or channels", (channel, channels))
     options = LoadOptions(
         samples=samples,
         part=part,
-        channels=split_names(channel),
+        channels=split_names(channel if channels is None else channels),
         label=label,
         labels=labels,
         fit=fit,
@@ -162,6 +177,7 @@ def load_dataset(
         columns=split_names(columns),
         decimal=decimal,
         thousands=thousands,
+        encoding=encoding,
     )
     title, accepted, read = _find_reader(source, options)
     optional = ("label", "labels", "trigger", "topic", "time", *TEXT_FORMAT)
@@ -295,7 +311,7 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
     arrays, all_names = _read_archives(named, options)
     if options.labels is not None:
         label = "y"
-        label_words, label_column = read_ordered_labels(options.labels, options.part, options.label)
+        label_words, label_column = read_ordered_labels(options.labels, options)
         if label in arrays and options.label is None:
             _check_same_labels(arrays[label], label_words, label_column, options)
         arrays[label] = np.array(label_words)
@@ -322,7 +338,28 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
             options = replace(options, channels=())
         about["channels"] = channels or tuple(map(str, arrays.get("channels", ())))
         data = _from_arrays(X, arrays[label], options, name, label_column, **about)
-        return refit(data, options, has_unit="unit" in arrays)
+        data = refit(data, options, has_unit="unit" in arrays)
+    read = {label, *traces, options.part, "scale", "rate_hz", "unit", "cause", "channels"}
+    return replace(data, notes=(*data.notes, *_archive_notes(data, all_names, read)))
+
+
+def _archive_notes(data: Dataset, names: Sequence[str], read: set[str]) -> list[str]:
+    """Return notes on what an archive does not tell, or tells and is not read.
+
+    names, read : its arrays, and those that are read.
+    """
+    notes = []
+    X = as_traces(data.X)
+    is_zero = (X == 0).all(axis=1)[:, ::-1]
+    n_zeros = np.where(is_zero.all(axis=1), 0, is_zero.argmin(axis=1))
+    if n_padded := int((n_zeros >= MIN_PADDING).sum()):
+        text = f"{n_padded} of {len(data)} traces end in up to {int(n_zeros.max())} zeros"
+        notes.append(f"{text}: if they are padded, cut them (samples), or leave the zeros out.")
+    if unread := [name for name in names if name not in read]:
+        notes.append(f"Not read: the arrays {listed(unread)}.")
+    if data.rate_hz is None:
+        notes.append(UNKNOWN_RATE)
+    return notes
 
 
 def _read_archives(
@@ -436,7 +473,7 @@ def _missing_arrays(named: Files, options: LoadOptions) -> str:
     elif traces:
         for path in sorted(next(iter(named.values())).parent.glob("*.csv")):
             with suppress(DataError):
-                if not label and len(read_ordered_labels(path, options.part)[0]) in lengths:
+                if not label and len(read_ordered_labels(path, options)[0]) in lengths:
                     label = f"labels={str(path)!r}, in the order of the traces"
     shapes = ", ".join(f"{name} {arrays[name].shape}" for name in all_names) or "none"
     channel = "" if "X" in all_names or not traces else f"channel={traces[0]!r} and "

@@ -38,12 +38,12 @@ from .dataset import (
     UnreadableError,
     as_dataset,
 )
+from .encodings import decode
 from .numerals import UndecidedError
 from .text import SUFFIXES as TEXTS
 from .text import (
     TextTable,
     TimedTrace,
-    decode,
     parse_numbers,
     read_recording,
     read_table,
@@ -112,6 +112,7 @@ def hold_many(named: Mapping[str, Path], options: LoadOptions) -> bool:
     path = next(iter(named.values()))
     if path.suffix.lower() not in TEXTS:
         return True
+    _check_encoding(list(named.values()), options)
     header = _first_rows(path, options)[0]
     if options.time is not None and options.part in header:
         return True
@@ -133,6 +134,19 @@ def hold_many(named: Mapping[str, Path], options: LoadOptions) -> bool:
     if not has_label and options.part not in header:
         return False
     return bool(_long_table_advice(read_table(path, options).frame, options, ""))
+
+
+def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
+    """Raise DataError, with advice, if the first, a middle and the last file cannot be decoded."""
+    error: UnreadableError | None = None
+    for path in (paths[0], paths[len(paths) // 2], paths[-1]):
+        try:
+            with suppress(OSError), path.open("rb") as file:
+                decode(file.read(2**18).rpartition(b"\n")[0], options.encoding)
+            return
+        except UnreadableError as caught:
+            error = caught
+    raise DataError(f"Cannot read {paths[0]}: {error}.")
 
 
 def read_folder(
@@ -209,9 +223,7 @@ def _label_source(
     """
     in_names = labels.labels_in_names(None, options.words)
     if options.labels is not None:
-        listing = labels.labels_in_file(
-            options.labels, options.part, list(named), options.words, options.label
-        )
+        listing = labels.labels_in_file(options.labels, list(named), options)
         columns = _verdict_columns(named, options)
         if options.label is not None:
             return listing, columns
@@ -334,7 +346,7 @@ def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOpt
         if words.isdisjoint(stems - {path.stem.lower()}):
             continue
         with suppress(DataError):
-            source = labels.labels_in_file(path, options.part, list(named), options.words)
+            source = labels.labels_in_file(path, list(named), options)
             if _look_like_labels(_count_labels(named, source)):
                 return f"{path.name} names files: give it, labels={str(path)!r}"
     return None
@@ -397,7 +409,7 @@ def _first_rows(path: Path, options: LoadOptions) -> list[list[str]]:
     """
     with suppress(UnreadableError, OSError), path.open("rb") as file:
         lines = file.read(2**18).split(b"\n")[:100]
-        text, _ = decode(b"\n".join(lines))
+        text, _ = decode(b"\n".join(lines), options.encoding)
         cells = split_cells(text, options.columns)
         return [cells.header, *cells.rows.values()]
     return [[]]
@@ -676,7 +688,7 @@ def _from_long(
     sources = [_labels_of_parts(rows_of_part, name, options) for name in label_columns]
     if options.labels is not None:
         parts = list(rows_of_part)
-        listing = labels.labels_in_file(options.labels, "part", parts, options.words, options.label)
+        listing = labels.labels_in_file(options.labels, parts, replace(options, part="part"))
         sources.insert(0, listing)
         do = listing.trust
     else:
@@ -904,7 +916,8 @@ def _parts_file_advice(parts: pd.Series, label_file: str, options: LoadOptions) 
     """
     names = [str(part) for part in parts.unique()]
     with suppress(DataError):
-        source = labels.labels_in_file(label_file, "part", names, options.words)
+        listed_by = replace(options, part="part", label=None)
+        source = labels.labels_in_file(label_file, names, listed_by)
         if _look_like_labels(_count_labels(names, source)):
             return f"labels={label_file!r}, a file of parts and labels"
     return "and a CSV file of parts and labels (labels)"

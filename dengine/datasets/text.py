@@ -1,7 +1,7 @@
 """Text files of numbers in the dialects that people's tools write: .csv, .tsv, .txt and .dat.
 
-`read_table` reads a file as a table of texts: it finds the encoding, the delimiter, the header, the
-row of units and the number format. `read_recording` makes a trace of one file, and `rows_to_trace`
+`read_table` reads a file as a table of texts: it finds the delimiter, the header, the row of units
+and the number format. `read_recording` makes a trace of one file, and `rows_to_trace`
 of rows of any table.
 """
 
@@ -34,6 +34,7 @@ from .clocks import (
     rising_columns,
 )
 from .dataset import Fault, LoadOptions, UnreadableError
+from .encodings import decode
 from .numerals import is_numeral, write_as_python
 
 if TYPE_CHECKING:
@@ -277,43 +278,27 @@ def _columns_advice(rows: list[list[str]]) -> str:
     return f"write one above, or name its {len(names)} columns, columns={','.join(names)[:200]!r}"
 
 
-def decode(content: bytes) -> tuple[str, str]:
-    """Return the text of a file, and the name of its encoding.
-
-    UTF-16 is known by its mark or its zeros; else UTF-8, Windows-1252 and Latin-1 are tried in this
-    order, of which the last reads anything.
-    """
-    head = content[:400]
-    encodings = ["utf-8-sig", "Windows-1252"]
-    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        encodings = ["UTF-16"]
-    elif b"\0" in head:
-        is_little = head[1::2].count(0) > head[::2].count(0)
-        encodings = ["UTF-16-LE" if is_little else "UTF-16-BE"]
-    for encoding in encodings:
-        with suppress(UnicodeDecodeError):
-            return content.decode(encoding), encoding
-    return content.decode("latin-1"), "Latin-1"
-
-
 def read_table(
     path: Path,
-    options: LoadOptions | None = None,
+    options: LoadOptions,
     notes: Counter[str] | None = None,
     decimal: str | None = None,
+    *,
+    as_text: bool = False,
 ) -> TextTable:
     """Read a text file as a table of texts.
 
     Parameters
     ----------
     path : Path
-    options : LoadOptions, optional
-        How its numbers and columns are written, where the user stated it. None: numbers stay texts
-        as they are written.
+    options : LoadOptions
+        How its text, numbers and columns are written, where the user stated it.
     notes : Counter, optional
         Counts what users should know; it is added to.
     decimal : str, optional
         Decimal mark of the other files of a folder, used if the cells of this one prove none.
+    as_text : bool, default False
+        Whether numbers stay texts as they are written.
 
     Returns
     -------
@@ -332,10 +317,10 @@ def read_table(
         wanted = f"at most {LARGEST // 2**20} MB"
         do = "split it, or write Parquet"
         raise UnreadableError(f"Expected {wanted}, got {size // 2**20} MB; {do}")
-    text, encoding = decode(path.read_bytes())
-    cells = split_cells(text, () if options is None else options.columns)
-    if notes is not None and encoding != "utf-8-sig":
-        notes[f"Text is read as {encoding}, not UTF-8"] += 1
+    text, encoding = decode(path.read_bytes(), options.encoding)
+    cells = split_cells(text, options.columns)
+    if notes is not None and encoding not in ("utf-8-sig", options.encoding):
+        notes[f"Text is read as {encoding}, not UTF-8; encoding=... states another"] += 1
     if not cells.header:
         raise UnreadableError("Expected a header and rows, it is empty")
     header = _without_trailing_empty(cells.header)  # a delimiter at its end
@@ -352,7 +337,7 @@ def read_table(
         list(complete.values()), index=list(complete), columns=header, dtype=object
     )
     mark = ""
-    if options is not None:
+    if not as_text:
         decimal = options.decimal or decimal
         mark, odd_cells = write_as_python(frame, cells.delimiter, decimal, options.thousands)
         wrong |= odd_cells

@@ -13,7 +13,7 @@ import pytest
 from dengine import DataEngine, Dataset, TraceSpec, load_dataset
 from dengine.datasets.importing import import_labelled
 from dengine.datasets.labels import labels_in_names, means_bad
-from dengine.errors import DataError, TraceError
+from dengine.errors import DataError, TraceError, as_options
 from tests.support.recording_forms import LABEL_FORMS, NOT_CHECKED_NAMES
 
 
@@ -459,19 +459,37 @@ def test_a_labels_file_that_does_not_fit_is_named_line_by_line(
     (tmp_path / "labels.csv").write_text("\n".join(["file,label", *rows]) + "\n")
     data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
     assert (data.source.tolist(), data.y.tolist()) == (
-        [f"{i}.csv" for i in (0, 1, 4, 5, 6)],
-        [1, 0, 1, 1, 0],
+        [f"{i}.csv" for i in (0, 1, 5, 6)],
+        [1, 0, 1, 0],
     )
     places = [(f.source, f.line) for f in data.faults]
     assert places == [
         ("labels.csv", 5),
-        ("labels.csv", 8),
         ("labels.csv", 6),
         ("2.csv", 0),
         ("3.csv", 0),
+        ("4.csv", 0),
         ("7.csv", 0),
     ]
-    assert "in labels.csv, line 4" in data.faults[3].message
+    assert "in labels.csv, line 4" in data.faults[2].message
+    assert "Expected one label in labels.csv, lines 7, 8, got OK, NOK" in data.faults[4].message
+
+
+def test_a_listing_with_a_row_for_each_characteristic_is_read_if_its_rows_agree(
+    small: Dataset, tmp_path: Path
+) -> None:
+    rows = []
+    for i, y in enumerate(small.y[:6]):
+        write_csv(tmp_path / "cell" / f"{i}.csv", small.X[i])
+        word = "i.O." if y else "n.i.O."
+        rows += [f"{i}.csv,Kraft,{word}", f"{i}.csv,Weg,{'n.i.O.' if i == 2 else word}"]
+        rows.append(f"{i}.csv,Maß,{'i.O.' if i == 2 else ''}")
+    (tmp_path / "l.csv").write_text("\n".join(["Datei,Merkmal,Ergebnis", *rows]), "utf-8")
+    data = load_dataset(tmp_path / "cell", labels=tmp_path / "l.csv")
+    assert data.y.tolist() == small.y[[0, 1, 3, 4, 5]].tolist()
+    assert [f.source for f in data.faults] == ["2.csv"]
+    assert "lines 8, 9, 10, got" in data.faults[0].message
+    assert "l.csv names recordings more than once: their labels must be equal." in data.notes
 
 
 PATHS = [
@@ -1053,3 +1071,73 @@ def test_a_summary_below_the_samples_is_no_sample(
     assert f"The last {n} rows have no time: they are no samples, and left out (4 times)." in (
         data.notes
     )
+
+
+def test_channels_is_another_name_of_channel_and_a_string_is_one(few: Path, small: Dataset) -> None:
+    np.testing.assert_array_equal(load_dataset(few, channels="FZ_Base").X, small.X[:4])
+    np.testing.assert_array_equal(load_dataset(few, channels=["FZ_Base"]).X, small.X[:4])
+    with pytest.raises(DataError, match="channel or channels"):
+        load_dataset(few, channel="FZ_Base", channels="FZ_Base")
+
+
+def test_an_archive_says_what_of_it_is_not_read_and_that_its_rate_is_unknown(
+    small: Dataset, tmp_path: Path
+) -> None:
+    X = small.X.copy()
+    X[3:5, 40:] = 0.0
+    np.savez(tmp_path / "x.npz", X=X, y=small.y, fs=500.0, length=np.full(24, 50))
+    notes = " ".join(load_dataset(tmp_path / "x.npz").notes)
+    assert "Not read: the arrays fs, length." in notes
+    assert "2 of 24 traces end in up to 10 zeros" in notes
+    assert "The rate is unknown" in notes
+    assert "rate_hz=..." in notes
+    notes = load_dataset(tmp_path / "x.npz", rate_hz=500).notes
+    assert not any("The rate is unknown" in note for note in notes)
+
+
+ENCODINGS = {  # header and labels in other scripts, and the encoding
+    "cp932": ("時間(ms),荷重(N),判定", "合格", "不合格"),
+    "gb18030": ("时间(ms),力(N),结果", "合格", "不合格"),
+    "big5": ("時間(ms),力(N),結果", "合格", "不合格"),
+    "cp949": ("시간(ms),힘(N),판정", "합격", "불합격"),
+    "cp1251": ("Время(ms),Сила(N),Результат", "годен", "брак"),
+}
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_text_in_another_encoding_is_refused_until_it_is_stated(
+    encoding: str, tmp_path: Path
+) -> None:
+    header, good, bad = ENCODINGS[encoding]
+    channel = header.split(",")[1]
+    for i in range(4):
+        word = bad if i % 2 else good
+        rows = [f"{4 * t},{t}.5,{word}" for t in range(50)]
+        (tmp_path / f"{i}.csv").write_bytes("\n".join([header, *rows]).encode(encoding))
+    with pytest.raises(DataError, match=r"UTF-8 or Windows-1252, got another encoding") as caught:
+        load_dataset(tmp_path)
+    assert f"encoding={encoding!r} if '{header[:24]}' is right" in str(caught.value)
+    assert f"--encoding {encoding} if" in as_options(str(caught.value))
+    options = {"encoding": encoding, "channel": channel, "label": header.split(",")[2]}
+    with pytest.raises(DataError) as caught:
+        load_dataset(tmp_path, **options)
+    assert f"{bad}=bad" in str(caught.value)
+    data = load_dataset(tmp_path, **options, label_map={good: True, bad: False})
+    assert (data.y.tolist(), data.channels) == ([1, 0, 1, 0], (channel,))
+    assert data.X[0, :2].tolist() == [0.5, 1.5]
+    with pytest.raises(DataError, match="Expected text in ascii, as stated, or UTF-8, got another"):
+        load_dataset(tmp_path, encoding="ascii")
+    with pytest.raises(DataError, match="Expected the name of an encoding"):
+        load_dataset(tmp_path, encoding="no such")
+
+
+@pytest.mark.parametrize(
+    "text", ["Größe;Prüfer °C", "Température;créée à 20 °C", "Kraft – „Prüfung“ ±5 µm²", "Año ¿y?"]
+)
+def test_western_texts_are_read_as_windows_1252(text: str, few: Path, small: Dataset) -> None:
+    for path in few.iterdir():
+        path.write_bytes(f"{text}\n\n".encode("cp1252") + path.read_bytes())
+    data = load_dataset(few)
+    np.testing.assert_array_equal(data.X, small.X[:4])
+    note = "Text is read as Windows-1252, not UTF-8; encoding=... states another (4 times)."
+    assert note in data.notes
