@@ -59,6 +59,8 @@ TEXT_FORMAT = (
     "thousands",
     "encoding",
 )  # options about how a text file is written
+# What `dengine simulate` writes beside them, for `experiments`.
+SIMULATED = ("height_mm", "cycle", "conditions", "condition_names", "seed", "scenario", "simulated")
 Files = Mapping[str, Path]
 TABLES = (*TEXTS, ".parquet", ".pq")
 MIN_PADDING = 5  # zeros at the end of a trace that are no measurement
@@ -339,7 +341,7 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         about["channels"] = channels or tuple(map(str, arrays.get("channels", ())))
         data = _from_arrays(X, arrays[label], options, name, label_column, **about)
         data = refit(data, options, has_unit="unit" in arrays)
-    read = {label, *traces, options.part, "scale", "rate_hz", "unit", "cause", "channels"}
+    read = {label, *traces, options.part, *ARRAYS, *SIMULATED}
     return replace(data, notes=(*data.notes, *_archive_notes(data, all_names, read)))
 
 
