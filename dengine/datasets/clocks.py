@@ -439,9 +439,10 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
 
 
 def check_rows(clock: Clock, lines: pd.Index) -> None:
-    """Check by a clock that rows are complete and in order, also where another rate is stated.
+    """Raise UnreadableError if rows are missing or out of order by their clock.
 
-    A clock may be coarse, late for some rows, or start anew where its counter is full.
+    It holds where another rate is stated, too. A clock may be coarse, late for some rows, or start
+    anew where its counter is full.
 
     Parameters
     ----------
@@ -451,7 +452,7 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
     Raises
     ------
     UnreadableError
-        If the clock goes back, or rows are missing in a gap.
+        If the clock goes back, or rows are missing in a gap, by more than five usual steps.
     """
     known = np.flatnonzero(~np.isnan(clock.seconds))
     steps = np.diff(clock.seconds[known])
@@ -474,7 +475,10 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
 
 
 def _is_counter_full(seconds: float, step: float) -> bool:
-    """Return whether a counter of 16 or 32 bits, or a time of day, starts anew after so long."""
+    """Return whether a clock starts anew after this many seconds, within one and a half steps.
+
+    Such is a counter of 16 or 32 bits, and a time of day.
+    """
     periods = [2.0**bits * unit for bits in (16, 32) for unit, _ in EPOCHS]
     return any(abs(seconds - period) < 1.5 * step for period in (*periods, DAY))
 
@@ -484,8 +488,8 @@ def in_order_of_time(
 ) -> tuple[NDArray[np.int64], Clock]:
     """Return the positions of rows in the order of their times, and the clock in that order.
 
-    They stay as they are unless the user names the clock or it holds dates, and if two times are
-    equal or one is not known.
+    The order stays as it is unless the user names the clock or the clock holds dates. It also stays
+    if two times are equal or one is not known.
 
     time : the clock's column, if the user stated it.
     """

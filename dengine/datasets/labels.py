@@ -482,9 +482,10 @@ def agreed_label(
 def _find_beside(
     label: SourcedLabel | None, find: Callable[[], SourcedLabel], place: str, do: str
 ) -> SourcedLabel:
-    """Return the label that a place tells beside one that is known, or None.
+    """Return the label that one place tells, by its `find`.
 
-    The known one is returned if the place cannot be read. Other errors are raised, with advice.
+    `label` is the one of an earlier place, or None; it is returned if this place cannot be read.
+    Other errors of `find` are raised, with advice.
     """
     try:
         return find()

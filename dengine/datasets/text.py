@@ -396,7 +396,8 @@ def _without_summary(
 ) -> pd.DataFrame:
     """Return a recording without the last rows that have no time, as Max;48.2 below samples.
 
-    They are a few rows below many that all have a time; a note says so.
+    These are left out only if all rows above them have a time and are at least ten times as many; a
+    note says so. Without a clock the table is returned whole.
     """
     place = None
     with suppress(UnreadableError):
@@ -428,8 +429,8 @@ def rows_to_trace(
     places : sequence of int
         Positions of the columns of the C channels.
     options : LoadOptions
-        A stated rate is taken instead of a clock's. With `fit="resample"` the samples are
-        interpolated at even times.
+        A stated rate is taken instead of a clock's, which still shows missing rows. With
+        `fit="resample"` the samples are interpolated at even times.
     notes : Counter
         Counts what users should know; it is added to.
     units_row : sequence of str
@@ -438,12 +439,14 @@ def rows_to_trace(
     Returns
     -------
     TimedTrace
-        An empty cell is NaN, which the engine finds.
+        In the order of the times, where these can be trusted; see `clocks.in_order_of_time`. An
+        empty cell is NaN, which the engine finds.
 
     Raises
     ------
     UnreadableError
-        For a cell that is no number, or a clock that cannot be read.
+        For a cell that is no number, rows that are missing or out of order, or a clock that cannot
+        be read, unless a rate is stated.
     """
     values, wrong = parse_numbers(rows.iloc[:, places])
     if wrong:
@@ -476,7 +479,7 @@ def rows_to_trace(
 
 
 def _offer_clock(rows: pd.DataFrame, places: Sequence[int], notes: Counter[str]) -> None:
-    """Note that a column that rises steadily and is no channel may be the clock."""
+    """Add a note if a column that is no channel rises steadily: it may be the clock."""
     names = [str(rows.columns[i]) for i in rising_columns(rows) if i not in places]
     for name in names[:1]:
         rises = f"column {name} rises steadily: time={name!r} if it is one"
