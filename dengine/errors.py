@@ -1,8 +1,8 @@
-"""The exceptions of dengine, and functions that build their messages.
+"""The exceptions of dengine, and functions that raise them and build their messages.
 
 `expect` and `instead` raise messages of one form: what was expected, what came, what to do.
 `shortened`, `excerpt` and `listed` keep a message to one line, `without_password` masks passwords,
-and `as_options` turns advice for Python into advice for the command line.
+`percent` writes shares, and `as_options` turns advice for Python into advice for the command line.
 """
 
 import math

@@ -1,4 +1,5 @@
-"""A recipe: every setting of an engine, read from and written to TOML.
+"""`Recipe`, every setting of an engine, read from and written to TOML; `RECIPES` has the named
+ones.
 
     >>> Recipe.load("conv")  # a name in `RECIPES`, a TOML file, or a Recipe
     >>> Recipe.load("my_cell.toml").to_toml()

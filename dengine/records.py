@@ -1,8 +1,9 @@
-"""The frozen records that travel between the layers, and the values that their fields may hold.
+"""The frozen records that travel between the layers, and the enumerations of their fields:
+`TraceSpec`, `Decision`, `RetrainReport` and `Cycle`; `Action`, `Reason`, `Source` and `Outcome`.
 
 An engine makes a `Decision` of each trace and a `Cycle` of each turn of its loop; a `TraceSpec`
-says what traces look like. The `as_...` functions check values that come from outside: labels,
-ids, what a cell returned.
+says what traces look like. The `as_...` functions check values that come from outside: labels, ids,
+what a cell returned.
 """
 
 import json

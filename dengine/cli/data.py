@@ -1,7 +1,5 @@
-"""The verbs `dengine data`, `simulate` and `train`.
-
-`data` surveys a data set, `simulate` generates one, and `train` imports one into a store and trains
-an engine on it.
+"""The verbs `dengine data`, which surveys a data set, `simulate`, which generates one, and `train`,
+which imports one into a store and trains an engine on it.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What the verbs of `dengine` print and write.
+"""What the verbs of `dengine` print and write: JSON or tables, files, progress bars.
 
 A verb calls `print_result` once: it prints one JSON document (`--json`), or tables and lines for
 people, and writes the files of `--out`. Besides: tables of records, values as people read them,

@@ -1,4 +1,4 @@
-"""The verbs that change or check a store by hand.
+"""The verbs that change, check or copy a store by hand.
 
 `dengine report`, `correct`, `forget`, `rollback`, `policy` and `retrain` change a store's engine,
 or show its policy; `verify` checks the store's history, `backup` copies it, and `import-labels`

@@ -1,4 +1,5 @@
-"""How a text file writes its numbers: 1043.5, 1,043.5, 1.043,5, 1 043,5 or 1'043.5.
+"""Finds how a text file writes its numbers, 1043.5, 1,043.5, 1.043,5, 1 043,5 or 1'043.5, and
+rewrites them for Python.
 
 A file has one number format. It is found from all cells of its numeric columns: cells such as
 0,004, 1.043,5 or 1,043,500 prove which mark is the decimal one, 1.043 alone does not. A file in

@@ -701,7 +701,7 @@ def _from_long(
 def _labels_of_parts(
     rows_of_part: Mapping[str, pd.DataFrame], name: str, options: LoadOptions
 ) -> labels.LabelSource:
-    """Return a source of labels in a column of a long table."""
+    """Return a source of the labels in column `name` of a long table, by the part's number."""
     notes = Counter[str]()
     column = labels.LabelColumn(name, options.words, notes)
 

@@ -1,4 +1,5 @@
-"""Methods that dengine is compared with, in the same loop; each decides by its own rule.
+"""Methods that dengine is compared with, in the same loop; each decides by its own rule: nearest
+neighbours, kernel densities, a Gaussian process, MiniRocket, always verify, never verify.
 
 >>> DataEngine(model=make_baseline("knn", Policy(alpha=0.1, lower_bound=0.9), seed=0))
 

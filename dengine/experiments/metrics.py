@@ -1,4 +1,5 @@
-"""Errors and costs of replays: the pooled error rate with its interval, and what a part costs.
+"""Errors and costs of replays: the pooled error rate with its interval, and `Costs`, the prices of
+checks and errors.
 
 >>> pooled_error(replays).rate, pooled_error(replays).upper     # of the accepted parts, bad ones
 """

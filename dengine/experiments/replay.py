@@ -1,7 +1,7 @@
-"""One stream of parts through one engine, cycle by cycle.
+"""One stream of parts through one engine: `replay` plays recordings, `watch` drives any cell.
 
-`replay` plays a recorded data set through a fresh engine, as the paper's prototype online
-environment does; `watch` lets an engine drive any cell. Both return a `Replay`.
+Both return a `Replay`, the record of each cycle. `replay` uses a fresh engine, as the paper's
+prototype online environment does. A `Contender` says who plays: a recipe or a baseline.
 
 >>> replay("insertion", "conv", seed=0).summary()["certain"]
 >>> watch(DataEngine(), SimulatedCell(cycles=600), cycles=600).stretches(6)

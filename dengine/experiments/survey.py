@@ -1,9 +1,9 @@
-"""A survey of a data set before anything is learned from it.
+"""A survey of a data set before anything is learned from it: counts, faults, repeats and drift.
 
     survey_dataset(load_dataset("cell_3/", channel="FZ_Base"))
 
-It counts traces, labels, faults and repeats, and looks for drift in the recorded order.
-`dengine data` prints it.
+It counts traces, labels, faults and repeats, and looks for drift in the recorded order. `dengine
+data` prints it.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,8 @@
-"""Replays as tables: a row for each replay in the CSV, a pooled row for each recipe and policy.
+"""Replays as tables: a row for each replay in the CSV, a pooled row for each recipe and policy on
+the screen, and sentences about them.
 
-frame = frame_of(replays)
-Console().print(pooled_table(pool(frame, replays)))   # and promise_lines(rows)
+frame = frame_of(replays) Console().print(pooled_table(pool(frame, replays))) # and
+promise_lines(rows)
 """
 
 from __future__ import annotations
