@@ -1,5 +1,4 @@
-"""`Recipe`, every setting of an engine, read from and written to TOML; `RECIPES` has the named
-ones.
+"""`Recipe`, every setting of an engine, read from and written to TOML, and the named `RECIPES`.
 
     >>> Recipe.load("conv")  # a name in `RECIPES`, a TOML file, or a Recipe
     >>> Recipe.load("my_cell.toml").to_toml()

@@ -1,8 +1,8 @@
-"""The verbs that change, check or copy a store by hand.
+"""The verbs that change, check or copy a store by hand: `report`, `correct`, `forget`, `rollback`,
+`policy`, `retrain`, `verify`, `backup` and `import-labels`.
 
-`dengine report`, `correct`, `forget`, `rollback`, `policy` and `retrain` change a store's engine,
-or show its policy; `verify` checks the store's history, `backup` copies it, and `import-labels`
-takes the labels of an exported cell.
+Those up to `retrain` change a store's engine, or show its policy; `verify` checks the store's
+history, `backup` copies it, and `import-labels` takes the labels of an exported cell.
 """
 
 from __future__ import annotations
