@@ -111,14 +111,15 @@ def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None
     Returns
     -------
     str or None
-        "." or ","; None if the values do not depend on it.
+        "." or ","; None if the values do not depend on it. If some cells prove one mark and some
+        the other, the one of most cells.
 
     Raises
     ------
     UndecidedError
         If the values depend on it and no cell proves it.
     UnreadableError
-        If one column contradicts the others.
+        If a column groups its thousands by the mark that other columns have before decimals.
     """
     proven = [mark for mark in MARKS if any(_proves(mark, text) for _, text in columns)]
     if len(proven) > 1:  # the mark of most cells; those in the other format become faults

@@ -90,7 +90,8 @@ class Contender:
         ----------
         recipe : Contender, str or object
             A contender is returned as it is. A baseline's name gives the baseline with its chosen
-            settings. Otherwise anything that `Recipe.load` takes.
+            settings. Otherwise anything that `Recipe.load` takes; a TOML file gives its stem as the
+            name.
 
         Raises
         ------
