@@ -48,7 +48,7 @@ def hash_weights(size: int) -> FoldArray:
 def content_hash(X: NDArray[np.floating]) -> FoldArray:
     """Hash the content of traces, a weighted sum of the samples that wraps around at 64 bits.
 
-    Each sample is first rounded down to 1/65,536 of its unit and clipped to ±2**46.
+    Each sample is first clipped to ±2**46 and rounded down to 1/65,536 of its unit.
 
     Parameters
     ----------

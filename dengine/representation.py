@@ -32,7 +32,7 @@ def to_html(record: Any) -> str:
 def to_jsonable(value: Any) -> Any:
     """Return a value as `json` takes it, without the passwords of database URLs.
 
-    Dataclasses become objects, arrays lists, paths and other objects text, NaN and infinities
+    Dataclasses become objects, arrays lists, paths, keys and other objects text, NaN and infinities
     None. A dataclass field with "flat" in its metadata gives its own fields in its place; one with
     "apart" is left out.
     """

@@ -222,7 +222,8 @@ def _make_simulated_cell(
 ) -> CellToDrive:
     """Return the simulated cell, with a seed that gives parts which the store has not seen.
 
-    The seed grows with the decisions in the store, and differs between the cells of a product.
+    The seed grows with the decisions in the store, and differs between the cells of a product. A
+    verification in it takes `check_seconds`.
     """
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters

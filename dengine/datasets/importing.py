@@ -79,8 +79,8 @@ def stored_form(store: "StoreLike", source: Any) -> dict[str, Any]:
 def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     """Raise TraceError if a data set does not agree with the `TraceSpec` of a store.
 
-    It must have its rate and channels, and its recordings must have been brought to one length in
-    the same way.
+    It must have its rate, within 2 %, and its channels, where both know them, and its recordings
+    must have been brought to one length in the same way.
     """
     data_spec = data.spec
     is_other_fit = data_spec.fit != trace_spec.fit and "resample" in (data_spec.fit, trace_spec.fit)

@@ -265,7 +265,8 @@ def iterate_replays(
     Raises
     ------
     SettingError
-        A baseline's library is missing. Raised before anything is played.
+        A baseline's library is missing; raised before anything is played, but after the kept
+        replays. With `keep` also as `KeptReplays.path`.
     """
     from joblib import Parallel, delayed
 
