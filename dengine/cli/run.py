@@ -334,7 +334,9 @@ COLUMNS = {  # title -> count of a stretch
 
 
 def _print_run(replay: Replay, record: dict[str, Any], cell: Any, out: Out | None) -> None:
-    """Print the result of a run: a table of stretches, what was saved, and the cell's own report.
+    """Print the result of a run: a table of stretches, the cell's own report, and sentences.
+
+    These say what was saved, how the retrains went, when safe mode was on, and the certificate.
 
     Adds the counts to `record`, which `--json` prints, and writes run.csv and run.png to `out`.
     """

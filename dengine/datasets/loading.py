@@ -346,7 +346,7 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
 
 
 def _archive_notes(data: Dataset, names: Sequence[str], read: set[str]) -> list[str]:
-    """Return notes on what an archive does not tell, or tells and is not read.
+    """Return notes for the user: traces that end in many zeros, arrays not read, an unknown rate.
 
     names, read : its arrays, and those that are read.
     """
