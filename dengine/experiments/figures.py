@@ -732,8 +732,8 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     """Draw a data set's traces, and how it changes in its order; return the figure.
 
     Above, a panel for each channel, of at most three: the median trace of good and of bad parts,
-    and where the middle 80 % lie. Below: the share of good parts and each trace's mean, in recorded
-    order. Traces that are not finite are not drawn.
+    and where the middle 80 % lie. Below: the share of good parts, and the mean of each trace's
+    first channel, in recorded order. Traces that are not finite are not drawn.
     """
     X = as_traces(data.X)
     y = data.y
