@@ -71,7 +71,7 @@ def paper_table(frame: "pd.DataFrame", recipe: str, interval: str) -> str:
 
 
 def _paper_cell(counts: "pd.DataFrame", published: tuple[float, float] | None) -> str:
-    """Return a cell of `paper_table` as text; "-" where nothing was played.
+    """Return a cell of `paper_table`, means ± deviations, as text; "-" where nothing was played.
 
     `counts` has a row for each replay, with false positives and certain predictions; `published` is
     the paper's pair.
@@ -85,6 +85,9 @@ def _paper_cell(counts: "pd.DataFrame", published: tuple[float, float] | None) -
 
 def findings(frame: "pd.DataFrame") -> list[str]:
     """Check which of the paper's findings the replays of a grid confirm, and say it in lines.
+
+    They are about how certain predictions, false positives and the first certain prediction depend
+    on alpha and LB, and that a retrain takes less than 0.45 s.
 
     A finding that the replays say nothing about is left out: for baselines, which have their own
     rules, the findings about intervals.

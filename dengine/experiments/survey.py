@@ -120,8 +120,9 @@ class Survey:
 def survey_dataset(data: Dataset) -> Survey:
     """Count the traces, labels, faults and repeats of a data set, and test its order for drift.
 
-    Labels are only counted, nothing is learned from them. Repeats and drift are looked for among
-    the usable traces: finite, not constant and not too large.
+    Labels are only counted, nothing is learned from them. Repeats, and the drift of the channels,
+    are looked for among the usable traces: finite, not constant and not too large. There is no
+    drift where the recorded order is not known.
 
     Returns
     -------
