@@ -137,7 +137,9 @@ def hold_many(named: Mapping[str, Path], options: LoadOptions) -> bool:
 
 
 def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
-    """Raise DataError, with advice, if the first, a middle and the last file cannot be decoded."""
+    """Raise DataError, with advice, if none of the first, a middle and the last file can be
+    decoded.
+    """
     error: UnreadableError | None = None
     for path in (paths[0], paths[len(paths) // 2], paths[-1]):
         try:
@@ -715,7 +717,7 @@ def _labels_of_parts(
 def _compared_columns(frame: pd.DataFrame, label: str | None, options: LoadOptions) -> list[str]:
     """Return the other columns of a table that have the name of a label and nothing but labels.
 
-    None are compared if the user names the column of labels.
+    The list is empty if the user names the column of labels.
 
     label : the column of labels; None for a file of them.
     """

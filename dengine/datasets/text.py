@@ -286,7 +286,7 @@ def read_table(
     *,
     as_text: bool = False,
 ) -> TextTable:
-    """Read a text file as a table of texts.
+    """Read a text file as a table of texts, in which numbers are written as Python writes them.
 
     Parameters
     ----------
@@ -308,7 +308,8 @@ def read_table(
     Raises
     ------
     UnreadableError
-        If the file is empty or too large, has no header, or its number format is undecided.
+        If the file is empty or too large, cannot be decoded, has no header, or its number format is
+        undecided.
     """
     import pandas as pd
 
