@@ -778,7 +778,10 @@ def labels_in_file(
 
 
 def _label_of_row(row: _LabelRow, column: LabelColumn, where: str) -> SourcedLabel:
-    """Return the label and the part of rows; the error of an unknown word says where it stands."""
+    """Return the label that a row's words mean together, with the number of its part.
+
+    Raises as `LabelColumn.find`; the error of an unknown word says where it stands.
+    """
     try:
         for word in row.labels:
             with suppress(UnlabelledError):

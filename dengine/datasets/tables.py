@@ -137,9 +137,7 @@ def hold_many(named: Mapping[str, Path], options: LoadOptions) -> bool:
 
 
 def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
-    """Raise DataError, with advice, if none of the first, a middle and the last file can be
-    decoded.
-    """
+    """Raise DataError with advice if neither first, middle nor last file can be decoded."""
     error: UnreadableError | None = None
     for path in (paths[0], paths[len(paths) // 2], paths[-1]):
         try:
