@@ -1,8 +1,9 @@
-"""How long a cycle takes: retraining and deciding, with umap-learn beside it, in one run.
+"""Measure how long a retrain and a decision take, with umap-learn beside them, in one run.
 
     python training/benchmark_cycle.py --replays 30 --out out/
 
-Run it on an idle machine. Prints a table with the median and the worst case of each quantity, and writes it to --out.
+Run it on an idle machine. It prints a table with the median and the worst case of each quantity,
+and writes it to --out.
 """
 
 import os
@@ -12,7 +13,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from common import POLICY, options, print_table, quantiles, wall_time
 
@@ -21,84 +22,105 @@ from dengine.engine.engine import core_of, frozen_objects, uncollected
 from dengine.engine.trainer import LATE
 from dengine.traces import as_traces
 
-BUDGET = 0.45
+BUDGET = 0.45  # of a retrain, in seconds
 WARM_UP = 0.07  # share of the cycles beside a retrain that are not timed
+PAUSE_SECONDS = 0.002  # a cell does other things between two parts
+
+Times = dict[str, list[float]]  # quantity -> wall times in seconds
 
 
 def measure(
     data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repeats: int
 ) -> list[dict[str, Any]]:
-    """Every quantity, a row each."""
-    # An engine that replays loads torch's optimiser before it begins; a cell has loaded it long before its first retrain.
-    DataEngine(recipe=recipe, replaying=True)
-    # By the clock, as a live cell: a replay of a recipe takes every step.
-    played = [replay(data, DataEngine(recipe=recipe, seed=seed), seed) for seed in range(replays)]
-    whole = [LATE not in each.reason for one in played for each in one.retrains]
-    print(f"All steps were taken in {sum(whole)} of {len(whole)} retrains of the replays.")
-    unhurried = [replay(data, recipe, seed) for seed in range(replays)]
-    certain = [sum(int((~each.verified).sum()) for each in some) for some in (played, unhurried)]
-    print(f"{certain[0]} decisions were certain; without a clock {certain[1]}.")
+    """Measure every quantity; return a row of the table for each.
+
+    Parameters
+    ----------
+    data : Dataset
+    recipe : Recipe
+    replays : int
+        Shuffled replays whose retrains are timed.
+    repeats : int
+        Warm retrains on the whole set.
+    umap_repeats : int
+        Fits of umap-learn; 0 leaves umap-learn out.
+    """
+    times = time_replays(data, recipe, replays)
     engine = filled_engine(data, recipe)
-    found = {
-        f"retrain, all of {replays} replays": [
-            each.seconds for one in played for each in one.retrains
-        ],
-        f"retrain on {len(data)} traces": [
-            engine.retrain().seconds for _ in range(repeats)
-        ],  # as a long run's last
-    }
+    times[f"retrain on {len(data)} traces"] = [engine.retrain().seconds for _ in range(repeats)]
     engine = filled_engine(data, recipe)
     with frozen_objects(), uncollected():  # as `DataEngine.run` has it
-        found["decide"] = [wall_time(engine.decide, trace)[0] for _ in range(3) for trace in data.X]
-    spawned = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
-    for name, executor in (("thread", ThreadPoolExecutor(1)), ("process", spawned)):
-        found[f"decide, retraining in a {name}"], found[f"decide and swap, {name}"] = beside(
-            data, recipe, executor
-        )
+        times["decide"] = [wall_time(engine.decide, trace)[0] for _ in range(3) for trace in data.X]
+    process = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+    for name, executor in (("thread", ThreadPoolExecutor(1)), ("process", process)):
+        concurrent = time_beside_retrains(data, recipe, executor)
+        times[f"decide, retraining in a {name}"] = concurrent.decisions
+        times[f"decide and swap, {name}"] = concurrent.swaps
     if umap_repeats:
-        X = as_traces(data.X).reshape(len(data), -1)
-        make_reducer("umap-learn").fit(X[:200])  # compiles
-        reducer = make_reducer("umap-learn")
-        found[f"umap-learn fit on {len(data)} traces"] = [
-            wall_time(reducer.fit, X)[0] for _ in range(umap_repeats)
-        ]
-        reducer.transform(X[:1])
-        found["umap-learn single transform"] = [
-            wall_time(reducer.transform, x[None])[0] for x in X[:200]
-        ]
-    return [
-        {
-            "what": name,
-            **quantiles(seconds),
-            "target_s": BUDGET if name.startswith("retrain") else None,
-        }
-        for name, seconds in found.items()
-    ]
+        times |= time_umap_learn(data, umap_repeats)
+    rows = []
+    for name, seconds in times.items():
+        target = BUDGET if name.startswith("retrain") else None
+        rows.append({"what": name, **quantiles(seconds), "target_s": target})
+    return rows
+
+
+def time_replays(data: Dataset, recipe: Recipe, n_replays: int) -> Times:
+    """Play shuffled replays by the clock, as a live cell does; return the times of their retrains.
+
+    Prints how many retrains had time for all steps, and the certain decisions with and without the
+    clock: a replay of a recipe takes every step.
+    """
+    # An engine that replays loads PyTorch's optimizers when it is made. A live cell has loaded them
+    # long before its first retrain.
+    DataEngine(recipe=recipe, replaying=True)
+    timed = [replay(data, DataEngine(recipe=recipe, seed=seed), seed) for seed in range(n_replays)]
+    untimed = [replay(data, recipe, seed) for seed in range(n_replays)]
+    reports = [report for played in timed for report in played.retrains]
+    n_complete = sum(LATE not in report.reason for report in reports)
+    print(f"All steps were taken in {n_complete} of {len(reports)} retrains of the replays.")
+    certain = sum(int((~played.verified).sum()) for played in timed)
+    certain_untimed = sum(int((~played.verified).sum()) for played in untimed)
+    print(f"{certain} decisions were certain; without a clock {certain_untimed}.")
+    return {f"retrain, all of {n_replays} replays": [report.seconds for report in reports]}
+
+
+def time_umap_learn(data: Dataset, repeats: int) -> Times:
+    """Return the times of umap-learn, for a fit on the whole set and for a single trace."""
+    X = as_traces(data.X).reshape(len(data), -1)
+    make_reducer("umap-learn").fit(X[:200])  # compiles
+    reducer = make_reducer("umap-learn")
+    fits = [wall_time(reducer.fit, X)[0] for _ in range(repeats)]
+    reducer.transform(X[:1])
+    transforms = [wall_time(reducer.transform, trace[None])[0] for trace in X[:200]]
+    return {
+        f"umap-learn fit on {len(data)} traces": fits,
+        "umap-learn single transform": transforms,
+    }
 
 
 def burn() -> None:
-    """Keep a core busy."""
+    """Keep a core busy until the process is ended."""
     while True:
         pass
 
 
 @contextmanager
 def busy_cores() -> Iterator[None]:
-    """Another process burns on each core until the block ends."""
-    burning = [
-        get_context("spawn").Process(target=burn, daemon=True) for _ in range(os.cpu_count() or 1)
-    ]
-    for each in burning:
-        each.start()
+    """Keep each core busy with another process until the block ends."""
+    context = get_context("spawn")
+    processes = [context.Process(target=burn, daemon=True) for _ in range(os.cpu_count() or 1)]
+    for process in processes:
+        process.start()
     try:
         yield
     finally:
-        for each in burning:
-            each.terminate()
+        for process in processes:
+            process.terminate()
 
 
 def filled_engine(data: Dataset, recipe: Recipe, executor: Executor | None = None) -> DataEngine:
-    """An engine that has verified the whole set: every trace a reference of the model that answers."""
+    """Return an engine that has learned the whole set: every trace is one of its references."""
     engine = DataEngine(recipe=recipe, executor=executor)
     for trace, label in zip(data.X, data.y, strict=True):
         decision = engine.decide(trace)
@@ -108,45 +130,61 @@ def filled_engine(data: Dataset, recipe: Recipe, executor: Executor | None = Non
     return engine
 
 
-def beside(data: Dataset, recipe: Recipe, executor: Executor) -> tuple[list[float], list[float]]:
-    """Wall time of the decisions made while retrains run in the executor, and of those that also swap a version in."""
-    engine, cell = filled_engine(data, recipe, executor), ReplayCell(data)
-    seconds: list[float] = []
-    swapping: list[float] = []
+class ConcurrentTimes(NamedTuple):
+    """Wall times in seconds of decisions beside retrains.
+
+    Attributes
+    ----------
+    decisions : list of float
+        By the version that the engine had.
+    swaps : list of float
+        Those that also swapped a new version in.
+    """
+
+    decisions: list[float]
+    swaps: list[float]
+
+
+def time_beside_retrains(data: Dataset, recipe: Recipe, executor: Executor) -> ConcurrentTimes:
+    """Time one decision on each trace, while retrains run all the time in an executor.
+
+    The executor is shut down at the end.
+    """
+    engine = filled_engine(data, recipe, executor)
+    cell = ReplayCell(data)
+    times = ConcurrentTimes([], [])
     with executor:
         for i in range(len(data)):
             if not core_of(engine).is_retraining:
                 core_of(engine).start_retrain()
-            version, (took, _) = engine.version, wall_time(engine.decide, cell.insert())
+            version = engine.version
+            trace = cell.insert()
+            seconds, _ = wall_time(engine.decide, trace)
             if i > WARM_UP * len(data):  # the pool starts its worker on the first
-                (seconds if engine.version == version else swapping).append(took)
-            time.sleep(0.002)  # a cell does other things between two parts
+                is_swap = engine.version != version
+                (times.swaps if is_swap else times.decisions).append(seconds)
+            time.sleep(PAUSE_SECONDS)
         engine.close()
-    return seconds, swapping
+    return times
 
 
 def main() -> None:
-    """Parse, measure, print, write."""
+    """Measure, print the table and write it."""
     parser = options(__doc__, data="insertion", samples=None, recipe="conv", out=Path("out"))
     parser.add_argument(
         "--replays", type=int, default=30, help="shuffled replays whose retrains are timed"
     )
     parser.add_argument("--repeats", type=int, default=10, help="warm retrains on the whole set")
-    parser.add_argument("--burn", action="store_true", help="beside a process that burns each core")
+    parser.add_argument("--burn", action="store_true", help="keep each core busy meanwhile")
     parser.add_argument(
         "--umap-repeats", type=int, default=3, help="fits of umap-learn on the whole set"
     )
-    args = parser.parse_args()
-    recipe = Recipe.load(args.recipe).with_policy(**POLICY)
-    with busy_cores() if args.burn else nullcontext():
-        rows = measure(
-            load_dataset(args.data, args.samples),
-            recipe,
-            args.replays,
-            args.repeats,
-            args.umap_repeats,
-        )
-    print_table(rows, "A cycle's times", args.out / "benchmark_cycle.csv")
+    arguments = parser.parse_args()
+    recipe = Recipe.load(arguments.recipe).with_policy(**POLICY)
+    data = load_dataset(arguments.data, arguments.samples)
+    with busy_cores() if arguments.burn else nullcontext():
+        rows = measure(data, recipe, arguments.replays, arguments.repeats, arguments.umap_repeats)
+    print_table(rows, "A cycle's times", arguments.out / "benchmark_cycle.csv")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
-"""How a retrain grows with the store: it must not.
+"""Measure how a retrain depends on the size of the store: it must not.
 
     python training/benchmark_scale.py --sizes 1503,10000,100000,1000000 --out out/
 
-Fills SQLite stores with labelled traces (the bundled ones, each with fresh sensor noise; 4 GB at a million), opens an
-engine on each, and times opening, retraining, reporting and deciding. A retrain is timed by the wall clock around the
-whole `engine.retrain()`: from taking the data until the new version is committed to the store, so that the commit counts
-against the budget of 0.45 s too (`RetrainReport.seconds` ends where the version answers).
+Fills SQLite stores with labelled traces: the bundled ones, each with fresh sensor noise; 4 GB for a
+million. It opens an engine on each store, and times opening, retraining, reporting and deciding.
+The time of a retrain is that of the whole `engine.retrain()`, from reading the data until the new
+version is committed to the store. So the commit counts against the budget of 0.45 s too, while
+`RetrainReport.seconds` ends when the new version decides.
 """
 
 import tempfile
@@ -20,62 +21,77 @@ from dengine import Action, DataEngine, Dataset, Decision, Reason, Recipe, Sourc
 from dengine.folds import content_hash
 from dengine.store.records import NewLabel, StoredDecision
 
-CHUNK = 5000
+CHUNK = 5000  # traces that are written at once
+N_DECISIONS = 300  # timed
 
 
-def fill(engine: DataEngine, data: Dataset, n: int) -> None:
-    """Put n labelled traces into the engine's store, in bulk."""
+def fill_store(engine: DataEngine, data: Dataset, n: int) -> None:
+    """Write n labelled traces into the engine's store, in chunks."""
     rng = np.random.default_rng(0)
-    engine.decide(noisy(data, 1, rng)[0][0])  # the first trace sets the contract
+    engine.decide(noisy(data, 1, rng)[0][0])  # the first trace sets the form of all
     for start in track(range(0, n, CHUNK), description=f"{n:,} traces"):
         X, y = noisy(data, min(CHUNK, n - start), rng)
         records: list[Any] = []
-        for i, (x, good, hash_) in enumerate(zip(X, y, content_hash(X), strict=True), start):
-            trace = np.array(x, np.float32, ndmin=2)
-            records.append(StoredDecision(_verified(f"import-{i}"), trace, hash_, False, 0.0))
+        hashes = content_hash(X)
+        for i, (trace, label, hash_) in enumerate(zip(X, y, hashes, strict=True), start):
+            decision = verified_decision(f"import-{i}")
+            trace = np.array(trace, np.float32, ndmin=2)
+            records.append(StoredDecision(decision, trace, hash_, False, 0.0))
             records.append(
-                NewLabel(
-                    f"import-{i}", bool(good), Source.VERIFICATION, 0, None, content_hash=hash_
-                )
+                NewLabel(decision.id, bool(label), Source.VERIFICATION, 0, None, content_hash=hash_)
             )
         engine.store.apply_records(records)
 
 
-def _verified(name: str) -> Decision:
+def verified_decision(decision_id: str) -> Decision:
+    """Return the decision to verify a part, made without a model."""
     return Decision(
-        name, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0
+        id=decision_id,
+        action=Action.VERIFY,
+        predicted=Action.VERIFY,
+        lower=0.0,
+        upper=1.0,
+        n_success=0,
+        n_failure=0,
+        embedding=None,
+        model_version=0,
+        reason=Reason.NO_MODEL,
+        audit=False,
+        propensity=1.0,
     )
 
 
 def measure_store(
     data: Dataset, recipe: Recipe, n: int, repeats: int, folder: Path
 ) -> dict[str, Any]:
-    """Times of one store of n labelled traces, in seconds."""
+    """Fill a store with n labelled traces; return its size and the times on it, in seconds."""
     path = folder / f"{n}.db"
     with DataEngine(recipe=recipe, store=path) as engine:
-        fill(engine, data, n)
-    opened, engine = wall_time(DataEngine.open, path)
+        fill_store(engine, data, n)
+    opening, engine = wall_time(DataEngine.open, path)
     retrains = [wall_time(engine.retrain)[0] for _ in range(repeats)]
-    decide, report = [], [np.nan]  # there may be none
-    for x in noisy(data, 300, np.random.default_rng(1))[0]:
-        seconds, decision = wall_time(engine.decide, x)
-        decide.append(seconds)
+    decides = []
+    reports = [np.nan]  # there may be none
+    for trace in noisy(data, N_DECISIONS, np.random.default_rng(1))[0]:
+        seconds, decision = wall_time(engine.decide, trace)
+        decides.append(seconds)
         if decision.action is Action.VERIFY:
-            report.append(wall_time(engine.report, decision.id, True)[0])
+            reports.append(wall_time(engine.report, decision.id, True)[0])
     engine.close()
-    took = {"opening": opened, "retrain_p50": np.median(retrains), "retrain_max": np.max(retrains)}
-    took |= {
-        "decide_p50": np.median(decide),
-        "decide_p99": np.quantile(decide, 0.99),
-        "report_p50": np.nanmedian(report),
-    }
-    return {"traces": n, "store_bytes": path.stat().st_size} | {
-        f"{name}_s": seconds for name, seconds in took.items()
+    return {
+        "traces": n,
+        "store_bytes": path.stat().st_size,
+        "opening_s": opening,
+        "retrain_p50_s": np.median(retrains),
+        "retrain_max_s": np.max(retrains),
+        "decide_p50_s": np.median(decides),
+        "decide_p99_s": np.quantile(decides, 0.99),
+        "report_p50_s": np.nanmedian(reports),
     }
 
 
 def main() -> None:
-    """Parse, measure, print, write."""
+    """Measure a store of each size, print the table and write it."""
     parser = options(
         __doc__, data="insertion", samples=None, recipe="conv", folder=None, out=Path("out")
     )
@@ -83,17 +99,15 @@ def main() -> None:
         "--sizes", default="1503,10000,100000,1000000", help="labelled traces in a store; 4 kB each"
     )
     parser.add_argument("--repeats", type=int, default=5, help="retrains at each size")
-    args = parser.parse_args()
-    data, recipe = (
-        load_dataset(args.data, args.samples),
-        Recipe.load(args.recipe).with_policy(**POLICY),
-    )
-    with tempfile.TemporaryDirectory(dir=args.folder) as folder:
-        stores = [
-            measure_store(data, recipe, int(n), args.repeats, Path(folder))
-            for n in args.sizes.split(",")
+    arguments = parser.parse_args()
+    data = load_dataset(arguments.data, arguments.samples)
+    recipe = Recipe.load(arguments.recipe).with_policy(**POLICY)
+    with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
+        rows = [
+            measure_store(data, recipe, int(size), arguments.repeats, Path(folder))
+            for size in arguments.sizes.split(",")
         ]
-    print_table(stores, "Times against store size", args.out / "benchmark_scale.csv")
+    print_table(rows, "Times against store size", arguments.out / "benchmark_scale.csv")
 
 
 if __name__ == "__main__":
