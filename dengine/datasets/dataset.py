@@ -33,6 +33,7 @@ UNKNOWN_RATE = (
     "The rate is unknown, for nothing tells it: times are in samples until it is stated,"
     " rate_hz=..."
 )
+LABEL_FORMS = "as True/False, OK/NOK, pass/fail or 1/0"
 MAX_LABEL_WORDS = 12  # more different words are no labels
 expect_data = partial(expect, error=DataError)
 
@@ -73,13 +74,15 @@ class UnreadableError(DataError):
 
 
 class UnknownWordError(UnreadableError):
-    """A label in a word whose meaning is unknown; the user can state it as `label_map`."""
+    """A label in a word whose meaning is unknown; the user can state it as `label_map`.
 
-    def __init__(self, word: str) -> None:
-        super().__init__(
-            f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {shortened(word)}"
-        )
+    forms : the labels that were expected.
+    """
+
+    def __init__(self, word: str, forms: str = LABEL_FORMS) -> None:
+        super().__init__(f"Expected a label, {forms}, got {shortened(word)}")
         self.word = word
+        self.forms = forms
 
 
 class UnlabelledError(UnreadableError):
@@ -361,6 +364,8 @@ class RecordingCollector:
         What users should know, and how many times.
     unknown_words : Counter
         Words in the place of labels whose meaning is unknown.
+    label_forms : str
+        The labels that were expected instead of the last of them.
     label_file : str
         Path of a file that may list labels, for advice; "" for none.
     unlabelled_words : Counter
@@ -375,6 +380,7 @@ class RecordingCollector:
     recordings: list[Recording] = field(default_factory=list)
     notes: Counter[str] = field(default_factory=Counter)
     unknown_words: Counter[str] = field(default_factory=Counter)
+    label_forms: str = LABEL_FORMS
     label_file: str = ""
     unlabelled_words: Counter[str] = field(default_factory=Counter)
     ordered: bool = True
@@ -407,6 +413,7 @@ class RecordingCollector:
         except (OSError, TraceError, UnreadableError) as error:
             if isinstance(error, UnknownWordError):
                 self.unknown_words[error.word] += 1
+                self.label_forms = error.forms
             line = line or getattr(error, "line", 0)
             self.faults.append(Fault(source, line, str(error).rstrip(".")))
 
@@ -441,7 +448,7 @@ class RecordingCollector:
         if self.unlabelled:
             n_all = n_known + len(self.faults) + self.unlabelled
             actual += f", and {self.unlabelled_text(n_all)}"
-        wanted = f"labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0"
+        wanted = f"labels in {self.name} {self.label_forms}"
         raise DataError(f"Expected {wanted}, got {actual}; {do}.")
 
     def leave_out(self, reasons: Mapping[int, str]) -> None:

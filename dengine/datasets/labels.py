@@ -60,6 +60,7 @@ LETTER = r"[^\W\d_]"
 WORD_START = rf"(?:(?<!{LETTER})|(?<=[a-z])(?=[A-Z]))"
 WORD_END = rf"(?:(?!{LETTER})|(?<=[a-z])(?=[A-Z]))"
 NOT = r"(?P<not>(?i:not|non|no|nicht)[\W_]*)?"
+USER_NOT = r"(?P<not>(?i:not|non|no|nicht|kein|keine)[\W_]+)?"
 WORDS = "|".join(word for word in MEANING if not word.isdecimal())
 # i.O., o.k., and what n makes of them: n.i.O., nio, n-ok.
 IN_CELL = re.compile(
@@ -80,6 +81,11 @@ UNCHECKED_AT_END = re.compile(rf"{WORD_START}(?i:{UNCHECKED_WORDS})$")
 LABEL_COLUMNS = (
     *("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome"),
     *("ergebnis", "bewertung", "urteil"),
+)
+# A column whose name ends in such a word says by true, yes or 1 that it is good.
+GOOD_COLUMNS = (
+    *(*LABEL_COLUMNS, *GOOD, "succeeded", "accepted", "accept", "approved", "valid", "correct"),
+    *("io", "bestanden", "konform", "conform", "conforme", "height_check"),
 )
 # A column of this name, or whose name ends in such a word, says by true, yes or 1 that it is bad.
 BAD_COLUMNS = (
@@ -287,12 +293,31 @@ def means_bad(column: str) -> bool:
 
     False for the opposite of it, as `not_failed` and `error_free`.
     """
+    words = _name_words(column)
+    if "".join(words) in BAD_COLUMNS:
+        return True
+    others = {*NEGATIONS, *GOOD}  # pass_fail says it of both
+    return bool(words) and words[-1] in BAD_COLUMNS and others.isdisjoint(words)
+
+
+def means_good(column: str) -> bool:
+    """Return whether the name of a column means the good outcome: `passed`, `is_ok`, `not_failed`.
+
+    False where that is not known, as of `crack` or `pass_fail`.
+    """
+    words = _name_words(column)
+    is_negated = not set(NEGATIONS).isdisjoint(words)
+    names = {*words[-1:], "".join(words), column.lower()}
+    others = BAD_COLUMNS if is_negated else GOOD_COLUMNS
+    return not names.isdisjoint(others) or (is_negated and not set(words).isdisjoint(BAD_COLUMNS))
+
+
+def _name_words(column: str) -> list[str]:
+    """Return the words of a column's name in lower case, without `FLAG_ENDINGS`."""
     words = re.findall(rf"{LETTER}+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", column).lower())
     while len(words) > 1 and words[-1] in FLAG_ENDINGS:
         words.pop()
-    if "".join(words) in BAD_COLUMNS:
-        return True
-    return bool(words) and words[-1] in BAD_COLUMNS and set(NEGATIONS).isdisjoint(words)
+    return words
 
 
 def is_verdict(column: str, cells: Sequence[Any], words: LabelMap) -> bool:
@@ -316,8 +341,9 @@ class LabelColumn:
     """Reads the labels in the cells of a column.
 
     If the name of the column means the bad outcome, true, yes and 1 in it are bad, and a note says
-    so. Words that are verdicts themselves, as OK and NOK, keep their meaning, and so do all if the
-    user states the meaning of one of true, yes, 1 and so on.
+    so. If it means neither outcome, they are words of unknown meaning. Words that are verdicts
+    themselves, as OK and NOK, keep their meaning, and so do all if the user states the meaning of
+    one of true, yes, 1 and so on.
 
     Parameters
     ----------
@@ -333,6 +359,7 @@ class LabelColumn:
         self.words = words
         self.notes = notes
         self.is_inverted = means_bad(name) and FLAGS.keys().isdisjoint(words)
+        self.is_ambiguous = not (means_bad(name) or means_good(name))
 
     def label_of(self, cell: Any) -> int:
         """Return the label that a cell means; raise as the function `label_of`.
@@ -342,6 +369,9 @@ class LabelColumn:
         """
         text = str(cell).strip().lower()
         flag = _flag_of(cell)
+        if flag is not None and text not in self.words and self.is_ambiguous:
+            forms = f"of known meaning, which the name of column {self.name} does not tell"
+            raise UnknownWordError(str(cell).strip(), forms)
         if flag is None or text in self.words or not self.is_inverted:
             return label_of(cell, self.words)
         note = f"Column {self.name} tells what is bad, by its name: true, yes or 1 in it is bad"
@@ -656,15 +686,18 @@ def _labels_in_folder(folder: str, start: int, words: LabelMap) -> list[_FoundLa
 def _find_user_word(text: str, start: int, words: LabelMap) -> _FoundLabel | None:
     """Return the longest word of the user's label map in which a name ends, if there is one.
 
+    Any blanks and marks stand for those in the word. A not before the word reverses its meaning.
+
     start : position of the name in the path.
     """
     longest_first = sorted((word for word in words if not word.isdecimal()), key=len, reverse=True)
     for ending in _endings(text):
         for word in longest_first:
             bare = re.sub(r"[\W_]+$", "", word)
-            match = re.search(f"{WORD_START}(?i:{re.escape(bare)})$", ending)
+            pattern = r"[\W_]+".join(map(re.escape, re.split(r"[\W_]+", bare)))
+            match = re.search(f"{WORD_START}{USER_NOT}(?i:{pattern})$", ending)
             if bare and match:
-                label = int(words[word])
+                label = int(words[word] != bool(match["not"]))
                 return _FoundLabel(match[0], label, start + match.start(), is_user_word=True)
     return None
 

@@ -32,6 +32,7 @@ from .dataset import (
     LoadOptions,
     Recording,
     RecordingCollector,
+    UnknownWordError,
     UnlabelledError,
     UnreadableError,
     as_dataset,
@@ -517,14 +518,16 @@ def _from_arrays(
         except UnlabelledError as error:
             collector.unlabelled_words[error.word] += 1
             return np.nan
-        except UnreadableError:
-            collector.unknown_words[str(word)] += 1
+        except UnknownWordError as error:
+            collector.unknown_words[error.word] += 1
+            collector.label_forms = error.forms
             return 0
 
     wanted = "a label for each trace, 1 (success) or 0 (failure)"
     with instead(DataError, f"Expected {wanted}", ValueError, TypeError):
         labels = np.asarray(y)
-        if labels.dtype.kind in "OUS" or options.words or label_column.is_inverted:
+        is_usual = not (label_column.is_inverted or label_column.is_ambiguous)
+        if labels.dtype.kind in "OUS" or options.words or not is_usual:
             labels = np.array([to_label(word) for word in labels.tolist()])
     collector.check_label_words()
     about["notes"] = tuple(f"{note}." for note in collector.notes)

@@ -228,7 +228,10 @@ def _label_source(
         if options.label is not None:
             return listing, columns
         sources = [labels.labels_in_column(named, column, options) for column in columns]
-        return labels.labels_that_agree(listing, [in_names, *sources], listing.trust), columns
+        # Numbers among the user's words are the listing's, not the numbers of files.
+        words = {word: good for word, good in options.words.items() if not word.isdecimal()}
+        sources.append(labels.labels_in_names(None, words))
+        return labels.labels_that_agree(listing, sources, listing.trust), columns
     if options.label in _first_rows(next(iter(named.values())), options)[0]:
         source = labels.labels_in_column(named, options.label, options)
         source.notes[f"The labels are those in column {options.label} of each file"] = 1

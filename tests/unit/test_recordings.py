@@ -12,7 +12,7 @@ import pytest
 
 from dengine import DataEngine, Dataset, TraceSpec, load_dataset
 from dengine.datasets.importing import import_labelled
-from dengine.datasets.labels import labels_in_names, means_bad
+from dengine.datasets.labels import labels_in_names, means_bad, parse_label_map
 from dengine.errors import DataError, TraceError, as_options
 from tests.support.recording_forms import LABEL_FORMS, NOT_CHECKED_NAMES
 
@@ -285,6 +285,32 @@ IN_COLUMN: dict[str, Callable[[list[object], str, Path], tuple[Any, dict[str, An
         {"label": column},
     ),
 }
+AMBIGUOUS = {  # the name of a column that means no outcome -> its cells
+    "error_code": [1, 0, 0],
+    "crack": ["yes", "no", "no"],
+    "leak": [True, False, False],
+    "pass_fail": [1, 0, 0],
+    "不良": [1.0, 0.0, 0.0],
+}
+
+
+@pytest.mark.parametrize("form", IN_COLUMN)
+@pytest.mark.parametrize("column", AMBIGUOUS)
+def test_true_in_a_column_that_means_neither_outcome_is_asked_for(
+    form: str, column: str, tmp_path: Path
+) -> None:
+    source, options = IN_COLUMN[form](AMBIGUOUS[column], column, tmp_path)
+    text = f"of known meaning, which the name of column {column} does not tell"
+    with pytest.raises(DataError, match=text) as caught:
+        load_dataset(source, **options)
+    label_map = re.search(r"label_map='([^']*)' or the other way round", str(caught.value))[1]
+    first, second = load_dataset(source, **options, label_map=label_map).y[:2].tolist()
+    assert {first, second} == {0, 1}
+    assert dict(pair.split("=") for pair in label_map.split(","))[str(AMBIGUOUS[column][0])] == (
+        "good" if first else "bad"
+    )
+
+
 # The name of a column -> cells of it that mean bad, good, good.
 FLAGS: dict[str, tuple[list[object], bool]] = {
     "failed": ([True, False, False], True),
@@ -413,6 +439,24 @@ def test_a_number_is_a_label_of_a_name_where_somebody_says_so_and_never_against_
         source_of_labels.find("part_0001_NOK_1.csv")
     with pytest.raises(DataError, match="at the end of the name"):
         source_of_labels.find("run_11.csv")
+
+
+@pytest.mark.parametrize(
+    "label_map",
+    [
+        "conforme=good,non conforme=bad",
+        "conforme=good,non_conforme=bad",
+        "non-conforme=bad,conforme=good",
+        "conforme=good",
+    ],
+)
+@pytest.mark.parametrize("form", ["{}_non_conforme.csv", "non conforme/{}.csv"])
+def test_a_word_of_the_user_is_found_with_any_marks_in_it_and_a_not_reverses_it(
+    label_map: str, form: str
+) -> None:
+    source = labels_in_names(None, parse_label_map(label_map))
+    assert source.find("piece_7_conforme.csv").label == 1
+    assert source.find(form.format("piece_7")).label == 0
 
 
 def test_labels_come_from_folders_a_pattern_or_a_file(small: Dataset, tmp_path: Path) -> None:
