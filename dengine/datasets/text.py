@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import excerpt, listed
+from ..traces import is_time_column
 from . import units
 from .clocks import (
     EMPTY_CELLS,
@@ -344,7 +345,17 @@ def read_table(
         wrong |= odd_cells
     faults = [Fault(path.name, i, message) for i, message in sorted(wrong.items())]
     frame = frame.drop(index=[i for i in wrong if i in complete])
-    return TextTable(frame, faults, cells.line, cells.units[:n], mark)
+    column_units = cells.units[:n]
+    without = [
+        i
+        for i, name in enumerate(header)
+        if not (column_units[i] or units.split(name)[1] or is_time_column(name))
+    ]
+    preamble = "\n".join(text.splitlines()[: max(cells.line - 1, 0)])
+    stated = units.in_preamble(preamble, [header[i] for i in without])
+    for i, unit in zip(without, stated, strict=True):
+        column_units[i] = unit
+    return TextTable(frame, faults, cells.line, column_units, mark)
 
 
 def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:

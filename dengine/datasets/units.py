@@ -90,6 +90,13 @@ SLASHED = re.compile(
     r"(?P<name>.*\S)\s*/\s*(?P<unit>\S+)|(?P<other>.*\S) in (?P<such>\S+)"
 )  # F/kN, F in kN
 ENDING = re.compile(r"(?P<name>.*[^_. -])[_. -]+(?P<unit>[A-Za-zµμ·]+)")  # FZ_kN
+# A line above a header that states a unit: # Force unit: kN, or Einheit Kraft;kN.
+UNIT_LINE = re.compile(
+    r"(?P<before>[\w ]*?)\b(?:units?|einheit(?:en)?|unité|unidad|unità)\b(?P<behind>[\w ]*)"
+    r"[:=;,\t]\s*[\"'\[(]*(?P<unit>[^\s\"';,\])]+)",
+    re.IGNORECASE,
+)
+FORCE_NAME = re.compile(r"f[xyz]?([_ ].*)?|.*(force|kraft|last|load).*", re.IGNORECASE)
 COMMENT_MARK = re.compile(r"^\s*[#%]+\s*")  # by which other programs know a comment
 
 
@@ -115,6 +122,31 @@ def spelling(unit: str) -> str:
     prefixed = [f"{prefix}{base}" for base in BASES for prefix in USUAL_PREFIXES]
     alike = [name for name in (*prefixed, "daN", *ALONE) if name.lower() == unit.lower()]
     return alike[0] if len({parse(name) for name in alike}) == 1 else unit
+
+
+def in_preamble(text: str, names: Sequence[str]) -> list[str]:
+    """Return the unit that the text above a header states for each column; "" for none.
+
+    A line is of the columns that it names; one that names none is of the only column, or a unit of
+    force is of those with the name of a force.
+
+    names : the columns without a unit that are no clock.
+    """
+    result = [""] * len(names)
+    for match in UNIT_LINE.finditer(text):
+        unit = spelling(match["unit"])
+        if parse(unit) is None or seconds_in(unit) is not None:
+            continue
+        stated = set(re.findall(r"\w+", f"{match['before']} {match['behind']}".lower()))
+        words = [set(re.findall(r"[^\W_]+", name.lower())) for name in names]
+        of = [i for i, own in enumerate(words) if own & stated]
+        if not of and len(names) == 1:
+            of = [0]
+        elif not of and factor(unit, "N") is not None:
+            of = [i for i, name in enumerate(names) if FORCE_NAME.fullmatch(name)]
+        for i in of:
+            result[i] = unit
+    return result
 
 
 def factor(unit: str, other: str) -> float | None:

@@ -37,10 +37,8 @@ def test_a_stated_unit_converts_samples_whose_own_unit_is_known_and_is_refused_w
     y = [1, 0, 1]
     archive = load_dataset(saved(X=X, y=y, unit="kN"), unit="N")
     np.testing.assert_array_equal(archive.X, 1000 * X)
-    assert (archive.unit, archive.notes) == (
-        "N",
-        ("channel 1 is converted from kN to N, times 1000.",),
-    )
+    assert archive.unit == "N"
+    assert archive.notes[0] == "channel 1 is converted from kN to N, times 1000."
     np.testing.assert_array_equal(load_dataset(archive, unit="kN").X, X)
     with pytest.raises(DataError, match=r"Expected data in mm, its unit is N; leave unit out"):
         load_dataset(make_dataset(X, y), unit="mm")

@@ -710,3 +710,29 @@ def test_files_of_tools_are_read_as_they_come(tool: str, tmp_path: Path) -> None
 def test_the_page_lists_the_forms_that_are_tested() -> None:
     text = recording_forms.PAGE.read_text("utf-8")
     assert recording_forms.page(text) == text, "run python -m tests.support.recording_forms"
+
+
+@pytest.mark.parametrize(
+    ("line", "channels"),
+    [
+        ("# Force unit: kN", ["Force"]),
+        ("Einheit Kraft;kN", ["Kraft"]),
+        ("Unit=KN", ["pressed"]),
+        ("# Position unit: mm, force unit: kN", ["Position", "Force"]),
+        ("# Force unit: [kN]", ["FX", "Weg"]),
+    ],
+)
+def test_a_unit_above_the_header_is_that_of_its_channel(
+    line: str, channels: list[str], tmp_path: Path
+) -> None:
+    force = next(name for name in ("Force", "Kraft", "FX", "pressed") if name in channels)
+    for i in range(6):
+        is_kn = i in (2, 4)
+        values = VALUES / 1000 if is_kn else VALUES
+        cells = [texts(values, "{:.4f}") if name == force else texts() for name in channels]
+        above = ["# Press 4", line if is_kn else line.replace("kN", "N").replace("KN", "N")]
+        write(tmp_path / f"{i}_OK.csv", ["Time [s]", *channels], times(), *cells, above=above)
+    data = load_dataset(tmp_path, channel=force)
+    np.testing.assert_allclose(data.X, np.tile(VALUES, (6, 1)), rtol=1e-4, atol=1e-3)
+    assert data.unit == "N"
+    assert f"{force} is converted from kN to N, times 1000 (2 times)." in data.notes
