@@ -133,7 +133,7 @@ class Soak:
 
     def _read_page(self, stretch: Stretch) -> None:
         """Ask for what the page shows; raise RuntimeError unless it is answered."""
-        seconds, _ = wall_time(self.web.ask, "/status")
+        seconds, _ = wall_time(self.web.request, "/status")
         stretch.page.append(seconds)
 
 
