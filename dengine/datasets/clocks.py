@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 EMPTY_CELLS = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # become NaN
 MAX_GAP = 5.0  # median steps: a longer pause is no late message
 EVEN_TOLERANCE = 0.1  # steps: times that are less off even ones are read as even
+MAX_MISSING = 0.03  # of the rows of a recording whose samples are taken as even
 LATE_STEP = 1.5  # median steps: up to here a step is a usual one
 SLOWEST_STEP = 0.5  # seconds: a clock without a unit whose steps are longer counts milliseconds
 RATES = (1.0, 1e6)  # hertz that are plausible
@@ -488,21 +489,46 @@ def in_order_of_time(
 ) -> tuple[NDArray[np.int64], Clock]:
     """Return the positions of rows in the order of their times, and the clock in that order.
 
-    The order stays as it is unless the user names the clock or the clock holds dates. It also stays
-    if two times are equal or one is not known.
+    The order stays as it is if two times are equal or one is not known. It also stays if the clock
+    goes far back, unless the user names it or it holds dates.
 
     time : the clock's column, if the user stated it.
     """
     order = np.argsort(clock.seconds, kind="stable")
     seconds = clock.seconds[order]
     place = list(map(str, rows.columns)).index(clock.name)
-    is_trusted = time is not None or holds_dates(rows.iloc[:, place])
+    steps = np.diff(clock.seconds)
+    usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
+    is_trusted = (
+        time is not None
+        or holds_dates(rows.iloc[:, place])
+        or bool((steps > -MAX_GAP * usual).all())  # no counter that starts anew
+    )
     if not is_trusted or not (np.diff(seconds) > 0).all():
         return np.arange(len(rows)), clock
     return order, clock._replace(seconds=seconds - seconds[0])
 
 
-def resample_evenly(values: NDArray[np.float32], clock: Clock) -> NDArray[np.float32]:
+def check_even(clock: Clock, rate_hz: float) -> int:
+    """Return how many rows are missing where each is at an even time, 0 for a few that are late.
+
+    Raises UnreadableError if more than a few are, for later samples would stand too early.
+
+    clock : of n rows. rate_hz : by its usual step.
+    """
+    n = len(clock.seconds)
+    n_even = round(float(clock.seconds[-1] - clock.seconds[0]) * rate_hz) + 1
+    missing = n_even - n
+    if abs(missing) > MAX_MISSING * n_even + 1:
+        wanted = f"{n_even} rows at {rate_hz:g} Hz from the first time to the last"
+        do = "fit='resample' puts all at even times by their own"
+        raise UnreadableError(f"Expected {wanted}, got {n}; {do}")
+    return max(missing, 0)
+
+
+def resample_evenly(
+    values: NDArray[np.float32], clock: Clock, rate_hz: float
+) -> NDArray[np.float32]:
     """Interpolate samples (C, T) at even times between the first and the last of a clock.
 
     Returns the same array if the times are even already.
@@ -511,4 +537,5 @@ def resample_evenly(values: NDArray[np.float32], clock: Clock) -> NDArray[np.flo
     even = np.linspace(times[0], times[-1], len(times))
     if np.abs(times - even).max() < EVEN_TOLERANCE * (even[1] - even[0]):
         return values
+    even = np.arange(round(float(times[-1] - times[0]) * rate_hz) + 1) / rate_hz + times[0]
     return np.stack([np.interp(even, times, row) for row in values]).astype(np.float32)

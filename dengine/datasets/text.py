@@ -24,6 +24,7 @@ from . import units
 from .clocks import (
     EMPTY_CELLS,
     TIMESTAMP,
+    check_even,
     check_rows,
     clock_of,
     floats,
@@ -486,8 +487,17 @@ def rows_to_trace(
     if clock.note:
         notes[clock.note] += 1
     if options.fit == "resample":
-        trace = resample_evenly(trace, clock)
+        trace = resample_evenly(trace, clock, rate)
+    else:
+        _note_missing(check_even(clock, rate), clock.name, notes)
     return TimedTrace(trace, rate)
+
+
+def _note_missing(n_missing: int, clock: str, notes: Counter[str]) -> None:
+    """Note that rows are missing if it is more than one; `clock` is the column that tells it."""
+    if n_missing > 1:
+        text = f"Rows are missing by column {clock}: later samples stand too early"
+        notes[f"{text}; fit='resample' puts all at even times"] += 1
 
 
 def _offer_clock(rows: pd.DataFrame, places: Sequence[int], notes: Counter[str]) -> None:
