@@ -1,9 +1,10 @@
-"""The proof: does what is called a guarantee hold, where the truth is known? Resumable: finished pieces are kept.
+"""The proof: is every promise kept on streams whose true probabilities are known?
 
     python -m tests.slow.proof --out out/proof --repeats 200
-    python -m tests.slow.proof --out out/proof --repeats 4 --only planted,noise --jobs 2 --docs out/proof
+    python -m tests.slow.proof --out out/proof --repeats 4 --only planted,noise --jobs 2
 
-Writes proof.csv (a row a configuration) and proof.md (the tables) into the folder that `--docs` names.
+Finished pieces are kept in --out, so that an interrupted run continues. Writes proof.csv (one row
+per configuration) and proof.md (the tables) into the folder that --docs names, by default --out.
 """
 
 import argparse
@@ -18,35 +19,51 @@ from .pieces import Piece, finish
 from .replays import noise_cases, planted_cases, priced_cases
 from .report import write_report
 
-QUICK = ("conv", "pca", "rocket")
+GARBAGE_REDUCERS = ("conv", "pca", "rocket")  # umap is slow, and has one seed
 CASES = {"planted": planted_cases, "cost": priced_cases, "noise": noise_cases}
 PARTS = ("null", "certificate", "planted", "cost", "noise", "garbage")
 
 
-def pieces_of(part: str, repeats: int) -> list[Piece]:
-    """All pieces of one part: of each configuration the seeds from 0 on."""
+def make_pieces(part: str, repeats: int) -> list[Piece]:
+    """Return all pieces of one part: for each configuration the seeds from 0 on.
+
+    Parameters
+    ----------
+    part : str
+        A name in `PARTS`.
+    repeats : int
+        Replays of a main configuration; others have a share of them.
+    """
     if part in CASES:
-        cases = [(case, max(2, round(case.share * repeats))) for case in CASES[part]()]
-        return [Piece(part, {"case": case}, seed) for case, n in cases for seed in range(n)]
-    n, settings = {
-        "null": (max(2, repeats // 20), [{"reducer": "conv", "data": "insertion"}]),
-        "certificate": (
-            max(2, repeats // 10),
-            _product(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,)),
-        ),
-        "garbage": (max(1, repeats // 40), _product(reducer=QUICK)),
-    }[part]
-    pieces = [Piece(part, setting, seed) for setting in settings for seed in range(n)]
-    return [*pieces, Piece(part, {"reducer": "umap"})] if part == "garbage" else pieces
+        return [
+            Piece(part, {"case": case}, seed)
+            for case in CASES[part]()
+            for seed in range(max(2, round(case.share * repeats)))
+        ]
+    if part == "null":
+        n_seeds = max(2, repeats // 20)
+        settings = [{"reducer": "conv", "data": "insertion"}]
+    elif part == "certificate":
+        n_seeds = max(2, repeats // 10)
+        settings = _combine(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))
+    elif part == "garbage":
+        n_seeds = max(1, repeats // 40)
+        settings = _combine(reducer=GARBAGE_REDUCERS)
+    else:
+        raise SystemExit(f"Expected parts of {', '.join(PARTS)}, got {part}.")
+    pieces = [Piece(part, setting, seed) for setting in settings for seed in range(n_seeds)]
+    if part == "garbage":
+        pieces.append(Piece(part, {"reducer": "umap"}))
+    return pieces
 
 
-def _product(**axes: Iterable[Any]) -> list[dict[str, Any]]:
-    """Every combination of settings, the last axis quickest."""
+def _combine(**axes: Iterable[Any]) -> list[dict[str, Any]]:
+    """Return every combination of the axes' values, the last axis varying fastest."""
     return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
 
 
 def main() -> None:
-    """Parse, finish every piece, write."""
+    """Finish every piece, write the report, print its conclusion."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -66,10 +83,12 @@ def main() -> None:
         "--only", default=",".join(PARTS), help=f"parts to do, of {', '.join(PARTS)}"
     )
     parser.add_argument("--jobs", type=int, default=2, help="processes")
-    args = parser.parse_args()
-    pieces = [piece for part in args.only.split(",") for piece in pieces_of(part, args.repeats)]
-    done = finish(pieces, args.out, args.jobs, functools.partial(print, flush=True))
-    print(write_report(done, args.docs or args.out))
+    arguments = parser.parse_args()
+    parts = arguments.only.split(",")
+    pieces = [piece for part in parts for piece in make_pieces(part, arguments.repeats)]
+    print_now = functools.partial(print, flush=True)
+    finished = finish(pieces, arguments.out, arguments.jobs, print_now)
+    print(write_report(finished, arguments.docs or arguments.out))
 
 
 if __name__ == "__main__":

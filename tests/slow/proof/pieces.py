@@ -1,9 +1,10 @@
-"""Work in pieces that are kept on disk: what is done is not done again.
+"""The proof in pieces that are kept on disk, so that no piece is done twice.
 
-    >>> done = finish(pieces, Path("out/proof"), jobs=2)
+    >>> finished = finish(pieces, Path("out/proof"), jobs=2)
 
-A piece is a function's name in `FUNCTIONS`, its settings and a seed. It is kept under these and a hash of the sources of
-dengine and of this folder: other code, other pieces.
+A piece is the name of a function in `FUNCTIONS`, its settings and a seed. Its rows are kept under
+these and a hash of the source of dengine and of this folder: if the code changes, pieces are done
+again.
 """
 
 import hashlib
@@ -18,36 +19,38 @@ from joblib import Memory, Parallel, delayed
 
 import dengine
 
-from .certificate import ever_wrong
+from .certificate import share_ever_wrong
 from .garbage import garbage
 from .replays import judge, spend
 
 Row = dict[str, Any]
-BESIDE = ("cli", "export", "store", "figures", "tables")  # sources that decide nothing here
-STREAMS = 100  # of the certificate, a seed
+FinishedPiece = tuple["Piece", list[Row]]
+# Files and folders whose source does not influence a result.
+UNRELATED = {"cli", "export", "store", "figures", "tables", "report"}
+N_STREAMS = 100  # of the certificate, for each seed
+N_STREAM_PARTS = 2000
 
 
 def null(seed: int, reducer: str, data: str) -> Row:
-    """Labels that are independent of the trace, four in five good, through the whole loop: how many came out certain."""
-    X, recipe = (
-        dengine.load_dataset(data).X,
-        dengine.Recipe.load(reducer).with_policy(alpha=0.1, lower_bound=0.9),
-    )
-    y = (
-        np.random.default_rng(100 + seed)
-        .permutation(np.arange(len(X)) < 0.8 * len(X))
-        .astype(np.int8)
-    )
-    return {
-        "cycles": len(X),
-        "certain": int((dengine.replay((X, y), recipe, 100 + seed).action != "verify").sum()),
-    }
+    """Play labels that are independent of the traces, four in five good, through an engine.
+
+    Returns
+    -------
+    row : dict
+        cycles, and how many decisions were certain.
+    """
+    X = dengine.load_dataset(data).X
+    recipe = dengine.Recipe.load(reducer).with_policy(alpha=0.1, lower_bound=0.9)
+    labels = np.arange(len(X)) < 0.8 * len(X)
+    y = np.random.default_rng(100 + seed).permutation(labels).astype(np.int8)
+    played = dengine.replay((X, y), recipe, 100 + seed)
+    return {"cycles": len(X), "certain": int((played.action != "verify").sum())}
 
 
-def certified(seed: int, stream: str, propensity: float, alpha: float) -> Row:
-    """In how many of `STREAMS` the bound was ever wrong."""
-    share = ever_wrong(stream, propensity, alpha, STREAMS, 2000, seed)
-    return {"streams": STREAMS, "wrong": round(STREAMS * share)}
+def certify(seed: int, stream: str, propensity: float, alpha: float) -> Row:
+    """Return in how many of `N_STREAMS` the certificate's bound was ever wrong."""
+    share = share_ever_wrong(stream, propensity, alpha, N_STREAMS, N_STREAM_PARTS, seed)
+    return {"streams": N_STREAMS, "wrong": round(N_STREAMS * share)}
 
 
 FUNCTIONS: dict[str, Callable[..., Row | list[Row]]] = {
@@ -55,14 +58,23 @@ FUNCTIONS: dict[str, Callable[..., Row | list[Row]]] = {
     "noise": judge,
     "planted": judge,
     "cost": spend,
-    "certificate": certified,
+    "certificate": certify,
     "garbage": garbage,
 }
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A seed of one configuration. kind : in `FUNCTIONS`.  settings : of its function."""
+    """One seed of one configuration.
+
+    Parameters
+    ----------
+    kind : str
+        A name in `FUNCTIONS`.
+    settings : dict
+        Arguments of the function.
+    seed : int, default 0
+    """
 
     kind: str
     settings: Row = field(hash=False)
@@ -70,44 +82,57 @@ class Piece:
 
     @property
     def name(self) -> str:
-        """Its configuration's."""
+        """Name of the configuration."""
         return ", ".join(str(getattr(value, "name", value)) for value in self.settings.values())
 
 
-def sources_digest() -> str:
-    """SHA-256 of every source that decides a result."""
-    parent, theirs = Path(__file__).parent, Path(dengine.__file__).parent
-    files = [*sorted(parent.glob("*.py")), *sorted(theirs.rglob("*.py"))]
-    files = [f for f in files if not {f.stem, f.parent.name} & {*BESIDE, "report"}]
-    return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
+def digest_of_source() -> str:
+    """Return the SHA-256 of every source file that influences a result."""
+    here = Path(__file__).parent
+    package = Path(dengine.__file__).parent
+    digest = hashlib.sha256()
+    for path in [*sorted(here.glob("*.py")), *sorted(package.rglob("*.py"))]:
+        if path.stem not in UNRELATED and path.parent.name not in UNRELATED:
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
-def run_piece(piece: Piece, sources: str) -> list[Row]:
-    """Every row of a piece, with its seed; sources : part of what it is kept under."""
+def run_piece(piece: Piece, source: str) -> list[Row]:
+    """Return the rows of a piece, with its seed; they are kept under both arguments."""
     result = FUNCTIONS[piece.kind](seed=piece.seed, **piece.settings)
-    return [
-        {"seed": piece.seed} | row for row in (result if isinstance(result, list) else [result])
-    ]
+    rows = result if isinstance(result, list) else [result]
+    return [{"seed": piece.seed} | row for row in rows]
 
 
 def finish(
-    pieces: list[Piece], out: Path, jobs: int, tell: Callable[[str], None] = print
-) -> list[tuple[Piece, list[Row]]]:
-    """Every piece with its rows, in order; those missing on the disk are done, `jobs` at a time."""
-    run, sources, begin = (
-        Memory(out, verbose=0).cache(run_piece),
-        sources_digest(),
-        time.perf_counter(),
-    )
-    there = sum(run.check_call_in_cache(piece, sources) for piece in pieces)
-    tell(f"{there} of {len(pieces)} pieces are there already.")
-    every = Parallel(n_jobs=jobs, return_as="generator", batch_size=1)(
-        delayed(run)(piece, sources) for piece in pieces
-    )
-    done: list[tuple[Piece, list[Row]]] = []
-    for piece, rows in zip(pieces, every, strict=True):
-        done.append((piece, rows))
-        if len(done) == len(pieces) or pieces[len(done)].name != piece.name:
+    pieces: list[Piece], out: Path, jobs: int, print_line: Callable[[str], None] = print
+) -> list[FinishedPiece]:
+    """Return every piece with its rows, in order; do those that are not kept.
+
+    Parameters
+    ----------
+    pieces : list of Piece
+    out : Path
+        Folder of the kept pieces.
+    jobs : int
+        Pieces at a time.
+    print_line : callable, default print
+        Called with lines on the progress: how many pieces are kept, and each finished
+        configuration.
+    """
+    run = Memory(out, verbose=0).cache(run_piece)
+    source = digest_of_source()
+    begin = time.perf_counter()
+    n_kept = sum(run.check_call_in_cache(piece, source) for piece in pieces)
+    print_line(f"{n_kept} of {len(pieces)} pieces are there already.")
+    parallel = Parallel(n_jobs=jobs, return_as="generator", batch_size=1)
+    all_rows = parallel(delayed(run)(piece, source) for piece in pieces)
+    finished: list[FinishedPiece] = []
+    for piece, rows in zip(pieces, all_rows, strict=True):
+        finished.append((piece, rows))
+        n = len(finished)
+        is_last_seed = n == len(pieces) or pieces[n].name != piece.name
+        if is_last_seed:
             minutes = (time.perf_counter() - begin) / 60
-            tell(f"[{len(done)}/{len(pieces)}] {piece.kind}: {piece.name}; {minutes:.1f} min")
-    return done
+            print_line(f"[{n}/{len(pieces)}] {piece.kind}: {piece.name}; {minutes:.1f} min")
+    return finished

@@ -1,10 +1,12 @@
-"""Replays of planted truths, judged by true probabilities: how often is more of what passed bad than was promised?
+"""Replays of planted truths: is more of what passed bad than was promised?
 
     >>> row = judge(seed=0, case=Case("soft", truth="soft"))
-    >>> row["members, ever"], row["passed, end"]   # mean true probabilities of failure, the worst and the last
+    >>> row["members, ever"], row["passed, end"]
 
-What is claimed is of *members*: the parts that reached the level in force when the rule was told of them. The engine is
-driven by hand, so that after each thing that it is told the rule's own count of members says whether that part was one.
+Each replay is judged by the true failure probabilities of its parts: by their mean at the worst
+moment ("ever") and at the end. The promise is about *members*, the parts whose score reached the
+threshold that was in force when the rule learned of them. The replay drives the engine by hand and
+looks at the rule's own count of members after each step, so it knows which parts are members.
 """
 
 from collections import deque
@@ -17,24 +19,45 @@ import numpy as np
 from dengine import Action, DataEngine, Decision, Recipe
 from dengine.recipe import RECIPES
 
-from .truths import planted
+from .truths import Stream, planted
 
 Row = dict[str, Any]
+# Fields of a case that are fields of its policy.
 POLICY = ("alpha", "lower_bound", "interval", "guarantee", "stops", "audit_rate", "label_within")
-LOOKS = 25  # parts between two certificates
-FEW = 30  # accepted parts: a mean over fewer is not looked at
+PARTS_PER_CERTIFICATE = 25
+FEWEST = 30  # accepted parts: a mean over fewer is not judged
 SIDES = {"accepted": Action.ACCEPT, "rejected": Action.REJECT}
-WHEN = ("ever", "end")
+MOMENTS = ("ever", "end")
 
 
 @dataclass(frozen=True)
 class Case:
-    """One configuration. Every field but the first three is one factor, at its base.
+    """One configuration of replays. Each field but the first three changes one factor of the base.
 
-    share : of the repeats that are asked for.  rate : of the labels where the truth has one rate.
-    order : "drawn", "best first", "worst first".  missing : share of the checks of bad parts that are never reported.
-    late : decisions by which a stop comes late, at most.  confirms : of what was accepted, whether under stops="some" the
-    good parts are told of, and not the bad ones.  mirrored : successes for failures, so rejects are looked at.
+    Parameters
+    ----------
+    name : str
+        Of the configuration.
+    truth : str
+        As `planted` takes it.
+    share : float
+        Of the repeats that were asked for.
+    rate : float
+        Success rate of a truth that has only one.
+    reducer : str
+        A name in `RECIPES`.
+    alpha, lower_bound, interval, guarantee, stops, audit_rate, label_within
+        Of the policy.
+    order : {"drawn", "best first", "worst first"}
+    missing : float
+        Share of the checks of bad parts that are never reported.
+    late : int
+        A line stop is reported up to this many decisions late.
+    confirms : bool
+        Of the accepted parts, under stops="some": report the good ones and not the bad ones.
+    mirrored : bool
+        Swap successes and failures, so that rejects are judged.
+    cycles : int
     """
 
     name: str
@@ -58,129 +81,252 @@ class Case:
 
     @property
     def side(self) -> str:
-        """What is looked at."""
+        """Which parts are judged: "accepted" or "rejected"."""
         return "rejected" if self.mirrored else "accepted"
 
     @property
     def tolerance(self) -> float:
-        """The mean failure probability that is allowed."""
+        """Mean failure probability that is allowed."""
         return 1.0 - self.lower_bound
 
     @property
-    def claims(self) -> bool:
-        """Whether the row's members are called a guarantee: of rejected parts only where audits are the evidence."""
+    def is_promise(self) -> bool:
+        """Whether a guarantee holds for the members.
+
+        For rejected parts there is one only if audits are the evidence.
+        """
         return self.guarantee == "pooled" and (not self.mirrored or self.stops == "some")
 
     @property
     def recipe(self) -> Recipe:
-        """The engine's."""
+        """Recipe of the engine."""
         return RECIPES[self.reducer].with_policy(**{name: getattr(self, name) for name in POLICY})
 
+    def stream(self, seed: int) -> Stream:
+        """Return the parts of the replay with this seed."""
+        stream = planted(self.truth, self.cycles, self.lower_bound, seed, self.rate, self.order)
+        return stream.mirrored() if self.mirrored else stream
 
-class Mean:
-    """A running mean of true failure probabilities: as last looked at, and the largest, from `least` parts on."""
+    def reports_accepted(self, good: bool) -> bool:
+        """Return whether the outcome of an accepted part is reported."""
+        return self.stops == "all" or good == self.confirms
 
-    def __init__(self, least: int = 1) -> None:
-        self.n, self.sum, self.least = 0, 0.0, least
-        self.end = self.ever = float("nan")
 
-    def add(self, p: float, counts: bool) -> None:
-        """A part, where it counts."""
-        self.n, self.sum = self.n + counts, self.sum + counts * p
+class RunningMean:
+    """A running mean of true failure probabilities.
 
-    def look(self, now: bool = True) -> None:
-        """At this moment, where something is said of it."""
-        if now and self.n >= self.least:
+    Parameters
+    ----------
+    fewest : int, default 1
+        Parts from which on the mean is judged.
+
+    Attributes
+    ----------
+    n : int
+    sum : float
+    end, ever : float
+        The mean when it was last judged, and the largest that was judged; NaN before that.
+    """
+
+    def __init__(self, fewest: int = 1) -> None:
+        self.n = 0
+        self.sum = 0.0
+        self.fewest = fewest
+        self.end = float("nan")
+        self.ever = float("nan")
+
+    def add(self, probability: float) -> None:
+        """Add a part."""
+        self.n += 1
+        self.sum += probability
+
+    def judge(self) -> None:
+        """Judge the mean at this moment, if it has enough parts."""
+        if self.n >= self.fewest:
             self.end = self.sum / self.n
             self.ever = float(np.fmax(self.ever, self.end))
 
 
-def judge(seed: int, case: Case) -> Row:
-    """How much passed, and the mean true failure probability of members and of what passed: the largest ever, the last.
+def count_members(engine: DataEngine, side: int) -> int:
+    """Return how many members the rule has counted, of accepted parts (0) or rejected ones (1)."""
+    evidence = None if engine.model is None else getattr(engine.model.rule, "evidence", None)
+    return 0 if evidence is None else int(evidence.member_counts[side, :, 0].sum())
 
-    Members are looked at whenever a part would pass, for then it is claimed of them; NaN where none did.
+
+def judge(seed: int, case: Case) -> Row:
+    """Play one replay; return the mean true failure probabilities of members and of what passed.
+
+    Members are judged whenever a part would pass, because that is when the promise is made; what
+    passed is judged after every part.
+
+    Returns
+    -------
+    row : dict
+        certain: decisions without a check; passed: accepted parts (rejected ones if mirrored);
+        "members, ever", "members, end", "passed, ever" and "passed, end": means, NaN without parts.
     """
-    stream = planted(case.truth, case.cycles, case.lower_bound, seed, case.rate, case.order)
-    stream = stream.mirrored() if case.mirrored else stream
-    wrong = stream.p if case.mirrored else 1.0 - stream.p
-    rng, side, action = np.random.default_rng([seed, 13]), int(case.mirrored), SIDES[case.side]
-    members, passed, certain = Mean(), Mean(FEW), 0
-    owed: deque[tuple[int, float]] = (
-        deque()
-    )  # checks that are never reported, and when they count as bad
-    stops: deque[tuple[int, Decision]] = deque()  # that come late
-    numbers = [None] * case.cycles if stream.data.part is None else stream.data.part
-    with DataEngine(recipe=case.recipe, seed=seed, replaying=True) as engine:
-        for i, (x, number, p) in enumerate(zip(stream.data.X, numbers, wrong, strict=True)):
-            while stops and stops[0][0] <= i:
-                engine.report(stops.popleft()[1].id, False)
-            before = _members(engine, side)
-            decision = engine.decide(x, part=number)
-            if owed and owed[0][0] <= i:
-                members.add(owed.popleft()[1], _members(engine, side) > before)
-            certain += decision.predicted in SIDES.values()
-            members.look(decision.predicted is action)
-            passed.add(p, decision.action is action)
-            passed.look()
-            good, before = bool(stream.data.y[i]), _members(engine, side)
-            checked, accepted = decision.action is Action.VERIFY, decision.action is Action.ACCEPT
-            if accepted and case.late and not good:
-                stops.append((i + 1 + int(rng.integers(case.late)), decision))
-            elif checked and not good and rng.random() < case.missing:
-                owed.append((i + 1 + case.label_within, p))
-            elif checked or (accepted and (case.stops == "all" or good == case.confirms)):
-                engine.report(decision.id, good)
-            members.add(p, _members(engine, side) > before)
-    means = {"members": members, "passed": passed}
-    return {"certain": certain, "passed": passed.n} | {
-        f"{name}, {when}": getattr(mean, when) for name, mean in means.items() for when in WHEN
-    }
+    return JudgedReplay(seed, case).play()
+
+
+class JudgedReplay:
+    """One replay of a planted truth, see `judge`.
+
+    Attributes
+    ----------
+    members, passed : RunningMean
+        Of the members, and of the parts that passed.
+    n_certain : int
+    missing_checks : deque of (int, float)
+        Checks of bad parts that are never reported: the cycle from which on they count as bad, and
+        the part's failure probability.
+    late_stops : deque of (int, str)
+        Line stops to be reported: at which cycle, and of which decision.
+    """
+
+    def __init__(self, seed: int, case: Case) -> None:
+        self.case = case
+        self.stream = case.stream(seed)
+        self.p_wrong = self.stream.p if case.mirrored else 1.0 - self.stream.p
+        self.action = SIDES[case.side]
+        self.rng = np.random.default_rng([seed, 13])
+        self.engine = DataEngine(recipe=case.recipe, seed=seed, replaying=True)
+        self.members = RunningMean()
+        self.passed = RunningMean(FEWEST)
+        self.n_certain = 0
+        self.missing_checks: deque[tuple[int, float]] = deque()
+        self.late_stops: deque[tuple[int, str]] = deque()
+
+    def play(self) -> Row:
+        """Play all parts and return the row."""
+        with self.engine:
+            for i in range(len(self.stream.data)):
+                self._report_late_stops(i)
+                decision = self._decide(i)
+                self._judge(i, decision)
+                self._report(i, decision)
+        row: Row = {"certain": self.n_certain, "passed": self.passed.n}
+        for name, mean in {"members": self.members, "passed": self.passed}.items():
+            row |= {f"{name}, {moment}": getattr(mean, moment) for moment in MOMENTS}
+        return row
+
+    def _report_late_stops(self, i: int) -> None:
+        """Report the line stops that are due at cycle i."""
+        while self.late_stops and self.late_stops[0][0] <= i:
+            _, decision_id = self.late_stops.popleft()
+            self.engine.report(decision_id, False)
+
+    def _decide(self, i: int) -> Decision:
+        """Decide on part i; a missing check that becomes overdue with it may be a member."""
+        data = self.stream.data
+        part = None if data.part is None else data.part[i]
+        n_members = self._count_members()
+        decision = self.engine.decide(data.X[i], part=part)
+        if self.missing_checks and self.missing_checks[0][0] <= i:
+            _, probability = self.missing_checks.popleft()
+            if self._count_members() > n_members:
+                self.members.add(probability)
+        return decision
+
+    def _judge(self, i: int, decision: Decision) -> None:
+        """Count the decision on part i, and judge both means at this moment."""
+        self.n_certain += decision.predicted in SIDES.values()
+        if decision.predicted is self.action:
+            self.members.judge()
+        if decision.action is self.action:
+            self.passed.add(self.p_wrong[i])
+        self.passed.judge()
+
+    def _report(self, i: int, decision: Decision) -> None:
+        """Report the outcome of part i now, later or never, as the case says."""
+        case = self.case
+        good = bool(self.stream.data.y[i])
+        n_members = self._count_members()
+        is_checked = decision.action is Action.VERIFY
+        is_accepted = decision.action is Action.ACCEPT
+        if is_accepted and case.late and not good:
+            cycle = i + 1 + int(self.rng.integers(case.late))
+            self.late_stops.append((cycle, decision.id))
+        elif is_checked and not good and self.rng.random() < case.missing:
+            self.missing_checks.append((i + 1 + case.label_within, self.p_wrong[i]))
+        elif is_checked or (is_accepted and case.reports_accepted(good)):
+            self.engine.report(decision.id, good)
+        if self._count_members() > n_members:
+            self.members.add(self.p_wrong[i])
+
+    def _count_members(self) -> int:
+        """Return how many members the rule has counted on the judged side."""
+        return count_members(self.engine, int(self.case.mirrored))
 
 
 def spend(seed: int, case: Case) -> Row:
-    """Under prices: the members' account in escapes, the most at which a part passed, and what the certificate said.
+    """Play one replay under the guarantee of costs and return what the accepted parts cost.
 
-    saved : at the end what not checking the accepted saved less what they cost, by their true probabilities of failure.
-    bound : what the certificate said of it then.  untrue : whether it ever said more.
+    Returns
+    -------
+    row : dict
+        accepted : number of accepted parts.
+        account : the members' cost beyond their checks, in false accepts, at the worst moment at
+        which a part passed; NaN if none did.
+        saved : what the accepted parts saved at the end, by their true failure probabilities.
+        bound : what the certificate said of it then.
+        untrue : whether the certificate ever said more than was saved.
     """
-    stream, policy = (
-        planted(case.truth, case.cycles, case.lower_bound, seed, case.rate, case.order),
-        case.recipe.policy,
-    )
-    (check, escape, _), accepted = policy.prices, Mean()
-    account, most, bound, untrue = 0.0, float("nan"), 0.0, False
+    stream = case.stream(seed)
+    policy = case.recipe.policy
+    check_price, escape_price, _ = policy.prices
+    accepted = RunningMean()
+    account = 0.0
+    largest_account = float("nan")
+    bound = 0.0
+    is_untrue = False
+
+    def saved() -> float:
+        return check_price * accepted.n - escape_price * accepted.sum
+
     with DataEngine(recipe=case.recipe, seed=seed, replaying=True) as engine:
-        for i, (x, y, p) in enumerate(zip(stream.data.X, stream.data.y, stream.p, strict=True)):
-            decision, before = engine.decide(x), _members(engine, 0)
+        for i, trace in enumerate(stream.data.X):
+            label = stream.data.y[i]
+            decision = engine.decide(trace)
+            n_members = count_members(engine, 0)
             if decision.action is Action.ACCEPT:
-                most = float(np.fmax(most, account))
-            accepted.add(1.0 - p, decision.action is Action.ACCEPT)
+                largest_account = float(np.fmax(largest_account, account))
+                accepted.add(1.0 - stream.p[i])
             if decision.action is not Action.REJECT:
-                engine.report(decision.id, bool(y))
-            account += (_members(engine, 0) > before) * (1.0 - y - policy.tolerances[0])
-            if i % LOOKS == LOOKS - 1:
+                engine.report(decision.id, bool(label))
+            if count_members(engine, 0) > n_members:
+                account += 1.0 - label - policy.tolerances[0]
+            if i % PARTS_PER_CERTIFICATE == PARTS_PER_CERTIFICATE - 1:
                 bound = engine.certificate().saved or 0.0
-                untrue |= bound > check * accepted.n - escape * accepted.sum
-    saved = check * accepted.n - escape * accepted.sum
+                is_untrue |= bound > saved()
     return {
         "accepted": accepted.n,
-        "account": most,
-        "saved": saved,
+        "account": largest_account,
+        "saved": saved(),
         "bound": bound,
-        "untrue": untrue,
+        "untrue": is_untrue,
     }
 
 
-def broken(rows: Iterable[Row], what: str, tolerance: float) -> int:
-    """In how many replays a mean of `judge` exceeds the tolerance."""
-    return sum(row[what] > tolerance + 1e-9 for row in rows)
+def count_broken(rows: Iterable[Row], mean: str, tolerance: float) -> int:
+    """Return in how many replays a mean that `judge` returned exceeds the tolerance."""
+    return sum(row[mean] > tolerance + 1e-9 for row in rows)
 
 
-HELD, MOVING = ("sharp", "soft", "step", "mesa", "edge", "trap", "staircase", "just beyond", "bad few"), (
-    "drifting", "jumping", "seasons")  # fmt: skip
-FACTORS: dict[
-    str, Row
-] = {  # one at a time, beside the base: all stops known, as drawn, 1,503 parts at (0.1, 90 %)
+FIXED_TRUTHS = (
+    "sharp",
+    "soft",
+    "step",
+    "mesa",
+    "edge",
+    "trap",
+    "staircase",
+    "just beyond",
+    "bad few",
+)
+MOVING_TRUTHS = ("drifting", "jumping", "seasons")
+FACTOR_TRUTHS = ("soft", "trap")  # that each factor is tried with
+# Name -> what it changes of the base: all stops known, drawn order, 1,503 parts at (0.1, 90 %).
+FACTORS: dict[str, Row] = {
     "best first": {"order": "best first"},
     "worst first": {"order": "worst first"},
     "10 % audits, some stops": {"stops": "some", "audit_rate": 0.1},
@@ -197,31 +343,26 @@ FACTORS: dict[
 
 
 def planted_cases() -> list[Case]:
-    """Every truth at the base, and every factor by itself at two of them."""
-    return [Case(truth, truth) for truth in (*HELD, *MOVING)] + [
-        Case(f"{truth}, {name}", truth, **factor)
-        for name, factor in FACTORS.items()
-        for truth in ("soft", "trap")
-    ]
+    """Return every truth at the base, and every factor at two of them."""
+    cases = [Case(truth, truth) for truth in (*FIXED_TRUTHS, *MOVING_TRUTHS)]
+    for name, changes in FACTORS.items():
+        cases += [Case(f"{truth}, {name}", truth, **changes) for truth in FACTOR_TRUTHS]
+    return cases
 
 
 def priced_cases() -> list[Case]:
-    """Truths under the guarantee of costs."""
+    """Return truths under the guarantee of costs."""
     truths = ("soft", "trap", "edge", "mesa", "drifting", "jumping")
     return [Case(truth, truth, share=0.2, guarantee="cost") for truth in truths]
 
 
 def noise_cases() -> list[Case]:
-    """Labels independent of the trace, or drawn once a part where parts repeat."""
-    about: Row = {"share": 0.2, "cycles": 600}
+    """Return cases whose labels are independent of the trace.
+
+    In "parts", parts come several times, with the same label.
+    """
     return [
-        Case(f"{truth} {rate:g}", truth, rate=rate, **about)
+        Case(f"{truth} {rate:g}", truth, rate=rate, share=0.2, cycles=600)
         for truth in ("noise", "parts")
         for rate in (0.5, 0.8, 0.88)
     ]
-
-
-def _members(engine: DataEngine, side: int) -> int:
-    """How many members the rule has counted, of the parts that it accepts (0) or rejects (1)."""
-    evidence = None if engine.model is None else getattr(engine.model.rule, "evidence", None)
-    return 0 if evidence is None else int(evidence.member_counts[side, :, 0].sum())

@@ -1,4 +1,4 @@
-"""The proof's rows as a table a part: proof.csv and proof.md."""
+"""The proof's tables, proof.csv and proof.md, from the rows of its pieces."""
 
 from __future__ import annotations
 
@@ -10,88 +10,103 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from .replays import WHEN, broken
+from .replays import MOMENTS, count_broken
 
 if TYPE_CHECKING:
-    from .pieces import Piece, Row
+    from .pieces import FinishedPiece, Row
 
-HEADS = {
+# Kind of pieces -> title and text of its section.
+SECTIONS = {
     "planted": (
         "Planted truths: replays that broke the tolerance",
-        "What is claimed is of members, at every moment at which a part passes (*members, ever*): their mean true failure "
-        "probability is at most 1 - LB, in all but a share alpha of the replays. Beside it, in brackets, what is not "
-        "claimed: of members at the end alone, of the parts that passed, at any moment from 30 on and at the end, of the "
-        "local rule, and of rejects without audits. The interval is Clopper and Pearson's, 95 %.",
+        "The promise is about members, at every moment at which a part passes (*members, ever*): "
+        "their mean true failure probability is at most 1 - LB, in all but a share alpha of the "
+        "replays. In brackets stands what is not promised: the members at the end alone; the parts "
+        "that passed, at any moment from 30 parts on and at the end; the local rule; and rejects "
+        "without audits. The interval is that of Clopper and Pearson, 95 %.",
     ),
     "cost": (
         "Planted truths: what the cost guarantee spent",
-        "At 5 a check and 120 an escape. Account: the most that the members stood at when a part passed, in escapes beyond "
-        "their checks, over all replays; the rule allows 1. Saved: by accepted parts' true failure probabilities. Bound: "
-        "what the certificate said of it at the end. Broke: it ever said more.",
+        "At 5 for a check and 120 for a false accept. Account: the members' cost beyond their "
+        "checks, in false accepts, at the worst moment of all replays at which a part passed; the "
+        "rule allows 1. Saved: by the accepted parts' true failure probabilities. Bound: what the "
+        "certificate said of it at the end. Broke: it said more at any moment.",
     ),
     "noise": ("Labels of noise", "As above. Certain: decisions per 1503 cycles."),
     "null": (
         "The null test",
-        "Labels independent of the trace, four in five good: certain decisions of a replay.",
+        "Labels independent of the trace, four in five good: certain decisions of each replay.",
     ),
     "certificate": (
         "Certificate",
-        "Streams of 2000 parts in which the bound, at any moment, was wrong; alpha 10 %.",
+        "Streams of 2000 parts in which the bound was wrong at any moment; alpha 10 %.",
     ),
     "garbage": (
         "Garbage accepted",
-        "Share accepted with the novelty gate, and without it; last, certain of clean parts.",
+        "Share accepted with the novelty gate and without it; *clean, certain*: share of certain "
+        "decisions on insertions.",
     ),
 }
+# What an interval may exceed alpha by, while the promise still counts as kept.
+MARGIN = 0.04
+CYCLES = 1503  # that certain decisions are scaled to
 
 
-WHO = ("members", "passed")
-NEAR = 0.04  # by which an interval may reach beyond alpha, and still say that a promise is kept
+def verdict_row(n_broken: int, n: int, alpha: float, is_promise: bool = True) -> Row:
+    """Return how often a promise was broken, and what the whole interval of this share says.
 
-
-def share_row(k: int, n: int, alpha: float, claimed: bool = True) -> Row:
-    """How often a promise was broken, and what its whole interval says; in brackets where nothing was promised."""
-    ends = binomtest(k, n).proportion_ci(0.95)
-    word = "BROKEN" if ends.low > alpha else "kept" if ends.high <= alpha + NEAR else "within error"
+    Returns
+    -------
+    row : dict
+        broke, the share; low and high, its 95 % interval; verdict: "BROKEN", "within error" or
+        "kept", in brackets and lower case if nothing was promised.
+    """
+    interval = binomtest(n_broken, n).proportion_ci(0.95)
+    verdict = "within error"
+    if interval.low > alpha:
+        verdict = "BROKEN"
+    elif interval.high <= alpha + MARGIN:
+        verdict = "kept"
     return {
-        "broke": k / n,
-        "low": ends.low,
-        "high": ends.high,
-        "verdict": word if claimed else f"({word.lower()})",
+        "broke": n_broken / n,
+        "low": interval.low,
+        "high": interval.high,
+        "verdict": verdict if is_promise else f"({verdict.lower()})",
     }
 
 
 def replay_row(settings: Row, rows: list[Row]) -> Row:
-    """One configuration of replays."""
-    case, n = settings["case"], len(rows)
-    certain = 1503 / case.cycles * _mean(row["certain"] for row in rows)
-    out: Row = {
+    """Return the row of a configuration of replays."""
+    case = settings["case"]
+    n = len(rows)
+    row: Row = {
         "alpha": case.alpha,
         "LB": case.lower_bound,
         "replays": n,
-        "certain per 1503": certain,
+        "certain per 1503": CYCLES / case.cycles * _mean(row["certain"] for row in rows),
+        case.side: _mean(row["passed"] for row in rows),
     }
-    out |= {case.side: _mean(row["passed"] for row in rows)}
-    shares = {
-        name: broken(rows, name, case.tolerance)
-        for name in (f"{who}, {when}" for who in WHO for when in WHEN)
-    }
-    out |= share_row(shares.pop("members, ever"), n, case.alpha, case.claims)
-    return out | {name: f"({k / n:.0%})" for name, k in shares.items()}
+    n_broken = count_broken(rows, "members, ever", case.tolerance)
+    row |= verdict_row(n_broken, n, case.alpha, case.is_promise)
+    means = [f"{who}, {moment}" for who in ("members", "passed") for moment in MOMENTS]
+    for mean in means[1:]:  # the first is the promise
+        row[mean] = f"({count_broken(rows, mean, case.tolerance) / n:.0%})"
+    return row
 
 
 def cost_row(settings: Row, rows: list[Row]) -> Row:
-    """One configuration under prices."""
-    out: Row = {"replays": len(rows)} | {
-        name: _mean(row[name] for row in rows) for name in ("accepted", "saved", "bound")
-    }
-    out["account"] = float(np.nanmax([row["account"] for row in rows]))
-    return out | share_row(sum(row["untrue"] for row in rows), len(rows), settings["case"].alpha)
+    """Return the row of a configuration with prices."""
+    row: Row = {"replays": len(rows)}
+    for name in ("accepted", "saved", "bound"):
+        row[name] = _mean(replay[name] for replay in rows)
+    row["account"] = float(np.nanmax([replay["account"] for replay in rows]))
+    n_untrue = sum(replay["untrue"] for replay in rows)
+    return row | verdict_row(n_untrue, len(rows), settings["case"].alpha)
 
 
 def null_row(settings: Row, rows: list[Row]) -> Row:
-    """Each replay's, and their mean."""
-    certain = [r["certain"] for r in rows]
+    """Return the certain decisions of each replay of the null test, and their mean."""
+    certain = [row["certain"] for row in rows]
     return {
         "replays": len(rows),
         "cycles": rows[0]["cycles"],
@@ -101,21 +116,23 @@ def null_row(settings: Row, rows: list[Row]) -> Row:
 
 
 def certificate_row(settings: Row, rows: list[Row]) -> Row:
-    """Share of streams in which the bound was ever wrong."""
-    n = sum(r["streams"] for r in rows)
-    return {"streams": n, **share_row(sum(r["wrong"] for r in rows), n, settings["alpha"])}
+    """Return the share of streams in which the bound was ever wrong."""
+    n_streams = sum(row["streams"] for row in rows)
+    n_wrong = sum(row["wrong"] for row in rows)
+    return {"streams": n_streams, **verdict_row(n_wrong, n_streams, settings["alpha"])}
 
 
 def garbage_rows(settings: Row, rows: list[Row]) -> list[Row]:
-    """A row a kind."""
-    means = pd.DataFrame(rows).groupby("kind", sort=False)[["gated", "open"]].mean()
+    """Return a row for each kind of garbage, with the means over the seeds."""
+    means = pd.DataFrame(rows).groupby("kind", sort=False)[["gated", "ungated"]].mean()
     return [
-        {"kind": kind, "with the gate": gated, "without": open_}
-        for kind, gated, open_ in means.itertuples()
+        {"kind": kind, "with the gate": gated, "without": ungated}
+        for kind, gated, ungated in means.itertuples()
     ]
 
 
-ROWS: dict[str, Callable[[Row, list[Row]], Any]] = {
+# Kind of pieces -> a function that returns the rows of a configuration.
+SUMMARIES: dict[str, Callable[[Row, list[Row]], Row | list[Row]]] = {
     "planted": replay_row,
     "cost": cost_row,
     "noise": replay_row,
@@ -125,55 +142,75 @@ ROWS: dict[str, Callable[[Row, list[Row]], Any]] = {
 }
 
 
-def tables(done: Iterable[tuple[Piece, list[Row]]]) -> dict[str, pd.DataFrame]:
-    """Part -> a row a configuration."""
-    gathered: dict[tuple[str, str], tuple[Row, list[Row]]] = {}
-    for piece, rows in done:
-        gathered.setdefault((piece.kind, piece.name), (piece.settings, []))[1].extend(rows)
-    result: dict[str, list[Row]] = {}
-    for (kind, name), (settings, rows) in gathered.items():
-        created = ROWS[kind](settings, rows)
-        named = [
-            {"configuration": name} | row
-            for row in (created if isinstance(created, list) else [created])
-        ]
-        result.setdefault(kind, []).extend(named)
-    return {kind: pd.DataFrame(rows) for kind, rows in result.items()}
+def make_tables(finished: Iterable[FinishedPiece]) -> dict[str, pd.DataFrame]:
+    """Return a table for each kind of pieces, with a row for each configuration."""
+    settings: dict[tuple[str, str], Row] = {}
+    rows: dict[tuple[str, str], list[Row]] = {}
+    for piece, piece_rows in finished:
+        configuration = (piece.kind, piece.name)
+        settings.setdefault(configuration, piece.settings)
+        rows.setdefault(configuration, []).extend(piece_rows)
+    tables: dict[str, list[Row]] = {}
+    for (kind, name), all_rows in rows.items():
+        summary = SUMMARIES[kind](settings[kind, name], all_rows)
+        summaries = summary if isinstance(summary, list) else [summary]
+        tables.setdefault(kind, []).extend({"configuration": name} | row for row in summaries)
+    return {kind: pd.DataFrame(kind_rows) for kind, kind_rows in tables.items()}
 
 
-def write_report(done: Iterable[tuple[Piece, list[Row]]], docs: Path) -> str:
-    """Write both files; returns what became of everything that is called a guarantee, in a few lines."""
+def write_report(finished: Iterable[FinishedPiece], docs: Path) -> str:
+    """Write proof.csv and proof.md into a folder, which is created.
+
+    Returns
+    -------
+    conclusion : str
+        Lines that name the promises that were broken and those that are not sure yet.
+    """
     docs.mkdir(parents=True, exist_ok=True)
-    result = tables(done)
+    tables = make_tables(finished)
     whole = pd.concat(
-        [frame.assign(part=kind) for kind, frame in result.items()], ignore_index=True
+        [table.assign(part=kind) for kind, table in tables.items()], ignore_index=True
     )
     whole.to_csv(docs / "proof.csv", index=False, float_format="%.6g")
     blocks = ["# The proof", "`make proof` writes this page."]
-    for kind in (kind for kind in HEADS if kind in result):
-        title, text = HEADS[kind]
-        blocks += [f"## {title}", text, _table(result[kind])]
+    for kind, (title, text) in SECTIONS.items():
+        if kind in tables:
+            blocks += [f"## {title}", text, _markdown_table(tables[kind])]
     (docs / "proof.md").write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
-    output = whole.get("verdict", pd.Series(dtype=str)).dropna()
-    claimed = output[~output.str.startswith("(")]
-    lines = [f"{title}: {', '.join(whole['configuration'][at.index]) or 'none'}." for title, at in (
-        (f"Of {len(claimed)} promises, broken beyond sampling error", claimed[claimed == "BROKEN"]),
-        ("Not yet known well enough", claimed[claimed == "within error"]),
-    )]  # fmt: skip
-    return "\n".join([*lines, f"Written to {docs}."])
+    return f"{_conclusion(whole)}\nWritten to {docs}."
 
 
-def _table(frame: pd.DataFrame) -> str:
-    def cell(value: Any) -> str:
-        if isinstance(value, float):
-            return "" if np.isnan(value) else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
-        return str(value)
+def _conclusion(whole: pd.DataFrame) -> str:
+    """Return two lines: which promises were broken, and which are not known well enough."""
+    verdicts = whole.get("verdict", pd.Series(dtype=str)).dropna()
+    promises = verdicts[~verdicts.str.startswith("(")]
+    lines = []
+    for title, verdict in (
+        (f"Of {len(promises)} promises, broken beyond sampling error", "BROKEN"),
+        ("Not yet known well enough", "within error"),
+    ):
+        names = whole["configuration"][promises[promises == verdict].index]
+        lines.append(f"{title}: {', '.join(names) or 'none'}.")
+    return "\n".join(lines)
 
-    body = [[cell(v) for v in row] for row in frame.to_numpy(dtype=object)]
-    rows = [list(frame.columns), ["---"] * len(frame.columns), *body]
+
+def _markdown_table(table: pd.DataFrame) -> str:
+    """Return a table as Markdown; numbers have three digits, and NaN is an empty cell."""
+    body = [[_format(value) for value in row] for row in table.to_numpy(dtype=object)]
+    rows = [list(table.columns), ["---"] * len(table.columns), *body]
     return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
 
 
+def _format(value: Any) -> str:
+    """Return the text of a cell."""
+    if not isinstance(value, float):
+        return str(value)
+    if np.isnan(value):
+        return ""
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+
+
 def _mean(values: Iterable[float]) -> float:
-    finite = [v for v in values if not np.isnan(v)]
+    """Return the mean of the values that are not NaN; NaN without any."""
+    finite = [value for value in values if not np.isnan(value)]
     return float(np.mean(finite)) if finite else float("nan")

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from dengine.decision.certificate import failure_bound, log_evidence
-from tests.slow.proof.certificate import PROPENSITIES, STREAMS, ever_wrong, most_bad
+from tests.slow.proof.certificate import PROPENSITIES, STREAMS, refuting_counts, share_ever_wrong
 
 
 @pytest.mark.parametrize("propensity", PROPENSITIES)
@@ -16,7 +16,7 @@ def test_the_bound_is_ever_wrong_in_at_most_alpha_of_the_streams(
     name: str, propensity: float, proof_repeats: int
 ) -> None:
     streams, alpha = min(2000, 100 * proof_repeats), 0.1
-    share = ever_wrong(name, propensity, alpha, streams, parts=2000)
+    share = share_ever_wrong(name, propensity, alpha, streams, n_parts=2000)
     assert (
         stats.binomtest(round(share * streams), streams, alpha, alternative="greater").pvalue > 1e-4
     )
@@ -40,6 +40,6 @@ def test_an_adversary_who_reacts_to_every_outcome_gains_nothing(proof_repeats: i
 
 def test_the_simulated_count_is_the_bound_itself() -> None:
     mean = STREAMS["sinusoidal"](np.arange(400) / 400).cumsum() / np.arange(1, 401)
-    for n, k in enumerate(most_bad(mean, 0.1, 1.0), 1):
+    for n, k in enumerate(refuting_counts(mean, 0.1, 1.0), 1):
         assert k < 0 or failure_bound(n, int(k), 0.1) <= mean[n - 1]
         assert failure_bound(n, min(n, int(k) + 1), 0.1) > mean[n - 1] or k == n

@@ -24,14 +24,14 @@ from dengine.recipe import RECIPES
 from dengine.reducers import rocket, torch_reducer
 from tests.slow.proof.counts import (
     count_noise,
+    decision_embeddings,
     mean_square,
-    moved,
-    places,
-    relabelled,
+    relabel,
+    share_moved,
     weak_signal,
     white_noise,
 )
-from tests.slow.proof.replays import Case, broken, judge
+from tests.slow.proof.replays import Case, count_broken, judge
 
 HONEST = (0.8, 1.3)  # mean z^2; heads trained on all folds: 3 to 4.4
 SEEDS = 16
@@ -50,7 +50,7 @@ def z2(reducer: str = "conv", seeds: int = SEEDS) -> float:
 def peeks(*strengths: float, folds: tuple[int, ...] = (3,), reducer: str = "conv") -> float:
     """Largest share of traces whose place in a fold's space was moved by the fold's labels."""
     return max(
-        moved(RECIPES[reducer], weak_signal(200, s, seed=1), fold, seed=0)
+        share_moved(RECIPES[reducer], weak_signal(200, s, seed=1), fold, seed=0)
         for s in strengths
         for fold in folds
     )
@@ -58,7 +58,9 @@ def peeks(*strengths: float, folds: tuple[int, ...] = (3,), reducer: str = "conv
 
 def worse_than_allowed(replays: int, case: Case = JUST_BEYOND) -> float:
     """Share of replays in which accepted parts were worse than the tolerance, as where every part is."""
-    return broken([judge(seed, case) for seed in range(replays)], "passed, end", 0.2) / replays
+    return (
+        count_broken([judge(seed, case) for seed in range(replays)], "passed, end", 0.2) / replays
+    )
 
 
 @pytest.mark.parametrize(
@@ -77,7 +79,7 @@ def test_labels_of_noise_on_real_traces_are_counted_as_chance_says(proof_repeats
     X = load_dataset("insertion").X[:, ::10]
     seeds = range(max(6, proof_repeats))
     result = mean_square(
-        count_noise(RECIPES["conv"], relabelled(X, 500, 0.5, seed), seed) for seed in seeds
+        count_noise(RECIPES["conv"], relabel(X, 500, 0.5, seed), seed) for seed in seeds
     )
     assert HONEST[0] - 0.1 <= result <= HONEST[1]
 
@@ -91,7 +93,10 @@ def test_it_would_be_seen_in_the_other_spaces() -> None:
     data = weak_signal(200, 8.0, seed=1)
     custom = content_fold(data.X[:, None, :], 5)
     turned = replace(data, y=np.where(custom == 0, 1 - data.y, data.y).astype(np.int8))
-    first, other = places(RECIPES["conv"], data, 0), places(RECIPES["conv"], turned, 0)
+    first, other = (
+        decision_embeddings(RECIPES["conv"], data, 0),
+        decision_embeddings(RECIPES["conv"], turned, 0),
+    )
     assert np.nanmax(np.abs(first[:, 1] - other[:, 1])) > 0.05
 
 
