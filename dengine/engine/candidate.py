@@ -71,9 +71,9 @@ class Candidate:
     def catch_up(self, window: TrainingWindow, seconds: float = np.inf) -> bool:
         """Make references of the window's labels that came since the training, oldest first.
 
-        It stops between two labels once `seconds` have passed by the clock; the time is added to
-        the report. A label that the model cannot take is logged and skipped. Returns True when no
-        label is left, and always where there is no model.
+        It stops between two labels once `seconds` have passed by the clock. The time counts as work
+        in the report that `complete_report` makes. A label that the model cannot take is logged and
+        skipped. Returns True when no label is left, and always where there is no model.
         """
         if self.model is None:
             return True

@@ -184,15 +184,16 @@ class EngineCore:
         decision_id: str | None = None,
         timed_out: bool = False,
     ) -> Decision:
-        """Decide on one trace, record the decision and return it.
+        """Decide on one trace, record the decision and return it, as `DataEngine.decide` says.
 
-        Arguments, result and errors are those of `DataEngine.decide`. With `timed_out` the caller
-        has given up waiting and verifies the part, so the decision is VERIFY, `Reason.LATE`; a
-        fault of the trace, or of the store, is the reason instead. Before it decides, the call
-        takes a short step with a version that the executor has trained, and counts an earlier
-        accepted part without a report as confirmed or unobserved. Afterwards it announces a safe
-        mode that began or ended. An id that has a decision already gets it back, and nothing else
-        happens.
+        An id that has a decision already gets it back, and nothing else happens; TraceError if the
+        trace is another one. An id that cannot be looked up gets a VERIFY that is not recorded.
+        With `timed_out` the caller has given up waiting, so the decision is VERIFY, `Reason.LATE`,
+        unless a fault of the trace, or of the store, is the reason.
+
+        Before it decides, the call takes a short step with a version that the executor has trained
+        (where cells share a product, all steps), and counts earlier accepted parts without a report
+        as confirmed or unobserved. Afterwards it announces a safe mode that began or ended.
         """
         self.outbox.check_usable()
         with self.exclusive:
@@ -281,11 +282,11 @@ class EngineCore:
         """Decide on a trace and hand the decision to the outbox, without waiting until it is on
         disk.
 
-        Before that, labels that the store has numbered enter the training window, and accepted
-        parts without a report count as confirmed or unobserved. The decision is VERIFY where
-        `timed_out` (`Reason.LATE`) and where the store is damaged or cannot be written
-        (`Reason.NO_STORE`). Returns the record with its number, 0 where it could not be recorded.
-        Raises TraceError for a wrong shape.
+        Before that, `Learner.catch_up` is called, and accepted parts without a report count as
+        confirmed or unobserved. The decision is VERIFY where `timed_out` (`Reason.LATE`), and where
+        the store is damaged or its journal cannot be written (`Reason.NO_STORE`); a fault of the
+        trace is the reason instead. Returns the record with its number, 0 where it could not be
+        recorded. Raises TraceError for a wrong shape.
         """
         x = self._check_trace(trace)
         self.learner.catch_up()
@@ -342,7 +343,8 @@ class EngineCore:
         One that is set already stays and is returned. Where the cell shares a product with others,
         a contract that these have set is taken in place of `spec`. `inferred` says that `spec`
         comes from a first trace. The settings are saved in the store; where that fails, they are
-        saved with a later trace.
+        saved with a later trace. Raises SettingError where the force limits do not fit the
+        contract.
         """
         if self.settings.now.trace is not None:
             return self.settings.now.trace
@@ -360,10 +362,10 @@ class EngineCore:
         """Return a trace as float32, shape (channels, samples), converted as the trace contract
         demands.
 
-        Where none is set, the first trace without a fault sets it. That trace also starts what an
-        untrained model can compute in advance. Settings that could not be saved before are saved.
-        Raises TraceError for a wrong shape; a trace with NaN, or another fault, is returned like
-        any other.
+        Where none is set, the first trace without a fault sets it, or a contract that peers have
+        set is taken. The first finite trace also has an untrained model compute in advance.
+        Settings that could not be saved before are saved. Raises TraceError for a wrong shape; a
+        trace with NaN, or another fault, is returned like any other.
         """
         settings = self.settings.now
         has_learned = self.live.version + self.learner.labels.new_labels > 0
@@ -385,12 +387,14 @@ class EngineCore:
     def report(
         self, decision_id: str, success: bool, trace: ArrayLike | None, part: str | int | None
     ) -> RetrainReport | None:
-        """Learn the outcome of a decision; return the report of a retrain that it set off here, or
+        """Learn the outcome of a decision; return the report of a retrain done here for it, or
         None.
 
-        Arguments, result and errors are those of `DataEngine.report`. It returns when the label is
-        on disk, and after a retrain in this thread, if one was due. The label of a trace with a
-        fault is stored, and sets off no retrain.
+        Arguments and errors are those of `DataEngine.report`; `trace` and `part` are used only
+        where the decision is unknown and `success` is False. It returns when the label is on disk,
+        and raises NotTakenError where that is not certain. Then a retrain that is due is done in
+        this thread, or begun in the executor. The label of a trace with a fault is stored, and sets
+        off no retrain.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)
@@ -408,10 +412,11 @@ class EngineCore:
     def _record_lost_accept(
         self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any
     ) -> StoredDecision:
-        """Record an ACCEPT under this id for a line stop whose decision was lost, and return the
+        """Record an ACCEPT under this id for a line stop whose decision was lost; return the
         record.
 
-        Raises UnknownDecisionError, and records nothing, without the trace and for a success.
+        Raises UnknownDecisionError without the trace and for a success, and TraceError for a wrong
+        trace or part's number; then nothing is recorded.
         """
         if trace is None or success:
             raise UnknownDecisionError(
@@ -443,9 +448,11 @@ class EngineCore:
         """Do between two parts what is due: swap in a trained version, retrain, announce safe mode.
 
         A version that the executor has trained is brought to its end, so that it answers or is
-        dropped; with `brief` it comes only one step further, a few milliseconds. A retrain that is
-        due begins in the executor, or without one runs here. Returns the report of the newest
-        finished retrain, once; None if there is none that was not returned before.
+        dropped; with `brief`, in a cell that learns alone, it comes only one step further, a few
+        milliseconds. A retrain that is due begins in the executor, or without one runs here.
+        Returns the report of the newest finished retrain (dropped ones, rollbacks, changes of the
+        policy, and those that `report` or `retrain` returned are among them), or None if this
+        method has returned it.
         """
         with self.exclusive:
             self.learner.collect(to_the_end=not brief)
@@ -479,7 +486,8 @@ class EngineCore:
         """Finish or give up a retrain under way within `CLOSE_SECONDS`, write everything, close the
         store.
 
-        A second call does nothing. Errors as of `DataEngine.close`.
+        A second call does nothing. Raises NotTakenError, and closes nothing, where the journal
+        cannot be written.
         """
         with self.exclusive:
             if self.outbox.is_usable:

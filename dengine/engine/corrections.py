@@ -97,6 +97,7 @@ class Corrections:
         Returns
         -------
         Changed
+            Its `event` is None where nothing changed.
 
         Raises
         ------
@@ -120,9 +121,10 @@ class Corrections:
         """Leave labels out of all that is learned and counted, from the next decision on.
 
         `correct` brings one back. Traces, and labels as they were reported, stay in the store; the
-        version that was trained with them goes on until the next retrain. A guarantee assumes that
-        the choice of what is forgotten does not depend on the label. The certificate counts a
-        forgotten outcome of a certain decision as wrong, so that forgetting earns nothing.
+        version that was trained with them goes on until the next retrain, but a baseline is
+        retrained before this returns. A guarantee assumes that the choice of what is forgotten does
+        not depend on the label. The certificate counts a forgotten outcome of a certain decision as
+        wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
@@ -134,6 +136,7 @@ class Corrections:
         Returns
         -------
         Changed
+            Its `event` is None where nothing changed.
 
         Raises
         ------
@@ -177,6 +180,7 @@ class Corrections:
         Returns
         -------
         Changed
+            Its `event` is None where nothing changed.
 
         Raises
         ------
@@ -204,8 +208,8 @@ class Corrections:
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on.
 
-        The policy is stored, and the model goes on under it as a new version. Every earlier version
-        keeps the bounds that it decided by.
+        The policy is stored, and a trained model goes on under it as a new version. Every earlier
+        version keeps the bounds that it decided by.
 
         Where alpha, lower_bound, interval, guarantee, stops or prices change, and under "pooled"
         and "cost" with stops="some" where the audit rate does too, the rule starts anew. It is then
@@ -230,6 +234,7 @@ class Corrections:
         Returns
         -------
         Changed
+            Its `event` is None where nothing changed.
 
         Raises
         ------
@@ -308,7 +313,8 @@ class Corrections:
     def _change_labels(self, change: Change) -> Changed:
         """Store a change of labels, and apply it to references, training window and rule.
 
-        A model that cannot change its references is retrained. Returns what was done.
+        A model that cannot change its references is retrained. A safe mode that began or ended is
+        announced. Returns what was done, with the number of the change's event.
         """
         self._store.apply_change(change)
         for id_ in change.decisions:
@@ -334,7 +340,10 @@ class Corrections:
 
 
 def _check_baseline_settings(changes: Mapping[str, Any]) -> None:
-    """Raise SettingError for changes of a policy that have no effect on a handed-in model."""
+    """Raise SettingError for changes of a policy that have no effect on a handed-in model.
+
+    `changes` holds the changed settings by name; those of `BASELINE_SETTINGS` have an effect.
+    """
     idle = sorted(set(changes) - set(BASELINE_SETTINGS))
     if idle:
         effect = f"so {', '.join(idle)} would have no effect"

@@ -77,9 +77,9 @@ WARM_UP = 100  # cycles of a loop, after which the objects that are there are ta
 def frozen_objects() -> Iterator[None]:
     """Let Python's garbage collector ignore, until the block ends, all objects that exist now.
 
-    A collection of them would go through 280,000 objects of imported libraries in 150 ms and free
-    nothing; the block does not begin with one either. It affects the whole process: use it in the
-    one that owns the loop.
+    A collection would go through 280,000 objects of imported libraries in 150 ms and free nothing.
+    None is made when the block begins. It affects the whole process, and its end unfreezes what
+    others froze, too: use it in the process that owns the loop.
     """
     gc.freeze()
     try:
@@ -234,7 +234,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> None:
         """Compose the engine's objects on an opened store; options as of `EngineCore`.
 
-        It sets `store`, `seed` and `resumed`, and closes the engine when it is garbage-collected.
+        It sets `store`, `seed`, and `resumed` to False. From now on the store is closed when the
+        engine is garbage-collected.
         """
         self.store = store
         self.seed = settings.seed
@@ -245,7 +246,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
-        """Close the engine's store where the block raises, and raise the error again."""
+        """Close the engine's store where the block raises, and raise the error again; else leave it
+        open.
+        """
         try:
             yield
         except BaseException:
@@ -320,7 +323,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Parameters
         ----------
         store : str, path, SqlStore or None
+            None: a new one in memory.
         seed : int, optional
+            None: that of the used store, of a peer, or 0.
         wait, allow_import
             As for `open`; a class that the settings name is allowed.
         **settings
@@ -473,7 +478,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Yield a record of each cycle; at the end, also after an error, write everything to disk.
 
-        After `WARM_UP` cycles the garbage collector ignores the objects that exist then.
+        After `WARM_UP` cycles the garbage collector ignores the objects that exist then, until the
+        end. Raises NotTakenError where the disk does not take everything in time.
         """
         with ExitStack() as ending:
             ending.callback(self.flush, LONG_WAIT if self.store.wait is not None else None)
@@ -521,8 +527,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def retrain(self) -> RetrainReport:
         """Retrain now, in this thread, and return the report.
 
-        A version that fails, or cannot be stored, is dropped and recorded; the report has
-        `accepted` False then. Raises StoreError where the labels before it cannot be stored.
+        A version that fails, or cannot be stored, is dropped: the report has `accepted` False then.
+        Raises StoreError where the labels before it cannot be stored.
         """
         return self._core.retrain()
 
@@ -559,7 +565,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def certificate(self) -> Certificate:
         """Flush, and return bounds, at confidence 1 - alpha, on the errors of unchecked decisions.
 
-        Decisions since the last change of policy count. Raises NotTakenError as `flush`.
+        Decisions since the last change of policy count. Raises NotTakenError as `flush`, and
+        StoreError where the store cannot be read.
         """
         self.flush()
         policy = self.policy

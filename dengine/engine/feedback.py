@@ -124,8 +124,9 @@ class Feedback:
     def record_decision(self, stored: StoredDecision) -> None:
         """Note a new decision: VERIFY as a pending check, ACCEPT as a part without an outcome.
 
-        The rule is updated with checks that have become overdue. When nearly all recent decisions
-        are `Reason.NOVEL`, an event is recorded, once until their share has fallen to one half.
+        A VERIFY of a trace with a fault, or that was not recorded, is not pending. The rule is
+        updated with checks that have become overdue. When nearly all recent decisions are
+        `Reason.NOVEL`, an event is recorded, once until their share has fallen to one half.
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
@@ -216,12 +217,12 @@ class Feedback:
         return was_confirmed
 
     def _learn(self, stored: StoredDecision, success: bool, source: Source) -> NewLabel:
-        """Update the rule and the references with the outcome of a part; return its label for the
-        store.
+        """Update rule and references with the outcome of a part; return its label for the store.
 
-        A trace with a fault teaches neither. A rejected part that was inspected does not update the
-        rule: which of them are inspected is somebody's choice, and no sample. Any other outcome
-        sets the count of unobserved parts back to zero.
+        A trace with a fault teaches neither; any other outcome counts as a new label. A rejected
+        part that was inspected does not update the rule: which of them are inspected is somebody's
+        choice, and no sample. All others set the count of unobserved parts back to zero, and the
+        label keeps that count.
         """
         decision = stored.decision
         version = self._live.version
@@ -266,10 +267,11 @@ class Feedback:
         return True
 
     def number_labels(self) -> None:
-        """Add labels that the store has newly numbered to the training window.
+        """Hand learned labels that the store has newly numbered on to the training window.
 
-        Their references get the same numbers. The rule is updated with checks that have become
-        overdue.
+        Their references get the same numbers. Labels of traces with a fault are left out. In a
+        product a label enters the window only after those before it. The rule is updated with
+        checks that have become overdue.
         """
         self._count_overdue()
         for id_, seq in self._outbox.pop_label_numbers():

@@ -76,10 +76,11 @@ class Peers:
     def fetch_news(self) -> tuple[ProductNews, bool]:
         """Ask the store for what is new in the product.
 
-        Returns the news, with at most `MOST` labels of all cells, this one included, and whether it
-        names a newer version than the one that answers; one that could not be taken over does not
-        count. Where there is something new, the store's integrity is checked. Raises StoreError
-        where the store gives no answer in time.
+        Returns the news, with at most `MOST` labels after the window's newest, this cell's among
+        them, and whether it names a newer version than the one that answers; one that could not be
+        taken over does not count. Where there is a new version or label, the store is checked,
+        which may set the outbox's `integrity_error`. Raises StoreError where the store gives no
+        answer in time.
         """
         store = self._outbox.store
         newest = self._window.newest_seq

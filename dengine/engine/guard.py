@@ -57,7 +57,7 @@ class GuardedModel:
     def update_rule(self, *outcome: Any) -> None:
         """Update the model's rule with an outcome, arguments as of `EngineModel.update_rule`.
 
-        Where it fails, the model refuses to predict.
+        Where it fails, that is logged, and the model refuses to predict.
         """
         with logged_failure(
             "an update of the rule failed; every part is verified until the engine is opened again"
@@ -73,10 +73,11 @@ class GuardedModel:
         embedding: Embedding | None = None,
         point: NDArray[Any] | None = None,
     ) -> Floats | None:
-        """Make a labelled trace a reference and return its point, float32 of shape (d,).
+        """Make a labelled trace a reference and return its point, as `EngineModel.add_reference`
+        does.
 
-        Arguments as of `EngineModel.add_reference`. Where it fails, no reference is added, and None
-        is returned.
+        The point is float32 of shape (d,); a baseline returns the trace. Where it fails, that is
+        logged, no reference is added, and None is returned.
         """
         with logged_failure(
             "the model cannot take a labelled trace; the next version learns it from the store"

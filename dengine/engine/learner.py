@@ -93,9 +93,9 @@ class Learner:
         """Restore window, version, rule and counts from the store, bit for bit, when an engine
         opens it.
 
-        `label_within` and `policy_since` are as of `LiveModel.resume`. With a version, or with an
-        import of `IMPORTED` labels, it also begins in a thread to compute what the next retrain
-        starts with.
+        `label_within` and `policy_since` are as of `LiveModel.resume`. With a version, or with at
+        least `IMPORTED` labels, it also begins in a thread to compute what the next retrain starts
+        with.
         """
         version = self._store.last_version()  # before the labels: a peer may store both meanwhile
         labelled = self._store.labelled(self._window.capacity)
@@ -136,8 +136,9 @@ class Learner:
 
         If silence had confirmed the part before, it also waits for the store, so that the rule is
         put right now; where the store does not answer, that happens later. A safe mode that began
-        or ended is announced. Raises NotTakenError where the label is not known to be on disk, and
-        ReportError as `Feedback.take_in`.
+        or ended is announced. Raises ReportError as `Feedback.take_in`, and NotTakenError where the
+        label is not known to be on disk: it is learned all the same, and the same report may come
+        again.
         """
         self.catch_up()
         confirmed_wrongly = self._feedback.take_in(stored, success)
@@ -153,9 +154,10 @@ class Learner:
         """Add labels that the store has numbered to the window, and do what `Feedback.remedy` asks
         for.
 
-        The remedy, a rebuild of the rule and perhaps a correction, waits until the store has every
-        label; until then this returns at once. A correction first finishes a retrain under way.
-        Where the store fails meanwhile, that is logged, and a later call tries again.
+        The remedy, a rebuild of the rule and perhaps a correction, is left to a later call while
+        the store lacks records or has a fault. A correction first finishes a retrain under way, or
+        gives it up after `HUNG` seconds. Where the store fails meanwhile, that is logged, and a
+        later call tries again.
         """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -198,9 +200,11 @@ class Learner:
     def retrain(self) -> RetrainReport:
         """Train a version in this thread, let it answer, and return the report.
 
-        A retrain under way in the executor is finished first, or given up after `HUNG` seconds. A
-        version that fails or cannot be stored is dropped and recorded, and the report says so.
-        Raises StoreError where the labels before it cannot be stored.
+        A retrain under way in the executor is finished first, or given up after `HUNG` seconds;
+        then news of peers is taken in. A version that fails or cannot be stored is dropped, and the
+        report says so. A version that is stored, while labels that came since cannot be, answers at
+        a later call; its report is returned all the same. Raises StoreError where the labels before
+        it cannot be stored.
         """
         self.collect(HUNG)
         self.store_labels()
@@ -215,10 +219,11 @@ class Learner:
         return self._report or candidate.report
 
     def start_retrain(self) -> RetrainReport | None:
-        """Begin to train in the executor, unless a training is under way, and return None.
+        """Begin to train in the executor and return None, unless a training is under way.
 
-        Without an executor that takes work, retrain in this thread and return the report. Raises
-        StoreError where the labels before it cannot be stored.
+        One under way comes a step further, and None is returned. Otherwise labels are stored and
+        news of peers is taken in first. Without an executor that takes work, retrain in this thread
+        and return the report. Raises StoreError where the labels before it cannot be stored.
         """
         self.collect()
         if self.is_busy:
@@ -233,9 +238,11 @@ class Learner:
     def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
         """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
-        With `once` a version that lacks steps is not trained on until the report of its last
-        retrain was taken. Nothing happens, and None is returned, where the store is away. Returns
-        the report of a retrain in this thread; None where none was due or it runs in the executor.
+        There must be as many labels as the model's `min_traces`. News of peers is taken in first,
+        so another version may answer even if none is trained here. With `once` a version that lacks
+        steps is not trained on until the report of its last retrain was taken. Returns the report
+        of a retrain in this thread; else None: none is due, the store is away, a training or its
+        preparation is under way, or it was begun in the executor.
         """
         is_due = self._is_due_after_news(recipe.retrain_every)
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
@@ -276,11 +283,12 @@ class Learner:
     def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
         """Take a training's outcome from the executor, and bring its version closer to answering.
 
-        Each call does one short step: take the outcome, catch up on labels, store the version, swap
-        it in. With `to_the_end`, and always where cells share a product, it does all steps and
-        blocks until the version answers or is dropped. With `wait` above 0 it also waits so many
-        seconds for a training that is not done; then that is given up. Without a training it does
-        nothing.
+        Each call does one short step: take the outcome, catch up on labels, store the version, or
+        swap it in. With `to_the_end`, with `wait` above 0, and always where cells share a product,
+        it does all steps of a training that is done, and blocks for the store. `wait` is also how
+        many seconds to wait for a training that is not done; then that is given up, as is one that
+        takes longer than `HUNG` seconds. Nothing happens while one is not done, or where there is
+        none.
         """
         if self._retrainer.future is None and self._candidate is None:
             return
@@ -299,8 +307,8 @@ class Learner:
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
 
     def _begin_retrain(self) -> None:
-        """Prepare for a training: wait for what is computed in advance, take in all news of peers,
-        and count new labels from zero.
+        """Prepare for a training: wait for what is computed in advance, take in news of peers as
+        `_take_in_all_news` does, and count new labels from zero.
         """
         if self._precomputed is not None:
             self._precomputed.result()
@@ -311,8 +319,9 @@ class Learner:
     def _advance(self, to_the_end: bool) -> None:
         """Bring the candidate further: catch up on labels, store it, catch up again, swap it in.
 
-        It takes one step, or all steps with `to_the_end`. A candidate that cannot be stored is
-        dropped. One that is stored waits for a later call where the newest labels cannot be stored.
+        It takes one step, or all steps with `to_the_end`; without a candidate none. A candidate
+        that cannot be stored is dropped. One that is stored waits for a later call where the newest
+        labels cannot be stored; that is logged.
         """
         candidate = self._candidate
         if candidate is None:
@@ -337,10 +346,11 @@ class Learner:
         self._swap(candidate)
 
     def _store_candidate(self, candidate: Candidate, to_the_end: bool) -> bool:
-        """Store the candidate, and return True once the store has it.
+        """Store the candidate, set the number that the store gave it, and return True.
 
-        False means that another step is needed: labels are missing, or the commit is under way.
-        With `to_the_end` it blocks instead. Raises StoreError where it cannot be stored.
+        Returns False if another step is needed: labels are missing, or the commit is under way.
+        With `to_the_end` it blocks instead, and without it for labels that `PATIENCE` steps did not
+        bring. Raises StoreError where it cannot be stored.
         """
         if candidate.storing is None:
             if not candidate.catch_up(self._window, np.inf if to_the_end else STEP):
@@ -359,7 +369,10 @@ class Learner:
         """Complete the candidate's report, and submit report and model to the thread that stores
         them.
 
-        Returns a future of the version's number. Without a model only the report is stored.
+        Returns a future of the version's number: the report's, or a higher one if a peer of the
+        product stored a version first. Without a model only the report is stored, and the number is
+        the report's. Without a journal the store is written before this returns. Raises StoreError
+        where the store is unavailable, or without a journal fails.
         """
         report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
@@ -382,9 +395,11 @@ class Learner:
         return not to_the_end and not has_lost_patience and self._outbox.request_label_drain()
 
     def _swap(self, candidate: Candidate) -> None:
-        """Let a stored candidate answer, and keep its report for `take_report`.
+        """Let a stored candidate answer, with the present rule, and keep its report for
+        `take_report`.
 
-        Without a model, when the training was dropped, the old version goes on answering.
+        Without a model, when the training was dropped, the old version goes on answering; the
+        report is kept, and its reason added to `dropped`.
         """
         self._report = candidate.report
         self._was_accepted = candidate.model is not None
@@ -396,9 +411,10 @@ class Learner:
             self.labels.add_missing_references(candidate.model)
 
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
-        """Drop a candidate that could not be stored, and keep a report that says so.
+        """Drop a candidate that could not be stored, and keep a report that says so, in memory
+        only.
 
-        Its labels count as new again, so that the next retrain is soon.
+        In a cell that learns alone its labels count as new again, so that the next retrain is soon.
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
@@ -425,10 +441,11 @@ class Learner:
     # News of a product
 
     def _is_due_after_news(self, retrain_every: int) -> bool:
-        """Return whether a retrain is due by the number of new labels.
+        """Return whether a retrain is due by the number of new labels, and this cell's to do.
 
-        Where cells share a product, their news is taken in first, and a peer's version that came
-        makes it due no more.
+        Where cells share a product, news is taken in first, if none was asked for lately. If a
+        retrain is due then, all news is taken in, and it is asked again: a peer's version may have
+        come.
         """
         if self._peers is not None and self._peers.is_news_due:
             self._take_in_news(self._peers)
@@ -438,8 +455,10 @@ class Learner:
         return self.labels.is_due(retrain_every)
 
     def _take_in_all_news(self) -> None:
-        """Take in the peers' news until there is no more, at most `ROUNDS` times; without peers do
-        nothing.
+        """Take in the peers' news until there is no more, but at most `ROUNDS` times.
+
+        Where the store is away it stops, `Peers.is_lost` is set, and nothing is raised. Without
+        peers it does nothing.
         """
         peers = self._peers
         if peers is None:
@@ -451,8 +470,9 @@ class Learner:
     def _take_in_news(self, peers: Peers) -> int:
         """Take in the peers' newest version, at most `MOST` labels, and corrections.
 
-        Returns the number of labels, 0 where the store is away, which is logged once. Corrections
-        that cannot be read come with the next news.
+        Before, it waits until this cell's recorded labels are in the store. Returns the number of
+        labels; 0 also where the store is away, which is noted in `peers` and not raised.
+        Corrections that cannot be read come with the next news.
         """
         version = None
         try:
@@ -481,9 +501,11 @@ class Learner:
     # What people put right
 
     def bring_up_to_date(self) -> None:
-        """Finish every retrain, label and news that is under way, before a person's change.
+        """Finish what is under way before a person's change: a retrain, labels, news of peers.
 
-        Raises StoreError where that cannot be.
+        A retrain that takes longer than `HUNG` seconds is given up; news is taken in as
+        `_take_in_all_news` does. Raises StoreError where the store is away, or where labels of
+        peers before one of this cell's are missing.
         """
         self.collect(HUNG)
         self.store_labels()
@@ -499,7 +521,7 @@ class Learner:
         return isinstance(self.labels, ProductLabels) and self.labels.has_gaps
 
     def apply_corrections(self, may_retrain: bool = True) -> None:
-        """Apply the store's newest corrections to window, references and rule.
+        """Apply the store's newest corrections to window, references, count of new labels and rule.
 
         A model that cannot change a reference is retrained, if `may_retrain`: only the cell that
         corrected does so. Raises StoreError where the store is away.
@@ -517,9 +539,9 @@ class Learner:
         """Let the earlier version `number` answer again, as a new version, and store it with
         `event`.
 
-        All later labels become its references, and the present rule goes on. New labels count from
-        zero. Raises StoreError for a version that is not kept, and where a trace that it was
-        trained on is damaged.
+        Later labels, up to the window's capacity, become its references, and the present rule goes
+        on. New labels count from zero. Raises StoreError for a version that is not kept, and where
+        a trace is damaged that the model must be fitted on again.
         """
         self._outbox.check_integrity()
         begin = self._clock()

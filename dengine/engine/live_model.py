@@ -203,8 +203,8 @@ class LiveModel:
     def assign_number(self, decision_id: str, seq: int) -> tuple[StoredDecision, bool] | None:
         """Give the reference of a learned label the sequence number that the store assigned.
 
-        Returns the decision and its label, for the training window; None for a label that taught
-        nothing.
+        Returns the decision and its label, for the training window. Returns None, and changes
+        nothing, for a label that taught nothing or has its number already.
         """
         if decision_id not in self._unnumbered:
             return None
@@ -216,7 +216,8 @@ class LiveModel:
     def count_overdue(self, decision: Decision) -> None:
         """Update the rule as if a decision was wrong, because its check was not reported in time.
 
-        A decision without evidence, or from before the present rule began, changes nothing.
+        The decision's id is kept in `overdue`. A decision without evidence, or from before the
+        present rule began, changes nothing.
         """
         if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
@@ -267,8 +268,9 @@ class LiveModel:
     def apply_corrections(self) -> bool:
         """Apply the store's newest corrections to the references of the answering model.
 
-        Returns False where the model cannot change a reference, as no baseline can, and must be
-        trained again; True before the first retrain. The rule is left to `rebuild_rule`.
+        Returns False where the model must be trained again: always for a baseline, and where it
+        cannot change a reference. Returns True before the first retrain. The rule is left to
+        `rebuild_rule`. Raises StoreError where the store is away.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None

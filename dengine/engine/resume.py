@@ -29,7 +29,7 @@ def restore_model(
     """Return a new model, made from the template, in the state of a stored version.
 
     A model that is stored by its traces is trained on them again. Returns None where one of these
-    traces is damaged.
+    traces is damaged or missing.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -120,9 +120,10 @@ def add_labels_since(
 def apply_correction(model: EngineModel, store: SqlStore, correction: Correction) -> bool:
     """Change the reference of a corrected label: relabel it, remove it or add it again.
 
-    Returns False where the model cannot change that reference, so that it must be trained again.
-    Otherwise True, also where there is nothing to change: for a baseline, a quarantined part, or a
-    damaged trace that would have to be added again.
+    Returns False, and changes nothing, where the model has references and cannot change that one:
+    it must be trained again. Otherwise True, also where nothing is changed: for a quarantined part,
+    for a damaged trace that would have to be added again, and for a baseline, which has no
+    references and which the caller trains again.
     """
     if not model.keeps_references:
         return True

@@ -214,10 +214,11 @@ class EngineSettings:
     def check_request(self, request: Mapping[str, Any]) -> None:
         """Raise SettingError where settings that a program gives are not the ones that are set.
 
-        `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. The
-        shadow mode is not compared, nor are force limits that the program leaves out, because an
-        operator sets both. Beside a baseline only `LOOP_SETTINGS` are compared. An unknown name is
-        an error, too.
+        `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. All
+        settings of a recipe in it are compared. The shadow mode is not, nor are force limits that
+        the program leaves out, because an operator sets both. A reducer that is an object is not
+        compared here, nor are its parameters. Beside a baseline only `LOOP_SETTINGS` are compared.
+        An unknown name is an error, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -367,10 +368,10 @@ def fill_from_peers(
 ) -> dict[str, Any]:
     """Return a copy of the settings for a new engine, with what is open taken from a peer.
 
-    A peer is another cell of the store's product. Taken are its seed (0 without a peer), and its
-    recipe if `request` names neither reducer, recipe nor model. A peer that was given an object
-    without a name has no recipe to take. Raises ImportRefusedError where the recipe names a class
-    that may not be imported.
+    A peer is another cell of the store's product. Taken are its seed if `request` has none (0
+    without a peer), and its recipe if `request` names neither reducer, recipe nor model. A peer
+    that was given an object without a name has no recipe to take. Raises ImportRefusedError where
+    the recipe names a class that may not be imported.
     """
     peer = next(iter(store.peers_settings().values()), {})
     filled = dict(request)
