@@ -29,12 +29,10 @@ from ..store.records import (
     unknown_decision,
 )
 from .core import EngineCore
-from .settings import EvidenceWindow
+from .settings import BASELINE_SETTINGS, EvidenceWindow
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
-# Settings of a policy that have an effect on a baseline.
-BASELINE_SETTINGS = ("audit_rate", "stops", "label_within", "windows", "shadow")
 SHADOW_TEXTS = {
     True: "shadow mode: every part is verified from now on",
     False: "the shadow mode ended: the model decides again",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 from .. import __version__
 from ..decision.decider import DecisionConditions
 from ..decision.policy import NO_WINDOWS, Policy
-from ..errors import ImportRefusedError, SettingError, StoreError, expect, shortened
+from ..errors import ImportRefusedError, SettingError, StoreError, expect, listed, shortened
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT_PREFIX, Recipe, describe_estimator
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 log = logging.getLogger("dengine")
 
 MAX_SEED = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
+# Settings of a policy that have an effect on a baseline.
+BASELINE_SETTINGS = ("audit_rate", "stops", "label_within", "windows", "shadow")
 # Settings that have an effect on any model, a baseline included.
 LOOP_SETTINGS = (
     "seed",
@@ -36,9 +38,7 @@ LOOP_SETTINGS = (
     "budget",
     "max_steps",
     "window",
-    "audit_rate",
-    "stops",
-    "windows",
+    *BASELINE_SETTINGS,
 )
 
 
@@ -243,9 +243,9 @@ class EngineSettings:
             requested.pop("params", None)
         if requested.get("windows") == NO_WINDOWS:
             requested.pop("windows")
-        counts = LOOP_SETTINGS if self.model is not None else [*present.keys() - {"shadow"}]
+        compared = {*(present if self.model is None else LOOP_SETTINGS)} - {"shadow"}
         different = sorted(
-            name for name in requested if name in counts and requested[name] != present[name]
+            name for name in compared & requested.keys() if requested[name] != present[name]
         )
         if different:
             stored = ", ".join(f"{name} {present[name]}" for name in different)
@@ -389,20 +389,20 @@ def check_model_settings(reducer: Any, given: Mapping[str, Any]) -> None:
     """Raise SettingError for settings that have no effect beside a model that is handed in.
 
     `given` holds settings by name. Without effect are radius, folds, reducer, and a policy that
-    differs from the default in more than audit_rate, stops, shadow and windows.
+    differs from the default in more than `BASELINE_SETTINGS`.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:
         idle.append("reducer")
     policy = given.get("policy")
-    effective = {"audit_rate": 0.0, "stops": "some", "shadow": False, "windows": ()}
+    effective = {name: getattr(Policy(), name) for name in BASELINE_SETTINGS}
     if policy is not None and replace(policy, **effective) != Policy():
         idle.append("policy")
     if idle:
         effect = f"so {', '.join(idle)} would have no effect"
         do = (
             "set it on the model, or leave it out "
-            "(of a policy audit_rate, stops, shadow and windows alone count)"
+            f"(of a policy {listed(BASELINE_SETTINGS)} alone count)"
         )
         raise SettingError(f"A model that is handed in decides by its own rule, {effect}; {do}.")
 

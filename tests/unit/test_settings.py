@@ -81,16 +81,19 @@ def test_what_contradicts_itself_or_has_no_effect_is_refused_and_spoils_no_store
     assert DataEngine("pca", store=tmp_path / "engine.db").store.settings()
 
 
-def test_the_audit_rate_and_the_loops_settings_count_for_a_baseline_too() -> None:
-    engine = DataEngine(
-        model=Counting(), policy=Policy(audit_rate=0.3), retrain_every=7, budget=0.2
-    )
-    assert (engine.policy.audit_rate, engine.recipe.retrain_every, engine.recipe.budget) == (
-        0.3,
-        7,
-        0.2,
-    )
-    assert engine.store.settings()["model"] == "Counting"
+def test_the_loops_settings_and_those_of_a_policy_that_are_no_rule_count_for_a_baseline_too(
+    tmp_path: Path,
+) -> None:
+    policy = Policy(audit_rate=0.3, label_within=200)
+    given = {"model": Counting(), "store": tmp_path / "e.db", "retrain_every": 7, "budget": 0.2}
+    with DataEngine(policy=policy, **given) as engine:
+        assert engine.policy == policy
+        assert (engine.recipe.retrain_every, engine.recipe.budget) == (7, 0.2)
+        assert engine.store.settings()["model"] == "Counting"
+    with pytest.raises(SettingError, match=r"\(label_within 200\), got label_within 300"):
+        DataEngine.open_or_create(policy=replace(policy, label_within=300), **given)
+    with DataEngine.open_or_create(policy=replace(policy, shadow=True), **given) as engine:
+        assert engine.policy == policy  # the shadow mode is an operator's
 
 
 def test_the_same_line_begins_and_goes_on(data: Dataset, tmp_path: Path) -> None:
