@@ -110,8 +110,9 @@ class Trigger:
 
         signals : arrays of shape (n,) by the names of the signals.
         """
-        values = np.stack([np.nan_to_num(signals[name]) for name in self.signals])
-        return np.asarray(KINDS[self.kind].is_active(values, self.number))
+        values = np.stack([signals[name] for name in self.signals])
+        active = KINDS[self.kind].is_active(np.nan_to_num(values), self.number)
+        return np.asarray(active & ~np.isnan(values).any(axis=0))
 
 
 def as_trigger(value: Any) -> Trigger:

@@ -19,6 +19,7 @@ BITS = "actual_digital_output_bits"
         ("bit=17", {BITS: [0, 2**17, np.nan]}, [0, 1, 0]),
         ("register@r", {"r": [0, 3, -1, np.nan]}, [0, 1, 1, 0]),
         ("register=3@r", {"r": [0, 3, -1]}, [0, 1, 0]),
+        ("register=0@r", {"r": [np.nan, 1, 0]}, [0, 0, 1]),
         ("contact=5", {"FZ_Base": [4.9, 5.0, -5.0, np.nan]}, [0, 1, 1, 0]),
         ("motion=0.1", {f"actual_TCP_speed[{i}]": [0.0, 0.06, 0.08] for i in range(3)}, [0, 1, 1]),
     ],
