@@ -467,16 +467,19 @@ class RadiusIndex(nn.Module):
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
-        """Return a new index with the points of a state, in the same slots.
+        """Return a new index with the points of a state; with the same capacity in the same slots.
 
-        `state` is what `get_state` returned; `capacity` must be that of the index that it came
-        from.
+        `state` is what `get_state` returned. With a smaller `capacity` the newest points stay, and
+        with a larger one they are counted from the oldest.
         """
+        n = state["points"].shape[1]
         index = cls(len(state["points"]), capacity)
-        columns = (state[name] for name in ("labels", "spaces", "parts", "numbers"))
-        index.add(state["points"].T, *columns)
+        older = int(state["total"]) - n  # points that left
+        index.total.fill_(older if capacity <= n else 0)
+        order = (older + np.arange(n)) % max(n, 1)  # oldest first
+        columns = (state[name][order] for name in ("labels", "spaces", "parts", "numbers"))
+        index.add(state["points"].T[order], *columns)
         index.agreement.fill_(float(state["agreement"]))
-        index.total.fill_(int(state["total"]))
         return index
 
     def digest(self) -> str:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -55,6 +56,29 @@ def test_a_full_ring_holds_exactly_the_newest_points(batches: list[int], capacit
     assert items == sorted(map(tuple, Z[kept].tolist()))
     expected = (int(y[kept].sum()), int((1 - y[kept]).sum()))
     assert tuple(int(c[0]) for c in index.count(np.zeros((1, 2)), radius=100.0)) == expected
+
+
+@settings(deadline=None)
+@given(st.integers(1, 30), st.integers(1, 12), st.integers(1, 30), st.integers(0, 10))
+def test_a_restored_ring_of_any_capacity_holds_the_newest_points_that_fit_and_goes_on(
+    n: int, capacity: int, other: int, more: int
+) -> None:
+    Z, y = points(n + more)
+    numbers = np.arange(1, n + more + 1)
+    index = RadiusIndex(2, capacity)
+    index.add(Z[:n], y[:n], parts=numbers[:n] % 4, numbers=numbers[:n])
+    for size in (capacity, other):
+        restored = RadiusIndex.from_state(index.get_state(), size)
+        for i in range(n, n + more):
+            restored.add_one(torch.from_numpy(Z[i]), float(y[i]), 0, int(numbers[i]) % 4, i + 1)
+        kept = min(min(n, capacity, size) + more, size)
+        assert sorted(restored.column("numbers")) == numbers[n + more - kept :].tolist()
+        slots = restored.column("numbers") - 1
+        np.testing.assert_array_equal(restored.column("points"), Z[slots])
+        np.testing.assert_array_equal(restored.column("labels"), y[slots])
+        np.testing.assert_array_equal(restored.column("parts"), (slots + 1) % 4)
+        if size == capacity:  # each in the slot that it would have without the restoring
+            np.testing.assert_array_equal(slots % size, np.arange(kept))
 
 
 @settings(deadline=None)
