@@ -42,7 +42,8 @@ def without_password(text: str) -> str:
 def shortened(value: Any) -> str:
     """Return the `repr` of a value for a message, its middle cut out beyond some 60 characters.
 
-    An integer of more digits than Python prints is described by its number of bits.
+    A container shows only its first items. An integer of more digits than Python prints is
+    described by its number of bits.
     """
     try:
         return _REPR.repr(value)
@@ -84,7 +85,8 @@ def listed(names: Iterable[Any]) -> str:
 def as_options(text: str) -> str:
     """Return a message in which Python's arguments are written as options of the command line.
 
-    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`; the rest stays.
+    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`; so do the arguments named in
+    `OPTIONS` alone, and the rest stays.
     """
 
     def to_option(match: re.Match[str]) -> str:

@@ -121,7 +121,7 @@ def read_archive(
     names : collection of str, optional
         Arrays to read; a name that the archive does not have is passed over. None: all.
     name : str
-        What to call the archive in errors; the path by default.
+        What to call the archive in errors; by default its path, or its number of bytes.
 
     Returns
     -------
@@ -132,8 +132,8 @@ def read_archive(
     Raises
     ------
     DataError
-        If it is no archive, is damaged, holds Python objects, or needs too much memory. Nothing is
-        unpacked then.
+        If it is no archive, is damaged, an array to read holds Python objects, which are not
+        unpacked, or these arrays need too much memory (see `check_size`).
     """
     title = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
     file = io.BytesIO(source) if isinstance(source, bytes) else source
@@ -158,7 +158,7 @@ def check_output(path: str | os.PathLike[str], force: bool = False) -> None:
     """Raise OutputError if a file must not be written.
 
     Call it before the work whose result the file is to hold. A file that does not exist yet is
-    accepted, and nothing is created.
+    accepted, even if its folder does not, and nothing is created.
 
     Parameters
     ----------

@@ -74,9 +74,10 @@ class ForceLimits:
 
     @classmethod
     def parse(cls, text: str) -> ForceLimits:
-        """Return the limits that a text as START:END:LOW:HIGH describes.
+        """Return the limits that a text as START:END:LOW:HIGH describes, as `str` writes it.
 
-        An empty LOW or HIGH is no limit. Raises SettingError for any other text.
+        An empty LOW or HIGH is no limit. `:channel=1`, `:along=2` and `:reject` may follow. Raises
+        SettingError for any other text, and for values that are no limits.
         """
         pairs = [field.partition("=") for field in text.split(":")]
         options: dict[str, Any] = {}

@@ -295,7 +295,7 @@ def _check_keys(table: Mapping[str, Any], record_type: Any, where: str) -> None:
 
 
 def _read_text(path: Path) -> str | None:
-    """Return the text of a recipe's file, None if there is no such file.
+    """Return the text of a recipe's file, None if there is no such file, or it is a folder.
 
     Raises SettingError if it is larger than 1 MB, is not UTF-8 or cannot be read.
     """

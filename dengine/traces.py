@@ -103,6 +103,7 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> NDArray[np.f
     Returns
     -------
     array of float32, shape (n, C, T)
+        Contiguous; it shares its memory with X if that is float32 already.
 
     Raises
     ------
@@ -179,8 +180,8 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
 def can_fit_length(have: int, samples: int, fit: int) -> bool:
     """Return whether a trace of `have` samples can be fitted to `samples` without making up data.
 
-    `fit` is a position in `FITS`. "strict" takes the same length alone, "cut" a longer one, "pad"
-    and "resample" from half to twice the length.
+    `fit` is a position in `FITS`. "strict" takes the same length alone, "cut" that or a longer one,
+    "pad" and "resample" from half to twice the length.
     """
     if fit == 0:
         return have == samples
@@ -211,7 +212,8 @@ def _frame_to_array(trace: Any, trace_spec: TraceSpec | None) -> Any:
     """Return the channels of a DataFrame as an array (C, T), anything else unchanged.
 
     The channels are the columns that the `TraceSpec` names, else all but those of time. Raises
-    TraceError if columns are missing, or there are not as many as its channels.
+    TraceError if columns are missing, or without names if there is none, or another number of them
+    than its channels.
     """
     if not _is_frame(trace):
         return trace
@@ -374,8 +376,10 @@ class TraceGate(nn.Module):
 
         Returns
         -------
-        reason, content_hash : int
-            As of `forward`.
+        reason : int
+            Position in `REASONS` of the first fault found, 0 if there is none.
+        content_hash : int
+            As `folds.content_hash`.
         """
         lowest, highest = torch.aminmax(x)
         low = float(lowest.item())  # NaN if there is one anywhere in the trace
@@ -448,7 +452,7 @@ class ForceLimitsGate(nn.Module):
 
         Returns 0 if it keeps all limits, or there are none; 1 if it leaves one and is to be
         verified; 2 if it leaves one that rejects. A trace without a sample in the stretch of a
-        limit leaves it.
+        limit leaves it; a NaN in the stretch does not.
         """
         if self.limits.size(0) == 0:
             return 0

@@ -58,9 +58,9 @@ class Verbs(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run a verb and return its result; raise its expected errors as click's.
 
-        Passwords in their messages are masked. The current folder is added to the end of
-        `sys.path`, so that `module:Class` is found there. Ctrl-C ends the process with exit code
-        130.
+        These are DengineError, OSError (but BrokenPipeError) and UnicodeError. Passwords in their
+        messages are masked. The current folder is added to the end of `sys.path`, so that
+        `module:Class` is found there. Ctrl-C ends the process with exit code 130.
         """
         folder = str(Path.cwd())
         if folder not in sys.path:

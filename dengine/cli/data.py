@@ -83,7 +83,7 @@ def data(source: DataChoice, out: Out | None) -> None:
 def _drift_row(drift: "Drift") -> tuple[str, str, str]:
     """Return three cells of a table: the quantity, its means over tenths, and whether it drifts.
 
-    It drifts, up or down, if the p-value is below 0.01.
+    It rises or falls if the p-value is below 0.01; rho is NaN for one that never changes.
     """
     means = " ".join(f"{mean:.2g}" for mean in drift.tenths)
     if math.isnan(drift.rho):
@@ -154,9 +154,10 @@ def train(
     """Import labelled traces into a store and train on them.
 
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant)
-    is stored, but never trained on. A store that has been used keeps its own recipe and seed. If
-    nothing is new and a version answers, nothing is trained. If the new version is not used, the
-    exit code is 1. Ctrl-C keeps what was imported; the same command continues there.
+    is stored, but never trained on. A store that has been used has its own recipe and seed: leave
+    them out, others are refused. If nothing is new and a version answers, nothing is trained. If
+    the new version is not used, the exit code is 1. Ctrl-C keeps what was imported; the same
+    command continues there.
     """
     from ..datasets.importing import import_labelled, stored_form
     from ..engine.engine import DataEngine, core_of

@@ -59,8 +59,9 @@ def export(
 ) -> None:
     """Write an engine's decision to a file for the controller.
 
-    FILE.sha256, the checksum, is written beside it, and with a key also FILE.sig, the signature.
-    --cpp writes the C and C++ sources that run such a file.
+    FILE.sha256, the checksum, is written beside it, and with a key also FILE.sig, the signature; an
+    older FILE is replaced only with --force. --cpp writes the C and C++ sources that run such a
+    file.
 
     STORE is the engine's store, as given to `dengine train` or `dengine run`. --make-key and --cpp
     need neither STORE nor --out. Whoever has the key can check an exported file, and can also sign

@@ -108,7 +108,9 @@ def history(store: str, events: bool, **criteria: Any) -> None:
 
 
 def _label_text(stored: StoredDecision) -> str:
-    """Return a label with its source, as "good verified" or "bad stop"; "-" without a label."""
+    """Return a label with its source, as "good verified" or "bad stop"; "-" without a label, or
+    with a forgotten one.
+    """
     if stored.success is None:
         return "-"
     source = "" if stored.source is None else stored.source.value

@@ -229,6 +229,7 @@ def store_option(text: str, *names: str, required: bool = False) -> Option:
     *names : str
         Further names of `--cell-id`.
     required : bool, default False
+        Whether `--store` must be given.
     """
     options: dict[str, Option] = {
         "store": click.option("--store", required=required, metavar="FILE|URL", help=text),
@@ -283,7 +284,7 @@ class RecipeChoice:
     def make_contender(self) -> Contender:
         """Return the contender of a replay: dengine with this recipe, or the baseline of this name.
 
-        Both get the settings that were given.
+        Both get the settings that were given. Without a name it is dengine with the recipe conv.
         """
         from ..experiments.replay import Contender
 
@@ -524,7 +525,8 @@ def data_options(default: str | None = "insertion", argument: bool = False) -> O
     default : str or None, default "insertion"
         None makes `--data` required.
     argument : bool, default False
-        The data set is the verb's argument DATA instead of an option.
+        The data set is the verb's argument DATA, required, instead of an option; `default` is not
+        used.
     """
     metavar = "NAME|FILE|FOLDER"
     if argument:

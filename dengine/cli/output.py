@@ -97,7 +97,8 @@ class Out:
         Raises
         ------
         OutputError
-            A file exists and `force` is not set, or it cannot be written.
+            A file exists and `force` is not set, or it cannot be written. Those before it are
+            written already.
         """
         from matplotlib.figure import Figure
 
@@ -240,7 +241,8 @@ def format_value(name: str, value: Any) -> str:
         The field's name. Its ending tells the unit, see `FORMATTERS`: `_s`, `_bytes`, `share` ...
     value : object
         A number, a text, a dataclass, or a mapping or sequence of these. "-" stands for None, for
-        NaN and for "". A mapping gives its items that are not 0, or "none".
+        NaN and for ""; "yes" and "no" for bools. A mapping gives its items that are not 0, or
+        "none". In a text passwords are masked.
     """
     if isinstance(value, str) or value is None:
         return without_password(value) if value else "-"

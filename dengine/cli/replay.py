@@ -306,7 +306,8 @@ def _replay_and_print(
 ) -> None:
     """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
 
-    After Ctrl-C the finished replays are shown, and the process ends with exit code 130.
+    After Ctrl-C the finished replays are shown, if there are some, and the process ends with exit
+    code 130.
     """
     from ..experiments import tables
     from ..experiments.grid import grid_tasks

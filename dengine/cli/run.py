@@ -220,10 +220,10 @@ def _make_simulated_cell(
     source: DataChoice,
     **others: Any,
 ) -> CellToDrive:
-    """Return the simulated cell, with a seed that gives parts which the store has not seen.
+    """Return the simulated cell, its name, and the traces' contract, if options gave one.
 
-    The seed grows with the decisions in the store, and differs between the cells of a product. A
-    verification in it takes `check_seconds`.
+    Its seed, which grows with the decisions in the store and differs between the cells of a
+    product, gives parts that the store has not seen. A verification takes `check_seconds`.
     """
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters
@@ -244,7 +244,7 @@ def _make_replay_cell(
 ) -> CellToDrive:
     """Return a cell that plays a recording, from the part after the last one that the store knows.
 
-    It knows a part whose trace has a label, and the one that was accepted last.
+    It knows a part whose trace has a label, and the newest accepted one without a report.
 
     Raises
     ------
@@ -279,6 +279,8 @@ def _make_robot_cell(source: DataChoice, host: str | None, **others: Any) -> Cel
     ------
     SettingError
         No host, or a port that is none.
+    CellError
+        The controller cannot be reached, or its program is not ready in time.
     """
     from ..cells.ur.cell import UrCell
 

@@ -145,7 +145,10 @@ def _without_audits(counts: dict[str, int]) -> dict[str, int]:
 
 
 def _span_cell(name: str, span: "Span") -> str:
-    """Return the text of a span's field: a time, a number, or a share of errors and its verdict."""
+    """Return the text of a span's field: a time, a number, or a share of errors and its verdict.
+
+    A sentence stands in place of a share of nothing, or of one that another row shows too.
+    """
     value = getattr(span, name)
     if name in ("first", "last"):
         return format_time(value)
@@ -159,7 +162,8 @@ def _span_cell(name: str, span: "Span") -> str:
 
 
 def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
-    """Return a text on the share of wrong decisions: counts, interval and verdict on the tolerance.
+    """Return a text on the share of wrong decisions: counts, interval and verdict on the tolerance;
+    or that none is known.
 
     Parameters
     ----------

@@ -96,8 +96,8 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
 
     The part is named by its number, if one decision was made on it, or by that decision's id. An
     accepted part that was bad is a line stop; a rejected one that was examined afterwards is an
-    inspection, and the engine trains on its label. The same label again changes nothing. A wrong
-    label is put right by `dengine correct`.
+    inspection, and the engine trains on its label. An event records it. The same label again
+    changes nothing. A wrong label is put right by `dengine correct`.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -176,10 +176,10 @@ def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
 def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool) -> None:
     """Show the policy in force, or change it.
 
-    What is not given stays as it is. Earlier decisions keep their bounds. What the rule learned,
-    and the certificate, start again: a tolerance that is chosen after the data was seen needs fresh
-    evidence. Shadow mode lasts over restarts; `dengine status` counts what the model would have
-    done, and how much of that was wrong.
+    What is not given stays as it is. Earlier decisions keep their bounds. The certificate starts
+    again after any change, and what the rule learned after one of the tolerance, such as --alpha:
+    a tolerance that is chosen after the data was seen needs fresh evidence. Shadow mode lasts over
+    restarts; `dengine status` counts what the model would have done, and how much was wrong.
     """
     if settings:
         _change_and_print(
@@ -303,8 +303,9 @@ def _verification_lines(report: HistoryReport) -> list[str]:
 def backup(store: str, out: Path) -> None:
     """Copy a store while it is in use.
 
-    The copy is one file with all cells and with the contents of their journals, which a plain copy
-    of the file lacks. It can be opened, and checked by `dengine verify`, wherever it is.
+    The copy is one file with all cells and with the contents of the journals that lie beside the
+    store, which a plain copy of the file lacks. It can be opened, and checked by `dengine verify`,
+    wherever it is.
     """
     from ..store.backup import backup_store
 

@@ -106,11 +106,11 @@ def field_types(record: type, *without: str) -> Json:
 
 
 def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[Struct]:
-    """Return a msgspec struct type with a field for each parameter of a handler.
+    """Return a msgspec struct type with a field for each parameter of a handler but **keywords.
 
     A parameter with a default may be left out of a request. So may the `optional_fields`, given as
-    types by name; they are UNSET then. Unknown fields are refused. The parameter `id_` is the field
-    `id`, and the handler's docstring is the type's.
+    types by name; they are UNSET then. Unknown fields are refused. In a request the parameter `id_`
+    is named `id`. The handler's docstring is the type's.
     """
     hints = get_type_hints(handler, include_extras=True)
     members: list[tuple[Any, ...]] = []
@@ -211,7 +211,8 @@ def as_samples(value: Any, channels: int = 1) -> NDArray[np.float32]:
     Raises
     ------
     TraceError
-        For anything else, for no samples, and for bytes that look like float64.
+        For lists of unequal length and anything else, for no samples, for bytes that are no whole
+        number of samples of each channel or that look like float64.
     """
     if isinstance(value, bytes):
         if len(value) % (4 * channels):
@@ -292,7 +293,9 @@ def _json_field_types(record: type) -> Json:
 
 @cache
 def _json_type(hint: Any) -> Any:
-    """Return a type as JSON has it: dataclasses as structs, tuples as lists, floats as nullable."""
+    """Return a type as JSON has it: dataclasses as structs, tuples as lists of the first item's
+    type, floats as nullable; in `X | Y` each of them, and other types as they are.
+    """
     if isinstance(hint, type) and is_dataclass(hint):
         return _response_type(hint.__name__, "", hint)
     if isinstance(hint, UnionType):
@@ -449,10 +452,10 @@ def problem_response(
 
 
 def _error_response(request: Request, error: Any) -> Response:
-    """Return the `Problem` response of an exception; `STATUSES` gives its status.
+    """Return the `Problem` response of an exception, with its own status or that in `STATUSES`.
 
-    An exception that is not expected gets 500 with a general text, and is logged with its
-    traceback.
+    A client that disconnected gets 400. An exception that is not expected gets 500 with a general
+    text, and is logged with its traceback.
     """
     if isinstance(error, Refusal):
         return problem_response(error.status, error.detail, error.headers)
@@ -520,8 +523,10 @@ class Operation:
     async def serve(self, request: Request) -> Response:
         """Read a request, call the handler with its fields, and return the response.
 
-        A result of the handler that is no response is sent as JSON. Raises Refusal for a request
-        that cannot be read, and what the handler raises; the application turns both into responses.
+        The fields are read from the query and path of a GET, or from the body; beside a body of
+        bytes, which is `raw_parameter`, from the query. A result of the handler that is no response
+        is sent as JSON. Raises Refusal for a request that cannot be read, and what the handler
+        raises; the application turns both into responses.
         """
         if self.method == "GET":
             values = read_query(request, self.request_type)

@@ -124,16 +124,17 @@ class RateLimiter:
 
 
 def read_tokens(file: Path) -> tuple[Token, ...]:
-    """Read tokens from a file that only its owner may read, in the order of its lines.
+    """Read tokens from a file that only its owner may use, in the order of its lines.
 
     Each line is a secret, optionally followed by `viewer` or `operator` and the owner's name.
-    Without these words a token may operate. Empty lines are skipped.
+    Without these words a token may operate. Empty lines are skipped, and what is beyond 64 KiB is
+    not read. The group may read a credential of systemd; on Windows no permission is checked.
 
     Raises
     ------
     SettingError
-        If the file cannot be read, others may read it, it has no token or one twice, a secret is
-        too short or not ASCII, or a line is not of this form.
+        If the file cannot be read, others may use it, it has no token or one twice, a secret is
+        shorter than `MIN_TOKEN_LENGTH` or not printable ASCII, or a line is not of this form.
     """
     with (
         instead(SettingError, f"Cannot read the token file {file}", OSError),
@@ -209,7 +210,7 @@ def is_own_host(host: str | None, names: tuple[str, ...]) -> bool:
 def take_token(scope: Scope, authorization: str) -> str:
     """Return the secret that a request carries, or "" if it has none that can be read.
 
-    It is a bearer token, the password of HTTP Basic, or the rest of a path /RPC2/SECRET. Such a
+    It is the rest of a path /RPC2/SECRET, else a bearer token or the password of HTTP Basic. Such a
     path is changed to /RPC2 in `scope`, so that the secret is not logged later.
 
     Parameters
@@ -281,8 +282,8 @@ class Guard:
     def _check(self, scope: Scope) -> None:
         """Raise Refusal for a request that is not allowed; else note its token for the handlers.
 
-        In this order it checks the host name, rate and token (`_check_token`), the site that a
-        change comes from, and the announced length of the body.
+        In this order it checks the host name (421), rate and token (`_check_token`), the site that
+        a change comes from (403), and the announced length of the body (400, 413).
         """
         headers = Headers(scope=scope)
         host = headers.get("host")
@@ -308,12 +309,12 @@ class Guard:
             raise _too_large(self.access.largest)
 
     def _check_token(self, scope: Scope, headers: Headers) -> None:
-        """Check a request's token and rate, and set `CURRENT_TOKEN` to the token, for the handlers.
+        """Check a request's rate and token, set `CURRENT_TOKEN` and mark the scope with `LET_IN`.
 
-        It also marks the scope with `LET_IN`. A secret in the path is removed from it. Raises
-        Refusal: 429 for too many requests of a client, 401 without a right token, 403 for a
-        viewer's token on a request that could change something. A wrong token is logged, but not
-        each time. /healthz needs no token.
+        A secret in the path is removed from it. Raises Refusal: 429 for too many requests of a
+        client, 401 without a right token, 403 for a viewer's token on a request that could change
+        something. A wrong token is logged, but not each time. /healthz needs no right token;
+        without one nothing is set or marked. A server without tokens takes every request.
         """
         client = (scope.get("client") or ("", 0))[0]
         secret = take_token(scope, headers.get("authorization", ""))

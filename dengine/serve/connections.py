@@ -109,7 +109,10 @@ class Connection(AutoHTTPProtocol):
         )
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as of uvicorn's
-        """Take a place in the pool and start the time of the first head; or respond 503, close."""
+        """Take a place in the pool and start the time of the first head; or respond 503, close.
+
+        A full pool may first close an idle connection that was never authorized (`add`).
+        """
         self.transport = transport
         self.address = str((transport.get_extra_info("peername") or ("",))[0])
         self._has_place = self._pool.add(self)

@@ -172,9 +172,10 @@ class HttpApi:
         part: Annotated[str | int | None, Meta(description="The part's number.")] = None,
         channels: Annotated[int, Meta(ge=1, le=99_999, description="Of bytes.")] = 1,
     ) -> Json:
-        """Decide on a trace. The same trace and request id get the same decision.
+        """Decide on a trace. The same trace and request id get the same decision; another trace
+        with that id gets 409.
 
-        A body of bytes has the other fields in the query. A decision that is not ready before the
+        A body of bytes has the other fields in the query. A decision that is not begun before the
         deadline is VERIFY, late. 503: the queue is full, nothing was recorded, verify the part.
         """
         samples = api.as_samples(trace, channels)
@@ -198,7 +199,8 @@ class HttpApi:
     ) -> Json:
         """Report the outcome of a part. The label is on disk when the response comes.
 
-        The same report twice is no error. With an author it is an event, too.
+        The same report twice is no error, a different one is 409. With an author, or a token that
+        has a name, a new label is an event, too.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
@@ -222,9 +224,9 @@ class HttpApi:
         part: PartNumber = "",
         author: Author = "",
     ) -> Json:
-        """Correct a label, from the next decision on. What was reported stays on record.
+        """Correct a label, from the next decision on, and return what changed.
 
-        A forgotten label counts again.
+        What was reported stays on record. A forgotten label counts again.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -237,9 +239,9 @@ class HttpApi:
         author: Author = "",
         reason: Annotated[str, Meta(description="For the event log.")] = "",
     ) -> Json:
-        """Leave labels out of training and of all counts. /correct takes one in again.
+        """Leave labels out of training and of all counts, and return what changed.
 
-        If one id is unknown, or has no label, none is forgotten.
+        /correct takes one in again. If one id is unknown, or has no label, none is forgotten.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -264,8 +266,9 @@ class HttpApi:
         )
 
     async def retrain(self, author: Author = "") -> Json:
-        """Begin a retrain on all labels, unless one is under way. The response does not wait for
-        its end.
+        """Begin a retrain, which is an event, and do not wait for its end.
+
+        If one is under way, the response says so, and nothing is begun or recorded.
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
@@ -285,7 +288,7 @@ class HttpApi:
         """Download the model that decides now: a TorchScript file and its checksum, in a zip.
 
         The download is an event. An accepted part that waits for its confirmation is not part of
-        the model.
+        the model. Before the first retrain there is nothing to download: 422.
         """
 
         def copy_model(engine: DataEngine) -> Exportable:
@@ -341,7 +344,7 @@ class HttpApi:
         **where: Any,
     ) -> Json:
         """Return decisions without their traces, newest first, and in `older` where the next page
-        begins.
+        begins, null without one.
 
         since and until are times in seconds since 1970; the first is included, the last is not.
         predicted is what the model alone would have done. part is a part's number.
@@ -383,8 +386,8 @@ class HttpApi:
         return response_fields("Course", course)
 
     async def embedding(self) -> Json:
-        """Return where the labelled and the newest parts lie in the model's embedding, in two
-        dimensions.
+        """Return where the newest 250 labelled parts and the newest 10 decided ones lie in the
+        model's embedding, in two dimensions; nothing before the first version.
         """
         engine = self.service.engine
         parts = await self.service.read(
@@ -425,9 +428,10 @@ class HttpApi:
         return Response(body, media_type=media)
 
     async def healthz(self) -> Response:
-        """Return whether the engine answers: ok; degraded (200); down (503). It needs no token.
+        """Return whether the engine answers: ok or degraded (200), down (503). It needs no token.
 
-        Degraded: the store cannot be written, or retrains are dropped again and again.
+        Degraded: the store cannot be written, or retrains are dropped again and again. Down: the
+        engine's thread has ended, or was busy with one thing for a minute.
         """
         core = self.service.core
         is_alive = self.service.silent_seconds < MAX_SILENT
@@ -468,8 +472,8 @@ class HttpApi:
 def _checked_author(author: str) -> str:
     """Return the author for the event log: the token's name if it has one, else the given name.
 
-    Runs of spaces become one. Raises Refusal 422 without a name, and for another name than the
-    token's.
+    Runs of spaces become one. Raises Refusal 422 without a name or for one that is too long, and
+    for another name than the token's.
     """
     owner = CURRENT_TOKEN.get().name
     name = " ".join(author.split())
@@ -499,9 +503,9 @@ def _read_newest(
 def _read_explanation(store: SqlStore, id_: str) -> Json:
     """Return the explanation of a decision, given by its id or its part's number, as a response.
 
-    It has the decision's trace, the band of good parts, the traces of the newest bad parts (at most
-    `N_BADS`), rounded for a picture, and the corrections of its label. Raises UnknownDecisionError
-    and ReportConflictError as `find_decision_id`.
+    It has the decision's trace, the band of good parts and up to `N_BADS` newest bad traces of the
+    same shape, both rounded for a picture, and the corrections of its label. Raises
+    UnknownDecisionError without a decision, ReportConflictError if the part has several.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
@@ -525,7 +529,10 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
 
 
 def _zip_export(source: Exportable) -> bytes:
-    """Return a zip archive, in bytes, of a model exported to TorchScript and its checksum."""
+    """Export a model to TorchScript, and return it with its checksum as a zip archive in bytes.
+
+    The export is recorded as an event. Raises ExportError for a model that cannot be exported.
+    """
     from ..export import export_torchscript
 
     with TemporaryDirectory(prefix="dengine-export-") as folder:

@@ -195,7 +195,8 @@ async def opcua_server(
     tokens : collection of str, optional
         Passwords of the user `dengine`; None: everybody may read and call.
     cert, key : path, optional
-        PEM or DER files. With them the server speaks only Basic256Sha256, signed and encrypted.
+        PEM or DER files. With both the server speaks only Basic256Sha256, signed and encrypted;
+        else it encrypts nothing.
 
     Yields
     ------
@@ -268,7 +269,9 @@ class AddressSpace:
         self._alarm = ""
 
     async def build(self) -> None:
-        """Create the object Cell, its variables and methods, and the generator of alarm events."""
+        """Create the object Cell, its `VARIABLES`, the methods Decide and Report, and the generator
+        of alarm events.
+        """
         self._index = await self._server.register_namespace(NAMESPACE)
         objects = self._server.nodes.objects
         cell = await objects.add_object(self._node_id(CELL), self._browse_name(CELL))
@@ -302,8 +305,9 @@ class AddressSpace:
         in order.
 
         If the queue is full or the store unavailable, the result is VERIFY with an empty id. Raises
-        SettingError for an empty trace and one that the channels do not divide, and TraceError, as
-        `DataEngine.decide`, for one that the engine does not take.
+        SettingError for an empty trace, one that the channels do not divide, and more than
+        `MAX_CHANNELS`; TraceError for a trace, and ReportError for a request, that the engine does
+        not take.
         """
         if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
             raise SettingError(

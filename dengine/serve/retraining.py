@@ -137,8 +137,9 @@ def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _
 def _end_with_parent() -> None:
     """Prepare the retraining process, in which it runs first: let it end with its parent.
 
-    It ends even during a call into C++. Where that can be set, it also leaves one core to decisions
-    and has a lower priority. On Windows it ignores the ending signals.
+    It ends even during a call into C++, and at once if the parent has ended already. Where that can
+    be set, it also leaves one of several cores to decisions and has a lower priority. On Windows it
+    ignores the ending signals.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned

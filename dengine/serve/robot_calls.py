@@ -151,8 +151,10 @@ class RobotCalls:
         Raises
         ------
         TraceError
-            For a part that was not begun, or not lately; a piece of several channels; more than
-            `MAX_SAMPLES` samples.
+            For a part that was not begun, or not lately; a piece that is no samples, or of several
+            channels; more than `MAX_SAMPLES` samples.
+        ReportError
+            For an id that is no id.
         """
         pieces = self._pieces.get(as_id(request))
         if pieces is None:
@@ -204,7 +206,7 @@ class RobotCalls:
 
         A part that has a decision gets it again. A recorded decision drops the pieces; after a
         VERIFY with an empty id they stay, so that the call can be repeated. Raises TraceError
-        without pieces.
+        without pieces, and as `decide`.
         """
         if (stored := await self._find(request)) is not None:
             return stored
@@ -223,8 +225,8 @@ class RobotCalls:
         """Decide on the insertion since `begin`, and return the struct of `decide`.
 
         It waits up to `RECORD_SECONDS` for the recording, which one call uses up. A part that has a
-        decision gets it again. Without a recording the result is verify, with an id "" and the
-        reason "not_recorded"; nothing is recorded then.
+        decision gets it again. Without a recording, as for any part but that of the newest `begin`,
+        the result is verify, with an id "" and the reason "not_recorded"; nothing is stored then.
 
         Parameters
         ----------
@@ -242,6 +244,8 @@ class RobotCalls:
         ------
         SettingError
             For a server without a recorder.
+        TraceError, ReportError
+            As `decide`.
         """
         if self._recorder is None:
             raise SettingError(
@@ -351,7 +355,7 @@ class RobotCalls:
 
     async def _find(self, request: Any) -> Struct | None:
         """Return the struct of the decision that a request has; None without one, or if it cannot
-        be read.
+        be read. Raises ReportError for an id that is no id.
         """
         try:
             stored = await self._service.find(as_id(request))
@@ -366,7 +370,7 @@ def one_line(text: str) -> str:
 
 
 def _as_struct(decision: Decision) -> Struct:
-    """Return a decision as a struct of plain types, its action as an integer."""
+    """Return a decision as the struct of `RobotCalls.decide`, its action as an integer."""
     return {
         "action": ACTIONS.index(decision.action),
         "id": decision.id,
@@ -378,7 +382,9 @@ def _as_struct(decision: Decision) -> Struct:
 
 
 def _unrecorded_verify(reason: str) -> Struct:
-    """Return the struct of a VERIFY that was not recorded: its id is "", its bound 0 to 1."""
+    """Return the struct of a VERIFY that was not recorded: its id is "", its version 0, its lower
+    and upper bound 0 and 1.
+    """
     return {
         "action": ACTIONS.index(Action.VERIFY),
         "id": "",

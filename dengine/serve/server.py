@@ -46,8 +46,8 @@ class LineFormatter(logging.Formatter):
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return a record as one line, with message and, if there is an exception, its traceback as
-        JSON.
+        """Return a record as one line: time in UTC, level, logger, and as JSON texts the message
+        and an exception's traceback, with passwords masked.
         """
         utc = datetime.fromtimestamp(record.created, UTC)
         time = utc.isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -60,9 +60,10 @@ class LineFormatter(logging.Formatter):
 
 @contextmanager
 def log_lines_to(stream: TextIO) -> Iterator[None]:
-    """Write the logs of all libraries to a stream as of `LineFormatter`, until the block ends.
+    """Write the logs of all libraries to a stream, a line each, until the block ends.
 
-    dengine's own are written from INFO on. The handlers that were there before get none meanwhile.
+    dengine's own are written from INFO on, others from their level on. The root logger's handlers
+    get none meanwhile, and are put back.
     """
     handler = logging.StreamHandler(stream)
     handler.setFormatter(LineFormatter())
@@ -226,9 +227,9 @@ class CellServer(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         """Handle the ending signals, within the block, as a request to end in order.
 
-        The first one ends the listening to changes and lets uvicorn finish. uvicorn would raise the
-        signals again after the end, which would change the exit code. In another thread than the
-        main one nothing is handled.
+        The first one is logged, ends the listening to changes and lets uvicorn finish; a second
+        SIGINT makes it wait no longer. uvicorn would raise the signals again after the end, which
+        would change the exit code. In another thread than the main one nothing is handled.
         """
         # Python delivers signals to the main thread alone.
         if threading.current_thread() is not threading.main_thread():

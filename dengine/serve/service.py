@@ -195,18 +195,20 @@ class CellService:
         trace : array, shape (T,) or (C, T)
         request : str, optional
             The caller's id, a different one for each trace. The same id and trace get the same
-            decision, after a restart too, and it is on disk when this returns.
+            decision, after a restart too, and it is on disk when this returns. None: a new id; the
+            decision may reach the disk later.
         part : str or int, optional
             The part's number.
 
         Returns
         -------
         ServiceResponse
-            After the deadline a decision VERIFY, `Reason.LATE`, which is counted in `late`.
+            If the engine has not begun by the deadline, a recorded decision VERIFY, `Reason.LATE`,
+            which is counted in `late`. One that it has begun is waited for.
 
         Raises
         ------
-        TraceError, ReportError
+        TraceError, ReportError, StoreError
             As `DataEngine.decide`.
         BusyError
             If the queue is full or the service is closing; nothing is recorded.
@@ -253,7 +255,8 @@ class CellService:
         success : bool or float
             1 or True: good. The same label twice is no error.
         author : str
-            Of a person's report, for the event log. "": a machine's, which is not an event.
+            Of a person's report, for the event log. "": a machine's, which is not an event. Nor is
+            a repeated one.
 
         Returns
         -------
@@ -318,7 +321,8 @@ class CellService:
 
         The engine is flushed first, so this waits in the queue. The function runs in a thread of
         its own, over the second connection, or in the engine's thread if the store is in memory.
-        Raises BusyError if the queue is full, and what the function raises.
+        Raises BusyError if the queue is full or the service is closing, and what the flush or the
+        function raises.
         """
         await self.call(lambda engine: engine.flush(), read_only=True)
         if self.read_store is self.engine.store:
@@ -346,7 +350,7 @@ class CellService:
         """Yield True at once, and then whenever something has changed since the last yield.
 
         After `quiet` seconds without a change False is yielded; None: never. The iteration ends
-        when `end_listening` is called.
+        when `end_listening` is called, and yields nothing if it was called before.
         """
         event = asyncio.Event()
         listener = (asyncio.get_running_loop(), event)

@@ -163,8 +163,8 @@ def insert_once(
 def _find_cause(conditions: Conditions, pushed: Push) -> str:
     """Return the cause of a failed insertion, one of `CAUSES` but "none".
 
-    It is the fault that was drawn, if it had an effect; else it follows from where the part
-    stopped, and whether it slipped in the gripper.
+    A missed grasp or a wrong part that was drawn is the cause, and so is debris if the part stopped
+    on it; else the cause follows from where the part stopped, and whether it slipped.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):

@@ -52,7 +52,7 @@ def simulate(
     Raises
     ------
     SettingError
-        For an unknown scenario, and for n below 1.
+        For an unknown scenario, n below 1, and a time step that does not divide 2 ms.
     DengineError
         If MuJoCo is not installed.
     """

@@ -152,8 +152,9 @@ class UrCell(AbstractContextManager["UrCell"]):
     def insert(self) -> NDArray[np.float32]:
         """Have a part inserted, wait for it, and return its trace, (T,) or (C, T).
 
-        Lost samples are NaN; all are if the start was lost. Set `last`, and count an incomplete
-        trace.
+        Lost samples are NaN; all are if no insertion was seen, as when its start was lost or the
+        trigger is wrong. Set `last`, and count an incomplete trace. Raise CellError if the robot
+        does not answer in time, fails, or its program stops.
         """
         self._execute_order(Verb.INSERT)
         if self.last is None:  # the start was lost, or the trigger is wrong
@@ -177,9 +178,9 @@ class UrCell(AbstractContextManager["UrCell"]):
         """Send an order, wait at most `order_timeout` seconds for its result, and return that.
 
         What was received before is discarded. Meanwhile the order is written again after a
-        reconnection. After INSERT, also wait for the end of the trace, and set `last` to it, or to
-        None if no insertion was seen. Raise CellError if the robot does not answer in time, fails,
-        or its program stops.
+        reconnection. After INSERT, also wait, in the same time, for the end of the trace, and set
+        `last` to it, or to None if it was not seen. Raise CellError if the robot does not answer in
+        time, fails, or its program stops.
         """
         self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1

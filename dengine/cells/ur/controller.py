@@ -379,7 +379,9 @@ class FakeController(AbstractContextManager["FakeController"]):
         """Carry out one request of a client, and send the response if the protocol has one.
 
         Text is ignored, and data sets `inputs`; neither has a response. The others are: declare
-        outputs or inputs, start (packages are sent from then on), pause, and ask for versions.
+        outputs or inputs, start (packages are sent until the next request), pause, and ask for
+        versions. What is in `refuses`, and an input of another client, is refused. A malformed
+        request raises one of `FOREIGN`.
         """
         is_allowed = type_ not in self.refuses
         match type_:
@@ -424,7 +426,7 @@ class FakeController(AbstractContextManager["FakeController"]):
     ) -> RtdeRecipe:
         """Return a recipe of the fields in `names`, a text with commas between them.
 
-        Refused ones have the type `why`, the others that of `type_of`.
+        Refused ones have the type `why`, the others that of `type_of`, which may be NOT_FOUND.
         """
         listed = names.decode().split(",")
         return RtdeRecipe(

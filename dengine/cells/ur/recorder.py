@@ -134,7 +134,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         """Wait for the next insertion after the last one, or after `arm`, and return it.
 
         An insertion that is not complete after `timeout` seconds, for example since the controller
-        fell silent, is returned with NaN for what is missing.
+        fell silent, is returned with NaN for what is missing; one whose start was lost is all NaN.
 
         Parameters
         ----------

@@ -306,11 +306,13 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def write(self, values: Values | None) -> None:
         """Write inputs now, or once there is a connection again; a lost connection raises nothing.
 
+        By the next connection they must be less than `REPEAT_S` old, and the controller must not
+        have been restarted; else they are not written again.
+
         Parameters
         ----------
         values : mapping of str to float, or None
-            By column. None writes nothing: the newest inputs are then not written again after a
-            reconnection.
+            By column. None writes nothing, and forgets the newest inputs.
         """
         with self._news:
             self._written = values
@@ -321,7 +323,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         """Write the newest inputs, if there are some and a connection; the caller holds the lock.
 
         A lost connection is noted in `trouble` and not raised: the thread reconnects and writes
-        them again.
+        them again, unless they are old by then.
         """
         if self._client is not None and self._written is not None:
             try:
@@ -358,8 +360,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def _count_and_buffer(self, row: Row) -> None:
         """Count a package and what is missing before it, buffer it, and wake who waits in `take`.
 
-        The first package of a new connection also has the inputs written again, if they are at most
-        REPEAT_S old. After a restart of the controller they are forgotten instead.
+        The first package of a new connection also has the inputs written again, if they are less
+        than `REPEAT_S` old. After a restart of the controller they are forgotten instead.
         """
         with self._news:
             if self._newest is not None:
