@@ -56,9 +56,9 @@ class Outcome(NamedTuple):
         return self[:4] != other[:4] or bool(distances.max() > BOUND_TOLERANCE)
 
 
-def table_row(what: str, value: float, unit: str = "", target: str = "") -> Row:
+def table_row(quantity: str, value: float, unit: str = "", target: str = "") -> Row:
     """Return one row of the table, with the value as a whole number."""
-    return {"what": what, "value": round(float(value)), "unit": unit, "target": target}
+    return {"what": quantity, "value": round(float(value)), "unit": unit, "target": target}
 
 
 def difference_row(

@@ -21,7 +21,7 @@ from dengine.traces import as_traces
 POLICY = {"alpha": 0.1, "lower_bound": 0.9}
 
 
-def span(text: str) -> range:
+def parse_seeds(text: str) -> range:
     """Parse '100:130' as the seeds 100 to 129; argparse prints an error for other text."""
     first, last = map(int, text.split(":"))
     if not 0 <= first < last:
@@ -37,9 +37,9 @@ OPTIONS: dict[str, tuple[Any, str]] = {
     "recipe": (str, "a recipe's name or TOML file, or module:Class"),
     "alpha": (float, "error level of the interval"),
     "lower_bound": (float, "the paper's LB"),
-    "seeds": (span, "first:last, the last one left out; a replay each"),
+    "seeds": (parse_seeds, "first:last, without last; one replay for each"),
     "cycles": (int, "of a replay, at most as many as there are traces"),
-    "n_jobs": (int, "replays at a time; -1: one a core; times are honest with 1"),
+    "n_jobs": (int, "replays at a time; -1: one for each core; times are right with 1 only"),
     "keep": (Path, "folder of finished replays"),
     "folder": (Path, "where the stores are made; a temporary folder by default"),
     "out": (Path, "folder for the tables and pictures"),
