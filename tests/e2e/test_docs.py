@@ -22,7 +22,7 @@ import pytest
 
 REPO = Path(__file__).resolve().parents[2]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
-QUICK = {"docs/howto/own_reducer.md", "docs/howto/labels.md"}
+QUICK = {"docs/howto/own_reducer.md", "docs/howto/parts.md"}
 
 SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data insertion": "--repeats 1 --cycles 120",
