@@ -51,6 +51,7 @@ NOT_RUN = ("make ", ". .venv", "python -m pip")  # this very suite, and what ins
 CPP = ("cmake", "build/")
 HAS_CPP = all(shutil.which(tool) for tool in ("cmake", "g++"))
 PYTHON = ("dengine ", "python training/", "python -m tests.", "python snippet.py")
+SPAWNS = "python training/benchmark_fleet.py"  # its processes need a `__main__` of their own
 HEAVY = (
     "matplotlib.pyplot",
     "pandas",
@@ -137,7 +138,8 @@ def record(folder: Path) -> None:
 
 def shell(command: str, desk: Path) -> None:
     """Run one command as it is typed, with the environment activated."""
-    if command.startswith(PYTHON) and not re.search(r"[<>|$&;`]", command):
+    is_plain = not re.search(r"[<>|$&;`]", command)
+    if command.startswith(PYTHON) and not command.startswith(SPAWNS) and is_plain:
         python(shlex.split(command.removeprefix("python ")), desk)
         return
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
