@@ -47,7 +47,7 @@ def data(source: DataChoice, out: Out | None) -> None:
     from ..datasets import load_dataset
     from ..experiments.figures import data_picture
     from ..experiments.survey import survey_dataset
-    from ..model.neighbours import SUSPICIOUS
+    from ..model.neighbours import MANY_REPEATS
 
     dataset = load_dataset(source.data, **source.options)
     survey = survey_dataset(dataset)
@@ -66,7 +66,7 @@ def data(source: DataChoice, out: Out | None) -> None:
             "The files are in the order of their labels, not of their recording: drift cannot be "
             "seen."
         )
-    if survey.near_repeats > SUSPICIOUS:
+    if survey.near_repeats > MANY_REPEATS:
         parts.append(
             "Many traces nearly repeat another part's. If parts come twice, give their numbers "
             "(--part)."

@@ -45,14 +45,15 @@ def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) 
     """Return the log capital of a bettor who stakes on a mean failure probability below tolerance.
 
     The capital starts at 1, so the result is 0 for no parts. It falls with each bad part and rises
-    with all others. It is a weighted mean of six capitals, each with a fixed stake.
+    with each other one, unless the tolerance is 0. It is a weighted mean of six capitals, each with
+    a fixed stake. No argument is checked.
 
     Parameters
     ----------
     n : int
         Number of parts, of known outcome or not.
     n_bad : int
-        Parts among them that are known to be bad.
+        Parts among them whose outcome was asked for and is bad.
     tolerance : float
         From 0 to 1.
     propensity : float, default 1.0
@@ -82,7 +83,7 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
     n : int
         Number of parts, of known outcome or not.
     n_bad : int
-        Parts among them that are known to be bad.
+        Parts among them whose outcome was asked for and is bad.
     alpha : float
         Error level, between 0 and 1.
     propensity : float, default 1.0
@@ -132,7 +133,7 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     Parameters
     ----------
     share : float
-        Probability, below 0.5, with which a part may be wrong.
+        Probability, above 0 and below 0.5, with which a part may be wrong.
     parts : float
         Mean number of parts to a false alarm, at least, while each part is wrong with probability
         `share` or less given the past.
@@ -142,7 +143,7 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     step : int
         At least 1.
     limit : int
-        The smallest, above 1, whose mean number of parts to a false alarm is `parts` or more.
+        The smallest, from 1 on, whose mean number of parts to a false alarm is `parts` or more.
 
     References
     ----------
@@ -337,10 +338,11 @@ class Certificate:
     def _claim(self, group: OutcomeBound, which: str, verb: str, wrong: str, unknown: str) -> str:
         """Return the claim about a group of parts as one sentence.
 
-        `which` describes the parts, `verb` is what the model does with them, `wrong` what they were
-        if that was wrong. The sentence gives the bound as a percentage, rounded up. If the group is
-        empty, if no outcome was asked for (`unknown` is the reason), or if too few outcomes are
-        known, it says that nothing can be claimed.
+        It gives the number of parts, the bound in per cent, rounded up, the confidence and the
+        tolerance. `which` describes parts without a check; if the claim rests on audits, their
+        number and `verb`, what the model would do, stand instead. `wrong` is what a part was that
+        was decided wrongly. The sentence says that nothing can be said if the group is empty, no
+        outcome was asked for (`unknown` is the reason), or the bound is 1.
         """
         parts = f"{group.n:,} part{'s' if group.n != 1 else ''}"
         but = " beyond the known stops" if verb == "accept" else ""
@@ -404,6 +406,8 @@ def certify(
     ------
     SettingError
         For `stops`, alpha, the audit rate or a tolerance out of range.
+    ValueError
+        If more parts of a group are wrong than are in it.
 
     Notes
     -----

@@ -76,6 +76,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         ------
         ValueError
             For more than two classes, and for arrays that scikit-learn refuses.
+        SettingError
+            For a setting of the classifier out of its range.
         """
         Z, y = validate_data(self, Z, y)
         self.classes_ = classes_of(y)
@@ -83,14 +85,17 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return self._add(Z, y)
 
     def partial_fit(self, Z: ArrayLike, y: ArrayLike, classes: ArrayLike | None = None) -> Self:
-        """Add references; beyond `capacity` the oldest leave.
+        """Add references to those of earlier calls; beyond `capacity` the oldest leave.
 
         Parameters
         ----------
         Z : array, shape (n, d)
+            Embeddings.
         y : array, shape (n,)
+            Labels.
         classes : array, optional
-            Both classes. It is read on the first call only; None: those in `y`.
+            Both classes. It is read only if neither `fit` nor this was called before, and sets
+            `classes_`; None: those in `y`.
 
         Returns
         -------
@@ -99,7 +104,10 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Raises
         ------
         ValueError
-            For a label that is not among the classes of the first call.
+            For a label that is not in `classes_`, more than two classes, and arrays that
+            scikit-learn refuses.
+        SettingError
+            On the first call, for a setting out of its range.
         """
         is_first = "index_" not in vars(self)
         Z, y = validate_data(self, Z, y, reset=is_first)

@@ -112,7 +112,7 @@ class Decider(nn.Module):
         -------
         fault : int
             Position in `Reason` of what is wrong with the trace, 0 if nothing. A faulty trace is
-            verified and its embedding is NaN.
+            verified.
         content : int
             Content hash of the trace (`folds.content_hash`).
         action, predicted : int
@@ -126,6 +126,7 @@ class Decider(nn.Module):
         n_success, n_failure : int
             Labels within the radius; 0 without a prediction.
         embedding : Tensor of float32, shape (K, d)
+            By the predictor, also where a force limit decides; NaN for a faulty trace.
         propensity : float
             Probability, fixed beforehand, that this part is verified: the audit rate if the model
             is certain, 0 if a force limit rejects, otherwise 1.
@@ -156,7 +157,10 @@ class Decider(nn.Module):
 
     @torch.jit.export
     def check(self, x: Tensor) -> tuple[int, int]:
-        """Return (fault, content hash) of a trace (C, T), as of `forward`; nothing is predicted."""
+        """Return (fault, content hash) of a trace (C, T); nothing is predicted.
+
+        The fault is a position in `Reason`, 0 if the trace has none.
+        """
         return self.gate.check(x, float(self.sensor_limit.item()))
 
     def is_audited(self, content: int, rate: float) -> bool:

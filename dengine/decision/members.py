@@ -46,10 +46,10 @@ FEW_NOVEL = 25.0  # traces in a row that are not novel; a novel one takes back 1
 
 
 def max_recent_errors(tolerance: float) -> int:
-    """Return the smallest k such that more than k wrong ones of `N_RECENT` outcomes are unlikely.
+    """Return the smallest k such that more than k of `N_RECENT` outcomes are rarely wrong.
 
-    More are wrong with a probability of at most `TAIL_PROBABILITY` where each outcome is wrong with
-    the probability `tolerance`, independently.
+    The probability of that is at most `TAIL_PROBABILITY` if each outcome is wrong with the
+    probability `tolerance`, independently.
     """
     tail = 1.0
     k = -1
@@ -230,10 +230,11 @@ class MemberEvidence(nn.Module):
     ) -> None:
         """Count a part's outcome on both sides, choose the thresholds, and end a safe mode if due.
 
-        Parameters and their meaning as of `DecisionRule.update`. A wrong outcome may raise an
-        alarm, which starts the safe mode. The safe mode ends when the side that raised the alarm
-        has an open level again; after too many novel traces, when novel ones are few again and
-        either side has one.
+        `lower` and `upper` are the bound that the part was decided by, `success` is its label,
+        `predicted` (position in `Action`) what the model alone would have done; for
+        `inclusion_probability` see `count_outcome`. A wrong outcome may raise an alarm, which
+        starts the safe mode. This ends when the side that raised the alarm has an open level
+        again; after too many novel traces, when novel ones are few again and either side has one.
         """
         self.count_outcome(0, lower, not success, predicted, inclusion_probability)
         self.count_outcome(1, 1.0 - upper, success, predicted, inclusion_probability)
@@ -259,7 +260,7 @@ class MemberEvidence(nn.Module):
         mode. The levels that the score reaches, and the members if it is one, count the part only
         if its outcome was asked for (`inclusion_probability` > 0) or all outcomes are known. A
         member reaches the target level, or the model was certain of it (`predicted` is the side's
-        action). The threshold stays as it is if the part was counted nowhere.
+        action). No threshold is chosen if the part is counted nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)

@@ -172,9 +172,9 @@ def fit_novelty(
     traces : array of float32, shape (n, C, T)
         Finite, with any labels, oldest first.
     margin : float
-        Factor on the limits, which are 99.5 % quantiles of the references' squared distances to one
-        another. With fewer than 200 different traces, and for distortions fewer than `REFERENCES`,
-        the limits are wider.
+        Factor on the limits, which are 99.5 % quantiles of the references' squared distances to the
+        nearest other reference, or lower where outliers would set these. With fewer than 200
+        different references, and for distortions fewer than `REFERENCES`, the limits are wider.
     parts : array of int64, shape (n,), optional
         Hashes of the parts; None: each trace is a part of its own. Only distances between different
         parts and different traces count, for what came twice is near itself.
@@ -182,7 +182,7 @@ def fit_novelty(
     Returns
     -------
     NoveltyGate
-        Disabled if there are fewer than `FEWEST` different traces.
+        Disabled if fewer than `FEWEST` of the references differ in part and content.
     """
     n, channels, samples = traces.shape
     gate = NoveltyGate(channels, samples)
@@ -272,8 +272,9 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
     """Return Fisher's discriminants between traces and their distortions, float32, shape (P, D).
 
     Column j separates the traces from their j-th distortion. x (n, C, T) are the traces, plain (n,
-    P) float64 their features. used (P,) bool marks the features that the discriminants read; the
-    rows of the others are 0.
+    P) float64 their features, not standardised, as the discriminants take them. used (P,) bool
+    marks the features that the discriminants read; the rows of the others are 0. Only about
+    `DISTORTED` of the traces are distorted.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
@@ -295,8 +296,8 @@ def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
 
     A glitch among the references must not be the measure of the others, so mean and deviation are
     computed after the outermost values of each feature (n, P) are drawn in. A floor is added to the
-    deviation: a feature that never moved is far away once it moves, but not by the rounding of its
-    own size.
+    deviation, so the gain is finite: a feature that never moved is far away once it moves, but not
+    by the rounding of its own size.
     """
     n = len(features)
     n_outer = 1 + n // TAIL_TRACES
@@ -331,11 +332,11 @@ def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tens
     """Return (usual squared distance between nearest points, reach of each point (n,)).
 
     `points` is (n, P); `same` (n, n) bool marks pairs whose distance does not count. The usual
-    distance is the QUANTILE of the distances to the nearest other point, capped by what nine in ten
-    show, so that a few outliers are not the measure of the others; it is 0.001 at least. The reach
-    of a point is the usual distance; an outlier's is the squared distance to its third nearest
-    outlier, if that is larger and all points that are no outliers are twice as far: such a cluster
-    is a kind of its own.
+    distance is the QUANTILE of the distances to the nearest other point, capped at six times what
+    nine in ten stay below, so that a few outliers are not the measure of the others; it is 0.001 at
+    least. The reach, squared as well, is the usual distance; of more than three outliers, one's is
+    the distance to its third nearest outlier, if that is larger and all points that are no outliers
+    are more than twice as far: such a cluster is a kind of its own.
     """
     norms = points.square().sum(1)
     squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)

@@ -243,9 +243,9 @@ class Policy:
         return rule
 
     def certificate(self, outcomes: Outcomes) -> Certificate:
-        """Bound how many of the parts that were decided without a check were decided wrongly.
+        """Return the bounds on how often parts decided without a check were decided wrongly.
 
-        Where all line stops are known, an accepted part counts once its outcome is known.
+        With `stops="all"`, accepted parts of unknown outcome are left out.
 
         Parameters
         ----------
@@ -255,7 +255,8 @@ class Policy:
         Returns
         -------
         Certificate
-            With the prices if the guarantee is "cost".
+            For accepted and for rejected parts, as of `certify`; with the prices if the guarantee
+            is "cost".
         """
         if self.stops == "all":
             bad = outcomes.false_accepts + outcomes.forgotten_accepts
@@ -269,8 +270,9 @@ class Policy:
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
         """Return (lower, upper) of the success probability by the policy's interval.
 
-        Parameters and result as of `wilson_interval`. The error level is alpha, or under the
-        guarantees "pooled" and "cost", where the interval only sorts parts, 0.5.
+        The counts are integers or arrays of one shape, the ends floats or arrays of that shape. The
+        error level is alpha, or under the guarantees "pooled" and "cost", where the interval only
+        sorts parts, 0.5.
         """
         error_level = interval_error_level(self.alpha, self.guarantee)
         return INTERVALS[self.interval](n_success, n_failure, error_level)

@@ -1,7 +1,7 @@
 """The decision rule: label counts around a trace -> confidence bound -> action. `DecisionRule` is
 the paper's rule and the base class of all others, a user's own included; `action_of` compares a
-bound with two thresholds. `member_rules` holds the rules that learn from outcomes, and
-`Policy.rule` makes the one that a policy asks for.
+bound with two thresholds. The rules that learn from outcomes are in another file,
+`member_rules.py`; `Policy.rule`, in `policy.py`, makes the one that a policy asks for.
 
     >>> rule = Policy(alpha=0.1, lower_bound=0.9).rule()
     >>> rule(40, 0)                      # 40 successes, no failure: (1, 0.93..., 1.0), accept

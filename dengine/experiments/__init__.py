@@ -1,4 +1,5 @@
 """Replays of recorded streams, with grids, baselines, costs, tables and figures.
 
-The command line and the scripts in `training/` use them; an engine in a cell does not.
+The command line and the scripts in `training/` use the modules of this folder; an engine in a cell
+does not. This file itself holds no code.
 """

@@ -168,10 +168,10 @@ class Baseline(ABC):
         return np.array([ACTIONS[number] for number in numbers], dtype=object)
 
     def predict(self, X: ArrayLike) -> BaselinePrediction:
-        """Return the prediction for traces X (n, C, T).
+        """Return bounds and counts of labels for traces X (n, C, T), as a `BaselinePrediction`.
 
         The last one is cached, and returned again for the same traces until a training or an `add`.
-        Before a training has succeeded the interval is (0, 1).
+        Before a training has succeeded the interval is (0, 1), with no labels.
         """
         traces = as_traces(X)
         key = traces.tobytes()
@@ -312,12 +312,13 @@ class ScaledComponents:
         self._pca = PcaReducer(n_components=n_components, random_state=seed)
 
     def fit(self, X: Traces) -> Floats | None:
-        """Find the components of traces (n, C, T).
+        """Find the components of traces (n, C, T) and their scale.
 
         Returns
         -------
         Z : array, shape (n, d), or None
-            The scaled components of these traces; None if there are too few traces.
+            The scaled components of these traces. None, and the scale stays, if there are no more
+            traces than components, or fewer samples in a trace than components.
         """
         try:
             components = np.asarray(self._pca.fit(X).transform(X), dtype=np.float64)
@@ -543,7 +544,7 @@ def guaranteed_threshold(confidence: Floats, wrong: Labels, risk: float, delta: 
     Returns
     -------
     threshold : float
-        One of `confidence`; infinity if no threshold can be guaranteed.
+        One of `confidence`; infinity if none that was tried can be guaranteed, or for m = 0.
     """
     if not len(confidence):
         return math.inf

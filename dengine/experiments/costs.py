@@ -138,7 +138,7 @@ class CostCurve:
 
         It names the cheapest policy, its cost per part with the interval, and what verifying
         everything costs; if it only may pay, also which share of bad parts among the accepted would
-        still pay.
+        still pay. If no policy decided anything, it says only that and what verifying costs.
         """
         row = self.cheapest
         verify_all = f"verifying everything costs {self.costs.check:g} a part"
@@ -200,7 +200,8 @@ def cost_curve(
 ) -> CostCurve:
     """Compute what a part costs under every alpha and LB, and under the guarantee of costs.
 
-    The data set is replayed `repeats` times under each of these policies.
+    The data set is replayed `repeats` times under each of these policies. The guarantee of costs is
+    left out for a baseline, and where it refuses these costs or the policy's feedback.
 
     Parameters
     ----------
@@ -209,7 +210,7 @@ def cost_curve(
     check, escape, false_reject : float
         As in `Costs`, in one unit.
     recipe : object, default "conv"
-        Anything `Recipe.load` takes. Its policy's alpha and lower_bound are replaced.
+        Anything `Contender.load` takes. Its policy's alpha and lower_bound are replaced.
     alphas, lower_bounds : sequence of float
         To try.
     repeats : int, default 10
@@ -218,8 +219,10 @@ def cost_curve(
         Of the first shuffle.
     cycles : int or None, default None
         Parts of each shuffle; None plays all.
-    n_jobs, keep
-        As in `run_grid`.
+    n_jobs : int, default 1
+        Replays at a time, as joblib counts them.
+    keep : path or None, default None
+        Folder of finished replays: those in it are not played again, others are added.
 
     Returns
     -------

@@ -169,7 +169,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     Raises
     ------
     OutputError
-        The file exists and `force` is not set, or the suffix names no format.
+        The file exists and `force` is not set, it cannot be written, or the suffix names no format.
     """
     path = Path(path)
     buffer = BytesIO()
@@ -253,7 +253,7 @@ def _set_map_limits(axes: Axes, z: Floats, is_probability: bool) -> None:
 
 
 def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, label: str) -> None:
-    """Draw a circle with its centre (2,) into all axes, and the label below the figure."""
+    """Draw a circle and its centre (2,), a cross, into all axes, and a legend below the figure."""
     from matplotlib.patches import Circle
 
     for axes in figure.axes:
@@ -313,9 +313,9 @@ def curves(
 ) -> Figure:
     """Draw the paper's curve, with a colour for each recipe.
 
-    Above: the share of certain decisions, those without a check, and their precision. Below: the
-    errors, as shares of what was decided alike, because the tolerance 100 - LB is a share of the
-    accepted parts.
+    Above: the share of certain decisions, those without a check, the precision of the accepted ones
+    and LB. Below: the errors, as shares of what was decided alike, and the tolerance 100 - LB, a
+    share of the accepted parts. Shares of fewer than `FEWEST` parts are not drawn.
 
     Parameters
     ----------
@@ -702,7 +702,8 @@ def _draw_distances(axes: Axes, explanation: Explanation) -> None:
 def _draw_bound(axes: Axes, bound: Bound | None) -> None:
     """Draw the interval of the success rate, its point estimate and the two thresholds.
 
-    If `bound` is None, a note says that no bound was asked for.
+    The estimate needs a label, and a threshold that is None is not drawn. If `bound` is None, a
+    note says that no bound was asked for.
     """
     x_label = "success rate in the neighbourhood"
     axes.set(yticks=[], xlim=(-0.02, 1.02), ylim=(-1.0, 1.0), xlabel=x_label)

@@ -126,7 +126,7 @@ class KeptReplays:
     def get(self, task: Task) -> Replay | None:
         """Read the kept replay of a task; return None if there is none or its file is damaged.
 
-        It has the present name and recipe of the contender.
+        It has the present name and recipe of the contender. Raises SettingError as `path`.
         """
         path = self.path(task)
         try:
@@ -239,7 +239,7 @@ def iterate_replays(
     keep: Folder | None = None,
     on_cycle: Any = None,
 ) -> Iterator[PlayedReplay]:
-    """Play tasks and yield each replay as soon as it is finished.
+    """Play tasks and yield each replay as soon as it is finished; nothing runs before the first.
 
     Tasks are played seed by seed, so that what an interrupted run has finished can be compared.
     Replays that were kept by an earlier run come first.
@@ -255,8 +255,8 @@ def iterate_replays(
         Folder of finished replays: those in it are not played again, and others are added as they
         end.
     on_cycle : callable or None, default None
-        As in `replay`. Only called where `n_jobs` is 1: a callback cannot travel to other
-        processes.
+        Called with the number of finished cycles of a replay, only where `n_jobs` is 1: a callback
+        cannot travel to other processes.
 
     Yields
     ------
@@ -266,7 +266,7 @@ def iterate_replays(
     ------
     SettingError
         A baseline's library is missing; raised before anything is played, but after the kept
-        replays. With `keep` also as `KeptReplays.path`.
+        replays. With `keep` also for a reducer that cannot be hashed.
     """
     from joblib import Parallel, delayed
 

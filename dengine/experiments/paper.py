@@ -125,7 +125,8 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
     The findings: whether the number of certain predictions varies with alpha and LB, as the paper
     says of Wilson and denies of the binomial interval, whether the mean share of false positives
     stays below 1 - LB, and, for Wilson, whether a lower alpha delays the first certain prediction.
-    Baselines get the second one alone.
+    The first and the third are left out for baselines, and where too few settings or no certain
+    predictions are there to compare.
     """
     who = f"{recipe}, {interval}"
     is_ours = recipe.split(" ")[0] not in BASELINES

@@ -292,7 +292,7 @@ class Replay:
             first_cycle and last_cycle, counted from 1. verified_share, NaN without cycles. Numbers
             of cycles: verified, accepted, rejected, false_positive, false_negative, novel,
             safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts passed on,
-            None without a clock.
+            None without a clock or without cycles.
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
@@ -329,7 +329,7 @@ class Replay:
             Among others certain, the number of decisions without a check; first_certain, the cycle
             of the first of them, counted from 1; dropped, the reason of the last retrain that was
             dropped, or ""; saved_s, the seconds of the checks that were left out, and net_s, less
-            what the errors cost, see `Costs`.
+            what the errors cost, in seconds by the defaults of `Costs`.
         """
         nan = float("nan")
         policy = self.recipe.policy
@@ -505,9 +505,10 @@ def replay(
         Anything `Recipe.load` takes, the name of a baseline (`experiments.baselines.BASELINES`), a
         `Contender`, or a fresh engine, for a model of your own.
     seed : int, default 0
-        Of the shuffle and of the engine; the same seed gives the same decisions.
+        Of the shuffle, and of the engine unless one is given; the same seed gives the same
+        decisions.
     cycles : int or None, default None
-        Only the first so many parts; None plays all.
+        Only the first so many parts, after the shuffle; None plays all.
     alpha, lower_bound : float or None, default None
         Of the policy; None takes the recipe's, which are 0.05 and 0.95 by default.
     shuffle : bool, default True

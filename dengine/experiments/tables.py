@@ -88,7 +88,7 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, 
         - Times of retrains and decisions, the first certain cycle and savings: median, largest or
           mean, as `AGGREGATED` says.
         - error_lower, error_upper : 95 % interval of the share of bad ones among the accepted
-          parts.
+          parts; NaN also if none was accepted.
         - promise_kept : whether the pooled precision is at least LB; None where fewer than `ENOUGH`
           parts were accepted.
         - retrains_dropped : number of retrains whose model was not used.
@@ -125,7 +125,8 @@ def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a sentence for each pooled row: whether the accepted parts kept to LB.
 
     It ends in "kept", "broken", or that there are too few accepted parts to say; or it says that no
-    part was accepted. It names those of the row's settings in which the rows differ.
+    part was accepted. It names the recipe, the guarantee, and interval, alpha and confirmation only
+    if the rows differ in them.
     """
     varying = [
         name for name in ("interval", "alpha", "confirm") if len({row[name] for row in rows}) > 1
@@ -239,7 +240,7 @@ CELLS: dict[str, Any] = {
 def retrain_line(retrains: Sequence[RetrainReport]) -> str:
     """Return a sentence: how many retrains there were, the slowest, and how many were dropped.
 
-    Of the dropped ones it gives the last one's reason.
+    Of the dropped ones it gives the last one's reason. "No retrain." without any.
     """
     if not retrains:
         return "No retrain."

@@ -104,7 +104,7 @@ def prepare_export(
     """Check that an engine or a model can be exported, and build its decision module.
 
     Nothing is written. The module shares references and rule with the model; it is not compiled
-    yet.
+    yet, but the decider in it is.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def prepare_export(
         TorchScript cannot compile, for code that was changed after it was compiled, and if the rule
         has missed an outcome.
     OutputError
-        If `path` must not be written; this is checked first.
+        If `path`, its checksum or its signature must not be written; this is checked first.
     """
     _check_outputs(path, force)
     is_engine = isinstance(engine_or_model, DataEngine)
@@ -278,7 +278,8 @@ def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -
     Raises
     ------
     ExportError
-        As of `read_checked`, and for a file that is no export or has another schema.
+        For a file that is missing, unreadable, damaged or not signed with the key, that is no
+        export or has another schema.
     """
     return metadata_of(read_checked(Path(path), key), Path(path))
 

@@ -95,9 +95,10 @@ class CellJournal:
 def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> CellJournal:
     """Read and check the journal of a cell program.
 
-    Rejected parts, and verified ones without a label, are left out. From a line whose checksum does
-    not fit on, everything is set aside, which is no error; `set_aside` says so. A warning is logged
-    if FILE.head is missing.
+    Rejected parts, and verified ones without a label, are left out. An accepted part whose label
+    came late is there twice. From a line whose checksum does not fit on, everything is set aside,
+    which is no error; `set_aside` says so, or that lines are missing that FILE.head knows of. A
+    warning is logged if FILE.head is missing.
 
     Parameters
     ----------
@@ -284,7 +285,7 @@ def import_journal(
 
     Each part is imported once, however often its journal is. Rule and certificate count the parts
     as the engine's own. If a journal lacks a line, what stands before it is imported. The store is
-    closed at the end, also one that was passed open.
+    closed at the end, also one that was passed open; after an error only one that was opened here.
 
     Parameters
     ----------
@@ -303,9 +304,9 @@ def import_journal(
     Raises
     ------
     DataError
-        Before anything is stored, for a line that cannot be read, or a journal of another model.
+        Before anything is stored, as of `read_journal`, and for a journal of another model.
     StoreError
-        While an engine runs on the cell, or if the store has no trace contract.
+        If there is no store, an engine runs on the cell, or the store has no trace contract.
     """
     with opening(store, must_exist=True) as opened:
         opened.claim_cell()  # an engine that runs would never learn these labels

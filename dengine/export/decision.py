@@ -117,6 +117,7 @@ class DecisionModule(nn.Module):
         n_success, n_failure : int
             Labels within the radius.
         embedding : Tensor of float32, shape (K, d)
+            NaN for a faulty trace, which is verified.
 
         Raises
         ------
@@ -173,10 +174,11 @@ class DecisionModule(nn.Module):
 
         Parameters
         ----------
-        trace, part
-            As of `decide`.
+        trace : Tensor of any real dtype, shape (T,) or (C, T)
         success : bool
             The label.
+        part : int, default 0
+            Hash of its part's number; 0 for an unknown part.
 
         Returns
         -------
@@ -306,9 +308,9 @@ class DecisionModule(nn.Module):
         """Update the rule with an outcome, and make the trace with embedding z (K, d) a reference.
 
         `part` is the hash of the part, which also gives the space of the reference. The rule gets
-        as inclusion probability 1 if the part was verified because the model was not certain, the
-        audit rate if it was audited, and 0 if it was accepted or rejected. It also gets the number
-        of silent parts, whose count restarts at 0.
+        as inclusion probability the audit rate if the part was audited, 1 if it was verified for
+        another reason, and 0 if it was accepted or rejected. It also gets the number of silent
+        parts, whose count restarts at 0.
         """
         inclusion_probability = 0.0
         if action == 0:

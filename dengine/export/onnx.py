@@ -67,13 +67,21 @@ def export_onnx(
 ) -> Path:
     """Write the decision of an engine, or of a fitted model, as ONNX, with its checksum beside it.
 
-    The file is kept only if onnxruntime decides on random traces as the model does. An engine's
+    The file is written only if onnxruntime decides on random traces as the model does. An engine's
     store records the export as an event.
 
     Parameters
     ----------
-    engine_or_model, path, trace, key, force
-        As of `export_torchscript`.
+    engine_or_model : DataEngine or ModelPrediction
+    path : path-like
+        The checksum is written beside it, as PATH.sha256.
+    trace : TraceSpec, optional
+        The trace contract, for a `ModelPrediction` whose traces have another rate or limit than the
+        defaults of `TraceSpec`.
+    key : path-like, optional
+        File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
+    force : bool, default False
+        Whether to replace an existing file; never a database, a folder or a link.
 
     Returns
     -------
@@ -120,8 +128,8 @@ def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> "O
     Raises
     ------
     ExportError
-        For a file that must not be used, see `read_checked` and `check_schema`, and if a package
-        for ONNX is missing.
+        For a file that is missing, damaged or not signed with the key, that is no ONNX export or
+        has another schema, and if a package for ONNX is missing.
     """
     onnx = _import_package("onnx")
     target = Path(path)
@@ -318,8 +326,9 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
 def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None:
     """Compare an ONNX model with the model that answers, on 64 random traces of every size.
 
-    Raises ExportError if actions, counts, bounds or embeddings differ by more than another order of
-    additions explains; two references at the radius may fall on either side.
+    Raises ExportError if embeddings differ by more than another order of additions explains, counts
+    by more than two references, which may lie at the radius, or, where counts are equal, actions or
+    bounds.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)

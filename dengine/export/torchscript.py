@@ -114,7 +114,9 @@ def export_torchscript(
     Raises
     ------
     ExportError
-        If nothing was trained yet, or the reducer, the interval or the rule cannot be compiled.
+        If nothing was trained yet, for a baseline, if the reducer, the interval or the rule cannot
+        be compiled, for code that was changed after it was compiled, if the rule has missed an
+        outcome, and if the key cannot be read.
     OutputError
         If `path` cannot be written; a file that was there is then unchanged.
     """
@@ -229,10 +231,11 @@ class ExportedModel:
 
         Parameters
         ----------
-        trace, part
-            As of `decide`.
+        trace : array, shape (T,) or (C, T)
         success : bool
             The label.
+        part : str or int, optional
+            Number of the part.
 
         Returns
         -------

@@ -162,15 +162,17 @@ class EngineModel(ABC):
         `hash_` is the hash of its part, whose references have no vote; 0 excludes none.
         """
 
-    def decide_one(self, x: Floats, part: int, conditions: DecisionConditions) -> Verdict:
+    def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
         """Decide on one trace: check faults and limits, ask `predict_one`, toss the audit coin.
 
-        The result has the form of `Decider.forward`. What `predict_one` raises is raised here.
+        `predict_one` is asked only if the trace has no fault and is within the limits; what it
+        raises is raised here.
 
         Parameters
         ----------
         x : array of float32, shape (channels, samples)
-        part : int
+            The raw trace.
+        part_hash : int
             Hash of its part's number; 0 for an unknown part.
         conditions : DecisionConditions
             Force limits, sensor limit and audits. The decider for them is kept and used again while
@@ -179,13 +181,15 @@ class EngineModel(ABC):
         Returns
         -------
         Verdict
-            Its embedding is empty, shape (0, 0).
+            (fault, content hash, action, predicted action, reason, lower, upper, n_success,
+            n_failure, embedding, propensity), as `Decider.forward` returns them. The embedding is
+            empty, shape (0, 0).
         """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
             self._decider = Decider(PythonPredictor(self), conditions)
             self._conditions = conditions
-        verdict: Verdict = self._decider(torch.from_numpy(x), part)
+        verdict: Verdict = self._decider(torch.from_numpy(x), part_hash)
         return verdict
 
     @abstractmethod

@@ -63,7 +63,7 @@ NEIGHBOURS = 10
 # distinct parts about one in two hundred is as near.
 NEAR = 0.12
 # More near repeats are reported; among 100 to 500 insertions of distinct parts there were up to 15.
-SUSPICIOUS = 25
+MANY_REPEATS = 25
 NOVEL = REASONS.index(Reason.NOVEL)
 KINDS = 16  # compiled modules that a process keeps
 
@@ -136,17 +136,18 @@ CONSTANTS = (bool, int, float, str, list, tuple, dict, FunctionType, type(None))
 _COMPILED: dict[Any, Any] = {}
 
 
-def template_of(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
+def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return the compiled decider of this structure, and compile it if there is none yet.
 
-    A new one decides three times on a ramp of `trace_shape` (C, T), so that later calls are fast,
-    and is kept in the process; of more than `KINDS` the oldest is dropped. It is shared, so do not
-    change it: `compiled` copies it. Compiling takes tens of milliseconds.
+    It is the same object for all deciders of one `structure_of`, so do not change it: `compiled`
+    copies it. A new one decides three times on a ramp of `warm_up_shape` (C, T), so that later
+    calls are fast, and is kept in the process; of more than `KINDS` the oldest is dropped.
+    Compiling takes tens of milliseconds; RuntimeError if TorchScript cannot compile it.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
         template = script(eager)
-        x = torch.linspace(0.0, 1.0, math.prod(trace_shape)).view(trace_shape)
+        x = torch.linspace(0.0, 1.0, math.prod(warm_up_shape)).view(warm_up_shape)
         with torch.inference_mode():
             for _ in range(3):  # TorchScript's first calls compile; a cell should not wait for that
                 template(x, 0)
@@ -219,12 +220,13 @@ def _tensors_of(module: nn.Module, recurse: bool = False) -> list[tuple[str, Ten
     return [*module.named_parameters(recurse=recurse), *module.named_buffers(recurse=recurse)]
 
 
-def compiled(eager: Decider, trace_shape: tuple[int, ...]) -> Any:
+def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return a compiled decider that shares the tensors of an eager one.
 
-    It is a copy of the template for `trace_shape` (C, T); a template that is missing is compiled.
+    It is a copy of the template of its structure. Where there is none, one is compiled and warmed
+    up on a trace of `warm_up_shape` (C, T), see `template_of`.
     """
-    module = copy.deepcopy(template_of(eager, trace_shape))
+    module = copy.deepcopy(template_of(eager, warm_up_shape))
     for name, tensor in _tensors_of(eager, recurse=True):
         *path, leaf = name.split(".")
         setattr(reduce(getattr, path, module), leaf, tensor)
@@ -316,7 +318,7 @@ class ModelPrediction(EngineModel):
         """Return the recipe with this model's own settings in place of its.
 
         These are radius, alpha, lower bound and interval of the classifier, folds (2 at least) and
-        novelty. The recipe's reducer stays.
+        novelty. All else, such as the reducer and the window, stays as the recipe has it.
         """
         classifier = self.classifier
         policy = replace(
@@ -367,7 +369,9 @@ class ModelPrediction(EngineModel):
         Raises
         ------
         SettingError
-            Where the reducer cannot be trained: one class only, or too few traces.
+            Where the reducer cannot be trained, as by one class or by too few traces.
+        TraceError, DataError
+            For traces of another shape, and for labels other than 1 and 0.
         """
         X = as_traces(X)
         y = as_labels(y)
@@ -383,11 +387,13 @@ class ModelPrediction(EngineModel):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Self:
-        """Train the reducer, from its last training where it can, and make every trace a reference.
+        """Train the reducer on traces (n, C, T), from its last training where it can; return self.
 
-        It replaces `index`, `scale`, `gate` and `trace_shape` and drops the decider. Of more traces
-        than the classifier's capacity the last become references. The rule stays as it is.
-        Parameters and result as of `EngineModel.train`.
+        All traces become references, or the last ones if they exceed the classifier's capacity.
+        `index`, `scale`, `gate` and `trace_shape` are replaced, the decider is dropped, and the
+        rule stays as it is. `hashes` (n,), of the parts, give the folds; `numbers` (n,), of the
+        labels, go to the references; `stop` may end the reducer's training early. Extreme samples
+        are clipped first.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -415,9 +421,9 @@ class ModelPrediction(EngineModel):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
-        Before the first training, a template of the decider is compiled meanwhile: the first
-        retrain has no time for that. The call returns when both are done, and raises what the
-        reducer raised.
+        Before the first training, if reducer and rule can be compiled, a template of the decider is
+        compiled meanwhile: the first retrain has no time for that. The call returns when both are
+        done, and raises what the reducer raised.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -447,9 +453,9 @@ class ModelPrediction(EngineModel):
     def prepare(self, previous: EngineModel) -> None:
         """Take over the rule of the previous model, stale or not, and build the decider.
 
-        It is built for the conditions under which the previous model decided. A decider that was
-        built with that rule for these is kept. Nothing happens if the previous model is no
-        `ModelPrediction`.
+        It is built for the conditions under which the previous model decided, or if it never did,
+        for this one's. A decider that was built with that rule for these is kept. Nothing happens
+        if the previous model is no `ModelPrediction`.
         """
         if not isinstance(previous, ModelPrediction):
             return
@@ -595,9 +601,10 @@ class ModelPrediction(EngineModel):
     ) -> None:
         """Update the rule in place with the outcome of one part and the novelty of its trace.
 
-        The rule's `observe` is called first, then its `update`; arguments as of
-        `EngineModel.update_rule`. The compiled decider decides by the new state at once. If either
-        raises, `rule_is_stale` is set and the exception goes on to the caller.
+        The rule's `observe` gets `unobserved`, the accepted parts without a known outcome since the
+        last update, and `novel`; then its `update` gets the other arguments. The compiled decider
+        decides by the new state at once. If either raises, `rule_is_stale` is set and the exception
+        goes on to the caller.
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
@@ -658,16 +665,18 @@ class ModelPrediction(EngineModel):
             ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason]
         )
 
-    def decide_one(self, x: Floats, part: int, conditions: DecisionConditions) -> Verdict:
-        """Decide on one trace by the decider for these conditions; it is built if it is not there.
+    def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
+        """Decide on one raw trace x (C, T) by `decider(conditions)`, which may have to be built.
 
-        Arguments and result as of `EngineModel.decide_one`, but the embedding is the scaled one,
-        (K, d). Raises RuntimeError where the rule is stale and the trace has no fault.
+        References of the part with this hash have no vote; 0 stands for an unknown part. Returns a
+        `Verdict`, the tuple that `Decider.forward` returns, with the scaled embedding (K, d).
+        Raises RuntimeError if the rule is stale and the trace has no fault, ValueError if nothing
+        was fitted.
         """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
         with torch._C._InferenceMode(True):
-            verdict: Verdict = decider.forward(torch.from_numpy(x), part)
+            verdict: Verdict = decider.forward(torch.from_numpy(x), part_hash)
         if verdict[0] == 0:  # a faulty trace does not ask the rule
             self._check_rule()
         return verdict
@@ -727,8 +736,8 @@ class ModelPrediction(EngineModel):
         """Return the state as arrays by name, which `set_state` takes.
 
         Trace shape, references and scale are always there; "reducer.", "rule." and "novelty." begin
-        the names of what these parts have. An enabled novelty gate is there, a disabled one not. Of
-        a stale rule only `rule_is_stale` is there.
+        the names of what these parts have. An enabled novelty gate is there, a disabled one not. A
+        stale rule is not there, but "rule_is_stale" is. AttributeError before the first training.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()
@@ -745,8 +754,9 @@ class ModelPrediction(EngineModel):
         """Restore the state that `get_state` returned; returns self.
 
         References, scale, rule and gate are restored, and the reducer if its state is there; the
-        decider is dropped. A state of a stale rule leaves the rule as it is. Raises StoreError for
-        a reducer of that name that has another kind of state, and for arrays of other sizes.
+        decider is dropped. A state of a stale rule leaves the rule, and `rule_is_stale`, as they
+        are. Raises StoreError if the reducer keeps a state but this one lacks it, and for arrays of
+        other sizes.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
@@ -797,9 +807,9 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     """Count the newest traces that nearly repeat a trace of another part.
 
     Labels are counted as independent trials, so a part that is inserted again must be known as such
-    (`part=`). This notices the plain cases where it is not; it changes no decision. A near repeat
-    is a nearest trace within `NEAR` of the distance to the tenth nearest, so a trace with more than
-    `NEIGHBOURS` near repeats is not noticed.
+    (`part=`). This notices the plain cases where it is not; it changes no decision. A trace counts
+    if the nearest one of another part is nearer than `NEAR` times the tenth nearest, so one with
+    more than `NEIGHBOURS` near repeats is not noticed.
 
     Parameters
     ----------
@@ -834,12 +844,13 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 
 
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
-    """Return a note for the retrain's report where many traces nearly repeat; "" where few do.
+    """Return a note for the retrain's report if many traces nearly repeat another part's, else "".
 
-    Many are more than `SUSPICIOUS` by `near_repeats`, whose arguments it takes.
+    `near_repeats`, whose arguments it takes, counts them among the newest `NEWEST` traces; more
+    than `MANY_REPEATS` are many.
     """
     n_repeats = near_repeats(traces, parts)
-    if n_repeats <= SUSPICIOUS:
+    if n_repeats <= MANY_REPEATS:
         return ""
     n_compared = min(len(traces), NEWEST)
     return (

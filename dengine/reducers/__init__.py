@@ -81,7 +81,8 @@ def make_reducer(name: str, **params: Any) -> Any:
     name : str
         A name in `REDUCERS`, or `module:Class`.
     **params
-        Parameters of its class. Types and ranges are checked for names in `REDUCERS` only.
+        Parameters of its class. Only for names in `REDUCERS` are types checked here, and that
+        integers have at most 32 bits; the ranges of single parameters are checked by `fit`.
 
     Returns
     -------
@@ -90,8 +91,7 @@ def make_reducer(name: str, **params: Any) -> Any:
     Raises
     ------
     SettingError
-        If the name or a parameter is unknown, or a value is of another type than its default or out
-        of range.
+        If the name or a parameter is unknown, or a value does not pass the check.
     """
     cls = reducer_class(name)
     allowed = signature(cls).parameters
@@ -108,9 +108,9 @@ def make_reducer(name: str, **params: Any) -> Any:
 def _check_parameter(default: Any, key: str, value: Any) -> None:
     """Raise SettingError unless a reducer's parameter `key` may have this value.
 
-    A value must have the type of the default; `folds` lies between 2 and 1000, another integer
-    within 32 bits, and a float is not NaN. Any value will do if the default is neither bool, str,
-    int nor float, such as None. Otherwise every retrain would fail.
+    A value must have the type of the default, or be any number but NaN where that is a float.
+    `folds` lies between 2 and 1000, another integer within 32 bits. Any value will do if the
+    default is neither bool, str, int nor float, such as None. Otherwise every retrain would fail.
     """
     types = {bool: "true or false", str: "a text", int: "an integer", float: "a number"}
     expected = types.get(type(default))

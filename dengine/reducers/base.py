@@ -160,8 +160,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
         Raises
         ------
-        NotFittedError, ValueError, TraceError
-            As of `check_traces`.
+        NotFittedError
+            Before a fit.
+        ValueError
+            For values that are not finite, and traces of another shape than in `fit`.
         """
         traces = self.check_traces(X)
         return np.concatenate(
@@ -282,7 +284,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             If a value is not finite or not a number, if a table has other columns than in `fit`,
             and with `reset` if there is no trace.
         TraceError
-            If the shape is another than in `fit`, or none of traces.
+            If the shape is none of traces, or another than in `fit`; a plain ValueError for
+            another number of columns of X (n, T).
         """
         if not reset:
             check_is_fitted(self)
@@ -364,7 +367,7 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
     Returns
     -------
     array of float32, shape (K,)
-        1 where a fold has no points, or points without spread.
+        1 where a fold has no points, or points without a finite spread above 0.
     """
     scale = np.ones(n_spaces, dtype=np.float32)
     for k in range(n_spaces):
@@ -583,7 +586,7 @@ class CrossFitted(_Wrapping):
             If K is below 2, the labels are missing or not of two classes, or the traces outside a
             fold have a single class.
         TraceError, ValueError
-            For X, as of `check_traces`.
+            For an X of another shape, and for values that are not finite.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)

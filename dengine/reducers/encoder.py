@@ -170,8 +170,8 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
 def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:
     """Return the number of features of each member, by embedding two traces of zeros.
 
-    Leaves the networks in training mode. Raises SettingError if their output does not have the
-    shape (B, K, features).
+    Leaves the networks in training mode. Raises SettingError if their output does not have three
+    dimensions, (B, K, features).
     """
     networks.eval()
     with torch.no_grad():

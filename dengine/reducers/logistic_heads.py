@@ -131,9 +131,9 @@ def fit_heads(
     max_iter : int
         Largest number of steps.
     stop : StopRule, optional
-        Asked before each step after the first `min_steps`. None: until all heads have converged.
+        Asked before each step. None: until all heads have converged, or `max_iter`.
     min_steps : int, default 0
-        Steps that are taken even after the deadline.
+        Steps that are taken even after the deadline of `stop`, not beyond its `max_steps`.
 
     Returns
     -------

@@ -48,7 +48,8 @@ class Preprocessor(nn.Module):
     def learn(self, traces: Tensor) -> None:
         """Set mean and scale of each channel, and the scale of its differences, in place.
 
-        They are read from the first 256 of the traces (n, C, T), after averaging.
+        They are read from the first 256 of the traces (n, C, T), after averaging. A scale is one
+        over the standard deviation: a channel becomes (x - mean) * scale.
         """
         averaged = self.average_samples(traces[:STATISTICS_TRACES]).double()
         self.mean.copy_(averaged.mean((0, 2))[:, None])

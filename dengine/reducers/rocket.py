@@ -324,7 +324,8 @@ class RocketReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, or the traces outside a fold have a single class.
+            If a parameter is out of its range, labels or folds do not fit the traces, or those
+            outside a fold have a single class.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -343,9 +344,11 @@ class RocketReducer(Reducer):
     ) -> Floats:
         """Fit the heads from their present weights; the kernels stay those of the first training.
 
-        Parameters and result as of `Reducer.train`. Features of traces with known `numbers` are
-        taken from the cache of the last call. Of more than 4000 traces the heads read 4000. Raises
-        SettingError for fewer than 20 traces, and if the traces outside a fold have a single class.
+        X are traces (n, C, T); y, folds and numbers, each (n,), their labels 1 or 0, folds, and the
+        labels' numbers, by which features are found in the cache of the last call; `stop` may end
+        the Newton steps. Of more than 4000 traces the heads read 4000. Returns the points of all
+        traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20
+        traces, and if the traces outside a fold have a single class.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)

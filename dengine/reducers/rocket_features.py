@@ -252,8 +252,9 @@ class RocketEncoder(nn.Module):
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
         """Set the scales of the channels and the filters, in place, from traces X (n, C, T).
 
-        `rng` draws the traces that are read, 256 for the scales and 64 for the filters, and the
-        kernels. It is done once, so that the features of a trace never change.
+        `rng` draws the traces that are read, at most 256 for the scales and 64 for the filters, and
+        the kernels. Call it once: a second call sets all of them anew, and the features of every
+        trace change.
         """
         if len(X) > SCALE_TRACES:
             X = X[torch.from_numpy(rng.permutation(len(X))[:SCALE_TRACES])]
@@ -300,10 +301,10 @@ class RocketEncoder(nn.Module):
                 self.competing_kernel[d] = kernels / width
 
     def learn_feature_scales(self, raw: Tensor) -> None:
-        """Set `gain` and `offset`, by which features are standardised, from raw features (n, P).
+        """Set `gain` and `offset` so that `offset + gain * raw` is standardised, from raw (n, P).
 
-        The features of the second tower share one deviation. A feature that hardly varies is scaled
-        by a small floor.
+        The features of the second tower share one deviation. A small floor is added to each
+        deviation, so that a feature that never varied does not explode.
         """
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         for tower in self.towers[1:]:  # of shares, those that vary more tell more
@@ -387,7 +388,7 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
 def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw n kernels from `choices` (N, 9), and the channels that each reads: float32 (n, C * 9).
 
-    No kernel is drawn twice before all were drawn. A kernel reads between one and all channels,
+    Unless n exceeds N, no kernel is drawn twice. A kernel reads between one and all channels,
     equally weighted, and has unit size; its weights on the other channels are 0.
     """
     drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)

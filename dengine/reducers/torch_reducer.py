@@ -199,8 +199,9 @@ class TorchReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, the checkpoint cannot be used, or fewer than two
-            traces lie outside a fold.
+            If a parameter is out of its range, labels or folds do not fit the traces, the
+            checkpoint cannot be used, a trace has one sample, or fewer than two traces lie outside
+            a fold.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -217,10 +218,12 @@ class TorchReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Take `n_steps_due` steps from the present weights, or from initial ones the first time.
+        """Train on traces (n, C, T), labels y (n,) 1 or 0, and folds (n,); replace `encoder_`.
 
-        Parameters and result as of `Reducer.train`; `numbers` is not read. Raises SettingError for
-        fewer than 20 traces in the first training.
+        It takes `n_steps_due` steps, or fewer if `stop` ends them, from the present weights, or
+        from initial ones the first time. `numbers` is not read. Returns the traces as references,
+        float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20 traces in
+        the first training.
         """
         if "members_" not in vars(self):
             do = "verify more parts first"
@@ -245,7 +248,8 @@ class TorchReducer(Reducer):
         """Build preprocessor and members anew for traces (n, C, T); no label is read.
 
         The channels' scales are read from the traces, the weights from the checkpoint, if any.
-        Earlier trainings are forgotten. Raises SettingError as of `fit`.
+        Earlier trainings are forgotten. Raises SettingError for a parameter out of its range, fewer
+        than 2 samples, or a checkpoint that cannot be used.
         """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))

@@ -218,7 +218,8 @@ class UmapReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, or there are no more than `n_neighbors` traces.
+            If a parameter is out of its range, or there are no more traces than `n_neighbors` or
+            than `n_components`.
         """
         traces = self.check_traces(X, reset=True)
         self.check(len(traces))
@@ -236,9 +237,10 @@ class UmapReducer(Reducer):
     ) -> Floats:
         """Lay traces out, from the last layout if it can, and make them the encoder's references.
 
-        Parameters as of `Reducer.train`; labels and folds are not read. The layout starts anew
-        without `numbers`, or if fewer than half of the traces were in the last training. Returns
-        the layout, float32 (n, n_components). Raises SettingError as of `fit`.
+        X are traces (n, C, T), `numbers` (n,) increasing numbers of their labels; labels and folds
+        are not read. `stop` may end the epochs. The layout starts anew without `numbers`, or if
+        fewer than half of the traces were in the last training. Returns the layout, float32 (n,
+        n_components). Raises SettingError as of `fit`.
         """
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))

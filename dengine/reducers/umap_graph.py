@@ -247,8 +247,8 @@ def membership_strengths(distances: Tensor, n_neighbors: int) -> Tensor:
 
     A strength is ``exp(-(distance - rho) / sigma)``. rho is the distance to the nearest
     neighbour that is not identical, and sigma is such that the strengths sum to
-    ``log2(n_neighbors)``. It is umap-learn's `smooth_knn_dist` and `compute_membership_strengths`
-    with a local connectivity of 1.
+    ``log2(n_neighbors)``, but no less than a small share of the mean distance. It is umap-learn's
+    `smooth_knn_dist` and `compute_membership_strengths` with a local connectivity of 1.
 
     Parameters
     ----------
