@@ -88,8 +88,8 @@ def load_past_version(
 ) -> PastVersion | None:
     """Load a model version from the store as it was when a decision was made.
 
-    Its references and its rule include the labels that had come by then. Later corrections are not
-    applied.
+    Its references and its rule include this cell's labels that had come by then, as they were
+    reported: later corrections are not applied.
 
     Parameters
     ----------
@@ -98,12 +98,14 @@ def load_past_version(
     recipe : Recipe
         Of that moment.
     item : StoredDecision or None
-        The decision, with its trace; None: the version with all labels that came under it.
+        The decision, with its trace; None: the version with all labels that came until the next
+        one.
 
     Returns
     -------
     PastVersion or None
-        None if the store does not keep the version's references.
+        None if there is no such version, or its references are damaged or not kept, as of a
+        baseline.
     """
     try:
         stored = store.load_version(version)
@@ -203,7 +205,8 @@ def _restore_thresholds(
 
     They are (accept, reject): a part was accepted where lower >= the first, rejected where 1 -
     upper >= the second. Labels of quarantined traces and of inspected rejects do not update the
-    rule. None if the state is not kept, or the rule has no such thresholds.
+    rule. The rule "local" with stops="some" learns nothing: both are the policy's lower bound.
+    Otherwise None if the state is not kept, or the rule has no such thresholds.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
@@ -231,7 +234,8 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     Returns
     -------
     DecisionRule or None
-        None before the first version, and if the rule's state is not kept.
+        None before the first version, and if its rule cannot be restored from what is stored: its
+        state is not kept or is stale, or its class is not imported.
     """
     stored = store.last_version()
     settings = store.settings()
@@ -267,7 +271,7 @@ def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None
 CENTRAL = 0.95  # share of the successes that the band contains at each sample
 MIN_SUCCESSES = 20  # the band of fewer would be their outermost values
 MIN_WIDTH = 0.05  # of a channel's median width: where all successes agree, noise is no large excess
-MAX_SUCCESSES = 1000  # newest labelled traces of which the band is made
+MAX_ENVELOPE_LABELS = 1000  # newest labels, whose successes make the band
 
 
 @dataclass(frozen=True, slots=True)
@@ -544,7 +548,8 @@ def _count_needed(
     """Return how many more labels of one kind within the radius would have reached a threshold.
 
     `success` is 1 for successes and `lower`, 0 for failures and `upper`. 0 if the threshold was
-    reached; None if no number up to MAX_NEEDED would do, and if there is no threshold.
+    reached; None if no number up to MAX_NEEDED would do, if there is no threshold, and if it was
+    missed by a score, which does not depend on counts.
     """
     if threshold is None:
         return None
@@ -686,9 +691,10 @@ def _bound_sentences(
 ) -> Iterator[str]:
     """Yield the sentences on a decision's evidence, its bounds, and what it would have needed.
 
-    The last is said of the action that the model decided on; for an uncertain decision of the
-    action that needed fewer labels. If nothing could pass, it says so instead. For a model that
-    decides by its own method there is one sentence, with its counts and bounds.
+    The last is said of the action that the model alone would have done; if that is to verify, of
+    the action that needed fewer labels. If nothing could pass, or the thresholds are unknown, it
+    says so instead. For a model that decides by its own method there is one sentence, with its
+    counts and bounds.
     """
     n = decision.n_success + decision.n_failure
     interval = f"{decision.lower:.3f} to {decision.upper:.3f}"
@@ -873,8 +879,8 @@ class Explanation:
 def find_decision_id(store: SqlStore, part: str) -> str:
     """Return the id of the decision on a part.
 
-    If a part was decided on again after rejects, the rejects do not count. Only the newest 20
-    decisions on the part are looked at.
+    If a part was decided on again after rejects, the rejects do not count, unless all are rejects.
+    Only the newest 20 decisions on the part are looked at.
 
     Parameters
     ----------
@@ -920,7 +926,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     decision_id : str
         Its id, or its part's number as `find_decision_id` takes it.
     neighbours : int, default 10
-        Number of nearest references.
+        Number of nearest references at most.
 
     Returns
     -------
@@ -1015,9 +1021,10 @@ def _find_neighbourhood(
 def _find_neighbours(
     store: SqlStore, neighbourhood: Neighbourhood | None, version: PastVersion | None, n: int
 ) -> Iterator[Neighbour]:
-    """Yield the `n` nearest references of other parts with their traces, nearest first.
+    """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
-    Nothing without a neighbourhood or version. What is not known of a reference is None.
+    Nothing without a neighbourhood or version. What is not known of a reference is None. Raise
+    StoreError for a damaged trace.
     """
     if neighbourhood is None or version is None:
         return
@@ -1044,13 +1051,14 @@ def _find_neighbours(
 def _find_envelope(
     store: SqlStore, item: StoredDecision, version: PastVersion | None, spec: TraceSpec
 ) -> Envelope | None:
-    """Return the envelope of the successes among the labels known when a decision was made.
+    """Return the envelope of the successes among the newest labels that the version could know.
 
-    They are the newest MAX_SUCCESSES labels without the decision's own trace. If these are too few,
-    the labels known now are taken; None if these are too few, too.
+    Traces of the decision's own part or content are left out. Without a version, or if these
+    successes are too few, the newest labels known now are taken; None if these are too few, too, or
+    of another shape.
     """
     for last in (None if version is None else version.last_seq, None):
-        labelled = store.labelled(MAX_SUCCESSES, last=last)
+        labelled = store.labelled(MAX_ENVELOPE_LABELS, last=last)
         is_other_success = (labelled.labels == 1) & (labelled.hashes != item.content_hash)
         envelope = envelope_of(labelled.traces[is_other_success], item.trace, spec.rate_hz)
         if envelope is not None:

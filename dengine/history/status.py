@@ -503,8 +503,9 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
 def read_watch(store: SqlStore, recipe: Recipe) -> Watch | None:
     """Return how close the detectors of drift are to an alarm, by the rule as it is now.
 
-    The rule is the stored one, updated with all outcomes since. None if it has no detectors, or its
-    state is not kept. In a safe mode that novel traces began, each is 0.
+    Each value is from 0 to 1, which is the alarm. The rule is the stored one, updated with all
+    outcomes since. None if it has no detectors, as "local" with stops="some", or cannot be
+    restored. In a safe mode that novel traces began, each is 0.
     """
     from ..decision.member_rules import MemberRule  # torch
     from .explain import load_rule
@@ -561,7 +562,7 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
         Number of newest decisions that are marked; it is only returned.
     **by
         `seconds`, `start` or `batch`, as of `SqlStore.stretches`. By default a stretch has at least
-        20 decisions.
+        20 decisions, the newest perhaps fewer.
 
     Returns
     -------

@@ -154,10 +154,10 @@ def _connect_sqlite(
 ) -> Any:
     """Return a new SQLite connection, for a file that cannot be written one that only reads.
 
-    SQLAlchemy calls it with the dialect and the driver's arguments. If neither the file nor its
-    folder can be written, the file is opened as immutable. If in addition a `-wal` is beside it
-    without a `-shm`, both files are copied to a temporary folder and the copy is opened, since
-    SQLite must create the `-shm` to read them.
+    SQLAlchemy calls it with the dialect and the driver's arguments. A file that cannot be written
+    and has no `-wal` beside it is opened as immutable. If it has a `-wal` without a `-shm`, which
+    SQLite must create to read it, both files are copied to a temporary folder, and the copy is
+    opened.
     """
     name = str(arguments[0])
     file = Path(name)
@@ -381,8 +381,9 @@ class Database:
     def _open(self, product: str | None) -> Scope:
         """Create the tables or check them, enter the cell if it is new, and set `newest_entry`.
 
-        Return the cell with its product. Raise StoreError, and disconnect, if the database is no
-        store of this schema, or if the cell has another ledger key or another product.
+        A new cell gets its product, and the key of its ledger. Return the cell with its product.
+        Raise StoreError, and disconnect, if the database is no store of this schema, or if the cell
+        has another ledger key or another product.
         """
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
@@ -402,7 +403,7 @@ class Database:
         """Context manager that opens a read transaction and gives its connection.
 
         `before_use` is called first, so that waiting records are seen. Raise StoreError if the
-        database fails or is closed.
+        database fails or is closed, and for a ValueError, TypeError or OSError of the block.
         """
         self.check_open()
         self._before_use()
@@ -414,9 +415,10 @@ class Database:
         """Context manager that opens a write transaction, locks the cell and gives the connection.
 
         After the block a ledger entry for the rows that it added is inserted, and both are
-        committed; then `newest_entry` is set and `on_entry` called. Without such rows there is no
-        entry. On an error everything is rolled back, and StoreError is raised: also if the file was
-        replaced, or if `commit_if` no longer wants the commit.
+        committed; then `newest_entry` is set and `on_entry` called. Without such rows, or changed
+        settings, there is no entry. On an error everything is rolled back; dengine's own errors
+        pass, others become StoreError. It is raised, too, if the file was replaced, or if
+        `commit_if` no longer wants the commit.
         """
         with _store_errors("write to", self.name), self._writer.connect() as connection:
             connection.execution_options(dengine_write=True)
@@ -484,7 +486,8 @@ class Database:
         Returns
         -------
         str
-            The first difference, in words; "" if there is none.
+            The first difference, in words; "" if there is none. Only a database that cannot be read
+            raises StoreError.
         """
         with self.reading() as connection:
             first = self.scope.first_label(connection, window) if since is None else since + 1
@@ -583,7 +586,8 @@ class Database:
         Raises
         ------
         StoreError
-            If the database fails or is closed; then nothing is written.
+            If the database fails or is closed; then nothing is written, nor if `add_rows` raises.
+            Other errors of dengine pass unchanged.
         """
         self.check_open()
         if flush_first:
@@ -714,7 +718,8 @@ class Database:
 
         Return (decision id, number) of each label, new or stored before with the same value. A
         record that contradicts a stored one becomes an event of kind "dead letter". A line stop of
-        a part whose label was "confirmed" by silence corrects that label to failure.
+        a part whose label was "confirmed" by silence corrects that label to failure, unless it was
+        forgotten.
         """
         events = self._new_events(
             connection, [record for record in records if isinstance(record, Event)]

@@ -186,8 +186,9 @@ class Outbox:
         """Drain what an earlier process left in the journal, check the store, start the threads.
 
         Damage in the journal is stored as an event. The journal is emptied, and space reserved in
-        it. The check by SQLite is waited for only CHECK_SECONDS and goes on in a thread. On an
-        error the journal is closed, and the error raised.
+        it. From now on every use of the store drains the journal first. The check by SQLite is
+        waited for only CHECK_SECONDS and goes on in a thread. On an error the journal is closed,
+        and the error raised.
         """
         try:
             self._compare_with_ledger(journal)  # before anything is drained
@@ -369,7 +370,8 @@ class Outbox:
         """Context manager that tries to take the outbox's lock, and gives whether that succeeded.
 
         It waits at most a millisecond. While the block holds the lock, the threads of the outbox
-        wait, and so do calls from other threads. The lock is released after the block.
+        wait, and so do calls from other threads. The block runs without the lock, too. Afterwards
+        it is released.
         """
         locked = self._changed.acquire(
             timeout=LOCK_SECONDS
@@ -498,7 +500,7 @@ class Outbox:
     def _remove_drained(
         self, records: Sequence[Record], numbers: Sequence[tuple[str, int]]
     ) -> None:
-        """Drop stored records from memory; keep the numbers that their labels were given.
+        """Drop stored records from memory; keep their labels' `numbers` for `pop_label_numbers`.
 
         Decisions among the newest N_RECENT stay in memory, now with their labels.
         """

@@ -60,7 +60,8 @@ def read_rule_progress(
     Returns
     -------
     RuleProgress
-        With `last_seq` 0 if there is no version, or if the rule must be rebuilt from all outcomes.
+        The newest label that the rule includes, and which decisions count as overdue. `last_seq` is
+        0 if there is no version, or if the rule must be rebuilt from all outcomes.
     """
     state = {} if version is None else version.state
     overdue_to = max(store.overdue_to(within, policy_since), int(state.get("overdue_to", 0)))

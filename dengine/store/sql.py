@@ -309,7 +309,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Parameters
         ----------
         limit : int or None
-            Number of newest labels; None: all.
+            Number of newest labels, damaged ones included; None: all.
         first, last : int, optional
             Numbers of the first and the last label, both included.
         corrected_to : int or None
@@ -356,7 +356,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def news_since(self, seq: int, limit: int) -> ProductNews:
         """Return what the cells of the product, this one included, stored after label number `seq`.
 
-        A trace that is not as it was stored is left out, and an event is written to the store.
+        Only labels that train are returned, as in `labelled`, with the numbers of the newest
+        version and correction. A trace that is not as it was stored is left out, and an event is
+        written to the store.
 
         Parameters
         ----------
@@ -668,8 +670,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Returns
         -------
         int
-            The version's number. It is the report's, unless a peer of the product stored a version
-            meanwhile: then the next.
+            The version's number. It is the report's, unless this one is accepted and a peer of the
+            product stored a version meanwhile: then the next.
 
         Raises
         ------
@@ -727,8 +729,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _insert_version(self, connection: sa.Connection, row: dict[str, Any]) -> int:
         """Insert the row of a retrain; return its version's number.
 
-        If a peer of the product has taken the number of an accepted version, it gets the next. The
-        states that `keeps_state` does not keep are then deleted.
+        For an accepted version this is the next number if a peer of the product has taken the given
+        one; and states that `keeps_state` does not keep are deleted.
         """
         number: int = row["version"]
         if self.product is not None and row["accepted"]:  # a peer's may have been stored before
@@ -768,8 +770,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Returns
         -------
         ModelVersion or None
-            None before the first, and if all are damaged. A peer's version is returned without the
-            state of its rule.
+            None before the first, and if all that are kept are damaged. A peer's version is
+            returned without the state of its rule.
         """
         for i, row in enumerate(self._read(self._accepted_query())):
             if not row.kept and i > 0:
@@ -795,7 +797,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Raises
         ------
         VersionError
-            If it is damaged or its state is not kept; the error names the versions that are.
+            If there is no such accepted version, if its state is not kept (the error names the
+            versions whose states are), or if it is damaged.
         """
         retrains = {
             row.version: row.retrain
