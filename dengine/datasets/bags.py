@@ -281,7 +281,7 @@ def _labels_in_topic(
     """Return a source of labels in a topic.
 
     The label of an insertion is the first message after it has begun, if that comes before the next
-    insertion begins.
+    insertion begins; else its `find` raises UnreadableError.
     """
     topic = str(options.label)
     words = dict[str, Any]()

@@ -216,7 +216,8 @@ def clock_of(
     Raises
     ------
     UnreadableError
-        If a cell of the clock states no time.
+        If a cell of the clock states no time, the stated column is not there, or its counts can be
+        of no unit.
     """
     place = place_of_clock(frame, time)
     if place is None or len(frame) < 2:
@@ -287,6 +288,11 @@ def seconds_of(
         Index of each cell that states no time.
     note : str
         What was assumed of the unit, for the user; "" for nothing.
+
+    Raises
+    ------
+    UnreadableError
+        For counts without a unit that are too large for a duration and give no plausible date.
     """
     import pandas as pd
 
@@ -510,9 +516,12 @@ def in_order_of_time(
 
 
 def check_even(clock: Clock, rate_hz: float) -> int:
-    """Return how many rows are missing where each is at an even time, 0 for a few that are late.
+    """Return how many rows are missing for one at each even time from the first time to the last.
 
-    Raises UnreadableError if more than a few are, for later samples would stand too early.
+    0 if there are more rows than that.
+
+    Raises UnreadableError if the number of rows is more than 3 % and one row off: samples would
+    stand at wrong times.
 
     clock : of n rows. rate_hz : by its usual step.
     """

@@ -238,7 +238,8 @@ def make_dataset(
     Raises
     ------
     DataError
-        If they do not fit together.
+        If they do not fit together, there is no trace, a label is neither 1 nor 0, or X has more
+        channels than samples.
     """
     try:
         X = as_traces(X)[:, 0] if np.ndim(X) == 2 else as_traces(X)
@@ -403,8 +404,9 @@ class RecordingCollector:
     def add(self, source: str, read: Callable[[], Recording], line: int = 0) -> None:
         """Call `read` and add the recording that it returns, or a fault if it raises.
 
-        Only OSError, TraceError and UnreadableError become faults. A recording without a label yet
-        is only counted. `line` is that of the source, for the fault, if it is known.
+        Only OSError, TraceError and UnreadableError become faults; an unknown word is counted, too.
+        A recording without a label yet is only counted. `line` is that of the source, for the
+        fault, if it is known.
         """
         try:
             self.recordings.append(read())
@@ -477,7 +479,8 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     Raises
     ------
     DataError
-        If no recording is left, or too many labels are unknown words.
+        If no recording is left, too many labels are unknown words, or lengths differ under
+        `fit="strict"`.
     """
     collector.check_label_words()
     unit = _convert_to_one_unit(collector, options)
@@ -750,7 +753,10 @@ def refit(data: Dataset, options: LoadOptions, *, has_unit: bool = True) -> Data
 
 
 def _select_channels(data: Dataset, channels: tuple[str, ...]) -> Dataset:
-    """Return a data set with the channels of these names alone, in this order, and their units."""
+    """Return a data set with the channels of these names alone, in this order, and their units.
+
+    With one channel its X has the shape (n, T).
+    """
     places = [data.channels.index(name) for name in channels]
     X = data.X[:, places[0]] if len(places) == 1 else data.X[:, places]
     all_units = split_unit(data.unit, data.X.shape[1])

@@ -53,8 +53,9 @@ def stored_form(store: "StoreLike", source: Any) -> dict[str, Any]:
     """Return the options `samples` and `fit` by which recordings get the form of those in a store.
 
     Without them files that are added would change the median length to which all are padded: all
-    would come out changed, and count again. The dict is empty for a new store, and for other
-    sources than folders and tables. The store is read, and closed if it was given by its address.
+    would come out changed, and count again. `fit` is None if the store's is strict. The dict is
+    empty for a new store, and for other sources than folders and tables. The store is read, and
+    closed if it was given by its address.
     """
     if not isinstance(source, str | os.PathLike):
         return {}
@@ -79,8 +80,9 @@ def stored_form(store: "StoreLike", source: Any) -> dict[str, Any]:
 def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     """Raise TraceError if a data set does not agree with the `TraceSpec` of a store.
 
-    It must have its rate, within 2 %, and its channels, where both know them, and its recordings
-    must have been brought to one length in the same way.
+    Its rate must be the same within 2 %, and its channels the same in the same order, where both
+    are known. Recordings that were brought to one length must have the store's length, and be
+    resampled if and only if the store's traces are.
     """
     data_spec = data.spec
     is_other_fit = data_spec.fit != trace_spec.fit and "resample" in (data_spec.fit, trace_spec.fit)

@@ -321,9 +321,10 @@ def _name_words(column: str) -> list[str]:
 
 
 def is_verdict(column: str, cells: Sequence[Any], words: LabelMap) -> bool:
-    """Return whether cells of a column are all one verdict, as OK or n.i.O.
+    """Return whether cells of a column are all one verdict, as OK or n.i.O.; unchecked ones do not
+    count, but are no verdict alone.
 
-    A number, yes or true is one only in a column whose name says of what, as `failed` or `ok`.
+    A number, yes or true is one only in a column whose name means the bad outcome, or is `ok`.
     """
     with suppress(UnreadableError):
         LabelColumn(column, words, Counter()).find(cells)
@@ -365,7 +366,8 @@ class LabelColumn:
         """Return the label that a cell means; raise as the function `label_of`.
 
         If the column's name means the bad outcome, true, yes and 1 give 0 and false, no and 0 give
-        1, and a note is made.
+        1, and a note is made, unless the user's words have one of these. If the name means neither
+        outcome, they raise UnknownWordError, unless the cell is one of the user's words.
         """
         text = str(cell).strip().lower()
         flag = _flag_of(cell)
@@ -381,8 +383,9 @@ class LabelColumn:
     def find(self, cells: Iterable[Any], place: str = "") -> SourcedLabel:
         """Return the label that all cells mean; those of a part that is not checked do not count.
 
-        Raises UnlabelledError if the part is not checked, SeveralLabelsError if cells differ, and
-        as `label_of`. `place` is what the column is called in errors, by default column NAME.
+        Raises UnlabelledError if the part is not checked, UnknownWordError for a single word of
+        unknown meaning, and SeveralLabelsError if labels differ or one of several words is unknown.
+        `place` is what the column is called in errors, by default column NAME.
         """
         place = place or f"column {self.name}"
         texts = list(dict.fromkeys(str(cell).strip() for cell in cells))
@@ -430,7 +433,8 @@ def labels_that_agree(
 ) -> LabelSource:
     """Return a source of the labels of `first`, which other sources must not contradict.
 
-    A recording whose labels contradict each other is a fault that names both places.
+    Its `find` raises SeveralLabelsError, which names both places, if labels contradict each other,
+    else what `agreed_label` raises.
 
     Parameters
     ----------
@@ -462,16 +466,21 @@ def agreed_label(
     *,
     fills_in: bool = False,
 ) -> SourcedLabel:
-    """Return the label that the first place tells, after comparing it with all other places.
+    """Return the label of the first place that has one, after comparing it with all later places.
+
+    A later place that cannot be read, or that is a name without a label, is ignored.
 
     Parameters
     ----------
     finders : mapping of str to callable
         Returns the label, by the place where it stands. Errors are those of `LabelSource.find`.
-    do, fills_in
-        As in `labels_that_agree`.
+    do
+        What to do about a contradiction, for the error.
     notes : Counter
-        Counts the recordings of which one place tells no label; it is added to.
+        If a label is returned, counts each place before its own, which has none, and each later one
+        that is empty or unchecked.
+    fills_in : bool, default False
+        Whether a later place may give the label if the first has none.
 
     Raises
     ------
@@ -479,8 +488,9 @@ def agreed_label(
         If labels contradict each other.
     UnknownWordError
         If a place has a word of unknown meaning, which may contradict the others.
-    UnreadableError
-        The error of the first place, or with `fills_in` of the last one, if it tells no label.
+    UnreadableError, OSError
+        The error of a place before any label that cannot be read; of the first place, if it has no
+        label; or with `fills_in` of the last one, if no place has a label.
     """
     label: SourcedLabel | None = None
     label_place = ""
@@ -515,7 +525,8 @@ def _find_beside(
     """Return the label that one place tells, by its `find`.
 
     `label` is the one of an earlier place, or None; it is returned if this place cannot be read.
-    Other errors of `find` are raised, with advice.
+    The errors for no label, an unchecked part, an unknown word and several labels are raised in any
+    case, the last two with advice.
     """
     try:
         return find()
@@ -647,8 +658,9 @@ def _found_labels(name: str, words: LabelMap) -> list[_FoundLabel]:
 def _labels_in_file(file: str, start: int, words: LabelMap) -> list[_FoundLabel]:
     """Return the labels in a file's name without suffix, which begins at `start` of the path.
 
-    The word at its end decides. Words in its middle are listed too, but only to find
-    contradictions. Numbers are labels only if they are in `words`, the user's label map.
+    The user's word or else the usual one at its end decides, and so does a number there that is in
+    `words`, the user's label map. Without a user's word those in its middle are listed too, but
+    only to find contradictions. The list is empty without a label.
     """
     digit = re.search(r"(?:^|(?<=[_\- ]))\d+$", file)
     numbers = []
@@ -672,7 +684,10 @@ def _labels_in_file(file: str, start: int, words: LabelMap) -> list[_FoundLabel]
 
 
 def _labels_in_folder(folder: str, start: int, words: LabelMap) -> list[_FoundLabel]:
-    """Return the label, or none, in a folder's name, which begins at `start` of the path."""
+    """Return a list of the label at the end of a folder's name, or of none.
+
+    The name begins at `start` of the path.
+    """
     if folder in words and folder.isdecimal():
         return [_FoundLabel(folder, int(words[folder]), start)]
     if user_word := _find_user_word(folder, start, words):

@@ -209,8 +209,8 @@ def _find_reader(
     """Find the reader of a source.
 
     Returns what to call the source in errors, the names of the optional options that apply to it,
-    and a function that reads it. Nothing but headers is read here. Raises DataError for a source of
-    an unknown kind.
+    and a function that reads it. Here no more is read than tells the kind of files. Raises
+    DataError for a source of an unknown kind.
     """
     if isinstance(source, Dataset):
         return "a Dataset", (), partial(refit, source, options)
@@ -370,10 +370,11 @@ def _read_archives(
 ) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """Return the arrays of archives that the options and `ARRAYS` name, and the names of all.
 
-    With `every` all arrays are returned.
-
-    Archives of one form are concatenated; those that hold different arrays are read as one. Raises
-    DataError if they are neither, or hold Python objects.
+    Archives that hold different arrays are read as one. Those of one form are concatenated; an
+    array that is not one of parts must be the same in all. With `every` all arrays are returned, to
+    describe them: of equal names that of the first archive, and nothing is compared. The axes of
+    the arrays are ordered by `_parts_first`. Raises DataError if archives do not fit together, or
+    hold Python objects.
     """
     label = options.label or "y"
     wanted = None if every else (*ARRAYS, options.part, label, *options.channels)
@@ -426,8 +427,9 @@ def _object_arrays_advice(path: Path, options: LoadOptions) -> str:
 def _parts_first(x: NDArray[Any], labels: NDArray[Any] | None) -> NDArray[Any]:
     """Return an array with the axis of the parts first, and of (n, T, C) as (n, C, T).
 
-    The axis of the parts is the only one that is as long as the labels; an array without such an
-    axis, or without labels, is returned unchanged.
+    The axis of the parts is the only one that is as long as the labels; if there is none, or there
+    are several, it is taken to be the first. (n, T, C) is recognized by T > C. Without labels, or
+    with fewer than two axes, the array is returned unchanged.
     """
     if labels is None or labels.ndim != 1 or x.ndim < 2:
         return x
@@ -440,6 +442,8 @@ def _check_same_labels(
     stored: NDArray[Any], words: Sequence[str], column: str, options: LoadOptions
 ) -> None:
     """Raise DataError if the labels of an archive contradict those of a file of labels.
+
+    A pair of which one is no known label is passed over.
 
     stored, words : the labels, one for each trace. column : of the file.
     """
@@ -555,7 +559,8 @@ def _index_as_column(frame: Any) -> Any:
 def _from_list(traces: list[Any], labels: list[Any], options: LoadOptions) -> Dataset:
     """Make a data set of a list of arrays, Series or DataFrames of any length.
 
-    A trace that cannot be read, or has other channels than the first, becomes a fault.
+    A trace that cannot be read, or has other channels than the first, becomes a fault. Raises
+    DataError if there are not as many labels, or as `as_dataset`.
     """
     one_each = len(traces) == len(labels)
     expect_data(one_each, f"a label for each of {len(traces)} traces", len(labels))

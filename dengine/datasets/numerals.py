@@ -88,8 +88,8 @@ def _proves(mark: str, text: str) -> bool:
 def _looks_grouped(text: str, mark: str) -> bool:
     """Return whether a mark seems to group the thousands in a column's cells, one on each line.
 
-    It does if all numbers of four digits and more have it, at least 44 of them, smaller ones do not
-    have it, and no cell proves it to be the decimal mark.
+    It does if all numbers of four digits and more have it, at least 44 of them, there are smaller
+    ones, which do not have it, and no cell proves it to be the decimal mark.
     """
     if mark not in text or PROOFS[mark].search(text):
         return False
@@ -112,7 +112,8 @@ def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None
     -------
     str or None
         "." or ","; None if the values do not depend on it. If some cells prove one mark and some
-        the other, the one of most cells.
+        the other, the one of most cells. If none proves one, the mark that groups no thousands, if
+        the other one seems to.
 
     Raises
     ------
@@ -175,7 +176,12 @@ def write_as_python(
     mark : str
         The decimal mark; "" if the values do not depend on it.
     wrong : dict of int to str
-        What is wrong in a line: a number in another format than the file's.
+        What is wrong in a line: a number in another format than the file's, which stays as it is.
+
+    Raises
+    ------
+    UnreadableError
+        As `decimal_of`, if the user stated no mark.
     """
     cell_lists = (frame.iloc[:, i].tolist() for i in range(frame.shape[1]))
     columns = {i: cells for i, cells in enumerate(cell_lists) if is_numeric(cells)}

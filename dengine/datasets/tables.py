@@ -74,11 +74,11 @@ SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
 
 
 def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
-    """Return the files of recordings in a folder, by their path in it.
+    """Return the files of recordings in a folder and those inside it, by their path in it.
 
-    They are of one kind: Parquet and .npz files if there are any, else the text files of the most
-    frequent suffix. `run_2.csv` comes before `run_10.csv`. Hidden files and the file of labels are
-    left out. Raises DataError if there is none.
+    They are the Parquet and .npz files if there are any, else the text files of the most frequent
+    suffix. `run_2.csv` comes before `run_10.csv`. Hidden files and the file of labels are left out.
+    Raises DataError if there is none.
     """
     label_file = None if options.labels is None else Path(options.labels).resolve()
     paths = {
@@ -107,7 +107,8 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
 def hold_many(named: Mapping[str, Path], options: LoadOptions) -> bool:
     """Return whether each file of a folder is a table of many insertions, and not one recording.
 
-    Parquet and .npz files are such tables; of text files the first one's header and the names tell.
+    Parquet and .npz files are such tables; of text files the names and columns tell. Raises
+    DataError if these cannot be decoded.
     """
     path = next(iter(named.values()))
     if path.suffix.lower() not in TEXTS:
@@ -301,7 +302,10 @@ def _column_cells(rows: Iterable[Sequence[str]], i: int) -> list[str]:
 
 
 def _has_label_column(named: Mapping[str, Path], options: LoadOptions) -> bool:
-    """Return whether the files have a column of labels, in which the first file has a label."""
+    """Return whether the files have a column of labels that can be read in the first file.
+
+    Its cells there may be empty, or a word of unknown meaning.
+    """
     with suppress(DataError):
         _, columns = _label_source(named, options)
         if columns:
@@ -313,7 +317,8 @@ def _has_label_column(named: Mapping[str, Path], options: LoadOptions) -> bool:
 def _count_labels(names: Iterable[str], source: labels.LabelSource) -> Counter[Any]:
     """Count the labels that a source finds for names.
 
-    The keys are labels, words whose meaning is unknown, "" for an empty label, and None for none.
+    The keys are labels, words whose meaning is unknown, "" for an empty or unchecked label, and
+    None for none, or for what cannot be read.
     """
     counts = Counter[Any]()
     for name in names:
@@ -387,7 +392,10 @@ def _label_advice(named: Mapping[str, Path], options: LoadOptions) -> str | None
 
 
 def _common_decimal_mark(paths: Sequence[Path], options: LoadOptions) -> str | None:
-    """Return the one decimal mark that all files of a folder prove; None if none or several do."""
+    """Return the decimal mark that files of a folder prove; None if none does, or both are proven.
+
+    Files that cannot be read are passed over.
+    """
     marks = set[str]()
     for path in paths:
         with suppress(UnreadableError, OSError):
@@ -406,9 +414,10 @@ def _unread_files_note(folder: Path, named: Mapping[str, Path], options: LoadOpt
 
 
 def _first_rows(path: Path, options: LoadOptions) -> list[list[str]]:
-    """Return the header and the first rows of a text file, up to 100 lines.
+    """Return the header and the first rows of a text file, of up to 100 lines and 256 KiB.
 
-    One empty row if they cannot be read: the error comes when the whole file is read.
+    The last row may be cut off. One empty row is returned if they cannot be read: the error comes
+    when the whole file is read.
     """
     with suppress(UnreadableError, OSError), path.open("rb") as file:
         lines = file.read(2**18).split(b"\n")[:100]
@@ -435,7 +444,7 @@ def _usual_channels(
     """
     headers = []
     for path in paths:
-        channels = _channels_of_header(_first_rows(path, options), options)
+        channels = _columns_without_clock(_first_rows(path, options), options)
         headers.append(tuple(name for name in channels if name not in label_columns))
     names = {name.lower() for header in headers for name in header}
     if not names or FORCE.lower() in names:
@@ -444,8 +453,11 @@ def _usual_channels(
     return _choose_channels(most_frequent, options)
 
 
-def _channels_of_header(first_rows: list[list[str]], options: LoadOptions) -> list[str]:
-    """Return the columns of a file that are no clock, given its header and some rows."""
+def _columns_without_clock(first_rows: list[list[str]], options: LoadOptions) -> list[str]:
+    """Return the names of a file's columns that are no clock, given its header and some rows.
+
+    Columns of labels are still among them; those without a name are not.
+    """
     import pandas as pd
 
     header, *rows = first_rows
@@ -462,7 +474,7 @@ def _channels_of_header(first_rows: list[list[str]], options: LoadOptions) -> li
 def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> Dataset:
     """Read text and Parquet files that are tables of one form, one after the other.
 
-    Raises DataError if one cannot be read, or their columns or units differ.
+    Raises DataError if one cannot be read or has no rows, or their columns or units differ.
     """
     collector = RecordingCollector(name, ())
     tables: dict[str, pd.DataFrame] = {}
@@ -790,9 +802,10 @@ def _are_stations(rows: pd.DataFrame, name: str) -> bool:
 def _order_by_time(
     rows_of_part: dict[str, pd.DataFrame], has_dates: bool
 ) -> tuple[dict[str, pd.DataFrame], list[str]]:
-    """Return the parts in the order of their first times, and a note if that is not the file's.
+    """Return the parts in the order of their first times, if these are dates and no parts overlap;
+    else in that of the rows.
 
-    They keep the order of the file if their times are no dates or overlap.
+    If the two orders differ, a note says which it is, unless the times are no dates and overlap.
     """
     starts = {part: rows[SECONDS_COLUMN].min() for part, rows in rows_of_part.items()}
     ends = {part: rows[SECONDS_COLUMN].max() for part, rows in rows_of_part.items()}

@@ -121,8 +121,10 @@ class TextTable(NamedTuple):
 def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
     """Split a text into cells; blank lines are left out.
 
-    columns : names of the columns, if the file has no header or another one. Raises UnreadableError
-    for a line of megabytes, and if there is no header.
+    A first line sep=; states the delimiter, which is found otherwise. Raises UnreadableError for a
+    cell of more than 131,072 characters, and if there is no header.
+
+    columns : names of the columns, if the file has no header or another one.
     """
     lines = {i: line for i, line in enumerate(text.splitlines(), start=1) if line.strip()}
     stated = DELIMITER_LINE.fullmatch(next(iter(lines.values()), "").strip())
@@ -152,8 +154,9 @@ def _split_line(line: str, delimiter: str) -> list[str]:
 def _find_delimiter(lines: Sequence[str]) -> str:
     """Return the delimiter that splits lines best.
 
-    It gives the most cells that are numbers or times, the same number of cells in each line, and a
-    header with as many. If none does, "," is returned.
+    It gives the most cells that are numbers, times or empty, the same number of cells in each line,
+    and a header with as many. Without such cells it is the first that splits most lines, of tab,
+    semicolon, bar and comma; "," if none does.
     """
     sample = [units.COMMENT_MARK.sub("", line) for line in lines[-SAMPLED_LINES:]]
     top = [units.COMMENT_MARK.sub("", line) for line in lines[:-1][:100]]
@@ -298,7 +301,8 @@ def read_table(
     notes : Counter, optional
         Counts what users should know; it is added to.
     decimal : str, optional
-        Decimal mark of the other files of a folder, used if the cells of this one prove none.
+        Decimal mark, as of the other files of a folder, that is taken if the user stated none.
+        None: as the cells prove.
     as_text : bool, default False
         Whether numbers stay texts as they are written.
 
@@ -389,7 +393,8 @@ def read_recording(
     """Read the channels of a file that holds one recording, in the order of `channels`.
 
     `notes` and `decimal` are as in `read_table`. Raises UnreadableError, with the line, for a cell
-    or row that cannot be read.
+    or row that cannot be read, a channel that is not there, and no samples; also as `read_table`
+    and `rows_to_trace`.
     """
     table = read_table(path, options, notes, decimal)
     header = list(table.frame.columns)
@@ -453,13 +458,14 @@ def rows_to_trace(
     -------
     TimedTrace
         In the order of the times, where these can be trusted; see `clocks.in_order_of_time`. An
-        empty cell is NaN, which the engine finds.
+        empty cell is NaN, which the engine finds. The rate is None if one is stated, or no clock is
+        known; there are no units.
 
     Raises
     ------
     UnreadableError
-        For a cell that is no number, rows that are missing or out of order, or a clock that cannot
-        be read, unless a rate is stated.
+        For a cell that is no number, for rows that are missing or out of order, and, unless a rate
+        is stated, for a clock that cannot be read or is not even enough.
     """
     values, wrong = parse_numbers(rows.iloc[:, places])
     if wrong:

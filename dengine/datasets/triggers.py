@@ -186,7 +186,8 @@ class StartFinder:
     def feed(self, time: float, active: bool) -> Start | None:
         """Take the next sample; return the start of an insertion if it shows one, else None.
 
-        The trigger must be on at this sample, and have been off for `quiet_s` before.
+        The trigger must be on at this sample, and have been off for `quiet_s` before; one that is
+        on from the first sample on has no start.
 
         If samples are missing just before it, the insertion may have begun in any of them, so the
         place of no sample in its trace is known: `Start.seen` is False.

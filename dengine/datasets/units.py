@@ -101,7 +101,10 @@ COMMENT_MARK = re.compile(r"^\s*[#%]+\s*")  # by which other programs know a com
 
 
 def parse(unit: str) -> tuple[str, float] | None:
-    """Return the dimension of a unit and its factor, ("N", 1000.0) for kN; None if it is none."""
+    """Return the dimension of a unit and its factor, ("N", 1000.0) for kN; None if it is none.
+
+    A unit in `ALONE`, which is not converted, is a dimension of its own.
+    """
     if unit in ALONE:
         return unit, 1.0
     for base in sorted(BASES, key=len, reverse=True):
@@ -128,7 +131,7 @@ def in_preamble(text: str, names: Sequence[str]) -> list[str]:
     """Return the unit that the text above a header states for each column; "" for none.
 
     A line is of the columns that it names; one that names none is of the only column, or a unit of
-    force is of those with the name of a force.
+    force is of those with the name of a force. Units of time are ignored.
 
     names : the columns without a unit that are no clock.
     """
@@ -150,7 +153,10 @@ def in_preamble(text: str, names: Sequence[str]) -> list[str]:
 
 
 def factor(unit: str, other: str) -> float | None:
-    """Return the factor that converts numbers in one unit to another; None if there is none."""
+    """Return the factor that converts numbers in one unit to another; None if there is none.
+
+    It is 1.0 for equal texts, even if they are no units.
+    """
     if unit == other:
         return 1.0
     source = parse(unit)
@@ -166,7 +172,10 @@ def seconds_in(unit: str) -> float | None:
 
 
 def split(name: str) -> tuple[str, str]:
-    """Return the name of a column without its unit, and the unit; "" if it states none."""
+    """Return the name of a column without its unit and a comment mark before it, and the unit.
+
+    The unit is "" if the name states none that is known.
+    """
     plain = COMMENT_MARK.sub("", name.strip())
     if match := BRACKETED.fullmatch(plain):
         unit = spelling(match["unit"])
