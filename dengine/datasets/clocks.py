@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 EMPTY_CELLS = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # become NaN
+NO_CLOCK = "none"  # what the user states as the clock of recordings whose times are wrong
 MAX_GAP = 5.0  # median steps: a longer pause is no late message
 EVEN_TOLERANCE = 0.1  # steps: times that are less off even ones are read as even
 MAX_MISSING = 0.03  # of the rows of a recording whose samples are taken as even
@@ -96,9 +97,11 @@ def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
 def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
     """Return the position of the clock's column, by its name or else its values; None without one.
 
-    time : its name, if the user stated it; UnreadableError if there is no such column.
+    time : its name, if the user stated it, or "none"; UnreadableError if there is no such column.
     """
     names = [str(name) for name in frame.columns]
+    if time == NO_CLOCK and time not in names:
+        return None
     head = frame.iloc[:HEAD]
     if time is not None:
         places = units.find_columns(time, names)
@@ -472,6 +475,7 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
             wanted = f"a later time in column {clock.name} than that of the row before"
             actual = f"{-steps[i]:.3g} s earlier"
             do = f"time={clock.name!r} puts rows in the order of their times, if they differ"
+            do = f"{do}; time={NO_CLOCK!r} with a stated rate (rate_hz) leaves them as they are"
             raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", lines[known[i + 1]])
     gaps = np.flatnonzero(steps > MAX_GAP * usual)
     # After a late row others come sooner, so that none are missing.
@@ -528,11 +532,13 @@ def check_even(clock: Clock, rate_hz: float) -> int:
     n = len(clock.seconds)
     n_even = round(float(clock.seconds[-1] - clock.seconds[0]) * rate_hz) + 1
     missing = n_even - n
+    steps = np.diff(clock.seconds) * rate_hz
+    n_skipped = int((np.rint(steps[steps > LATE_STEP]) - 1).sum())
     if abs(missing) > MAX_MISSING * n_even + 1:
         wanted = f"{n_even} rows at {rate_hz:g} Hz from the first time to the last"
         do = "fit='resample' puts all at even times by their own"
         raise UnreadableError(f"Expected {wanted}, got {n}; {do}")
-    return max(missing, 0)
+    return max(min(missing, n_skipped), 0)
 
 
 def resample_evenly(

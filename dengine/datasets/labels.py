@@ -13,6 +13,7 @@ An empty label, and a word as pending or unknown, is that of a part that was not
 
 import os
 import re
+import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -60,7 +61,7 @@ LETTER = r"[^\W\d_]"
 WORD_START = rf"(?:(?<!{LETTER})|(?<=[a-z])(?=[A-Z]))"
 WORD_END = rf"(?:(?!{LETTER})|(?<=[a-z])(?=[A-Z]))"
 NOT = r"(?P<not>(?i:not|non|no|nicht)[\W_]*)?"
-USER_NOT = r"(?P<not>(?i:not|non|no|nicht|kein|keine)[\W_]+)?"
+USER_NOT = r"(?P<not>(?i:not|non|no|nicht|keine?)(?:[\W_]+|(?=[A-Z])))?"
 WORDS = "|".join(word for word in MEANING if not word.isdecimal())
 # i.O., o.k., and what n makes of them: n.i.O., nio, n-ok.
 IN_CELL = re.compile(
@@ -198,7 +199,7 @@ def label_of(word: Any, words: LabelMap = NO_WORDS) -> int:
     UnlabelledError
         If it is empty or in `UNCHECKED`, as the cell of a part that was not checked yet.
     """
-    text = str(word).strip().lower()
+    text = normalized(word).strip().lower()
     if text in words:
         return int(words[text])
     if text in UNCHECKED:
@@ -207,6 +208,11 @@ def label_of(word: Any, words: LabelMap = NO_WORDS) -> int:
     if match is None:
         raise UnknownWordError(str(word).strip())
     return _label_of_match(match)
+
+
+def normalized(text: Any) -> str:
+    """Return a text whose letters with marks are one character each: macOS writes names in two."""
+    return unicodedata.normalize("NFC", str(text))
 
 
 def _letters(text: str) -> str:
@@ -235,7 +241,10 @@ def parse_label_map(label_map: Mapping[str, Any] | str | None) -> dict[str, bool
         pair = re.compile(r"(.*?)=([^=,]*)(?:,|$)")
         expect_data(not pair.sub("", label_map or ""), wanted, label_map)
         pairs = dict(pair.findall(label_map or ""))
-    words = {str(word).strip().lower(): str(label).strip().lower() for word, label in pairs.items()}
+    words = {
+        normalized(word).strip().lower(): str(label).strip().lower()
+        for word, label in pairs.items()
+    }
     for word, label in words.items():
         expect_data(bool(word) and IN_CELL.fullmatch(label) is not None, wanted, label_map)
     return {word: bool(label_of(label)) for word, label in words.items()}
@@ -537,7 +546,8 @@ def _find_beside(
             error.args = (f"{error} in {place}, where {label.text}; say what it means, or {do}",)
         raise
     except SeveralLabelsError as error:
-        error.args = (f"{error}; {do}",)
+        if label is not None:
+            error.args = (f"{error}, where {label.text}; {do}",)
         raise
     except (UnreadableError, OSError):
         if label is None:
@@ -709,7 +719,7 @@ def _find_user_word(text: str, start: int, words: LabelMap) -> _FoundLabel | Non
     for ending in _endings(text):
         for word in longest_first:
             bare = re.sub(r"[\W_]+$", "", word)
-            pattern = r"[\W_]+".join(map(re.escape, re.split(r"[\W_]+", bare)))
+            pattern = r"[\W_]*".join(map(re.escape, re.split(r"[\W_]+", bare)))
             match = re.search(f"{WORD_START}{USER_NOT}(?i:{pattern})$", ending)
             if bare and match:
                 label = int(words[word] != bool(match["not"]))
@@ -785,6 +795,7 @@ def labels_in_file(
     notes = Counter[str]()
     if any(len(row.lines) > 1 for row in rows):
         notes[f"{source} names recordings more than once: their labels must be equal"] = 1
+    notes[f"The labels are those in column {column} of {source}"] = 1
     label_column = LabelColumn(column, options.words, notes)
     rows_by_file = defaultdict[str, list[_LabelRow]](list)
     for row in rows:
@@ -908,7 +919,7 @@ def _path_words(path: str) -> tuple[str, ...]:
 
     Backslashes of Windows are read as slashes.
     """
-    words = path.lower().replace("\\", "/").split("/")
+    words = normalized(path).lower().replace("\\", "/").split("/")
     words = [word for word in words if word not in ("", ".")] or [""]
     file = words.pop()
     suffix = next((suffix for suffix in SUFFIXES if file.endswith(suffix)), "")

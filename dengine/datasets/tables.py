@@ -87,7 +87,7 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
         if path.suffix.lower() in SUFFIXES and (path.is_file() or path.is_symlink())
     }
     named = {
-        inner.as_posix(): path
+        labels.normalized(inner.as_posix()): path
         for inner, path in paths.items()
         if path.resolve() != label_file and not any(word.startswith(".") for word in inner.parts)
     }

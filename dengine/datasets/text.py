@@ -230,8 +230,13 @@ def _find_header(
     above = [_without_comment_mark(row, delimiter) for row in rows[: max(data, 1)]]
     is_units = [any(row) and all(map(_is_unit, row)) for row in above]
     header = max(data - 1 - (data > 1 and is_units[-1]), 0)
-    if header == 1 and len(rows[0]) >= len(rows[data]) and not is_units[0]:
+    is_remark = (
+        header == 1 and units.COMMENT_MARK.match(rows[0][0]) and not _numeric_columns(rows[1])
+    )
+    if header == 1 and len(rows[0]) >= len(rows[data]) and not (is_units[0] or is_remark):
         header = data = 0
+    if not columns and above and _numeric_columns(above[header]):
+        header, data = _true_header(above, is_units, header, data)
     units_row = above[header + 1] if header + 1 < data else []
     if columns:
         data_rows = dict(zip(lines[data:], rows[data:], strict=True))
@@ -249,6 +254,24 @@ def _find_header(
         names = names[:-1]  # LabVIEW's, which its rows leave out
     line = lines[header] if lines else 0
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter)
+
+
+def _true_header(
+    above: list[list[str]], is_units: list[bool], header: int, data: int
+) -> tuple[int, int]:
+    """Return the positions of the header and of the first row of data.
+
+    A row in which some cells are numbers, and one above it of as many names, is damaged data.
+
+    above, is_units : the rows above the data, and whether they are of units.
+    """
+    row = above[header]
+    if len(_numeric_columns(row)) == len(row):
+        return header, data
+    for i, names in enumerate(above[:header]):
+        if len(names) == len(row) and all(names) and not _numeric_columns(names):
+            return i, i + 1 + is_units[i + 1]
+    return header, data
 
 
 def _numeric_columns(row: list[str]) -> frozenset[int]:
@@ -357,7 +380,7 @@ def read_table(
         if not (column_units[i] or units.split(name)[1] or is_time_column(name))
     ]
     preamble = "\n".join(text.splitlines()[: max(cells.line - 1, 0)])
-    stated = units.in_preamble(preamble, [header[i] for i in without])
+    stated = units.in_preamble(preamble, header, without)
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
     return TextTable(frame, faults, cells.line, column_units, mark)
@@ -415,21 +438,25 @@ def _without_summary(
     """Return a recording without the last rows that have no time, as Max;48.2 below samples.
 
     These are left out only if all rows above them have a time and are at least ten times as many; a
-    note says so. Without a clock the table is returned whole.
+    note says so. Without a clock any column of numbers stands for it.
     """
     place = None
     with suppress(UnreadableError):
         place = place_of_clock(frame, options.time)
-    if place is None:
-        return frame
-    cells = frame.iloc[:, place].astype(str)
-    has_time = [is_numeral(cell) or TIMESTAMP.fullmatch(cell) is not None for cell in cells]
-    n_last = next((n for n, is_time in enumerate(reversed(has_time)) if is_time), 0)
-    n_samples = len(frame) - n_last
-    if not 0 < n_last <= n_samples / SUMMARY_SHARE or not all(has_time[:n_samples]):
-        return frame
-    notes[f"The last {n_last} rows have no time: they are no samples, and left out"] += 1
-    return frame.iloc[:n_samples]
+    for i in range(frame.shape[1]) if place is None else [place]:
+        cells = frame.iloc[:, i].astype(str).tolist()
+        reverse = (_is_value(cell) and cell != "" for cell in reversed(cells))
+        n_last = next((n for n, is_value in enumerate(reverse) if is_value), 0)
+        samples = cells[: len(cells) - n_last]
+        has_words = place is not None or any(cells[len(samples) :])
+        if not (has_words and 0 < n_last <= len(samples) / SUMMARY_SHARE):
+            continue
+        if all(cell != "" and _is_value(cell) for cell in samples):
+            what = "time" if place is not None else f"number in column {frame.columns[i]}"
+            text = f"The last {n_last} rows have no {what}: they are no samples, and left out"
+            notes[text] += 1
+            return frame.iloc[: len(samples)]
+    return frame
 
 
 def rows_to_trace(

@@ -92,7 +92,7 @@ SLASHED = re.compile(
 ENDING = re.compile(r"(?P<name>.*[^_. -])[_. -]+(?P<unit>[A-Za-zµμ·]+)")  # FZ_kN
 # A line above a header that states a unit: # Force unit: kN, or Einheit Kraft;kN.
 UNIT_LINE = re.compile(
-    r"(?P<before>[\w ]*?)\b(?:units?|einheit(?:en)?|unité|unidad|unità)\b(?P<behind>[\w ]*)"
+    r"(?P<before>[\w -]*?)\b(?:units?|einheit(?:en)?|unité|unidad|unità)\b(?P<behind>[\w ]*)"
     r"[:=;,\t]\s*[\"'\[(]*(?P<unit>[^\s\"';,\])]+)",
     re.IGNORECASE,
 )
@@ -127,16 +127,21 @@ def spelling(unit: str) -> str:
     return alike[0] if len({parse(name) for name in alike}) == 1 else unit
 
 
-def in_preamble(text: str, names: Sequence[str]) -> list[str]:
-    """Return the unit that the text above a header states for each column; "" for none.
+def in_preamble(text: str, header: Sequence[str], places: Sequence[int]) -> list[str]:
+    """Return the unit that the text above a header states for each of some columns; "" for none.
 
     A line is of the columns that it names; one that names none is of the only column, or a unit of
-    force is of those with the name of a force. Units of time are ignored.
+    force is of those with the name of a force. A line may list the units of all columns.
 
-    names : the columns without a unit that are no clock.
+    places : positions of the columns without a unit that are no clock.
     """
+    names = [header[i] for i in places]
     result = [""] * len(names)
     for match in UNIT_LINE.finditer(text):
+        line = text[match.start("unit") :].partition("\n")[0]
+        items = [spelling(item.strip(" \"'[]()")) for item in re.split(r"[,;\t]", line)]
+        if len(items) == len(header) > 1:
+            return [items[i] if parse(items[i]) else "" for i in places]
         unit = spelling(match["unit"])
         if parse(unit) is None or seconds_in(unit) is not None:
             continue

@@ -768,3 +768,45 @@ def test_a_few_lost_rows_are_noted_and_swapped_rows_are_put_in_order(tmp_path: P
         np.testing.assert_allclose(data.X[0], np.sin(t), atol=1e-6)
         assert "Rows are put in the order of their times." in data.notes
     assert "later samples stand too early" in load_dataset(tmp_path, channel="FZ").notes[1]
+
+
+@pytest.mark.parametrize("odd", ["Init", "(2.87)", "Max"])
+def test_words_in_the_first_rows_are_no_header(odd: str, tmp_path: Path) -> None:
+    cells = [odd] * 30 + texts()[30:]
+    write(tmp_path / "a_OK.csv", ["time", "FZ"], times(), cells)
+    write(tmp_path / "b_OK.csv", ["time", "FZ"], times(), texts(), above=["Presse;3"])
+    data = load_dataset(tmp_path)
+    assert (data.channels, [f.source for f in data.faults]) == (("FZ",), ["a_OK.csv"])
+    assert f"Expected a number in column FZ, got '{odd}'" in data.faults[0].message
+    assert data.faults[0].line == 2
+
+
+def test_a_summary_below_samples_without_a_clock_is_no_sample(tmp_path: Path) -> None:
+    numbers = [str(i) for i in range(N)]
+    write(tmp_path / "a_OK.csv", ["Nr", "F"], [*numbers, "Max", "Min"], [*texts(), "9.9", "1.1"])
+    data = load_dataset(tmp_path, channel="F")
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    assert "The last 2 rows have no number in column Nr" in data.notes[0]
+
+
+@pytest.mark.parametrize(
+    "above", [["X-Unit;mm", "Y-Unit;kN"], ["# Units: ms, mm, kN"], ["Einheit Y: kN"]]
+)
+def test_units_above_the_header_are_those_of_the_columns_they_name(
+    above: list[str], tmp_path: Path
+) -> None:
+    for i in range(3):
+        lines = above if i else [line.replace("kN", "N") for line in above]
+        cells = [times(), texts(), texts(VALUES / 1000 if i else VALUES, "{:.4f}")]
+        write(tmp_path / f"{i}_OK.csv", ["Time [ms]", "X", "Y"], *cells, above=lines)
+    data = load_dataset(tmp_path, channel="Y", rate_hz=250, unit="N")
+    np.testing.assert_allclose(data.X, np.tile(VALUES, (3, 1)), rtol=1e-3, atol=0.06)
+
+
+def test_a_clock_that_is_wrong_is_left_out_by_name(tmp_path: Path) -> None:
+    wrong = [f"{i * STEP % 0.1:.3f}" for i in range(N)]
+    write(tmp_path / "a_OK.csv", ["time", "FZ"], wrong, texts())
+    refused = dengine("data", tmp_path, "--rate-hz", "250")
+    assert "--time none with a stated rate (--rate-hz) leaves them as they are" in refused.stderr
+    data = load_dataset(tmp_path, rate_hz=250.0, time="none")
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))

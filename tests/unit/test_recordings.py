@@ -1185,3 +1185,20 @@ def test_western_texts_are_read_as_windows_1252(text: str, few: Path, small: Dat
     np.testing.assert_array_equal(data.X, small.X[:4])
     note = "Text is read as Windows-1252, not UTF-8; encoding=... states another (4 times)."
     assert note in data.notes
+
+
+def test_words_of_the_user_are_found_in_capitals_and_in_marks_that_are_characters() -> None:
+    source = labels_in_names(None, parse_label_map("conforme=good,non conforme=bad"))
+    assert source.find("p1_Conforme.csv").label == 1
+    assert source.find("p1_NonConforme.csv").label == 0
+    source = labels_in_names(None, parse_label_map("conforme=good"))
+    assert source.find("p1_NonConforme.csv").label == 0
+    words_read = parse_label_map("godk\u00e4nd=good,ej_godk\u00e4nd=bad")
+    assert words_read == parse_label_map("godka\u0308nd=good,ej_godka\u0308nd=bad")
+
+
+def test_a_file_name_of_macos_is_the_same_text(small: Dataset, tmp_path: Path) -> None:
+    for i, word in enumerate(["godka\u0308nd", "ej_godka\u0308nd"]):
+        write_csv(tmp_path / f"{i}_{word}.csv", small.X[i])
+    data = load_dataset(tmp_path, label_map="godk\u00e4nd=good,ej_godk\u00e4nd=bad")
+    assert data.y.tolist() == [1, 0]
