@@ -186,10 +186,11 @@ class EngineCore:
     ) -> Decision:
         """Decide on one trace, record the decision and return it, as `DataEngine.decide` says.
 
-        An id that has a decision already gets it back, and nothing else happens; TraceError if the
-        trace is another one. An id that cannot be looked up gets a VERIFY that is not recorded.
-        With `timed_out` the caller has given up waiting, so the decision is VERIFY, `Reason.LATE`,
-        unless a fault of the trace, or of the store, is the reason.
+        With an id, an ACCEPT or REJECT is on disk when this returns. An id that has a decision
+        already gets it back, and nothing else happens; TraceError if the trace is another one. An
+        id that cannot be looked up gets a VERIFY that is not recorded. With `timed_out` the caller
+        has given up waiting, so the decision is VERIFY, `Reason.LATE`, unless a fault of the trace,
+        or of the store, is the reason.
 
         Before it decides, the call takes a short step with a version that the executor has trained
         (where cells share a product, all steps), and counts earlier accepted parts without a report
@@ -223,7 +224,7 @@ class EngineCore:
         a baseline, uses classes of the user's, or is not compiled. The decision is recorded in
         memory and goes to the disk later. Any thread may call it while no other uses the engine;
         else it raises StoreError. It leaves swapping versions and announcing safe mode to
-        `process_retrains`. Other errors as of `decide`.
+        `process_retrains`. Raises TraceError for a wrong trace or part's number.
         """
         self.outbox.check_usable()
         with self.outbox.try_lock() as is_free, self.exclusive:
@@ -251,7 +252,8 @@ class EngineCore:
         already gets that one. It may be called in any thread, also during another call. With a
         store in memory, before the first trace, and where the id cannot be looked up, a VERIFY is
         returned that is not recorded; in the first two cases `decide` must record it, with
-        `timed_out`. Errors as of `DataEngine.decide`.
+        `timed_out`. Raises TraceError for a wrong trace or part's number and for an id of another
+        trace, ReportError for what is no id, and StoreError for a closed engine.
         """
         self.outbox.check_usable()
         id_ = as_id(decision_id)
@@ -364,8 +366,9 @@ class EngineCore:
 
         Where none is set, the first trace without a fault sets it, or a contract that peers have
         set is taken. The first finite trace also has an untrained model compute in advance.
-        Settings that could not be saved before are saved. Raises TraceError for a wrong shape; a
-        trace with NaN, or another fault, is returned like any other.
+        Settings that could not be saved before are saved. Raises TraceError for a wrong shape, or
+        too few samples of a first trace; a trace with NaN, or another fault, is returned like any
+        other.
         """
         settings = self.settings.now
         has_learned = self.live.version + self.learner.labels.new_labels > 0

@@ -163,10 +163,11 @@ class Corrections:
     def rollback(self, version: int, author: str = "") -> Changed:
         """Let an earlier version answer again, stored as a new version with a new number.
 
-        Labels that came since are among its references, corrections count, and the rule in force
-        goes on. The next retrain starts from this version. A reducer that is stored by its traces
-        (umap-learn), and a baseline, are fitted again: the first on the traces that it was fitted
-        on, the second on the same traces with the labels as they count now.
+        Labels that came since, up to the training window's size, are among its references,
+        corrections count, and the rule in force goes on. The next retrain starts from this version.
+        A reducer that is stored by its traces (umap-learn), and a baseline, are fitted again: the
+        first on the traces that it was fitted on, the second on the same traces with the labels as
+        they count now.
 
         Parameters
         ----------

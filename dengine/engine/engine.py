@@ -343,8 +343,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ------
         SettingError
             Where a given setting is not the used store's.
-        StoreError, ImportRefusedError
-            As `open`.
+        StoreError
+            Where another engine owns the cell, or the store cannot be used.
+        ImportRefusedError
+            Where a class would have to be imported that is not allowed.
         """
         with opening(store, wait=wait) as opened:
             allowed = allow_import or named_classes(**settings)

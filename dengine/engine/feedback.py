@@ -166,7 +166,7 @@ class Feedback:
 
         The same report once more, before `note_synced`, does nothing and returns False. Returns
         whether silence had confirmed the part before this report, whatever its label is now. Raises
-        ReportError if the store has a label of the decision, except that a line stop may follow a
+        ReportError if the decision has a label already, except that a line stop may follow a
         confirmation.
         """
         id_ = stored.decision.id
@@ -284,7 +284,7 @@ class Feedback:
         """Make the rule count as wrong each decision whose check is overdue.
 
         It is if nothing was reported of it while `label_within` later decisions were recorded. Each
-        decision is counted once.
+        is counted once; one without evidence, or from before the present rule began, is not.
         """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within

@@ -55,7 +55,8 @@ class GuardedModel:
             self.model.prepare(previous)
 
     def update_rule(self, *outcome: Any) -> None:
-        """Update the model's rule with an outcome, arguments as of `EngineModel.update_rule`.
+        """Update the model's rule with the outcome of a part: the arguments of
+        `EngineModel.update_rule`.
 
         Where it fails, that is logged, and the model refuses to predict.
         """

@@ -93,9 +93,9 @@ class Learner:
         """Restore window, version, rule and counts from the store, bit for bit, when an engine
         opens it.
 
-        `label_within` and `policy_since` are as of `LiveModel.resume`. With a version, or with at
-        least `IMPORTED` labels, it also begins in a thread to compute what the next retrain starts
-        with.
+        A check is overdue after `label_within` later decisions; `policy_since` is the first version
+        under the policy in force. With a version, or with at least `IMPORTED` labels, it also
+        begins in a thread to compute what the next retrain starts with.
         """
         version = self._store.last_version()  # before the labels: a peer may store both meanwhile
         labelled = self._store.labelled(self._window.capacity)
@@ -219,11 +219,11 @@ class Learner:
         return self._report or candidate.report
 
     def start_retrain(self) -> RetrainReport | None:
-        """Begin to train in the executor and return None, unless a training is under way.
+        """Begin to train in the executor and return None.
 
-        One under way comes a step further, and None is returned. Otherwise labels are stored and
-        news of peers is taken in first. Without an executor that takes work, retrain in this thread
-        and return the report. Raises StoreError where the labels before it cannot be stored.
+        A training under way comes a step further instead. Before a new one, labels are stored, and
+        news of peers is taken in. Without an executor that takes work, retrain in this thread and
+        return the report. Raises StoreError where the labels before it cannot be stored.
         """
         self.collect()
         if self.is_busy:

@@ -40,8 +40,9 @@ def restore_model(
 def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on the traces of a stored version, with the labels that these had then.
 
-    The traces are checked against the ledger. Returns False, with the model untrained, where one is
-    damaged or missing. A label that was forgotten by then is left out, and is not missing.
+    Labels are first checked against the ledger, which may set the outbox's `integrity_error`.
+    Returns False, with the model untrained, where a trace is damaged or missing. A label that was
+    forgotten by then is left out, and is not missing.
     """
     store = outbox.store
     first = int(trained_on.seq[0])
@@ -123,7 +124,7 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     Returns False, and changes nothing, where the model has references and cannot change that one:
     it must be trained again. Otherwise True, also where nothing is changed: for a quarantined part,
     for a damaged trace that would have to be added again, and for a baseline, which has no
-    references and which the caller trains again.
+    references.
     """
     if not model.keeps_references:
         return True

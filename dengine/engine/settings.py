@@ -146,7 +146,8 @@ class EngineSettings:
         reducer, model : object, optional
             Objects that the engine was made with and the store cannot name.
         allow_import : bool or collection of str
-            As of `check_imports`; a class that `reducer` names is allowed.
+            Whether any class that the recipe names may be imported, or which; a class that
+            `reducer` names is allowed.
 
         Returns
         -------

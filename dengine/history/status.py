@@ -561,8 +561,8 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
     last : int
         Number of newest decisions that are marked; it is only returned.
     **by
-        `seconds`, `start` or `batch`, as of `SqlStore.stretches`. By default a stretch has at least
-        20 decisions, the newest perhaps fewer.
+        `seconds` and `start` for periods of time, or `batch` for batches, as `SqlStore.stretches`
+        takes them. By default a stretch has at least 20 decisions, the newest perhaps fewer.
 
     Returns
     -------
@@ -595,7 +595,7 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     Raises
     ------
     SettingError
-        For a value that a field cannot have, and for a `last` below 1.
+        For a value that a field cannot have, and for a `last` below 1 or from 10 ** 9 on.
     """
     is_valid = last is None or 1 <= last < MAX_LAST
     expect(

@@ -694,9 +694,10 @@ class Database:
     def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
         """Commit records of a journal; return (decision id, label number) of their labels.
 
-        All are committed in one transaction, as `SqlStore.apply_records` describes. If the database
-        refuses a value, the records are halved until the refused one is alone: it is left out, and
-        an event of kind "dead letter" is stored instead. Any other failure raises StoreError.
+        All are committed in one transaction. A record that is stored already changes nothing, and
+        its label is returned, too; one that contradicts what is stored becomes an event of kind
+        "dead letter". If the database refuses a value, the records are halved until the refused one
+        is alone, and that one becomes such an event. Any other failure raises StoreError.
         """
         try:
             return self.write(lambda connection: self._insert_records(connection, records))

@@ -49,7 +49,8 @@ def open_store(
     Raises
     ------
     StoreError
-        For an argument of another type, and as of `SqlStore`.
+        For an argument of another type, a database that cannot be used or is another program's, and
+        a cell of another product.
     """
     from .peers import check_cell_exists  # SQLAlchemy is imported where it is used
     from .sql import SqlStore

@@ -369,9 +369,9 @@ class Outbox:
     def try_lock(self) -> Iterator[bool]:
         """Context manager that tries to take the outbox's lock, and gives whether that succeeded.
 
-        It waits at most a millisecond. While the block holds the lock, the threads of the outbox
-        wait, and so do calls from other threads. The block runs without the lock, too. Afterwards
-        it is released.
+        It waits at most a millisecond, and the block runs in either case. While the block holds the
+        lock, the threads of the outbox wait, and so do calls from other threads. The lock is
+        released after the block.
         """
         locked = self._changed.acquire(
             timeout=LOCK_SECONDS

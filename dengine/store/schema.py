@@ -168,7 +168,7 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
     Raises
     ------
     StoreError
-        As of `check_schema`.
+        For tables of another program or schema, and if a column is missing.
     """
     lock(connection, TABLES)  # two cells may create them at the same moment
     tables = set(sa.inspect(connection).get_table_names())

@@ -1170,7 +1170,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         n : int
             Without effect on stretches of time and on batches.
         **by
-            `seconds`, `start` or `batch` of `stretches_query`: stretches of time, or batches.
+            For periods of time `seconds`, their length, and `start`, when one begins; for batches
+            `batch`, the length or the separators of a batch's name in the parts' numbers. As in
+            `stretches_query`.
 
         Returns
         -------
