@@ -467,7 +467,7 @@ class ForceLimitsGate(nn.Module):
 def convert_trace(
     trace: Any, trace_spec: TraceSpec | None, may_start_over: bool
 ) -> NDArray[np.float32]:
-    """Convert a trace as `as_trace` does, and explain in a TraceError how to start over.
+    """Convert a trace by `as_trace`; where it raises TraceError, explain how to start over.
 
     Parameters
     ----------

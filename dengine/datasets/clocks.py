@@ -456,8 +456,9 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
 
     Parameters
     ----------
-    clock, lines
-        As in `rate_of`.
+    clock : Clock
+    lines : Index
+        Line in the file of each time, for errors.
 
     Raises
     ------

@@ -156,7 +156,7 @@ def import_labelled(
     on_traces : callable, optional
         Called with the number of traces that were just imported.
     allow_import : bool
-        As for `DataEngine.open`.
+        Whether classes of the user that a used store names may be imported.
 
     Returns
     -------

@@ -259,8 +259,8 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
         Regular expression whose one group finds the label in the path. None: the label is at the
         end of the file's name, or of a folder's.
     words : mapping of str to bool
-        As in `label_of`. A number among them is a label of a name that ends in it, and of a folder
-        that has it as name.
+        The user's own words in lower case, and whether they are good. A number among them is a
+        label of a name that ends in it, and of a folder that has it as name.
 
     Raises
     ------
@@ -372,7 +372,9 @@ class LabelColumn:
         self.is_ambiguous = not (means_bad(name) or means_good(name))
 
     def label_of(self, cell: Any) -> int:
-        """Return the label that a cell means; raise as the function `label_of`.
+        """Return the label that a cell means, 1 or 0.
+
+        Raises UnlabelledError for an empty or unchecked cell, UnknownWordError for another word.
 
         If the column's name means the bad outcome, true, yes and 1 give 0 and false, no and 0 give
         1, and a note is made, unless the user's words have one of these. If the name means neither
@@ -839,7 +841,8 @@ def labels_in_file(
 def _label_of_row(row: _LabelRow, column: LabelColumn, where: str) -> SourcedLabel:
     """Return the label that a row's words mean together, with the number of its part.
 
-    Raises as `LabelColumn.find`; the error of an unknown word says where it stands.
+    Raises UnknownWordError, which says where it stands, for a word of unknown meaning, else
+    UnlabelledError if no word is a label yet, or SeveralLabelsError if labels differ.
     """
     try:
         for word in row.labels:
@@ -879,8 +882,9 @@ def _read_label_rows(
 ) -> tuple[list[_LabelRow], list[Fault], str]:
     """Return the rows of a file of labels, file by file, and the faults of its other lines.
 
-    The name of the column of labels comes last. Parameters as in `labels_in_file`. Raises DataError
-    if the file or a column cannot be found.
+    The name of the column of labels comes last. `options` name the columns of labels and parts;
+    `names`, those of recordings, help to find the column of files. Raises DataError if the file
+    cannot be read, or a column cannot be found.
     """
     try:
         table = read_table(Path(path), replace(options, columns=()), as_text=True)

@@ -181,7 +181,8 @@ def write_as_python(
     Raises
     ------
     UnreadableError
-        As `decimal_of`, if the user stated no mark.
+        If the user stated no mark, and the decimal mark is undecided, or groups thousands in one of
+        the columns.
     """
     cell_lists = (frame.iloc[:, i].tolist() for i in range(frame.shape[1]))
     columns = {i: cells for i, cells in enumerate(cell_lists) if is_numeric(cells)}

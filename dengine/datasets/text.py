@@ -415,9 +415,9 @@ def read_recording(
 ) -> TimedTrace:
     """Read the channels of a file that holds one recording, in the order of `channels`.
 
-    `notes` and `decimal` are as in `read_table`. Raises UnreadableError, with the line, for a cell
-    or row that cannot be read, a channel that is not there, and no samples; also as `read_table`
-    and `rows_to_trace`.
+    `notes` is added to; `decimal` is the mark that is taken if the user stated none. Raises
+    UnreadableError, with the line if it is known, for a cell, a row, a clock or a text that cannot
+    be read, a channel that is not there, and no samples.
     """
     table = read_table(path, options, notes, decimal)
     header = list(table.frame.columns)

@@ -202,11 +202,11 @@ class RobotCalls:
         return await self.decide_array(as_samples(trace), request, part)
 
     async def decide_added(self, request: Any, part: Any = "") -> Struct:
-        """Decide on the pieces of a part's trace, and return the struct of `decide`.
+        """Decide on the pieces of a part's trace; return action, id, reason, bounds and version.
 
         A part that has a decision gets it again. A recorded decision drops the pieces; after a
         VERIFY with an empty id they stay, so that the call can be repeated. Raises TraceError
-        without pieces, and as `decide`.
+        without pieces or for a trace, and ReportError for an id, that the engine does not take.
         """
         if (stored := await self._find(request)) is not None:
             return stored
@@ -222,7 +222,7 @@ class RobotCalls:
         return result
 
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
-        """Decide on the insertion since `begin`, and return the struct of `decide`.
+        """Decide on the insertion since `begin`, as recorded.
 
         It waits up to `RECORD_SECONDS` for the recording, which one call uses up. A part that has a
         decision gets it again. Without a recording, as for any part but that of the newest `begin`,
@@ -238,14 +238,15 @@ class RobotCalls:
         Returns
         -------
         struct
-            As of `decide`.
+            action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If the
+            queue is full or the store unavailable, verify with an id "" and the reason "busy".
 
         Raises
         ------
         SettingError
             For a server without a recorder.
         TraceError, ReportError
-            As `decide`.
+            For a trace, or an id, that the engine does not take.
         """
         if self._recorder is None:
             raise SettingError(
@@ -280,10 +281,12 @@ class RobotCalls:
         return int((await self.decide_recorded(request, part))["action"])
 
     async def decide_array(self, trace: ArrayLike, request: Any, part: Any) -> Struct:
-        """Decide on a trace of shape (T,) or (C, T), and return the struct of `decide`.
+        """Decide on a trace of shape (T,) or (C, T); return action, id, reason, bounds and version.
 
         If the queue is full or the store unavailable, that is logged, and the struct is an
-        unrecorded VERIFY with an id "". Raises TraceError and ReportError as `DataEngine.decide`.
+        unrecorded VERIFY with an id "" and the reason "busy". A request "" gets a new id, a part ""
+        means none. Raises TraceError for a trace, and ReportError for an id, that the engine does
+        not take.
         """
         id_ = as_id(request) if request != "" else None
         try:
@@ -305,7 +308,8 @@ class RobotCalls:
         Raises
         ------
         ReportError
-            For a report that contradicts an earlier one, and what is no label.
+            For a report that contradicts an earlier one, unless it is a line stop after a
+            confirmation; and for what is no label.
         """
         if decision_id == "":  # of an unrecorded VERIFY
             return False
@@ -370,7 +374,9 @@ def one_line(text: str) -> str:
 
 
 def _as_struct(decision: Decision) -> Struct:
-    """Return a decision as the struct of `RobotCalls.decide`, its action as an integer."""
+    """Return a decision as a dict of plain types: action (0 verify, 1 accept, 2 reject), id,
+    reason, lower, upper and version.
+    """
     return {
         "action": ACTIONS.index(decision.action),
         "id": decision.id,

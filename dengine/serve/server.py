@@ -115,11 +115,12 @@ def serve(
     say : callable
         Called with a line that says where the server listens, once it does.
     beside : sequence of callable
-        As of `create_app`.
+        Called with the service, each returns an async context that lasts as long as the server; one
+        that fails to start ends it, and its error is raised.
     recorder : callable
-        Opens the recorder for `RobotCalls.decide_recorded`.
+        Opens the recorder of a robot's insertions, or gives None.
     **interfaces : bool
-        `xmlrpc` and `page`, as of `create_app`.
+        `xmlrpc` and `page`: whether they are served beside HTTP.
     host, port, ... : optional
         The options of `dengine serve`, under their names.
 

@@ -208,8 +208,12 @@ class CellService:
 
         Raises
         ------
-        TraceError, ReportError, StoreError
-            As `DataEngine.decide`.
+        TraceError
+            For a wrong shape, a part's number that is none, or an id that belongs to another trace.
+        ReportError
+            For an id that is no id.
+        StoreError
+            If the engine cannot record it.
         BusyError
             If the queue is full or the service is closing; nothing is recorded.
         """
@@ -264,8 +268,11 @@ class CellService:
 
         Raises
         ------
-        ReportError, StoreError
-            As `DataEngine.report`.
+        ReportError
+            For an unknown id, what is no label, and another label than was reported; but a line
+            stop after a confirmation corrects it.
+        StoreError
+            If the label is not known to be on disk: report it again.
         BusyError
             If the queue is full or the service is closing.
         """
