@@ -231,10 +231,11 @@ class MemberEvidence(nn.Module):
         """Count a part's outcome on both sides, choose the thresholds, and end a safe mode if due.
 
         `lower` and `upper` are the bound that the part was decided by, `success` is its label,
-        `predicted` (position in `Action`) what the model alone would have done; for
-        `inclusion_probability` see `count_outcome`. A wrong outcome may raise an alarm, which
-        starts the safe mode. This ends when the side that raised the alarm has an open level
-        again; after too many novel traces, when novel ones are few again and either side has one.
+        `predicted` (position in `Action`) what the model alone would have done, and
+        `inclusion_probability` that with which the outcome would be asked for. A wrong outcome may
+        raise an alarm, which starts the safe mode. This ends when the side that raised the alarm
+        has an open level again; after too many novel traces, when novel ones are few again and
+        either side has one.
         """
         self.count_outcome(0, lower, not success, predicted, inclusion_probability)
         self.count_outcome(1, 1.0 - upper, success, predicted, inclusion_probability)

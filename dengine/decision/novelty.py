@@ -165,7 +165,8 @@ def fit_novelty(
 ) -> NoveltyGate:
     """Fit the gate that takes these traces for usual; there is no randomness.
 
-    At most `REFERENCES` of the traces, evenly spaced in time, become its references.
+    At most `REFERENCES` of the traces, evenly spaced in time, become its references; of these, ones
+    whose features overflow are left out.
 
     Parameters
     ----------

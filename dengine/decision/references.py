@@ -62,7 +62,7 @@ def label_agreement(
     -------
     float
         Upper confidence bound on the intraclass correlation, one-sided at 95 %, from 0 to 1; 1 if
-        fewer than `FEWEST_PARTS` parts came twice.
+        fewer than `FEWEST_PARTS` known parts are among these points at least twice.
     """
     points = points[-SAMPLE:]
     labels = labels[-SAMPLE:]
@@ -95,8 +95,9 @@ def _success_rate_around(
 ) -> NDArray[np.float64]:
     """Return for each point the success rate among the nearest points of other parts, float64 (n,).
 
-    The `N_NEIGHBOURS` nearest are taken, or all if there are fewer. Half a success in one trial is
-    added to the counts: the rate is one half without neighbours.
+    `N_NEIGHBOURS` nearest are taken, or n - 1 if that is less; if other parts have fewer points,
+    some of the point's own part fill the number up. Half a success in one trial is added to the
+    counts: the rate is one half for n = 1. Unknown parts, which have one `part`, are one part.
     """
     from scipy.spatial.distance import cdist
 

@@ -171,7 +171,8 @@ class Baseline(ABC):
         """Return bounds and counts of labels for traces X (n, C, T), as a `BaselinePrediction`.
 
         The last one is cached, and returned again for the same traces until a training or an `add`.
-        Before a training has succeeded the interval is (0, 1), with no labels.
+        Before a training has succeeded the bounds are 0 and 1. Without labels to count, as then,
+        both counts are the integer 0, not arrays.
         """
         traces = as_traces(X)
         key = traces.tobytes()

@@ -208,7 +208,8 @@ def cost_curve(
     dataset : object
         Anything `load_dataset` takes, such as a folder of recordings.
     check, escape, false_reject : float
-        As in `Costs`, in one unit.
+        What a check, a bad part that is accepted and a good part that is rejected cost, in one
+        unit.
     recipe : object, default "conv"
         Anything `Contender.load` takes. Its policy's alpha and lower_bound are replaced.
     alphas, lower_bounds : sequence of float
@@ -358,7 +359,7 @@ def cost_per_part(replay: Replay, costs: Costs, cycles: slice = slice(None)) -> 
     replay : Replay
     costs : Costs
     cycles : slice, default all
-        The cycles by their position, from 0; at least one.
+        The cycles by their position, from 0, without a step; at least one.
 
     Returns
     -------

@@ -1,4 +1,5 @@
 """Pictures as matplotlib figures: of replays, grids, costs, runs, data sets and single decisions.
+Each function returns a figure, and `save` writes it. The command line draws them.
 
     save(curves({"conv": replays}), "out/curves.png")
 
@@ -397,6 +398,7 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
         Of one contender and interval, all equally long.
     title : str, default ""
     window : int, default 300
+        Cycles of the sliding window; at most a third of a replay.
 
     Returns
     -------

@@ -1,4 +1,6 @@
 """Grids of replays over recipes, intervals, alphas and lower bounds, on one machine or a cluster.
+`run_grid` plays one and returns a table; the verb `compare` and `costs` play theirs by
+`grid_tasks` and `iterate_replays`.
 
 >>> run_grid("insertion", ["conv", "umap"], alphas=[0.1], lower_bounds=[0.9], repeats=3, keep="out")
 
@@ -126,7 +128,8 @@ class KeptReplays:
     def get(self, task: Task) -> Replay | None:
         """Read the kept replay of a task; return None if there is none or its file is damaged.
 
-        It has the present name and recipe of the contender. Raises SettingError as `path`.
+        It has the present name and recipe of the contender. Raises SettingError for a reducer that
+        cannot be hashed.
         """
         path = self.path(task)
         try:
@@ -145,7 +148,11 @@ class KeptReplays:
             return None
 
     def put(self, task: Task, replay: Replay) -> None:
-        """Write the finished replay of a task, as a whole or not at all, over an earlier one."""
+        """Write the finished replay of a task, as a whole or not at all, over an earlier one.
+
+        Raises OutputError if it cannot be written, SettingError for a reducer that cannot be
+        hashed.
+        """
         arrays: dict[str, Any] = {}
         values: dict[str, Any] = {}
         for field in fields(replay):
@@ -373,8 +380,11 @@ def grid_tasks(
         Settings of the policy; None leaves one to the recipe.
     seeds : iterable of int
     confirms : sequence of bool
-    cycles, shuffle
-        The same for all tasks; see `Task`.
+        Whether accepted good parts are confirmed.
+    cycles : int or None, default None
+        Parts of each replay; None plays all.
+    shuffle : bool, default True
+        Of all replays; False plays the recorded order.
 
     Returns
     -------

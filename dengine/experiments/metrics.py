@@ -1,5 +1,5 @@
 """Errors and costs of replays: the pooled error rate with its interval, and `Costs`, the prices of
-checks and errors.
+checks and errors. `costs`, `tables` and `Replay.summary` compute with them.
 
 >>> pooled_error(replays).rate, pooled_error(replays).upper     # of the accepted parts, bad ones
 """

@@ -1,8 +1,9 @@
 """Replays as tables: a row for each replay in the CSV, a pooled row for each recipe and policy on
-the screen, and sentences about them.
+the screen, and sentences about them. The verbs `replay` and `compare` print them.
 
-frame = frame_of(replays) Console().print(pooled_table(pool(frame, replays))) # and
-promise_lines(rows)
+    frame = frame_of(replays)
+    rows = pool(frame, replays)
+    Console().print(pooled_table(rows), *promise_lines(rows))
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ def prepare_export(
     ----------
     engine_or_model : DataEngine or ModelPrediction
     trace : TraceSpec or None
-        Another trace contract than the engine's.
+        Another trace contract than the engine's or the model's own.
     path : path-like
         Where the file will be written.
     force : bool

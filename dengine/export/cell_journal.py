@@ -304,9 +304,12 @@ def import_journal(
     Raises
     ------
     DataError
-        Before anything is stored, as of `read_journal`, and for a journal of another model.
+        Before anything is stored, for a file that is no journal, holds no label, or has a line that
+        cannot be read, and for a journal of another model.
     StoreError
         If there is no store, an engine runs on the cell, or the store has no trace contract.
+    OSError
+        If the journal cannot be read.
     """
     with opening(store, must_exist=True) as opened:
         opened.claim_cell()  # an engine that runs would never learn these labels

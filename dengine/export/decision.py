@@ -244,8 +244,9 @@ class DecisionModule(nn.Module):
         """Make an earlier decision, as a journal has it, the pending one again.
 
         The present pending decision is settled first. The trace (T,) or (C, T) is embedded anew,
-        with the fields of the decision as they are given; `predicted` follows from these. A faulty
-        trace leaves none pending. Raises ValueError for another shape.
+        with the fields of the decision as they are given; `part` is a hash, 0 if unknown, and
+        `predicted` follows from the others. A faulty trace leaves none pending. Raises ValueError
+        for another shape.
         """
         x = self.as_trace(trace)
         self.settle()

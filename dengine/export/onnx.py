@@ -77,7 +77,7 @@ def export_onnx(
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
         The trace contract, for a `ModelPrediction` whose traces have another rate or limit than the
-        defaults of `TraceSpec`.
+        defaults of `TraceSpec`. None: the engine's, or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False

@@ -100,7 +100,7 @@ def export_torchscript(
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
         The trace contract, for a `ModelPrediction` whose traces have another rate or limit than the
-        defaults of `TraceSpec`.
+        defaults of `TraceSpec`. None: the engine's, or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
@@ -208,7 +208,7 @@ class ExportedModel:
         Raises
         ------
         TraceError
-            For a wrong shape.
+            For a wrong shape, or a part that is neither a whole number nor a short text.
         """
         x = torch.from_numpy(as_trace(trace, self.trace))
         with torch.inference_mode():
@@ -245,7 +245,7 @@ class ExportedModel:
         Raises
         ------
         TraceError
-            For a wrong shape.
+            For a wrong shape, or a part that is neither a whole number nor a short text.
         ReportError
             For a label that is not True, False, 1 or 0.
         """

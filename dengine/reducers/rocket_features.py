@@ -270,9 +270,9 @@ class RocketEncoder(nn.Module):
     def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
         """Draw the kernels, and set thresholds and widths of ramps from what they give on traces.
 
-        x : Tensor of float32, shape (n, C, T), with scaled channels.
-
-        It writes the buffers `kernel`, `threshold` and, if there are groups, `competing_kernel`.
+        x : Tensor of float32, shape (n, C, T), with channels scaled by `shift` and `scale`, which
+        are set before. It writes the buffers `kernel`, `threshold` and, if there are groups,
+        `competing_kernel`.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)

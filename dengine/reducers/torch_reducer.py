@@ -449,7 +449,7 @@ class TorchReducer(Reducer):
         warm_optimizer()
 
     def untrained_module(self, X: Floats) -> Encoder | None:
-        """Return a module like the one that training on X (n, C, T) leads to; see `Reducer`.
+        """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
 
         After a training it is the present one; before, that of a clone with initial weights. None
         if TorchScript cannot compile the network.

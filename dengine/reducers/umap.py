@@ -240,7 +240,7 @@ class UmapReducer(Reducer):
         X are traces (n, C, T), `numbers` (n,) increasing numbers of their labels; labels and folds
         are not read. `stop` may end the epochs. The layout starts anew without `numbers`, or if
         fewer than half of the traces were in the last training. Returns the layout, float32 (n,
-        n_components). Raises SettingError as of `fit`.
+        n_components). Raises SettingError for a parameter out of its range, or too few traces.
         """
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
@@ -266,7 +266,8 @@ class UmapReducer(Reducer):
         """Search the neighbours of traces X (n, C, T), and keep them for the next training.
 
         It does nothing without the numbers of the traces' labels, by which they are found again.
-        Before the first training it sets shape, seed and frames. Raises SettingError as of `fit`.
+        Before the first training it sets shape, seed and frames. Raises SettingError for a
+        parameter out of its range, or too few traces.
         """
         if numbers is None:
             return
@@ -381,7 +382,7 @@ class UmapReducer(Reducer):
         return torch.cat([self.encoder_(chunk) for chunk in torch.split(traces, CHUNK)]).numpy()
 
     def untrained_module(self, X: Floats) -> UmapEncoder:
-        """Return a module like the one that training on X (n, C, T) leads to; see `Reducer`.
+        """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
 
         After a training it is the present encoder; before, a new one whose references are all 0.
         """
