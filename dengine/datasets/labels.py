@@ -696,7 +696,7 @@ def _labels_in_file(file: str, start: int, words: LabelMap) -> list[_FoundLabel]
 
 
 def _labels_in_folder(folder: str, start: int, words: LabelMap) -> list[_FoundLabel]:
-    """Return a list of the label at the end of a folder's name, or of none.
+    """Return the label at the end of a folder's name in a list, which is empty without one.
 
     The name begins at `start` of the path.
     """

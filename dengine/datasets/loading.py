@@ -306,9 +306,10 @@ def _read_store(path: Path, name: str, options: LoadOptions) -> Dataset:
 def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
     """Read archives: `X`, `y`, and the other arrays of `ARRAYS` that are there.
 
-    Without an `X` the channels are arrays (n, T) by their names. Several archives are of one form,
-    or hold different arrays of one set. If only another axis is as long as the labels, it is the
-    axis of the parts. Raises DataError if arrays are missing or do not fit together.
+    Without an `X` the channels are arrays (n, T) by their names. A file of labels goes before `y`,
+    which must not contradict it. Several archives are of one form, or hold different arrays of one
+    set. If only another axis is as long as the labels, it is the axis of the parts. Raises
+    DataError if arrays are missing or do not fit together.
     """
     label = label_column = options.label or "y"
     arrays, all_names = _read_archives(named, options)
@@ -560,7 +561,7 @@ def _from_list(traces: list[Any], labels: list[Any], options: LoadOptions) -> Da
     """Make a data set of a list of arrays, Series or DataFrames of any length.
 
     A trace that cannot be read, or has other channels than the first, becomes a fault. Raises
-    DataError if there are not as many labels, or as `as_dataset`.
+    DataError if there are not as many labels, or no trace is left.
     """
     one_each = len(traces) == len(labels)
     expect_data(one_each, f"a label for each of {len(traces)} traces", len(labels))

@@ -108,7 +108,7 @@ def hold_many(named: Mapping[str, Path], options: LoadOptions) -> bool:
     """Return whether each file of a folder is a table of many insertions, and not one recording.
 
     Parquet and .npz files are such tables; of text files the names and columns tell. Raises
-    DataError if these cannot be decoded.
+    DataError for text files in another encoding.
     """
     path = next(iter(named.values()))
     if path.suffix.lower() not in TEXTS:
@@ -267,8 +267,8 @@ def _verdict_columns(named: Mapping[str, Path], options: LoadOptions) -> list[st
     """Return the columns of a folder's files that tell labels.
 
     They have the name of a label and labels in them, or any name and one verdict in the first rows
-    of each file, good in some and bad in others. A number or yes is a verdict if the column's name
-    says of what.
+    of each file, good in some and bad in others. A number or yes is a verdict only if the column's
+    name means the bad outcome, or is `ok`.
     """
     sample = list(named)[:: max(len(named) // TRIED, 1)]
     usual = _usual_label_columns(named, options)
@@ -344,8 +344,8 @@ def _look_like_labels(counts: Counter[Any]) -> bool:
 def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOptions) -> str | None:
     """Return advice, for an error, to give a file of labels that is in the folder.
 
-    Such a file names other files in its last line, and has labels for most recordings. None if
-    there is none.
+    Such a file names other files in the last of its first 100 lines, and has labels for most
+    recordings. None if there is none.
     """
     stems = {path.stem.lower() for path in named.values()}
     for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in TEXTS):
@@ -438,7 +438,7 @@ def _usual_channels(
 ) -> tuple[str, ...]:
     """Return `FZ_Base` if a file has it or none has channels, else the only channel of most files.
 
-    Raises DataError if most files have several channels.
+    Raises DataError if the most frequent choice of channels is of several, or of none.
 
     label_columns : the columns that tell labels, which are no channels.
     """
@@ -557,7 +557,9 @@ def _from_tables(
 
 
 def _check_columns(frame: pd.DataFrame, source: str) -> None:
-    """Raise DataError if a column of a table holds lists, or two columns have one name."""
+    """Raise DataError if a column of a table holds lists, by its first cell, or two columns have
+    one name.
+    """
     for name in frame.columns:
         is_single = (frame.columns == name).sum() == 1 and len(frame) > 0
         if is_single and isinstance(frame[name].iloc[0], list | tuple | np.ndarray):
@@ -805,7 +807,8 @@ def _order_by_time(
     """Return the parts in the order of their first times, if these are dates and no parts overlap;
     else in that of the rows.
 
-    If the two orders differ, a note says which it is, unless the times are no dates and overlap.
+    If the two orders differ, a note says which it is, unless the times are no dates and overlap, or
+    one is not known.
     """
     starts = {part: rows[SECONDS_COLUMN].min() for part, rows in rows_of_part.items()}
     ends = {part: rows[SECONDS_COLUMN].max() for part, rows in rows_of_part.items()}
@@ -1017,7 +1020,8 @@ def _numbered_columns(names: Iterable[str]) -> dict[str, list[tuple[int, str]]]:
 def _sample_columns(names: list[str], options: LoadOptions) -> dict[str, list[str]]:
     """Return the columns of each channel of a wide table, in the order of their numbers.
 
-    Raises DataError if there are none, if a number is missing, for what comes after it would be
+    The channels are those that the user stated, else the force, else the only one. Raises DataError
+    if one is not there or must be named, if a number is missing, for what comes after it would be
     shifted, or if the channels have different numbers of samples.
     """
     channels = {

@@ -157,8 +157,8 @@ class TokenUsers(UserManager):
     ) -> User | None:
         """Return the user of a new session, who may read and call; or None to refuse the session.
 
-        None for a wrong user name or token, and without a certificate where the server encrypts.
-        Without tokens everybody is let in.
+        None without a certificate where the server encrypts, and for a wrong user name or token,
+        where it has tokens.
         """
         if self._encrypted and not certificate:
             return None
@@ -301,8 +301,9 @@ class AddressSpace:
         self._events.event.SourceName = CELL
 
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
-        """Decide on a flat trace, channel after channel, and return the values of `DECIDE_RESULTS`
-        in order.
+        """Decide on a flat trace, channel after channel.
+
+        Returns a list of action (0 verify, 1 accept, 2 reject), id, reason, lower, upper, version.
 
         If the queue is full or the store unavailable, the result is VERIFY with an empty id. Raises
         SettingError for an empty trace, one that the channels do not divide, and more than
