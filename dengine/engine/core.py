@@ -453,9 +453,9 @@ class EngineCore:
         A version that the executor has trained is brought to its end, so that it answers or is
         dropped; with `brief`, in a cell that learns alone, it comes only one step further, a few
         milliseconds. A retrain that is due begins in the executor, or without one runs here.
-        Returns the report of the newest finished retrain (dropped ones, rollbacks, changes of the
-        policy, and those that `report` or `retrain` returned are among them), or None if this
-        method has returned it.
+        Returns the newest report, of a retrain that was accepted or dropped, a rollback or a new
+        policy; None if this method has returned it before. `report` and `retrain` may have returned
+        it, too.
         """
         with self.exclusive:
             self.learner.collect(to_the_end=not brief)

@@ -86,7 +86,8 @@ def add_labels_since(
 
     They are at most as many as `window` holds, and end with the window's newest label. Corrections
     that came meanwhile are applied in the same order as then, so that the model is the same bit for
-    bit. Returns the number of the newest correction in the store.
+    bit. A baseline, which cannot be corrected, gets the labels as they count now. Returns the
+    number of the newest correction in the store.
     """
     corrected_to = newest_correction(version)
     # A baseline cannot be corrected afterwards, so it gets each label as it was when the version

@@ -217,9 +217,9 @@ class EngineSettings:
 
         `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. All
         settings of a recipe in it are compared. The shadow mode is not, nor are force limits that
-        the program leaves out, because an operator sets both. A reducer that is an object is not
-        compared here, nor are its parameters. Beside a baseline only `LOOP_SETTINGS` are compared.
-        An unknown name is an error, too.
+        the program leaves out, because an operator sets both. Nor is a reducer that is an object,
+        with its parameters, nor a trace contract where none is set. Beside a baseline only
+        `LOOP_SETTINGS` are compared. An unknown name is an error, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)

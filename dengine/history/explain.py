@@ -235,7 +235,7 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     -------
     DecisionRule or None
         None before the first version, and if its rule cannot be restored from what is stored: its
-        state is not kept or is stale, or its class is not imported.
+        state is not kept (a peer's never is) or is stale, or its class is not imported.
     """
     stored = store.last_version()
     settings = store.settings()

@@ -657,7 +657,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Commit a retrain, and delete the states of older versions that are no longer kept.
 
         A store in memory without a product keeps the arrays as they are, and writes them when it is
-        next read.
+        next read, or when 40 wait.
 
         Parameters
         ----------
@@ -1255,7 +1255,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _write_memory(self) -> None:
         """Write the versions and records that a store in memory was given to its database.
 
-        It is called before every read; a replay, which reads nothing, never calls it.
+        It is called before every read and most writes; a replay, which reads nothing, never calls
+        it.
         """
         self._write_versions()
         unwritten = self._unwritten
