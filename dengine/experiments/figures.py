@@ -180,19 +180,20 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
 
 
 def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure:
-    """Draw where the newest parts of a replay lie: left by their label, right by their decision.
+    """Draw where the newest parts of a replay lie: left by their truth, right by their decision.
 
     Each part is drawn where it lay when it was decided, though each retrain moves the map; those
-    that no model embedded are left out. The first two dimensions are drawn, the mean over the
-    spaces. The circle is the neighbourhood of the newest part, with the recipe's radius. Units are
-    equal on both axes, unless the first dimension is a probability: then the second is only for the
-    eye, and the circle is cut off above and below.
+    that no model embedded are left out, on the left also those of unknown truth. The first two
+    dimensions are drawn, the mean over the spaces. The circle is the neighbourhood of the newest
+    part drawn, with the recipe's radius. Units are equal on both axes, unless the first dimension
+    is a probability: then the second is only for the eye, and the circle is cut off above and
+    below.
 
     Parameters
     ----------
     replay : Replay
     last : int, default 300
-        How many parts are drawn.
+        How many parts are drawn, at most.
     title : str, default ""
 
     Returns

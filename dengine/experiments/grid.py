@@ -246,7 +246,7 @@ def iterate_replays(
     keep: Folder | None = None,
     on_cycle: Any = None,
 ) -> Iterator[PlayedReplay]:
-    """Play tasks and yield each replay as soon as it is finished; nothing runs before the first.
+    """Play tasks and yield each replay as soon as it is finished, in the order of their ends.
 
     Tasks are played seed by seed, so that what an interrupted run has finished can be compared.
     Replays that were kept by an earlier run come first.

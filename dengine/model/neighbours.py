@@ -350,9 +350,10 @@ class ModelPrediction(EngineModel):
         return replace(report, note="; ".join(filter(None, (report.note, self._note))))
 
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
-        """Train the reducer from scratch, and make every trace a reference.
+        """Train the reducer from scratch, and make the traces the references.
 
-        Scales and novelty gate are computed anew as well. The rule stays as it is.
+        Of more traces than the classifier's capacity the last become references. Scales and novelty
+        gate are computed anew as well. The rule stays as it is.
 
         Parameters
         ----------
@@ -694,7 +695,8 @@ class ModelPrediction(EngineModel):
         """Count the labels in the neighbourhood of each trace of X, summed over the K spaces.
 
         X has the shape (n, samples) or (n, channels, samples). Returns (n_success, n_failure), each
-        an array of int64, shape (n,); 0 for a novel trace. No part is excluded.
+        an array of int64, shape (n,); 0 for a novel trace. No part is excluded, so a reference
+        counts itself. Raises RuntimeError where the rule is stale.
         """
         predictions = self.predict_many(X)
         n_success = np.array([prediction.n_success for prediction in predictions], dtype=np.int64)
@@ -705,7 +707,7 @@ class ModelPrediction(EngineModel):
         """Return (lower, upper), each float64 (n,): the bounds of each trace's success probability.
 
         X has the shape (n, samples) or (n, channels, samples). The bound is (0, 1) for a novel
-        trace.
+        trace. Raises RuntimeError where the rule is stale.
         """
         predictions = self.predict_many(X)
         lower = np.array([prediction.lower for prediction in predictions])

@@ -82,7 +82,7 @@ def make_reducer(name: str, **params: Any) -> Any:
         A name in `REDUCERS`, or `module:Class`.
     **params
         Parameters of its class. Only for names in `REDUCERS` are types checked here, and that
-        integers have at most 32 bits; the ranges of single parameters are checked by `fit`.
+        integers have at most 32 bits; narrower ranges are checked when it is fitted.
 
     Returns
     -------
