@@ -258,10 +258,10 @@ class MemberEvidence(nn.Module):
         Side 0 is accepting, with the lower bound as score; side 1 is rejecting, with 1 - upper
         bound. `wrong` says whether the side's action would have been wrong. If the score reaches
         the threshold, the drift detector of the side takes a step first, which may start the safe
-        mode. The levels that the score reaches, and the members if it is one, count the part only
-        if its outcome was asked for (`inclusion_probability` > 0) or all outcomes are known. A
-        member reaches the target level, or the model was certain of it (`predicted` is the side's
-        action). No threshold is chosen if the part is counted nowhere.
+        mode. Then all levels that the score reaches count the part, and the members do if it
+        reaches the target level or `predicted` is the side's action. A part whose outcome was not
+        asked for (`inclusion_probability` 0) is only counted if all outcomes are known. No
+        threshold is chosen if the part is counted nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)

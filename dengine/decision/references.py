@@ -203,6 +203,8 @@ class RadiusIndex(nn.Module):
     def put(self, point: Tensor, label: float, space: int, part: int = 0) -> None:
         """Add one point; in a full index it replaces the oldest.
 
+        The slot's entry in `numbers` stays as it is; `add_one` sets it.
+
         Parameters
         ----------
         point : Tensor of float32, shape (d,)

@@ -113,7 +113,7 @@ def fit_window(window: int, replays: Sequence[Replay]) -> int:
 
 
 def blank(width: float, height: float, title: str = "") -> Figure:
-    """Return an empty figure; width and height in inches."""
+    """Return an empty figure with a title; width and height are in inches."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")

@@ -739,7 +739,8 @@ class ModelPrediction(EngineModel):
 
         Trace shape, references and scale are always there; "reducer.", "rule." and "novelty." begin
         the names of what these parts have. An enabled novelty gate is there, a disabled one not. A
-        stale rule is not there, but "rule_is_stale" is. AttributeError before the first training.
+        stale rule is not there, but "rule_is_stale" is. Scale and reducer may be views. Raises
+        AttributeError before the first training.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()

@@ -634,7 +634,8 @@ class RocketReducer(Reducer):
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
         They are shape, counters, losses, the towers and, after "net.", the module's tensors. The
-        cache of features is not among them. Raises NotFittedError before a fit.
+        cache of features is not among them. Losses and towers are not copies. Raises NotFittedError
+        before a fit.
         """
         check_is_fitted(self, "net_")
         counts = [self.average_, self.n_fits_, self.n_component_traces_, self.n_iter_]
@@ -675,8 +676,8 @@ class RocketReducer(Reducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        Sizes are integers of at least 1, except groups (0 to 64); regions are at most 16,
-        n_components 1 or 2, folds at least 2, and l2 is above 0.
+        Sizes and max_iter are integers of at least 1, except groups (0 to 64); regions are at most
+        16, n_components 1 or 2, folds at least 2, and l2 is above 0.
         """
         integers = (
             "n_components",

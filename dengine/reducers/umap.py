@@ -422,8 +422,8 @@ class UmapReducer(Reducer):
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
         They are shape, counters, and of the last training numbers, frames, neighbours, distances
-        and points. Neighbours that `precompute` found are not among them. Raises NotFittedError
-        before a fit.
+        and points, not all of them copies. Neighbours that `precompute` found are not among them.
+        Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]
