@@ -219,7 +219,8 @@ class EngineSettings:
         settings of a recipe in it are compared. The shadow mode is not, nor are force limits that
         the program leaves out, because an operator sets both. Nor is a reducer that is an object,
         with its parameters, nor a trace contract where none is set. Beside a baseline only
-        `LOOP_SETTINGS` are compared. An unknown name is an error, too.
+        `LOOP_SETTINGS`, which have an effect on any model, are compared. An unknown name is an
+        error, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -390,7 +391,8 @@ def check_model_settings(reducer: Any, given: Mapping[str, Any]) -> None:
     """Raise SettingError for settings that have no effect beside a model that is handed in.
 
     `given` holds settings by name. Without effect are radius, folds, reducer, and a policy that
-    differs from the default in more than `BASELINE_SETTINGS`.
+    differs from the default in more than `BASELINE_SETTINGS`: audit_rate, stops, label_within,
+    windows and shadow.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:
