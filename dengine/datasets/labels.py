@@ -860,20 +860,29 @@ def listing_to_trust(file: str, column: str) -> str:
 
 
 def read_ordered_labels(
-    path: str | os.PathLike[str], options: LoadOptions
+    path: str | os.PathLike[str], options: LoadOptions, keys: Mapping[str, Sequence[str]]
 ) -> tuple[list[str], str]:
-    """Return the label words of a file that lists the traces of an array in their order.
+    """Return the label words of a file that lists the traces of an array, in the traces' order.
 
-    The name of their column comes second. Raises DataError if the file cannot be read, or its rows
-    are numbered in another order.
+    Its rows are numbered in that order, or name each trace by one of the `keys`. The name of the
+    column of labels comes second. Raises DataError if the file cannot be read, or its rows are in
+    an order that is not known.
+
+    keys : texts of each trace, as serial numbers, by the names of their arrays.
     """
     rows, faults, column = _read_label_rows(path, options)
-    numbers = [int(row.file) for row in rows if row.file.isdecimal()]
-    in_order = not numbers or numbers == list(range(numbers[0], numbers[0] + len(rows)))
-    in_order = in_order and all(len(row.lines) == 1 for row in rows)
+    label_of_key = {row.file: row.labels[0] for row in rows if len(row.lines) == 1}
+    for texts in keys.values():
+        if len(texts) == len(rows) and set(texts) == set(label_of_key):
+            return [label_of_key[text] for text in texts], column
+    numbers = [int((re.findall(r"\d+", row.words[0]) or [-1])[-1]) for row in rows]
+    in_order = numbers == list(range(numbers[0], numbers[0] + len(rows))) if numbers else False
+    in_order = in_order and len(label_of_key) == len(rows)
     if faults or not in_order:
-        actual = faults[0] if faults else numbers[:9]
-        raise DataError(f"Expected a label of each trace in {path}, in their order, got {actual}.")
+        actual = faults[0] if faults else [row.file for row in rows[:9]]
+        wanted = f"a label of each trace in {path}, numbered in their order"
+        do = f" or by an array of them ({listed(keys)})" if keys else ""
+        raise DataError(f"Expected {wanted}{do}, got {actual}.")
     return [row.labels[0] for row in rows], column
 
 

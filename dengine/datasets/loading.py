@@ -315,7 +315,8 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
     arrays, all_names = _read_archives(named, options)
     if options.labels is not None:
         label = "y"
-        label_words, label_column = read_ordered_labels(options.labels, options)
+        keys = _keys_of_traces(_read_archives(named, options, every=True)[0])
+        label_words, label_column = read_ordered_labels(options.labels, options, keys)
         if label in arrays and options.label is None:
             _check_same_labels(arrays[label], label_words, label_column, options)
         arrays[label] = np.array(label_words)
@@ -464,6 +465,12 @@ def _check_same_labels(
         raise DataError(f"Expected {wanted}, traces {listed(rows)} have others; {do}.")
 
 
+def _keys_of_traces(arrays: Mapping[str, NDArray[Any]]) -> dict[str, list[str]]:
+    """Return the arrays of an archive that may name its traces, as texts that differ."""
+    texts = {name: list(map(str, x.tolist())) for name, x in arrays.items() if x.ndim == 1}
+    return {name: words for name, words in texts.items() if len(set(words)) == len(words) > 1}
+
+
 def _missing_arrays(named: Files, options: LoadOptions) -> str:
     """Return the message of an error: the arrays X and y are missing, and which could be them.
 
@@ -481,7 +488,8 @@ def _missing_arrays(named: Files, options: LoadOptions) -> str:
     elif traces:
         for path in sorted(next(iter(named.values())).parent.glob("*.csv")):
             with suppress(DataError):
-                if not label and len(read_ordered_labels(path, options)[0]) in lengths:
+                keys = _keys_of_traces(arrays)
+                if not label and len(read_ordered_labels(path, options, keys)[0]) in lengths:
                     label = f"labels={str(path)!r}, in the order of the traces"
     shapes = ", ".join(f"{name} {arrays[name].shape}" for name in all_names) or "none"
     channel = "" if "X" in all_names or not traces else f"channel={traces[0]!r} and "

@@ -59,7 +59,9 @@ NUMBER_LAST = re.compile(r"(?P<channel>.*?)[_\-. \[]*(?P<number>\d+)\]?")  # FZ_
 NUMBER_FIRST = re.compile(
     r"[A-Za-z]{0,6}[_\-. ]?(?P<number>\d+)[_\-. ]+(?P<channel>\D.*)"
 )  # s000_fz
-SECONDS_COLUMN = "\0seconds"  # added to a long table; no file has this name
+# Added to a long table; no file has these names.
+SECONDS_COLUMN = "\0seconds"
+RUN_COLUMN = "\0run"  # number of the rows of a part that stand together and in the order of time
 MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered ones
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 TRIED = 20  # recordings, on which advice about a column is tried
@@ -545,7 +547,7 @@ def _from_tables(
             raise DataError(f"Expected {wanted}, only one of them has {differing}.")
     if options.time is not None or options.labels is not None:
         column_units = dict(zip(tables[first].columns, units_row, strict=False))
-        frame = _concatenate_long(tables, options)
+        frame = _concatenate_long(_without_repeated_parts(tables, options, collector), options)
         return _from_long(frame, options, collector, first, column_units)
     if advice := _long_table_advice(tables[first], options, collector.label_file):
         columns = listed(tables[first].columns)
@@ -605,6 +607,7 @@ def _add_wide_rows(
     values, wrong = parse_numbers(frame[all_columns])
     traces = values.reshape(len(frame), len(columns), -1)
     collector.channels = tuple(filter(None, columns))
+    _check_single_signal(frame, others, options)
     label_cells = [
         labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
     ]
@@ -628,6 +631,50 @@ def _add_wide_rows(
     words = zip(*(frame[name].tolist() for name in label_columns), strict=True)
     for row in zip(frame.index, traces, words, parts, strict=True):
         collector.add(source, partial(read, *row), row[0])
+
+
+def _check_single_signal(frame: pd.DataFrame, names: Sequence[str], options: LoadOptions) -> None:
+    """Raise DataError if each part has a row for each of a few texts of a column, its signals.
+
+    names : columns that are no labels and no parts' numbers.
+    """
+    if options.part not in frame or not frame[options.part].duplicated().any():
+        return
+    for name in names:
+        texts = frame[name].nunique()
+        if not 2 <= texts <= MAX_STATIONS or not floats(frame[name])[1]:
+            continue
+        counts = frame.groupby(options.part)[name].agg(["nunique", "size"])
+        if (counts == texts).all(axis=None):
+            values = listed(frame[name].unique())
+            wanted = f"a row for each part, a part has one for each {name} ({values})"
+            raise DataError(f"Expected {wanted}; keep the rows of one in the table.")
+
+
+def _without_repeated_parts(
+    tables: Mapping[str, pd.DataFrame], options: LoadOptions, collector: RecordingCollector
+) -> dict[str, pd.DataFrame]:
+    """Return long tables without the parts that an earlier one has with equal rows and dates.
+
+    So they count once if two exports overlap; a note of the collector says how many do.
+    """
+    import pandas as pd
+
+    seen = set[tuple[str, bytes]]()
+    result = dict(tables)
+    for source, frame in tables.items() if len(tables) > 1 else ():
+        time = _time_column(frame, options)
+        if options.part not in frame or time not in frame or not holds_dates(frame[time]):
+            continue
+        hashes = pd.util.hash_pandas_object(frame.astype(str), index=False)
+        groups = hashes.groupby(frame[options.part].astype(str).to_numpy(), sort=False)
+        contents = {str(part): (str(part), rows.to_numpy().tobytes()) for part, rows in groups}
+        repeated = [part for part, content in contents.items() if content in seen]
+        seen.update(contents.values())
+        result[source] = frame[~frame[options.part].astype(str).isin(repeated)]
+        text = "Parts are in two files with equal rows and times: they count once"
+        collector.notes.update(dict.fromkeys([text] * bool(repeated), len(repeated)))
+    return {source: frame for source, frame in result.items() if len(frame)}
 
 
 def _concatenate_long(tables: Mapping[str, pd.DataFrame], options: LoadOptions) -> pd.DataFrame:
@@ -683,7 +730,9 @@ def _from_long(
     numeric = [name for name in others if not floats(frame[name])[1]]
     collector.channels = _choose_channels(numeric, options)
     seconds, *_ = seconds_of(frame[time], time, column_units.get(time, ""))
-    with_seconds = frame.assign(**{SECONDS_COLUMN: seconds})
+    part = frame[options.part]
+    is_new = (part != part.shift()).to_numpy() | np.r_[False, np.diff(seconds) < 0]
+    with_seconds = frame.assign(**{SECONDS_COLUMN: seconds, RUN_COLUMN: np.cumsum(is_new)})
     groups = with_seconds.groupby(options.part, sort=False)
     rows_of_part = {str(part): rows for part, rows in groups}
     no_stations = {options.part, time, *label_columns, *collector.channels}
@@ -695,24 +744,33 @@ def _from_long(
 
     def read(rows: pd.DataFrame) -> TimedTrace:
         """Return the rows of a part as a trace, in the order of their times."""
-        rows = rows.sort_values(SECONDS_COLUMN, kind="stable").drop(columns=SECONDS_COLUMN)
+        rows = rows.sort_values(SECONDS_COLUMN, kind="stable")
+        rows = rows.drop(columns=[SECONDS_COLUMN, RUN_COLUMN])
         units_row = [column_units.get(name, "") for name in rows.columns]
         timed = rows_to_trace(rows, places, read_options, collector.notes, units_row)
         channels = collector.channels
         channel_units = (column_units.get(name) or units.split(name)[1] for name in channels)
         return timed._replace(units=tuple(channel_units))
 
-    sources = [_labels_of_parts(rows_of_part, name, options) for name in label_columns]
-    if options.labels is not None:
-        parts = list(rows_of_part)
-        listing = labels.labels_in_file(options.labels, parts, replace(options, part="part"))
-        sources.insert(0, listing)
-        do = listing.trust
-    else:
-        do = f"name the column to trust: label={label!r}"
-    label_source = labels.labels_that_agree(sources[0], sources[1:], do)
+    label_source = _label_source_of_parts(rows_of_part, label_columns, options)
     labels.collect_recordings(rows_of_part, read, label_source, collector)
     return as_dataset(collector, options)
+
+
+def _label_source_of_parts(
+    rows_of_part: Mapping[str, pd.DataFrame], label_columns: Sequence[str], options: LoadOptions
+) -> labels.LabelSource:
+    """Return the source of the labels of a long table: a file of labels, or the first column.
+
+    The other columns of labels are compared with it.
+    """
+    sources = [_labels_of_parts(rows_of_part, name, options) for name in label_columns]
+    do = f"name the column to trust: label={(*label_columns, '')[0]!r}"
+    if options.labels is not None:
+        listed_by = replace(options, part="part")
+        sources.insert(0, labels.labels_in_file(options.labels, list(rows_of_part), listed_by))
+        do = sources[0].trust
+    return labels.labels_that_agree(sources[0], sources[1:], do)
 
 
 def _labels_of_parts(
@@ -773,6 +831,12 @@ def _check_single_station(rows_of_part: Mapping[str, pd.DataFrame], columns: Seq
                 wanted = f"one recording for each part, part {part} has several values of {name}"
                 do = f"make the parts' numbers unique, as {name} and number in one column"
                 raise DataError(f"Expected {wanted} ({values}) at the same time; {do}.")
+        runs = rows.groupby(RUN_COLUMN)
+        if 2 <= runs.ngroups <= MAX_STATIONS and _are_stations(rows, RUN_COLUMN):
+            lines = listed(run.index[0] for _, run in runs)
+            wanted = f"one recording for each part, part {part} begins in lines {lines}"
+            do = "make the parts' numbers unique"
+            raise DataError(f"Expected {wanted}, at the same times; {do}.")
 
 
 def _are_stations(rows: pd.DataFrame, name: str) -> bool:

@@ -1202,3 +1202,50 @@ def test_a_file_name_of_macos_is_the_same_text(small: Dataset, tmp_path: Path) -
         write_csv(tmp_path / f"{i}_{word}.csv", small.X[i])
     data = load_dataset(tmp_path, label_map="godk\u00e4nd=good,ej_godk\u00e4nd=bad")
     assert data.y.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("rate_hz", [None, 250.0])
+@pytest.mark.parametrize("offset", [0.0, 0.001])
+def test_a_part_whose_times_begin_again_is_refused(
+    rate_hz: float | None, offset: float, small: Dataset
+) -> None:
+    table = long_table(small, lambda i: offset * (i // 12))
+    table["part"] = (table["part"] - 1) % 12 + 1
+    with pytest.raises(DataError, match="part 1 begins in lines 1, 601, at the same times; make"):
+        load_dataset(table, time="time", rate_hz=rate_hz)
+
+
+def test_a_part_in_two_exports_counts_once(small: Dataset, tmp_path: Path) -> None:
+    stamp = pd.Timestamp("2026-03-01 06:00")
+    table = long_table(
+        small, lambda i: stamp + i * pd.Timedelta(minutes=1), pd.Timedelta(milliseconds=4)
+    )
+    table[table["part"] <= 15].to_csv(tmp_path / "a.csv", index=False)
+    table[table["part"] > 10].to_csv(tmp_path / "b.csv", index=False)
+    data = load_dataset(tmp_path, time="time")
+    np.testing.assert_array_equal(data.X, small.X)
+    text = "Parts are in two files with equal rows and times: they count once (5 times)."
+    assert text in data.notes
+
+
+def test_labels_of_an_archive_are_joined_by_its_serial_numbers(
+    small: Dataset, tmp_path: Path
+) -> None:
+    serial = np.array([f"SN{7 * i % 24:02d}" for i in range(24)])
+    np.savez(tmp_path / "x.npz", X=small.X, serial=serial)
+    table = pd.DataFrame({"serial": serial, "label": words(small)}).sort_values("label")
+    table.to_csv(tmp_path / "l.csv", index=False)
+    data = load_dataset(tmp_path / "x.npz", labels=tmp_path / "l.csv")
+    np.testing.assert_array_equal(data.y, small.y)
+    np.savez(tmp_path / "x.npz", X=small.X)
+    with pytest.raises(DataError, match=r"numbered in their order, got \['SN"):
+        load_dataset(tmp_path / "x.npz", labels=tmp_path / "l.csv")
+
+
+def test_a_wide_table_with_a_row_for_each_signal_is_refused(small: Dataset) -> None:
+    table = wide(small).assign(part=np.arange(24))
+    both = pd.concat([table.assign(axis="FX"), table.assign(axis="FZ")])
+    with pytest.raises(DataError, match=r"a part has one for each axis \(FX, FZ\); keep the rows"):
+        load_dataset(both)
+    again = pd.concat([table, table.iloc[:5]]).assign(shift=["a", "b"] * 14 + ["a"])
+    assert len(load_dataset(again)) == 29
