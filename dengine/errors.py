@@ -85,8 +85,8 @@ def listed(names: Iterable[Any]) -> str:
 def as_options(text: str) -> str:
     """Return a message in which Python's arguments are written as options of the command line.
 
-    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`; so do the arguments named in
-    `OPTIONS` alone, and the rest stays.
+    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`. Arguments that are not in
+    `OPTIONS`, and the rest of the text, stay.
     """
 
     def to_option(match: re.Match[str]) -> str:

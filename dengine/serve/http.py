@@ -371,7 +371,8 @@ class HttpApi:
         """Return counts of the decisions in stretches, oldest first, and the retrains and safe
         modes meanwhile.
 
-        A stretch is a shift, a batch, or without these a share of the decisions.
+        A stretch is a shift, a batch, or without these a share of the decisions, 20 or more, the
+        newest perhaps fewer. The newest 120 stretches are returned.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,
@@ -386,8 +387,10 @@ class HttpApi:
         return response_fields("Course", course)
 
     async def embedding(self) -> Json:
-        """Return where the newest 250 labelled parts and the newest 10 decided ones lie in the
-        model's embedding, in two dimensions; nothing before the first version.
+        """Return where parts lie in the model's embedding, in two dimensions.
+
+        They are the newest 250 references, and those of the newest 10 decisions that the present
+        version made; none before the first version.
         """
         engine = self.service.engine
         parts = await self.service.read(

@@ -379,9 +379,9 @@ class FakeController(AbstractContextManager["FakeController"]):
         """Carry out one request of a client, and send the response if the protocol has one.
 
         Text is ignored, and data sets `inputs`; neither has a response. The others are: declare
-        outputs or inputs, start (packages are sent until the next request), pause, and ask for
-        versions. What is in `refuses`, and an input of another client, is refused. A malformed
-        request raises one of `FOREIGN`.
+        outputs or inputs, start (packages are sent until the next of these requests), pause, and
+        ask for versions. What is in `refuses`, and an input of another client, is refused. A
+        malformed request raises one of `FOREIGN`.
         """
         is_allowed = type_ not in self.refuses
         match type_:
