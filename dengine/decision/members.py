@@ -46,10 +46,10 @@ FEW_NOVEL = 25.0  # traces in a row that are not novel; a novel one takes back 1
 
 
 def max_recent_errors(tolerance: float) -> int:
-    """Return the smallest k such that more than k of `N_RECENT` outcomes are rarely wrong.
+    """Return the smallest k for which more than k of `N_RECENT` outcomes are unlikely to be wrong.
 
-    The probability of that is at most `TAIL_PROBABILITY` if each outcome is wrong with the
-    probability `tolerance`, independently.
+    More are wrong with a probability of at most `TAIL_PROBABILITY` if each outcome is wrong with
+    the probability `tolerance`, independently.
     """
     tail = 1.0
     k = -1
@@ -315,7 +315,7 @@ class MemberEvidence(nn.Module):
 
         `safe_mode` is the position of the reason in `SAFE_MODES`. The detectors and the counts
         since the last alarm restart at 0, and the target is the strictest level again. The counts
-        over all time stay.
+        over all time, and the newest errors of each level, stay.
         """
         self.detector_sums.zero_()
         self.member_counts_since_alarm.zero_()
