@@ -344,8 +344,8 @@ class RocketReducer(Reducer):
     ) -> Floats:
         """Fit the heads from their present weights; the kernels stay those of the first training.
 
-        X are traces (n, C, T); y, folds and numbers, each (n,), their labels 1 or 0, folds, and the
-        labels' numbers, by which features are found in the cache of the last call; `stop` may end
+        X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. By `numbers`
+        (n,), those of the labels, features are found in the cache of the last call. `stop` may end
         the Newton steps. Of more than 4000 traces the heads read 4000. Returns the points of all
         traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20
         traces, and if the traces outside a fold have a single class.
@@ -563,7 +563,8 @@ class RocketReducer(Reducer):
         """Return the raw features (n, P) of traces (n, C, T), from the cache where they are in it.
 
         `numbers` (n,), increasing, identify the traces. The cache then holds the traces of these
-        numbers and no others. Without numbers it is neither read nor written.
+        numbers and no others, and is what is returned, not a copy. Without numbers it is neither
+        read nor written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
@@ -615,7 +616,8 @@ class RocketReducer(Reducer):
     def embed(self, X: ArrayLike) -> Floats:
         """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
-        Raises NotFittedError before a fit, TraceError for traces of another shape.
+        Raises NotFittedError before a fit, ValueError for traces of another shape and for values
+        that are not finite.
         """
         traces = self.check_traces(X)
         with torch.inference_mode():

@@ -155,7 +155,7 @@ class RocketEncoder(nn.Module):
     def raw_features(self, x: Tensor) -> Tensor:
         """Raw traces (B, C, T) -> features (B, P) of both towers, tower 1 first, before scaling.
 
-        `scale_features` standardises them.
+        Without groups tower 1 is alone. `scale_features` standardises the features.
         """
         values = self.read_taps(self.average_samples(x))
         n_dense = self.n_dense_taps
@@ -253,8 +253,8 @@ class RocketEncoder(nn.Module):
         """Set the scales of the channels and the filters, in place, from traces X (n, C, T).
 
         `rng` draws the traces that are read, at most 256 for the scales and 64 for the filters, and
-        the kernels. Call it once: a second call sets all of them anew, and the features of every
-        trace change.
+        the kernels. A channel then becomes scale * x + shift. Call it once: a second call sets
+        everything anew, and the features of every trace change.
         """
         if len(X) > SCALE_TRACES:
             X = X[torch.from_numpy(rng.permutation(len(X))[:SCALE_TRACES])]

@@ -438,7 +438,8 @@ class TorchReducer(Reducer):
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
-        Raises NotFittedError before a fit, TraceError for traces of another shape.
+        Raises NotFittedError before a fit, ValueError for traces of another shape and for values
+        that are not finite.
         """
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
