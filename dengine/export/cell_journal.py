@@ -294,7 +294,8 @@ def import_journal(
     path : path-like
         The journal.
     any_model : bool, default False
-        Whether to take a journal of a model that the store has not noted as exported from it.
+        Whether to take a journal of a model that the store has not noted as exported from it. A
+        store that has noted no export takes every journal.
 
     Returns
     -------

@@ -173,7 +173,7 @@ class EngineModel(ABC):
         x : array of float32, shape (channels, samples)
             The raw trace.
         part_hash : int
-            Hash of its part's number; 0 for an unknown part.
+            Hash of its part's number; 0 for an unknown part, for which the content hash stands.
         conditions : DecisionConditions
             Force limits, sensor limit and audits. The decider for them is kept and used again while
             they stay equal.

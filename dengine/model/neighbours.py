@@ -392,9 +392,10 @@ class ModelPrediction(EngineModel):
 
         All traces become references, or the last ones if they exceed the classifier's capacity.
         `index`, `scale`, `gate` and `trace_shape` are replaced, the decider is dropped, and the
-        rule stays as it is. `hashes` (n,), of the parts, give the folds; `numbers` (n,), of the
-        labels, go to the references; `stop` may end the reducer's training early. Extreme samples
-        are clipped first.
+        rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds;
+        `numbers` (n,), of the labels, go to the references; `stop` may end the reducer's training
+        early. Extreme samples are clipped first. Raises SettingError if the reducer cannot be
+        trained on these.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -669,10 +670,10 @@ class ModelPrediction(EngineModel):
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
         """Decide on one raw trace x (C, T) by `decider(conditions)`, which may have to be built.
 
-        References of the part with this hash have no vote; 0 stands for an unknown part. Returns a
-        `Verdict`, the tuple that `Decider.forward` returns, with the scaled embedding (K, d).
-        Raises RuntimeError if the rule is stale and the trace has no fault, ValueError if nothing
-        was fitted.
+        References of the part with this hash have no vote; for an unknown part, 0, the content hash
+        stands. Returns a `Verdict`, the tuple that `Decider.forward` returns, with the scaled
+        embedding (K, d). Raises RuntimeError if the rule is stale and the trace has no fault,
+        ValueError if nothing was fitted.
         """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
@@ -811,8 +812,9 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 
     Labels are counted as independent trials, so a part that is inserted again must be known as such
     (`part=`). This notices the plain cases where it is not; it changes no decision. A trace counts
-    if the nearest one of another part is nearer than `NEAR` times the tenth nearest, so one with
-    more than `NEIGHBOURS` near repeats is not noticed.
+    if the nearest one of another part is nearer than `NEAR` times the distance of the next behind
+    the `NEIGHBOURS` nearest, so one with more near repeats is not noticed, and one with fewer
+    traces of other parts always counts.
 
     Parameters
     ----------
