@@ -154,7 +154,8 @@ class Baseline(ABC):
         """Return an `Action` for each trace of X (n, C, T), as an array of objects, shape (n,).
 
         ACCEPT where the lower bound reaches the accept threshold, REJECT where the upper bound is
-        at or below the reject threshold, else VERIFY; see `thresholds`.
+        at or below the reject threshold, else VERIFY. These are `thresholds`, or LB and 1 - LB
+        where that is None.
         """
         from ..decision.rule import action_of
 
@@ -281,7 +282,9 @@ class AgreeingNeighbours(Baseline):
         self._references.add(_rows(X), good)
 
     def _predict(self, X: Traces) -> BaselinePrediction:
-        """Return the share of successes among the k nearest, as both bounds, and their counts."""
+        """Return the share of successes among the k nearest as both bounds, and how many of the k
+        are successes and failures.
+        """
         distances = self._references.squared_distances(_rows(X))
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]
         n_success = self._references.good[nearest].sum(axis=1)
