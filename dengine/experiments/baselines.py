@@ -282,9 +282,7 @@ class AgreeingNeighbours(Baseline):
         self._references.add(_rows(X), good)
 
     def _predict(self, X: Traces) -> BaselinePrediction:
-        """Return the share of successes among the k nearest as both bounds, and how many of the k
-        are successes and failures.
-        """
+        """Return bounds, both the share of successes among the k nearest, and counts of these k."""
         distances = self._references.squared_distances(_rows(X))
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]
         n_success = self._references.good[nearest].sum(axis=1)
