@@ -178,8 +178,11 @@ def report_until_taken(engine: DataEngine, decision_id: str, good: bool) -> Retr
             return engine.report(decision_id, good)
 
 
-def run_cell(plan: Plan, data: Dataset, cell: int) -> CellRun:
-    """Run one cell, in its own process, on marked traces of the data set with fresh noise."""
+def run_cell(plan: Plan, data: Dataset, cell: int) -> dict[str, Any]:
+    """Run one cell, in its own process, on marked traces of the data set with fresh noise.
+
+    Returns the fields of its `CellRun`: a class of a script may not be found by another process.
+    """
     rng = np.random.default_rng(cell)
     measurements: list[dict[str, Any]] = []
     sent: dict[str, tuple[int, bool]] = {}
@@ -213,7 +216,15 @@ def run_cell(plan: Plan, data: Dataset, cell: int) -> CellRun:
             learned = engine.store.labelled().traces
             products = [plan.product(read_mark(trace)[0]) for trace in learned]
             n_foreign = sum(product != plan.product(cell) for product in products)
-        return CellRun(cell, engine.version, certain, sent, seconds, n_foreign, measurements)
+        return {
+            "cell": cell,
+            "version": engine.version,
+            "certain": certain,
+            "sent": sent,
+            "seconds": seconds,
+            "n_foreign": n_foreign,
+            "measurements": measurements,
+        }
 
 
 def flush_within(engine: DataEngine, seconds: float) -> None:
@@ -278,7 +289,8 @@ def run_cells(plan: Plan, data: Dataset) -> list[CellRun]:
     context = multiprocessing.get_context("spawn")
     barrier = context.Barrier(plan.cells)
     with ProcessPoolExecutor(plan.cells, context, _share_barrier, (barrier,)) as pool:
-        return list(pool.map(partial(run_cell, plan, data), range(plan.cells)))
+        runs = pool.map(partial(run_cell, plan, data), range(plan.cells))
+        return [CellRun(**fields) for fields in runs]
 
 
 def check_rows(plan: Plan, run: CellRun) -> dict[str, Any]:
