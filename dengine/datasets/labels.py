@@ -935,7 +935,7 @@ def _path_words(path: str) -> tuple[str, ...]:
     words = normalized(path).lower().replace("\\", "/").split("/")
     words = [word for word in words if word not in ("", ".")] or [""]
     file = words.pop()
-    suffix = next((suffix for suffix in SUFFIXES if file.endswith(suffix)), "")
+    suffix = next((suffix for suffix in (*SUFFIXES, ".npz") if file.endswith(suffix)), "")
     return file.removesuffix(suffix), *reversed(words)
 
 

@@ -24,6 +24,7 @@ from ..files import is_database, read_archive, read_errors
 from ..records import stored_trace_spec
 from ..traces import as_trace, as_traces, spec_of
 from . import units
+from .archives import hold_one_each, read_archive_each
 from .bags import is_stream, read_bag
 from .clocks import clock_of, rate_of
 from .dataset import (
@@ -94,12 +95,12 @@ def load_dataset(
     Parameters
     ----------
     source : str, path, Dataset, DataFrame or pair (X, y), default "insertion"
-        The name of a bundled set; a folder of CSV files, one for each insertion, or of tables or
-        archives of one form, which are one set; a wide table, with a row for each insertion, or a
-        long one, with a row for each sample, as .csv, .parquet or a DataFrame; one long recording
-        as .mcap, or a rosbag2 folder of them; an .npz file with X (n, T) or (n, C, T), multiplied
-        by the number `scale` if there is one, and y (n,), or with arrays that `channel` and `label`
-        name; the SQLite file of a store, for its labelled traces; a `Dataset`; or a pair (X, y), in
+        The name of a bundled set; a folder of CSV files or archives, one for each insertion, or of
+        tables or archives of one form, which are one set; a wide table, with a row for each
+        insertion, or a long one, with a row for each sample, as .csv, .parquet or a DataFrame; one
+        long recording as .mcap, or a rosbag2 folder of them; an .npz file with X (n, T) or
+        (n, C, T), multiplied by the number `scale` if there is one, and y (n,), or with arrays that
+        `channel` and `label` name; the SQLite file of a store, for its labelled traces; a `Dataset`; or a pair (X, y), in
         which X may be a list of traces of any length.
     samples : int, optional
         Samples of each trace: the first so many, or with `fit="resample"` the points at which the
@@ -263,7 +264,9 @@ def _find_file_reader(
         read = partial(read_tables, named, name, options)
         return ("label", "labels", "time", *TEXT_FORMAT), read
     if path.is_dir() or path.suffix.lower() == ".npz" or zipfile.is_zipfile(path):
-        return ("label", "labels"), partial(_read_npz, named, name, options)
+        is_each = len(named) > 1 and hold_one_each(named, options)
+        read_npz = read_archive_each if is_each else _read_npz
+        return ("label", "labels", "time"), partial(read_npz, named, name, options)
     raise DataError(f"Expected a file {FORMS}, got {path}; save it as one of these.")
 
 

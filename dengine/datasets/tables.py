@@ -452,7 +452,7 @@ def _usual_channels(
     if not names or FORCE.lower() in names:
         return (FORCE,)
     most_frequent = Counter(headers).most_common(1)[0][0]
-    return _choose_channels(most_frequent, options)
+    return choose_channels(most_frequent, options)
 
 
 def _columns_without_clock(first_rows: list[list[str]], options: LoadOptions) -> list[str]:
@@ -608,6 +608,8 @@ def _add_wide_rows(
     traces = values.reshape(len(frame), len(columns), -1)
     collector.channels = tuple(filter(None, columns))
     _check_single_signal(frame, others, options)
+    if unread := [_values_of(frame, name) for name in others if name not in all_columns]:
+        collector.notes[f"Not read: the columns {listed(unread)}"] = 1
     label_cells = [
         labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
     ]
@@ -631,6 +633,14 @@ def _add_wide_rows(
     words = zip(*(frame[name].tolist() for name in label_columns), strict=True)
     for row in zip(frame.index, traces, words, parts, strict=True):
         collector.add(source, partial(read, *row), row[0])
+
+
+def _values_of(frame: pd.DataFrame, name: str) -> str:
+    """Return the name of a column, with its values and their counts if these are few and equal."""
+    counts = frame[name].value_counts()
+    if not 2 <= len(counts) <= MAX_STATIONS or counts.min() < counts.max():
+        return name
+    return f"{name} ({listed(counts.index)}, {counts.iloc[0]} times each)"
 
 
 def _check_single_signal(frame: pd.DataFrame, names: Sequence[str], options: LoadOptions) -> None:
@@ -728,7 +738,7 @@ def _from_long(
     frame = _pivot_signals(frame, [options.part, time, *label_columns], options)
     others = [name for name in frame.columns if name not in (options.part, time, *label_columns)]
     numeric = [name for name in others if not floats(frame[name])[1]]
-    collector.channels = _choose_channels(numeric, options)
+    collector.channels = choose_channels(numeric, options)
     seconds, *_ = seconds_of(frame[time], time, column_units.get(time, ""))
     part = frame[options.part]
     is_new = (part != part.shift()).to_numpy() | np.r_[False, np.diff(seconds) < 0]
@@ -1006,7 +1016,7 @@ def _parts_file_advice(parts: pd.Series, label_file: str, options: LoadOptions) 
     return "and a CSV file of parts and labels (labels)"
 
 
-def _choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str, ...]:
+def choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str, ...]:
     """Return the channels that the user stated, else the force, else the only one available.
 
     Raises DataError for a channel that is not available, and if several are and none was stated.
@@ -1103,7 +1113,7 @@ def _sample_columns(names: list[str], options: LoadOptions) -> dict[str, list[st
             i = int(odd[0])
             actual = f"after {columns[i][1]} comes {columns[i + 1][1]}"
             raise DataError(f"Expected columns that are numbered one by one, {actual}.")
-    chosen = _choose_channels(list(channels), options)
+    chosen = choose_channels(list(channels), options)
     if len({len(channels[name]) for name in chosen}) > 1:
         counts = ", ".join(f"{name} {len(channels[name])}" for name in chosen)
         raise DataError(f"Expected as many samples of each channel, got {counts}.")

@@ -24,6 +24,7 @@ from . import units
 from .clocks import (
     EMPTY_CELLS,
     TIMESTAMP,
+    Clock,
     check_even,
     check_rows,
     clock_of,
@@ -511,6 +512,7 @@ def rows_to_trace(
             trace = np.ascontiguousarray(trace[:, order])
             rows = rows.iloc[order]
         check_rows(clock, rows.index)
+        _check_repeated(rows, clock)
     if options.rate_hz is not None:
         return TimedTrace(trace)
     if clock is None:
@@ -524,6 +526,15 @@ def rows_to_trace(
     else:
         _note_missing(check_even(clock, rate), clock.name, notes)
     return TimedTrace(trace, rate)
+
+
+def _check_repeated(rows: pd.DataFrame, clock: Clock) -> None:
+    """Raise UnreadableError if all rows of one time are equal, and some times have several."""
+    is_repeated = rows.duplicated().to_numpy()
+    n_repeated = int(is_repeated.sum())
+    if n_repeated and len(np.unique(clock.seconds)) == len(rows) - n_repeated:
+        line = int(rows.index[int(is_repeated.argmax())])
+        raise UnreadableError("Expected each row once, this one came before", line)
 
 
 def _note_missing(n_missing: int, clock: str, notes: Counter[str]) -> None:

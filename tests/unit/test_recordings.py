@@ -150,7 +150,7 @@ BROKEN: dict[str, tuple[list[str], int, str]] = {
     "back_True.csv": (
         [*ROWS[:20], "", ROWS[19], *ROWS[20:]],
         22,
-        "Expected a later time than that of the row before",
+        "Expected each row once, this one came before",
     ),
     "gap_True.csv": (
         [*ROWS[:10], *ROWS[25:]],
@@ -1249,3 +1249,68 @@ def test_a_wide_table_with_a_row_for_each_signal_is_refused(small: Dataset) -> N
         load_dataset(both)
     again = pd.concat([table, table.iloc[:5]]).assign(shift=["a", "b"] * 14 + ["a"])
     assert len(load_dataset(again)) == 29
+
+
+@pytest.mark.parametrize("form", ["1-D", "one row", "channels", "label inside", "listing"])
+def test_a_folder_of_archives_one_for_each_part_is_read(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    folder = tmp_path / "cell"
+    folder.mkdir()
+    options: dict[str, Any] = {}
+    for i, (x, y) in enumerate(zip(small.X[:6], small.y[:6], strict=True)):
+        arrays: dict[str, Any] = {"force": x, "time": np.arange(50) / 250.0}
+        name = f"{i}_{'OK' if y else 'NOK'}"
+        if form == "one row":
+            arrays = {"X": x[None], "rate_hz": 250.0, "unit": "kN"}
+        if form == "channels":
+            arrays = {"X": np.stack([x, -x]), "y": y, "rate_hz": 250.0}
+            name = str(i)
+        if form == "label inside":
+            arrays |= {"accepted": bool(y)}
+            name = str(i)
+            options = {"label": "accepted"}
+        if form == "listing":
+            arrays |= {"way": -x}
+            name = str(i)
+            options = {"labels": tmp_path / "l.csv", "channel": "force"}
+        np.savez(folder / f"{name}.npz", **arrays)
+    pd.DataFrame({"file": range(6), "label": words(small)[:6]}).to_csv(
+        tmp_path / "l.csv", index=False
+    )
+    if form == "channels":
+        options = {"channel": "X"}
+    data = load_dataset(folder, **options)
+    X = small.X[:6]
+    np.testing.assert_array_equal(data.X, np.stack([X, -X], axis=1) if form == "channels" else X)
+    assert (data.y.tolist(), data.rate_hz, data.faults) == (small.y[:6].tolist(), 250.0, ())
+    assert data.unit == ("kN" if form == "one row" else "N")
+
+
+def test_an_archive_of_a_part_that_contradicts_its_name_is_a_fault(
+    small: Dataset, tmp_path: Path
+) -> None:
+    for i in range(4):
+        np.savez(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.npz", X=small.X[i], y=int(i in (0, 3)))
+    data = load_dataset(tmp_path, rate_hz=250)
+    assert [f.source for f in data.faults] == ["2_OK.npz", "3_NOK.npz"]
+    assert "its array y says bad (0), its name says good (OK)" in data.faults[0].message
+    assert len(load_dataset(tmp_path, label="y")) == 4
+
+
+@pytest.mark.parametrize("rate_hz", [None, 500.0])
+def test_rows_that_are_there_twice_are_a_fault(
+    rate_hz: float | None, few: Path, small: Dataset
+) -> None:
+    path = min(few.iterdir())
+    header, *rows = path.read_text("utf-8").splitlines()
+    path.write_text("\n".join([header, *(row for row in rows for _ in range(2))]) + "\n")
+    data = load_dataset(few, rate_hz=rate_hz, samples=50)
+    assert [(f.source, f.line) for f in data.faults] == [(path.name, 3)]
+    assert "Expected each row once" in data.faults[0].message
+
+
+def test_a_wide_table_says_which_columns_are_not_read(small: Dataset) -> None:
+    table = pd.concat([wide(small).assign(serial=np.arange(24), axis=axis) for axis in ("X", "Z")])
+    notes = load_dataset(table).notes
+    assert "Not read: the columns serial, axis (X, Z, 24 times each)." in notes

@@ -1,0 +1,138 @@
+"""A folder of NumPy archives, one for each insertion, as a recorder writes them.
+
+An archive has arrays of one length, one for each channel and perhaps the times, or one array
+(C, T). Its label is in its name, in a scalar array `y`, or in a file of labels. `load_dataset`
+calls `read_archive_each` for a folder of which `hold_one_each` is true.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError, listed
+from ..files import read_archive
+from ..traces import is_time_column
+from . import labels
+from .dataset import Dataset, LoadOptions, RecordingCollector, UnreadableError, as_dataset
+from .tables import choose_channels
+from .text import TimedTrace, rows_to_trace
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LABEL = "y"
+
+
+def hold_one_each(named: Mapping[str, Path], options: LoadOptions) -> bool:
+    """Return whether each archive of a folder holds one insertion.
+
+    All have arrays of the same names, a label of one value if any, and traces of one row, or of
+    several channels beside such a label.
+    """
+    paths = list(named.values())
+    if len(paths) < 2:
+        return False
+    arrays, names = read_archive(paths[0])
+    if set(names) != set(read_archive(paths[-1], ())[1]):
+        return False
+    label = arrays.get(options.label or LABEL)
+    traces = [x for x in arrays.values() if x.dtype.kind in "iuf" and x.size > 1]
+    if (label is not None and label.size > 1) or not traces:
+        return False
+    dimensions = max(np.squeeze(x).ndim for x in traces)
+    return dimensions == 1 or (dimensions == 2 and label is not None)
+
+
+def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions) -> Dataset:
+    """Read a folder of archives, one for each insertion.
+
+    Parameters
+    ----------
+    named : mapping of str to Path
+    name : str
+        Name of the data set.
+    options : LoadOptions
+
+    Raises
+    ------
+    DataError
+        If no recording can be read, most have no label, or the channel is not named.
+    """
+    frame = _to_frame(read_archive(next(iter(named.values())))[0], options)
+    available = [column for column in frame.columns if not is_time_column(column)]
+    several = f"{options.channels[0]}_0" if options.channels else ""
+    channels = tuple(column for column in available if several and column.startswith(several[:-1]))
+    if several not in available:
+        channels = choose_channels(available, options)
+    collector = RecordingCollector(name, channels)
+
+    def read(path: Path) -> TimedTrace:
+        """Return the trace of an archive, with the rate that it states or its times tell."""
+        arrays, _ = read_archive(path)
+        rows = _to_frame(arrays, options)
+        missing = [column for column in channels if column not in rows]
+        if missing:
+            raise UnreadableError(f"Expected arrays {listed(missing)}, got {listed(arrays)}")
+        places = [rows.columns.get_loc(column) for column in channels]
+        timed = rows_to_trace(rows, places, options, collector.notes)
+        unit = (str(arrays["unit"]),) * len(channels) if "unit" in arrays else ()
+        rate = float(arrays["rate_hz"]) if "rate_hz" in arrays else timed.rate_hz
+        return TimedTrace(timed.trace, None if options.rate_hz else rate, unit)
+
+    labels.collect_recordings(named, read, _label_source(named, options), collector)
+    return as_dataset(collector, options)
+
+
+def _to_frame(arrays: Mapping[str, NDArray[Any]], options: LoadOptions) -> pd.DataFrame:
+    """Return the arrays of an archive that have its most frequent length, a column each.
+
+    An array (C, T) has C columns, `X_0`, `X_1`, ...
+    """
+    import pandas as pd
+
+    columns = dict[str, NDArray[Any]]()
+    for name, x in arrays.items():
+        x = np.squeeze(x)
+        if x.dtype.kind not in "iufMm" or x.size < 2 or name == options.label:
+            continue
+        rows = x if x.ndim == 1 else x if x.shape[0] < x.shape[-1] else x.T
+        columns |= {name: rows} if x.ndim == 1 else {f"{name}_{c}": r for c, r in enumerate(rows)}
+    lengths = Counter(len(x) for x in columns.values())
+    length = max(lengths, key=lambda n: (lengths[n], n), default=0)
+    return pd.DataFrame({name: x for name, x in columns.items() if len(x) == length})
+
+
+def _label_source(named: Mapping[str, Path], options: LoadOptions) -> labels.LabelSource:
+    """Return the source of the labels: a file of them, an array of one value, or the names.
+
+    What the user does not state is compared with the others.
+    """
+    in_names = labels.labels_in_names(None, options.words)
+    if options.labels is not None:
+        listing = labels.labels_in_file(options.labels, list(named), options)
+        others = [in_names] if options.label is None else []
+        return labels.labels_that_agree(listing, others, listing.trust)
+    array = options.label or LABEL
+    if array not in read_archive(next(iter(named.values())), ())[1]:
+        return labels.labels_in_names(options.label, options.words)
+    notes = Counter[str]()
+    column = labels.LabelColumn(array, options.words, notes)
+    place = f"its array {array}"
+
+    def find(name: str) -> labels.SourcedLabel:
+        """Return the label in an archive's array."""
+        try:
+            cells = read_archive(named[name], (array,))[0].get(array, np.array([]))
+        except DataError as error:
+            raise UnreadableError(str(error).rstrip(".")) from error
+        return column.find(np.atleast_1d(cells).tolist(), place)
+
+    source = labels.LabelSource(find, "name the array of labels (label)", place, notes=notes)
+    do = f"name the one to trust: label={array!r}"
+    return labels.labels_that_agree(source, [in_names] if options.label is None else [], do)
