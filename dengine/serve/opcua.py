@@ -206,11 +206,14 @@ async def opcua_server(
     Raises
     ------
     SettingError
-        For an address that other machines can reach, without tokens, certificate and key.
+        For an address that other machines can reach, without tokens, certificate and key; for a
+        certificate without its key, or a key alone.
     OSError
         For a port in use.
     """
-    is_secure = cert is not None and key is not None
+    if (cert is None) != (key is None):
+        raise SettingError("Expected a certificate and its key together, got one of them.")
+    is_secure = cert is not None
     if not (is_loopback(host) or (is_secure and tokens)):
         raise SettingError(
             f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on "

@@ -464,7 +464,9 @@ def test_a_part_without_a_verdict_is_counted_as_unlabelled_and_left_out(
         "--repeats",
         1,
     )
-    note = r"20 of 30 recordings of wide have no label yet( \('.*' 20 times\))?: they are left out\."
+    note = (
+        r"20 of 30 recordings of wide have no label yet( \('.*' 20 times\))?: they are left out\."
+    )
     assert re.search(note, played.stderr)
 
 

@@ -263,6 +263,15 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
             threading.Timer(0.2, start_anew).start()
         with pytest.raises(CellError, match=text):
             cell.insert()
+        before = cell.report().reconnects
+        fake.inputs.clear()
+        fake.hang_up(False)
+        while cell.report().reconnects == before:
+            cell.recorder.stream.take(0.05)
+        begun = cell.report().packages
+        while cell.report().packages < begun + 50:
+            cell.recorder.stream.take(0.05)
+        assert ORDER not in fake.inputs, "an order that failed is not written again"
 
 
 def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:

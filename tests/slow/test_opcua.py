@@ -302,6 +302,14 @@ async def test_elsewhere_it_wants_a_token_and_a_certificate(service: CellService
                 raise AssertionError("it must not be served")
 
 
+async def test_a_certificate_without_its_key_is_refused_on_this_machine_too(
+    service: CellService,
+) -> None:
+    with pytest.raises(SettingError, match="a certificate and its key together"):
+        async with opcua.opcua_server(service, port=0, cert="c.pem"):
+            raise AssertionError("it must not be served")
+
+
 async def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
     service, tmp_path, monkeypatch
 ) -> None:

@@ -180,23 +180,25 @@ class UrCell(AbstractContextManager["UrCell"]):
         What was received before is discarded. Meanwhile the order is written again after a
         reconnection. After INSERT, also wait, in the same time, for the end of the trace, and set
         `last` to it, or to None if it was not seen. Raise CellError if the robot does not answer in
-        time, fails, or its program stops.
+        time, fails, or its program stops; then the order is not written again.
         """
         self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1
         self.last = None if verb is Verb.INSERT else self.last
         self.recorder.stream.write({ORDER: encode_message(self._number, verb)})
         result: ResultCode | None = None
-        for row in self.recorder.rows(self.order_timeout):
-            if verb is Verb.INSERT and self.last is None:
-                self.last = self.recorder.feed(row)
-            result = result or self._find_result(row, verb)
-            is_recording = verb is Verb.INSERT and self.last is None and self.recorder.begun
-            if result and not is_recording:
-                break
+        try:
+            for row in self.recorder.rows(self.order_timeout):
+                if verb is Verb.INSERT and self.last is None:
+                    self.last = self.recorder.feed(row)
+                result = result or self._find_result(row, verb)
+                is_recording = verb is Verb.INSERT and self.last is None and self.recorder.begun
+                if result and not is_recording:
+                    break
+        finally:
+            self.recorder.stream.write(None)
         if result is None:
             raise self._timeout_error(f"to answer order {self._number} ({verb.name.lower()})")
-        self.recorder.stream.write(None)
         return result
 
     def _timeout_error(self, expected: str) -> CellError:

@@ -389,7 +389,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         while not self._closing.is_set():
             try:
                 return self._open()
-            except CellError as error:
+            except (CellError, SettingError) as error:  # a controller may change while it is away
                 if until < float("inf") and not (
                     isinstance(error, HeldError) and time.monotonic() < until
                 ):
