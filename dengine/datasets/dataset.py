@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import DataError, TraceError, expect, instead, shortened
+from ..errors import DataError, TraceError, expect, instead, listed, shortened
 from ..records import FITS, TraceSpec
 from ..representation import to_html
 from ..traces import as_traces, can_fit_length, fit_length
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RATE_TOLERANCE = 0.03  # of the others' rate: recordings within it have one rate
+FAR = 50.0  # times the usual largest value: a recording beyond has another unit or is none
 MAX_RATE_RATIO = 2.0  # a recording at a rate further from the others' is not resampled
 UNKNOWN_RATE = (
     "The rate is unknown, for nothing tells it: times are in samples until it is stated,"
@@ -495,6 +496,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     }
     collector.leave_out(reasons)
     recordings = collector.recordings
+    _note_scales(collector)
     X = np.stack([_fit_array(recording.trace, samples, fit) for recording in recordings])
     rates = np.array([recording.rate_hz or np.nan for recording in recordings])
     notes = [f"{text}{f' ({n} times)' if n > 1 else ''}." for text, n in collector.notes.items()]
@@ -524,6 +526,18 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         lengths=np.array(lengths_read, dtype=np.int64),
         rates=rates if np.isfinite(rates).any() else None,
     )
+
+
+def _note_scales(collector: RecordingCollector) -> None:
+    """Note recordings whose largest value is far from that of most: their unit may be another."""
+    with np.errstate(invalid="ignore"):
+        peaks = np.array([np.nan_to_num(np.abs(r.trace)).max() for r in collector.recordings])
+    usual = float(np.median(peaks))
+    is_far = (peaks > 0) & ((peaks > FAR * usual) | (peaks * FAR < usual))
+    if usual > 0 and is_far.any():
+        names = [r.source for r, far in zip(collector.recordings, is_far, strict=True) if far]
+        text = f"{len(names)} recordings are {FAR:g} times larger or smaller than most"
+        collector.notes[f"{text}, in another unit or not measured: {listed(names)}"] = 1
 
 
 def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) -> str:

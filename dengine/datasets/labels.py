@@ -37,9 +37,36 @@ from .dataset import (
 )
 from .text import SUFFIXES, TimedTrace, column_place, read_table
 
-GOOD = ("true", "okay", "ok", "passed", "pass", "good", "successful", "success", "gut")
+GOOD = (
+    "true",
+    "wahr",
+    "vrai",
+    "verdadero",
+    "vero",
+    "okay",
+    "ok",
+    "passed",
+    "pass",
+    "good",
+    "successful",
+    "success",
+    "gut",
+)
 BAD = (
-    *("false", "nok", "ng", "failed", "failure", "fail", "bad", "unsuccessful", "schlecht"),
+    *(
+        "false",
+        "falsch",
+        "faux",
+        "falso",
+        "nok",
+        "ng",
+        "failed",
+        "failure",
+        "fail",
+        "bad",
+        "unsuccessful",
+        "schlecht",
+    ),
     "nio",
 )
 MEANING = {
@@ -100,6 +127,9 @@ NEGATIONS = ("not", "no", "non", "nicht", "kein", "keine", "without", "ohne", "f
 FLAGS = {  # in any column, whether what its name says is so
     **dict.fromkeys(("true", "yes", "1", "y", "ja", "j", "oui"), True),
     **dict.fromkeys(("false", "no", "0", "n", "nein", "non"), False),
+    # What Excel writes in other languages.
+    **dict.fromkeys(("wahr", "vrai", "verdadero", "vero"), True),
+    **dict.fromkeys(("falsch", "faux", "falso"), False),
 }
 # In the columns of a recording these may be something else: a position, a robot's state.
 SIGNAL_COLUMNS = ("y", "class", "status", "ok")

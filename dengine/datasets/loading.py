@@ -100,8 +100,8 @@ def load_dataset(
         insertion, or a long one, with a row for each sample, as .csv, .parquet or a DataFrame; one
         long recording as .mcap, or a rosbag2 folder of them; an .npz file with X (n, T) or
         (n, C, T), multiplied by the number `scale` if there is one, and y (n,), or with arrays that
-        `channel` and `label` name; the SQLite file of a store, for its labelled traces; a `Dataset`; or a pair (X, y), in
-        which X may be a list of traces of any length.
+        `channel` and `label` name; the SQLite file of a store, for its labelled traces; a
+        `Dataset`; or a pair (X, y), in which X may be a list of traces of any length.
     samples : int, optional
         Samples of each trace: the first so many, or with `fit="resample"` the points at which the
         whole trace is interpolated.

@@ -1314,3 +1314,21 @@ def test_a_wide_table_says_which_columns_are_not_read(small: Dataset) -> None:
     table = pd.concat([wide(small).assign(serial=np.arange(24), axis=axis) for axis in ("X", "Z")])
     notes = load_dataset(table).notes
     assert "Not read: the columns serial, axis (X, Z, 24 times each)." in notes
+
+
+def test_recordings_of_another_scale_are_named_in_a_note(few: Path, small: Dataset) -> None:
+    write_csv(few / "small_OK.csv", small.X[5] / 1000)
+    data = load_dataset(few)
+    text = "1 recordings are 50 times larger or smaller than most, in another unit or not measured"
+    assert f"{text}: small_OK.csv." in data.notes
+    (few / "small_OK.csv").unlink()
+    assert load_dataset(few).notes == ()
+
+
+@pytest.mark.parametrize("pair", ["WAHR,FALSCH", "VRAI,FAUX", "VERDADERO,FALSO", "VERO,FALSO"])
+def test_booleans_of_excel_are_labels_in_any_language(pair: str, tmp_path: Path) -> None:
+    good, bad = pair.split(",")
+    source, options = as_folder([good, bad], "bestanden", tmp_path)
+    assert load_dataset(source, **options).y.tolist() == [1, 0]
+    source, options = as_folder([good, bad], "Ausschuss", tmp_path)
+    assert load_dataset(source, **options).y.tolist() == [0, 1]
