@@ -180,8 +180,9 @@ def instead(
     error : type
         Class of the new error. An exception of this class passes unchanged.
     message : str
-        Beginning of the new message; the message of the caught exception, cut to 300 characters,
-        follows.
+        Beginning of the new message; the reason follows: the text of the caught exception, of an
+        OSError only its `strerror`, without the file's name, cut to 300 characters and on one line.
+        So `message` must name the file.
     *caught : type
         Exceptions to catch. All others pass unchanged.
     do : str

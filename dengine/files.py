@@ -132,8 +132,8 @@ def read_archive(
     Raises
     ------
     DataError
-        If it is no archive, is damaged, an array to read holds Python objects, which are not
-        unpacked, or these arrays need too much memory (see `check_size`).
+        If it cannot be read, is no archive, is damaged, an array to read holds Python objects,
+        which are not unpacked, or these arrays need too much memory (see `check_size`).
     """
     title = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
     file = io.BytesIO(source) if isinstance(source, bytes) else source

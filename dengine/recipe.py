@@ -204,7 +204,7 @@ class Recipe:
         """Parse the text that `to_toml` writes, and return the recipe.
 
         Settings that are missing get their defaults, and "none" is read as None. Raises
-        SettingError, which begins with `where`, for text that is not TOML, an unknown key or a
+        SettingError, which names `where`, for text that is not TOML, an unknown key or a
         value out of range.
         """
         # tomllib raises ValueError for huge integers, too.

@@ -103,7 +103,7 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> NDArray[np.f
     Returns
     -------
     array of float32, shape (n, C, T)
-        Contiguous; it shares its memory with X if that is float32 already.
+        Contiguous; it may share its memory with X, if that is float32 already.
 
     Raises
     ------
@@ -135,7 +135,8 @@ def as_labels(y: ArrayLike) -> NDArray[np.int64]:
 def spec_of(x: NDArray[np.float32], trace: Any = None) -> TraceSpec:
     """Return the `TraceSpec` of a converted trace `x` (C, T), with defaults for all but its shape.
 
-    If `trace`, the same trace before its conversion, is a DataFrame, the columns get its names.
+    If `trace`, the same trace before its conversion, is a DataFrame, the columns get the names of
+    its channels.
     """
     columns = tuple(map(str, _channel_columns(trace))) if _is_frame(trace) else ()
     return TraceSpec(samples=x.shape[1], channels=x.shape[0], columns=columns)

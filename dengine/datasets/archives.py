@@ -30,10 +30,10 @@ LABEL = "y"
 
 
 def hold_one_each(named: Mapping[str, Path], options: LoadOptions) -> bool:
-    """Return whether each archive of a folder holds one insertion.
+    """Return whether each archive of a folder holds one insertion, as the first and last tell.
 
-    All have arrays of the same names, a label of one value if any, and traces of one row, or of
-    several channels beside such a label.
+    These two have arrays of the same names, and the first a label of one value if any, and traces
+    of one row, or of several channels beside such a label. False for a single archive.
     """
     paths = list(named.values())
     if len(paths) < 2:

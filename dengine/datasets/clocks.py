@@ -219,8 +219,8 @@ def clock_of(
     Raises
     ------
     UnreadableError
-        If a cell of the clock states no time, the stated column is not there, or its counts can be
-        of no unit.
+        If a cell of the clock is no time (an empty one among numbers is NaN), the stated column is
+        not there, or its counts can be of no unit.
     """
     place = place_of_clock(frame, time)
     if place is None or len(frame) < 2:
@@ -288,7 +288,7 @@ def seconds_of(
     seconds : array of float64, shape (n,)
         Since the first known time; NaN where a cell states none.
     wrong : list of int
-        Index of each cell that states no time.
+        Index of each cell that states no time, but not of empty ones among numbers.
     note : str
         What was assumed of the unit, for the user; "" for nothing.
 
@@ -523,7 +523,7 @@ def in_order_of_time(
 def check_even(clock: Clock, rate_hz: float) -> int:
     """Return how many rows are missing for one at each even time from the first time to the last.
 
-    0 if there are more rows than that.
+    At most as many as its long steps skip, and 0 if there are more rows than that.
 
     Raises UnreadableError if the number of rows is more than 3 % and one row off: samples would
     stand at wrong times.

@@ -610,7 +610,11 @@ class _FoundLabel(NamedTuple):
 
 
 def _find_label(name: str, words: LabelMap) -> SourcedLabel:
-    """Return the label in a path; raise as `_find_word`."""
+    """Return the label in a path.
+
+    Raises NoLabelError if there is none, UnlabelledError if there is only a word of `UNCHECKED`,
+    and UnreadableError if several labels contradict each other.
+    """
     word = _find_word(name, words)
     place = "its folder" if word.start <= name.rfind("/") else "its name"
     return _sourced(word.label, place, word.text)
@@ -958,9 +962,10 @@ def _read_label_rows(
 
 
 def _path_words(path: str) -> tuple[str, ...]:
-    """Return a path's file without suffix, then its folders from the nearest on, in lower case.
+    """Return a path's file, then its folders from the nearest on, in lower case.
 
-    Backslashes of Windows are read as slashes.
+    Of suffixes only those of text files (`SUFFIXES`) and .npz are removed, so `part_3.7` stays.
+    Backslashes of Windows are read as slashes; empty words and "." are left out.
     """
     words = normalized(path).lower().replace("\\", "/").split("/")
     words = [word for word in words if word not in ("", ".")] or [""]

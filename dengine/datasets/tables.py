@@ -520,7 +520,8 @@ def _number_rows(frame: pd.DataFrame) -> pd.DataFrame:
 def from_frame(frame: pd.DataFrame, options: LoadOptions) -> Dataset:
     """Make a data set of a DataFrame, a wide or a long table; its rows count from 1 in faults.
 
-    Raises DataError as `_from_tables`.
+    Raises DataError if a column holds lists or occurs twice, or columns that are needed are missing
+    or not named.
     """
     return _from_tables({"row": _number_rows(frame)}, options, RecordingCollector("data", ()))
 
@@ -666,7 +667,8 @@ def _without_repeated_parts(
 ) -> dict[str, pd.DataFrame]:
     """Return long tables without the parts that an earlier one has with equal rows and dates.
 
-    So they count once if two exports overlap; a note of the collector says how many do.
+    So they count once if two exports overlap; a note of the collector says how many do. A table
+    without other parts is left out.
     """
     import pandas as pd
 
@@ -1019,7 +1021,8 @@ def _parts_file_advice(parts: pd.Series, label_file: str, options: LoadOptions) 
 def choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str, ...]:
     """Return the channels that the user stated, else the force, else the only one available.
 
-    Raises DataError for a channel that is not available, and if several are and none was stated.
+    Raises DataError for a channel that is not available, and if none was stated where several, or
+    none, are.
     """
     default = (FORCE,) if FORCE in available else tuple(available)
     chosen = options.channels or default

@@ -123,7 +123,8 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
     """Split a text into cells; blank lines are left out.
 
     A first line sep=; states the delimiter, which is found otherwise. Raises UnreadableError for a
-    cell of more than 131,072 characters, and if there is no header.
+    cell of more than 131,072 characters, and for numbers without a header; the header of an empty
+    text is empty.
 
     columns : names of the columns, if the file has no header or another one.
     """
@@ -218,8 +219,8 @@ def _find_header(
 
     A row is data if it has numbers in most of the columns that are numeric in the last 20 rows.
     What stands above the header is left out. If two lines stand above the data and the first can be
-    the header, it is the header, and the second is a damaged row. Raises UnreadableError if there
-    is no header and no `columns` are given.
+    the header, it is the header, and the second is a damaged row. Raises UnreadableError for
+    numbers without a header if no `columns` are given; without rows the header is empty.
     """
     lines = list(rows_by_line)
     rows = list(rows_by_line.values())

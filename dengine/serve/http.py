@@ -176,7 +176,8 @@ class HttpApi:
         with that id gets 409.
 
         A body of bytes has the other fields in the query. A decision that is not begun before the
-        deadline is VERIFY, late. 503: the queue is full, nothing was recorded, verify the part.
+        deadline is VERIFY, late. 503: the queue is full or the store cannot be written, nothing was
+        recorded, verify the part.
         """
         samples = api.as_samples(trace, channels)
         response = await self.service.decide(samples, request, part)
@@ -389,7 +390,7 @@ class HttpApi:
     async def embedding(self) -> Json:
         """Return where parts lie in the model's embedding, in two dimensions.
 
-        They are the newest 250 references, and those of the newest 10 decisions that the present
+        They are the newest 250 references and, of the newest 10 decisions, those that the present
         version made; none before the first version.
         """
         engine = self.service.engine
@@ -492,8 +493,8 @@ def _read_newest(
 ) -> list[StoredDecision]:
     """Return up to `limit` decisions that `where` selects, newest first, without their traces.
 
-    With `before` only those older than the decision of this id. With `unlabelled` only verified
-    ones whose label was never reported; a forgotten label was.
+    With `before` only those older than the decision of this id; none if it is unknown. With
+    `unlabelled` only verified ones whose label was never reported; a forgotten label was.
     """
     if unlabelled:
         where = replace(where, action=Action.VERIFY, label="none")
@@ -506,9 +507,10 @@ def _read_newest(
 def _read_explanation(store: SqlStore, id_: str) -> Json:
     """Return the explanation of a decision, given by its id or its part's number, as a response.
 
-    It has the decision's trace, the band of good parts and up to `N_BADS` newest bad traces of the
-    same shape, both rounded for a picture, and the corrections of its label. Raises
-    UnknownDecisionError without a decision, ReportConflictError if the part has several.
+    It has the decision's trace, the band of good parts (None where there is none), up to `N_BADS`
+    newest bad traces among the newest `N_LABELS` labels (none if their shape differs), both rounded
+    for a picture, and the corrections of its label. Raises UnknownDecisionError without a decision,
+    ReportConflictError if the part has several.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
@@ -563,7 +565,7 @@ def create_app(
     ----------
     service : CellService
     access : Access, optional
-        None: without tokens, for this machine alone.
+        None: without tokens; then serve it at a loopback address alone, which is not checked here.
     xmlrpc, page : bool
         Whether XML-RPC and the web page are served beside HTTP.
     beside : sequence of callable

@@ -206,10 +206,10 @@ async def opcua_server(
     Raises
     ------
     SettingError
-        For an address that other machines can reach, without tokens, certificate and key; for a
-        certificate without its key, or a key alone.
+        For an address that other machines can reach, unless there are tokens, a certificate and a
+        key; for a certificate without its key, or a key alone.
     OSError
-        For a port in use.
+        For a port in use, and a file that cannot be read.
     """
     if (cert is None) != (key is None):
         raise SettingError("Expected a certificate and its key together, got one of them.")
@@ -309,9 +309,9 @@ class AddressSpace:
         Returns a list of action (0 verify, 1 accept, 2 reject), id, reason, lower, upper, version.
 
         If the queue is full or the store unavailable, the result is VERIFY with an empty id. Raises
-        SettingError for an empty trace, one that the channels do not divide, and more than
-        `MAX_CHANNELS`; TraceError for a trace, and ReportError for a request, that the engine does
-        not take.
+        SettingError for an empty trace, one that the channels do not divide, and other than 1 to
+        `MAX_CHANNELS` channels; TraceError for a trace, and ReportError for a request, that the
+        engine does not take.
         """
         if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
             raise SettingError(

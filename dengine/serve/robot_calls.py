@@ -302,8 +302,8 @@ class RobotCalls:
         Returns
         -------
         bool
-            True if the label is on disk, also if it was reported before. False, and nothing is
-            reported, if the id is "" or unknown, or the report cannot be stored now.
+            True if the label is on disk, also if it was reported before. False if the id is "" or
+            unknown, or the report cannot be stored now: repeat it then.
 
         Raises
         ------

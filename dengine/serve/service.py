@@ -302,8 +302,8 @@ class CellService:
     async def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision with its trace and label, after waiting for the engine's thread.
 
-        None for an unknown id. Raises BusyError if the queue is full, and StoreError where the id
-        cannot be looked up.
+        None for an unknown id. Raises BusyError if the queue is full or the service is closing, and
+        StoreError where the id cannot be looked up.
         """
         return await self.call(lambda engine: engine.find(decision_id), read_only=True)
 
@@ -311,15 +311,16 @@ class CellService:
         """Call a function with the engine in the engine's thread, and return or raise what it does.
 
         It waits in the queue, without a deadline. With `read_only` the function changes nothing,
-        and listeners to `changes` are not notified. Raises BusyError if the queue is full.
+        and listeners to `changes` are not notified. Raises BusyError if the queue is full or the
+        service is closing.
         """
         return await asyncio.wrap_future(self.submit(work, read_only))
 
     def submit(self, work: Callable[[DataEngine], T], read_only: bool = False) -> Future[T]:
-        """Put a call as of `call` into the queue, from any thread, and return a future of its
-        result.
+        """Put a function, as `call` takes it, into the queue, from any thread; return a future of
+        its result.
 
-        Raises BusyError if the queue is full.
+        Raises BusyError if the queue is full or the service is closing.
         """
         return self._enqueue(lambda engine, late: work(engine), read_only)
 
@@ -337,7 +338,7 @@ class CellService:
         return await asyncio.to_thread(work, self.read_store)
 
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Return the status as of `DataEngine.status`; the engine's thread only flushes for it."""
+        """Return the status, as `DataEngine.status`; the engine's thread only flushes for it."""
         stored = await self.read(lambda store: status(store, last, watching))
         return self.core.complete_status(stored)
 

@@ -84,7 +84,7 @@ def save_insertions(
     rounded to integer steps of `scale`, 0.01 N or more.
 
     The arrays are X int16 (n, 1000) with `scale`, so that X * scale is in `unit`; y int8 (n,);
-    cause str; height_mm float32; cycle int32; `conditions` float32 (n, m), all values that were
+    cause str; height_mm float32; cycle int32; `conditions` float32 (n, m), all numbers that were
     drawn, with their names `condition_names`; and rate_hz, unit, seed, scenario, simulated.
 
     Parameters

@@ -215,8 +215,8 @@ class UrCell(AbstractContextManager["UrCell"]):
     def _find_result(self, row: Row, verb: Verb) -> ResultCode | None:
         """Return the result code of the present order if this package holds it, else None.
 
-        Raise CellError if the order failed, is void or has a result that it cannot have, and if the
-        robot's program has stopped.
+        Raise CellError if the order failed, is void or has a result that it cannot have; without a
+        result, if the robot's program has stopped.
         """
         number, code = divmod(int(row.values[ANSWER]), 10)
         state = int(row.values[RUNTIME])

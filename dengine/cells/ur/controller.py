@@ -16,7 +16,7 @@ import struct
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from itertools import repeat
@@ -121,7 +121,7 @@ class RobotProgram:
                 last = number
             yield
 
-    def _carry_out(self, number: int, verb: int) -> Any:
+    def _carry_out(self, number: int, verb: int) -> Generator[None, None, ResultCode]:
         """Simulate one order, a yield per control cycle; return its result code (`yield from`).
 
         VERIFY, PROCEED and REJECT answer for the newest inserted part, by its label. FAILED if
@@ -142,11 +142,13 @@ class RobotProgram:
             return ResultCode.STOPPED
         return ResultCode.CONFIRMED if self.confirm else ResultCode.UNKNOWN
 
-    def _insert(self, number: int) -> Any:
-        """Play the next trace into the outputs, one sample per control cycle; return DONE.
+    def _insert(self, number: int) -> Generator[None, None, ResultCode]:
+        """Play the next trace into the outputs, a yield per control cycle; return DONE (`yield
+        from`).
 
         Before it come `approach` cycles, after it two at rest. While it plays, the output PHASE has
-        the order's number, and `place` is set. Return FAILED if all traces were played.
+        the order's number, and `place` is set. Returns FAILED at once, without a cycle, if all
+        traces were played.
         """
         if len(self.played) == len(self.data):
             return ResultCode.FAILED  # the bin is empty

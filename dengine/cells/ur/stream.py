@@ -292,7 +292,10 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             return StreamReport(**self._counts)
 
     def take(self, timeout: float) -> Row | None:
-        """Remove and return the oldest buffered package; None if none comes in `timeout` s."""
+        """Remove and return the oldest buffered package.
+
+        None if none comes in `timeout` s, or the stream is closed.
+        """
         with self._news:
             self._news.wait_for(lambda: self._rows or self._closing.is_set(), timeout)
             return self._rows.popleft() if self._rows else None
