@@ -44,9 +44,9 @@ BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # never 1: after one bad part its capit
 def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) -> float:
     """Return the log capital of a bettor who stakes on a mean failure probability below tolerance.
 
-    The capital starts at 1, so the result is 0 for no parts. It falls with each bad part and rises
-    with each other one, unless the tolerance is 0. It is a weighted mean of six capitals, each with
-    a fixed stake. No argument is checked.
+    The capital starts at 1, so the result is 0 for no parts. It falls with each bad part, unless
+    tolerance and propensity are 1, and rises with each other one, unless the tolerance is 0. It is
+    a weighted mean of six capitals, each with a fixed stake. No argument is checked.
 
     Parameters
     ----------

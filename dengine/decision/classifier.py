@@ -161,7 +161,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         -------
         array of float64, shape (n, 2)
             Rate of failure, rate of success, in the order of `classes_`; 0.5 each without
-            neighbours. Ones of shape (n, 1) if only one class was seen.
+            neighbours. Ones of shape (n, 1) if `classes_` has one class.
         """
         n_success, n_failure = self.count(Z)
         n = n_success + n_failure

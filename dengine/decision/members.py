@@ -123,7 +123,7 @@ class MemberEvidence(nn.Module):
     recent_errors : Tensor of int64, shape (2, L, N_RECENT)
         1 for each of the newest parts of a level that was wrong; the oldest is overwritten.
     detector_sums : Tensor of float64, shape (3,)
-        CUSUM of accepted parts, of rejected parts, and of novel traces.
+        CUSUM of accepted parts, of rejected parts, and of novel traces; may be one step below 0.
     thresholds : Tensor of float64, shape (2,)
         Score that a part must reach to be accepted, and to be rejected; `CLOSED` if nothing may
         pass.
@@ -293,10 +293,11 @@ class MemberEvidence(nn.Module):
     def step_detector(self, detector: int, step: float, times: int) -> None:
         """Add `step` to a CUSUM `times` times; start the safe mode if the sum reaches its limit.
 
-        Detector 0 watches accepted parts, 1 rejected parts, 2 novel traces. The sum restarts at 0
-        where it would fall below. With more than one step, `step` must be negative. Nothing happens
-        if `times` is 0. The safe mode's reason is the detector's; an alarm during a safe mode
-        starts it anew, under that of the two reasons that stands first in `SAFE_MODES`.
+        Detector 0 watches accepted parts, 1 rejected parts, 2 novel traces. Before each step a sum
+        below 0 is taken as 0, so the stored sum may be one step below 0. An alarm
+        (`start_safe_mode`) sets all sums to 0. With more than one step, `step` must be negative.
+        Nothing happens if `times` is 0. The safe mode's reason is the detector's; an alarm during a
+        safe mode starts it anew, under that of the two reasons that stands first in `SAFE_MODES`.
         """
         if times <= 0:
             return

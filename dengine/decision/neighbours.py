@@ -52,7 +52,7 @@ class RadiusNeighbours(nn.Module):
         return self.uncertain if self.rule.safe_mode() == 0 else self.safe_mode
 
     def forward(self, z: Tensor, part: int = 0) -> tuple[int, float, float, int, int]:
-        """Decide on one embedded trace; the rule and the references are read only.
+        """Decide on one embedded trace; the rule and the references do not change.
 
         Parameters
         ----------
@@ -69,7 +69,7 @@ class RadiusNeighbours(nn.Module):
             Bound on the success probability, from the counts; if `scored`, both are the mean of the
             first axis over the K spaces, and the action follows from it.
         n_success, n_failure : int
-            Labels within the radius, several of one part counted as fewer.
+            Labels within the radius; several of one part may count as fewer.
         """
         distances = self.references.squared_distances(z, part)
         n_success, n_failure = self.references.count_near(distances, self.radius)

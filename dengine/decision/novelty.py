@@ -274,8 +274,8 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
 
     Column j separates the traces from their j-th distortion. x (n, C, T) are the traces, plain (n,
     P) float64 their features, not standardised, as the discriminants take them. used (P,) bool
-    marks the features that the discriminants read; the rows of the others are 0. Only about
-    `DISTORTED` of the traces are distorted.
+    marks the features that the discriminants read; the rows of the others are 0. Fewer than two
+    times `DISTORTED` of the traces, evenly spaced, are distorted.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)

@@ -200,7 +200,8 @@ class Policy:
         """Probability that the outcome of a certain decision is known; it is an argument of rules.
 
         Where all line stops are known it is 1, of rejects too: nothing is claimed of rejects there,
-        because few audits would keep them closed for hundreds of parts.
+        because few audits would keep them closed for hundreds of parts. Else it is `audit_rate`,
+        but 1 where that is 0: without audits it says nothing.
         """
         return 1.0 if self.stops == "all" else self.audit_rate or 1.0
 

@@ -287,7 +287,7 @@ class RadiusIndex(nn.Module):
         -------
         n_success, n_failure : int
             (0, 0) for an empty index. If any part came more than once, several points of one part
-            are worth less than as many parts, see `count_votes`.
+            may be worth less than as many parts, see `count_votes`.
         """
         n = distances.size(0)
         if n == 0:

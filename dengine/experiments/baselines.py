@@ -202,7 +202,10 @@ class Constant(Baseline):
     lower: ClassVar[float]
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Learn nothing; labels of one class are enough."""
+        """Learn nothing, count as trained from now on, and return self.
+
+        Labels of one class, or none, are enough.
+        """
         self._last = None
         self.is_trained = True
         return self

@@ -101,7 +101,10 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
 
 
 def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> NDArray[np.float64]:
-    """Return how often each trace was marked by the field `name` of the replays, shape (size,)."""
+    """Return in how many cycles of all replays each trace was marked, shape (size,).
+
+    `name` is a field of bool, one value a cycle; `replay.index` says which trace a cycle had.
+    """
     counts = np.zeros(size)
     for replay in replays:
         counts += np.bincount(replay.index[getattr(replay, name)], minlength=size)

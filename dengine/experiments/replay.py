@@ -442,7 +442,7 @@ def _positions(decisions: list[Decision]) -> Floats:
     """Return the embedding of each decision, the mean over its spaces, (n, d).
 
     d is the width of the newest one, 2 without any. A reducer may widen as it sees more traces;
-    rows with a narrower embedding, or none, are NaN.
+    rows with an embedding of another width, or none, are NaN.
     """
     means = [
         np.mean(decision.embedding, axis=0) if decision.embedding else np.empty(0)

@@ -122,7 +122,7 @@ class DecisionModule(nn.Module):
         Raises
         ------
         ValueError
-            For another shape; nothing changes then.
+            For another shape; nothing changes then. Compiled, it is a torch.jit.Error.
         """
         x = self.as_trace(trace)
         self.settle()
@@ -188,7 +188,7 @@ class DecisionModule(nn.Module):
         Raises
         ------
         ValueError
-            For another shape.
+            For another shape. Compiled, it is a torch.jit.Error.
         """
         x = self.as_trace(trace)
         fault, content = self.decider.check(x)
@@ -245,8 +245,8 @@ class DecisionModule(nn.Module):
 
         The present pending decision is settled first. The trace (T,) or (C, T) is embedded anew,
         with the fields of the decision as they are given; `part` is a hash, 0 if unknown, and
-        `predicted` follows from the others. A faulty trace leaves none pending. Raises ValueError
-        for another shape.
+        `predicted` follows from the others. A faulty trace leaves none pending. Raises ValueError,
+        compiled torch.jit.Error, for another shape.
         """
         x = self.as_trace(trace)
         self.settle()
@@ -327,8 +327,9 @@ class DecisionModule(nn.Module):
     def as_trace(self, trace: Tensor) -> Tensor:
         """Return the trace as (C, T) float32 with the number of samples of the contract.
 
-        Another number of samples is fitted as the contract's `fit` says. Raises ValueError for
-        another shape, and for another number of samples if `fit` is "strict".
+        Another number of samples is fitted as the contract's `fit` says. Raises ValueError,
+        compiled torch.jit.Error, for another shape, and for another number of samples if `fit` is
+        "strict".
         """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
         fits = x.size(-1) == self.samples or (self.fit != 0 and x.numel() > 0)

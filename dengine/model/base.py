@@ -227,13 +227,16 @@ class EngineModel(ABC):
         """
 
     def renumber_reference(self, old: int, new: int) -> None:  # noqa: B027  # a default
-        """Replace the provisional number of a reference by the sequence number of its label."""
+        """Replace the provisional number of a reference by the sequence number of its label.
+
+        The default does nothing.
+        """
 
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
         """Relabel the reference of this number, or remove it where `y` is None.
 
-        Returns False, and changes nothing, where the reference has another hash, or the model
-        cannot change one.
+        Returns True, also where there is no such reference; False, with nothing changed, where it
+        has another hash, or the model cannot change one, as by default.
         """
         return False
 
@@ -254,7 +257,7 @@ class EngineModel(ABC):
         predicted: int = 0,
         inclusion_probability: float = 1.0,
     ) -> None:
-        """Update the rule with the outcome of one part.
+        """Update the rule with the outcome of one part; the default does nothing.
 
         Parameters
         ----------
@@ -275,7 +278,7 @@ class EngineModel(ABC):
     def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
         """Make the rule forget every outcome and start in a safe mode, a position in `SAFE_MODES`.
 
-        Position 0 is no safe mode.
+        Position 0 is no safe mode. The default does nothing.
         """
 
     @abstractmethod
@@ -283,7 +286,10 @@ class EngineModel(ABC):
         """Return a model to train next, starting from this one, which is not changed by that."""
 
     def prepare(self, previous: EngineModel) -> None:  # noqa: B027  # a default: nothing to prepare
-        """Take over the previous model's rule, stale or not, and be ready to predict at once."""
+        """Take over the previous model's rule, stale or not, and be ready to predict at once.
+
+        The default does nothing.
+        """
 
     @property
     def safe_mode(self) -> str:

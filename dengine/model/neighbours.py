@@ -187,7 +187,10 @@ def _own_structure(module: nn.Module) -> tuple[Any, ...]:
 
 
 def is_compiled_in(name: str, value: object) -> bool:
-    """Return whether scripting compiles an attribute into the code: a plain value or a function."""
+    """Return whether scripting compiles an attribute into the code.
+
+    That is a plain value or a function, under a name without a leading underscore.
+    """
     return not name.startswith("_") and isinstance(value, CONSTANTS)
 
 
@@ -623,9 +626,10 @@ class ModelPrediction(EngineModel):
         self.rule_is_stale = was_stale
 
     def reset_rule(self, safe_mode: int) -> None:
-        """Make the rule forget every outcome and start in this safe mode.
+        """Make the rule forget every outcome and start in a safe mode, a position in `SAFE_MODES`.
 
-        It is reset in place, because the compiled module shares its tensors.
+        Position 0 is no safe mode. The rule is reset in place, because the compiled module shares
+        its tensors. `rule_is_stale` stays as it is.
         """
         self.rule.load_state_dict(self.rule.clone().state_dict())
         self.rule.start_in_safe_mode(safe_mode)
@@ -808,18 +812,18 @@ def _module_state(module: nn.Module, prefix: str) -> State:
 
 
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
-    """Count the newest traces that nearly repeat a trace of another part.
+    """Count those of the newest `NEWEST` traces that nearly repeat one of another part among them.
 
     Labels are counted as independent trials, so a part that is inserted again must be known as such
     (`part=`). This notices the plain cases where it is not; it changes no decision. A trace counts
     if the nearest one of another part is nearer than `NEAR` times the distance of the next behind
-    the `NEIGHBOURS` nearest, so one with more near repeats is not noticed, and one with fewer
-    traces of other parts always counts.
+    the `NEIGHBOURS` nearest, so one with more near repeats is not noticed, one with 1 to
+    `NEIGHBOURS` traces of other parts always counts, and one with none never.
 
     Parameters
     ----------
     traces : array of float32, shape (n, channels, samples)
-        Oldest first; the newest `NEWEST` are compared.
+        Oldest first; only the newest `NEWEST` are read, and they are compared with each other.
     parts : array of int64, shape (n,)
         Hash of each trace's part.
 

@@ -434,7 +434,8 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
 def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     """Return the folds of traces (n, C, T), int64 (n,): those given, or by the traces' content.
 
-    Raises SettingError if folds are given, but not one from 0 to n_folds - 1 for each trace.
+    Given folds are cast to int64. Raises SettingError if they are not one from 0 to n_folds - 1 for
+    each trace.
     """
     if folds is None:
         return content_fold(traces, n_folds)

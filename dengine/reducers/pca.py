@@ -58,6 +58,8 @@ class PcaReducer(Reducer):
         ------
         SettingError
             If there are no more than `n_components` traces, or fewer samples in a trace.
+        TraceError, ValueError
+            For an X of another shape, and for values that are not finite.
         """
         rows = as_rows(self.check_traces(X, reset=True))
         if len(rows) <= self.n_components:

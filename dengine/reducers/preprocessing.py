@@ -84,7 +84,7 @@ def averaging(traces: Tensor, min_frames: int = MIN_FRAMES) -> int:
     Parameters
     ----------
     traces : Tensor of float32, shape (n, C, T)
-        At least one; of many, about 256 that are evenly spaced are read.
+        At least one; of many, 256 at most that are evenly spaced are read.
     min_frames : int, default 200
         Smallest number of samples of an averaged trace.
 

@@ -324,8 +324,10 @@ class RocketReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, labels or folds do not fit the traces, or those
-            outside a fold have a single class.
+            If a parameter is out of its range, labels or folds do not fit the traces, a trace has
+            one sample, or the traces outside a fold have a single class.
+        TraceError, ValueError
+            For an X of another shape, and for values that are not finite.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -393,7 +395,7 @@ class RocketReducer(Reducer):
         """Build the module `net_`, and set channel scales and kernels from traces (n, C, T).
 
         No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its
-        range.
+        range or fewer than 2 samples.
         """
         x = torch.from_numpy(traces)
         self.average_ = averaging(x)
@@ -404,7 +406,7 @@ class RocketReducer(Reducer):
         """Set an empty module, `net_`, and an empty state for traces of this shape.
 
         The number of samples that are averaged, `average_`, must be set. Raises SettingError for a
-        parameter out of its range.
+        parameter out of its range or fewer than 2 samples.
         """
         self.check()
         encoder = RocketEncoder(

@@ -202,6 +202,8 @@ class TorchReducer(Reducer):
             If a parameter is out of its range, labels or folds do not fit the traces, the
             checkpoint cannot be used, a trace has one sample, or fewer than two traces lie outside
             a fold.
+        TraceError, ValueError
+            For an X of another shape, and for values that are not finite.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)

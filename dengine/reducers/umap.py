@@ -220,6 +220,8 @@ class UmapReducer(Reducer):
         SettingError
             If a parameter is out of its range, or there are no more traces than `n_neighbors` or
             than `n_components`.
+        TraceError, ValueError
+            For an X of another shape, and for values that are not finite.
         """
         traces = self.check_traces(X, reset=True)
         self.check(len(traces))
@@ -296,7 +298,7 @@ class UmapReducer(Reducer):
     def _start(self, traces: Floats) -> None:
         """Forget all trainings, draw the seed, and fit the frames to traces (n, C, T).
 
-        Of many traces about 256, evenly spaced, are read.
+        Of many traces 256 at most, evenly spaced, are read.
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)

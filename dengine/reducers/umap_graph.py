@@ -76,9 +76,10 @@ class Frames(nn.Module):
 
 
 def frames_for(traces: Floats) -> Frames:
-    """Return a new `Frames` module for traces (n, C, T).
+    """Return a new `Frames` module for traces (n, C, T), which has yet to `learn` them.
 
-    It makes about 100 frames of each channel, more where an oscillation would be lost.
+    It makes 100 to 199 frames of each channel, more where an oscillation would be lost, and fewer,
+    one for each sample, of traces shorter than that.
     """
     _, channels, samples = traces.shape
     n_frames = samples // averaging(torch.from_numpy(traces), MIN_FRAMES)

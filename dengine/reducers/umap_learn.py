@@ -73,6 +73,8 @@ class UmapLearnReducer(Reducer):
         ------
         SettingError
             If there are no more than `n_neighbors` traces.
+        TraceError, ValueError
+            For an X of another shape, and for values that are not finite.
         ImportError
             If umap-learn is not installed.
         """
