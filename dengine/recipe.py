@@ -232,7 +232,8 @@ class Recipe:
         """Parse the recipe among the settings of a store, without importing a class that it names.
 
         Raises StoreError if `radius` or `retrain_every` is missing and a user's class would have to
-        be imported for its default: the store is damaged. Raises SettingError as `from_toml`.
+        be imported for its default: the store is damaged. Raises SettingError for a text
+        that is no recipe.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]

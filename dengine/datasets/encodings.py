@@ -35,8 +35,8 @@ SHOWN = 24  # characters of a text
 def decode(content: bytes, stated: str | None = None) -> tuple[str, str]:
     """Return the text of a file, and the name of its encoding.
 
-    UTF-16 is known by its mark or its zeros. Else UTF-8 is tried, then the stated encoding or
-    Windows-1252, and at last Latin-1, which reads anything.
+    UTF-16 is known by its mark or its zeros. Else UTF-8 is tried (the name is utf-8-sig), then the
+    stated encoding; without one Windows-1252, and at last Latin-1, which reads anything.
 
     Parameters
     ----------

@@ -352,7 +352,7 @@ def means_good(column: str) -> bool:
 
 
 def _name_words(column: str) -> list[str]:
-    """Return the words of a column's name in lower case, without `FLAG_ENDINGS`."""
+    """Return the words of a column's name in lower case, without `FLAG_ENDINGS` at its end."""
     words = re.findall(rf"{LETTER}+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", column).lower())
     while len(words) > 1 and words[-1] in FLAG_ENDINGS:
         words.pop()
@@ -475,7 +475,8 @@ def labels_that_agree(
     """Return a source of the labels of `first`, which other sources must not contradict.
 
     Its `find` raises SeveralLabelsError, which names both places, if labels contradict each other,
-    else what `agreed_label` raises.
+    UnknownWordError for a word of unknown meaning in any source, and without a label the error of
+    the first source, or with `fills_in` of the last.
 
     Parameters
     ----------

@@ -365,7 +365,7 @@ def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOpt
 def _label_advice(named: Mapping[str, Path], options: LoadOptions) -> str | None:
     """Return advice, for an error, how the user can say where the labels of recordings are.
 
-    Other ways to read names are tried on all recordings, then each column on twenty of them. None
+    Other ways to read names are tried on all recordings, then each column on a sample of them. None
     if no way finds labels for most.
     """
     suggestions = [

@@ -331,7 +331,7 @@ class RobotCalls:
             decisions, accepted, rejected, bad (false accepts): so far. verified_share: of the
             newest 500 decisions, 1 without any. version: of the model. safe_mode, alarm: why, or
             "".
-            shadow: whether every part is verified. waiting: requests in the queue. late, busy:
+            shadow: whether the shadow mode is on. waiting: requests in the queue. late, busy:
             decisions past the deadline, and requests refused.
 
         Raises
