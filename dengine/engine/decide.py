@@ -93,7 +93,7 @@ class DecisionMaker:
             Number of the part.
         model : EngineModel or None
             The model that answers; None before the first training: then the decision is VERIFY,
-            `Reason.NO_MODEL`, unless the trace has a fault or a force limit rejects.
+            `Reason.NO_MODEL`, unless the trace has a fault or is outside a force limit.
         version : int
             Number of the model's version.
         verify_reason : Reason, optional
@@ -107,7 +107,7 @@ class DecisionMaker:
         StoredDecision
             The record for the store, with number 0. It is quarantined if the trace has a fault. A
             model that raises, or returns impossible bounds, is logged, and the decision is VERIFY
-            with `Reason.MODEL_ERROR`, unless a force limit rejects.
+            with `Reason.MODEL_ERROR`, unless the trace has a fault or is outside a force limit.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         conditions = self._settings.conditions or self._first_conditions

@@ -292,7 +292,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             Where the store does not exist or is not used, or another engine owns the cell.
         SettingError
-            Where an object is missing, not needed, or another than before.
+            Where an object is missing or another than before, or a model is not needed.
         ImportRefusedError
             A SettingError, where a class would have to be imported that is not allowed.
         """
@@ -330,9 +330,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             As for `open`; a class that the settings name is allowed.
         **settings
             As `DataEngine` takes them. For a used store those that are given must be those in
-            force: the settings of a running cell do not change in silence. `model`, `executor`,
-            `clock`, `replaying` and `on_safe_mode` are not stored and taken as they are. A new cell
-            of a product takes what is left open from its peers.
+            force: the settings of a running cell do not change in silence. `model` is as for
+            `open`; `executor`, `clock`, `replaying` and `on_safe_mode` are not stored and taken as
+            they are. A new cell of a product takes what is left open from its peers.
 
         Returns
         -------
@@ -394,8 +394,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         part : str or int, optional
             The part's number. A part that comes again has one vote, and none on itself.
         decision_id : str, optional
-            An id of the caller's. The same id and trace have the same decision for ever, and the
-            decision is on disk when this returns.
+            An id of the caller's. The same id and trace have the same decision for ever, and an
+            ACCEPT or REJECT is on disk when this returns.
 
         Returns
         -------
@@ -444,8 +444,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ------
         ReportError
             For an unknown id, a second report, or what is no label.
+        TraceError
+            For a wrong trace or part's number of a lost decision.
         StoreError
-            Where the label is not known to be on disk: report the same again.
+            Where the label is not known to be on disk: report the same again. Also as of `decide`.
         """
         return self._core.report(decision_id, success, trace, part)
 

@@ -221,8 +221,8 @@ class Feedback:
 
         A trace with a fault teaches neither; any other outcome counts as a new label. A rejected
         part that was inspected does not update the rule: which of them are inspected is somebody's
-        choice, and no sample. All others set the count of unobserved parts back to zero, and the
-        label keeps that count.
+        choice, and no sample. An outcome that updates the rule sets the count of unobserved parts
+        back to zero, and its label keeps that count, without the part itself.
         """
         decision = stored.decision
         version = self._live.version

@@ -221,9 +221,10 @@ class Learner:
     def start_retrain(self) -> RetrainReport | None:
         """Begin to train in the executor and return None.
 
-        A training under way comes a step further instead. Before a new one, labels are stored, and
-        news of peers is taken in. Without an executor that takes work, retrain in this thread and
-        return the report. Raises StoreError where the labels before it cannot be stored.
+        A training under way comes a step further, and a new one begins only if that ended it.
+        Before a new one, labels are stored, and news of peers is taken in. Without an executor that
+        takes work, retrain in this thread and return the report. Raises StoreError where the labels
+        before it cannot be stored.
         """
         self.collect()
         if self.is_busy:

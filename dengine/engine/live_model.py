@@ -106,7 +106,8 @@ class LiveModel:
         """Restore a stored version, bit for bit, and learn the outcomes that came after it.
 
         Without a version, or where its model cannot be restored, the template stays, and its rule
-        is updated with every stored outcome. Stored reference points are read, not computed again.
+        is updated with the stored outcomes since it began. Stored reference points are read, not
+        computed again.
 
         Parameters
         ----------
@@ -240,9 +241,11 @@ class LiveModel:
         return True
 
     def rebuild_rule(self) -> None:
-        """Reset the newest model's rule and update it with every stored outcome since it began.
+        """Reset the newest model's rule, and update it with `SqlStore.outcomes_since` it began.
 
-        Raises StoreError, and changes nothing, where the store is away.
+        Overdue checks are among these. Labels that are not in the store yet are not, so the rule
+        forgets them: store them before. The ledger is not checked here. Raises StoreError, and
+        changes nothing, where the store is away.
         """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
@@ -269,8 +272,9 @@ class LiveModel:
         """Apply the store's newest corrections to the references of the answering model.
 
         Returns False where the model must be trained again: always for a baseline, and where it
-        cannot change a reference. Returns True before the first retrain. The rule is left to
-        `rebuild_rule`. Raises StoreError where the store is away.
+        cannot change a reference. That is said once for each correction: the caller must retrain
+        then. Returns True before the first retrain. The rule is left to `rebuild_rule`. Raises
+        StoreError where the store is away.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None

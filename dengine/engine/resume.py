@@ -90,8 +90,8 @@ def add_labels_since(
     number of the newest correction in the store.
     """
     corrected_to = newest_correction(version)
-    # A baseline cannot be corrected afterwards, so it gets each label as it was when the version
-    # was stored.
+    # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another
+    # model gets it as it was when the version was stored, and then the corrections.
     as_of = corrected_to if model.keeps_references else None
     # Up to the newest label in the window: what peers stored since then comes as their news.
     since = store.labelled(

@@ -158,7 +158,8 @@ class EngineSettings:
         StoreError
             For an unused store, and for a seed that is damaged.
         SettingError
-            Where an object is missing, not needed, or another than the engine was made with.
+            Where an object is missing or another than the engine was made with, or a model is not
+            needed.
         ImportRefusedError
             Where the recipe names a class that may not be imported.
         """
@@ -261,10 +262,12 @@ class EngineSettings:
 def _with_objects(
     recipe: Recipe, texts: Mapping[str, str], name: str, reducer: Any, model: Model | None
 ) -> Recipe:
-    """Return a stored recipe, with the reducer object that was handed in put into it, if any.
+    """Return a stored recipe, with the reducer object put into it if the recipe cannot name it.
 
-    Raises SettingError where an object is missing, not needed, or another than the store was made
-    with.
+    `texts` are the store's settings, `name` is the store's, for errors. An object equal to the
+    reducer that the recipe names is accepted and not used, as is any reducer beside a model. Raises
+    SettingError where an object is missing, a model is not needed, or an object is another than the
+    store was made with.
     """
     if "model" in texts and model is None:
         raise SettingError(

@@ -251,8 +251,8 @@ class Retrainer:
         """Begin to train a successor of the current model in the executor, on the window as it is
         now.
 
-        `collect` returns the outcome. Returns False, and begins nothing, without an executor and
-        where it takes no more work; such an executor is given up.
+        `collect` returns the outcome; none may be under way. Returns False, and begins nothing,
+        without an executor and where it takes no more work; such an executor is given up.
         """
         if self.executor is None:
             return False
@@ -295,7 +295,8 @@ class Retrainer:
     def _give_up(self, future: Future[Trained], error: Exception) -> str:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
-        An executor that died or did not finish in time is used no more.
+        An executor that died or did not finish in time is used no more: later retrains run in the
+        calling thread.
         """
         training_raised = future.done() and not isinstance(error, BrokenExecutor)
         log.error("a retrain in the executor failed: %s", error, exc_info=training_raised)

@@ -1,5 +1,5 @@
 """The map of the parts for the web page: where known and newest parts lie in the embedding.
-`part_map` reads it from the store as a `PartMap`, a list of `Mark`s: the newest references of the
+`part_map` reads it from the store as a `PartMap` with its `Mark`s: the newest references of the
 model with their labels, and the newest decisions.
 """
 
@@ -84,8 +84,8 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     Returns
     -------
     PartMap
-        With the newest 250 references, and those of the newest 10 decisions that this version made.
-        A part that is both is a newest one.
+        With the newest 250 references, and those of the newest 10 decisions that this version made
+        and embedded. A part that is both is drawn once, as a newest one.
     """
     recent = [item.decision for item in store.decisions(HistoryFilter(), N_NAMED)]
     ids = [decision.id for decision in recent[-N_NEWEST:] if decision.model_version == version]

@@ -274,7 +274,8 @@ def reading(url: str) -> Iterator[sa.Connection]:
     Raises
     ------
     StoreError
-        If there is no file, if it is no store of the present schema, and if the database fails.
+        If there is no file, if it is no store of the present schema, if the database fails, and for
+        a ValueError, TypeError or OSError of the block that is not dengine's own.
     """
     engine = make_engine(url)
     name = engine.url.render_as_string(hide_password=True)
@@ -403,7 +404,8 @@ class Database:
         """Context manager that opens a read transaction and gives its connection.
 
         `before_use` is called first, so that waiting records are seen. Raise StoreError if the
-        database fails or is closed, and for a ValueError, TypeError or OSError of the block.
+        database fails or is closed, and for a ValueError, TypeError or OSError of the block that is
+        not dengine's own.
         """
         self.check_open()
         self._before_use()
@@ -417,8 +419,9 @@ class Database:
         After the block a ledger entry for the rows that it added is inserted, and both are
         committed; then `newest_entry` is set and `on_entry` called. Without such rows, or changed
         settings, there is no entry. On an error everything is rolled back; dengine's own errors
-        pass, others become StoreError. It is raised, too, if the file was replaced, or if
-        `commit_if` no longer wants the commit.
+        pass, those of the database, a file or a value become StoreError, any other passes.
+        StoreError is raised, too, if the file was replaced, or if `commit_if` no longer wants the
+        commit.
         """
         with _store_errors("write to", self.name), self._writer.connect() as connection:
             connection.execution_options(dengine_write=True)
@@ -586,8 +589,9 @@ class Database:
         Raises
         ------
         StoreError
-            If the database fails or is closed; then nothing is written, nor if `add_rows` raises.
-            Other errors of dengine pass unchanged.
+            If the database fails or is closed, and for a ValueError, TypeError or OSError of
+            `add_rows` that is not dengine's own. Other errors pass unchanged. Whatever is raised,
+            nothing is written.
         """
         self.check_open()
         if flush_first:
@@ -719,8 +723,8 @@ class Database:
 
         Return (decision id, number) of each label, new or stored before with the same value. A
         record that contradicts a stored one becomes an event of kind "dead letter". A line stop of
-        a part whose label was "confirmed" by silence corrects that label to failure, unless it was
-        forgotten.
+        a part whose label was "confirmed" by silence corrects that label to failure, and its number
+        is returned, too; if it was forgotten, the line stop is a dead letter.
         """
         events = self._new_events(
             connection, [record for record in records if isinstance(record, Event)]

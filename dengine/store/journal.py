@@ -279,7 +279,8 @@ class Journal:
         """Cut off the reserved space, and the records if all are drained; close, unlock the file.
 
         The file stays with its header, for the next engine to compare with the ledger. A journal
-        that was opened for reading is only closed.
+        that was opened for reading is only closed. Raise StoreError, and leave it open, if the cut
+        fails.
         """
         if self._owning and not self._file.closed:
             with _os_errors(self.path):

@@ -58,7 +58,7 @@ def _when(record: Any) -> datetime:
     return datetime.fromtimestamp(record.time, UTC)
 
 
-def unknown_decision(decision_id: str) -> ReportError:
+def unknown_decision(decision_id: str) -> UnknownDecisionError:
     """Return the error for a report on a decision that the store does not hold."""
     actual = f"{shortened(decision_id)}, which this cell's store does not hold"
     do = "report the `Decision.id` that `decide` returned, to the same store and cell_id"
@@ -67,7 +67,7 @@ def unknown_decision(decision_id: str) -> ReportError:
 
 def already_reported(
     decision_id: str, first: tuple[bool, Source], second: tuple[bool, Source]
-) -> ReportError:
+) -> ReportConflictError:
     """Return the error for a second label of a decision; it names both labels.
 
     Parameters

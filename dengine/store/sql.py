@@ -656,8 +656,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     ) -> int:
         """Commit a retrain, and delete the states of older versions that are no longer kept.
 
-        A store in memory without a product keeps the arrays as they are, and writes them when it is
-        next read, or when 40 wait.
+        A store in memory without a product keeps the copied arrays, and writes them when it is next
+        read, or when 40 retrains wait.
 
         Parameters
         ----------
@@ -1215,7 +1215,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return journal
 
     def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
-        """Commit records of a journal in one transaction.
+        """Commit records of a journal, in one transaction unless the database refuses a record.
 
         A record that is stored already and is the same counts as taken. A line stop of a part that
         silence had confirmed corrects its label. Another decision with the same id, a label without
