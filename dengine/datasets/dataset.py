@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RATE_TOLERANCE = 0.03  # of the others' rate: recordings within it have one rate
+MANY = 10  # recordings, among which both labels are expected
 FAR = 50.0  # times the usual largest value: a recording beyond has another unit or is none
 MAX_RATE_RATIO = 2.0  # a recording at a rate further from the others' is not resampled
 UNKNOWN_RATE = (
@@ -505,6 +506,9 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         notes.append(f"{collector.unlabelled_text(n)}: they are left out.")
     if not rate:
         notes.append(UNKNOWN_RATE)
+    n_good = sum(recording.label for recording in recordings)
+    if n_good in (0, len(recordings)) and len(recordings) >= MANY:
+        notes.append(f"No recording is {'bad' if n_good else 'good'}: check how labels are read.")
     # A recording without a number is a part of its own.
     parts = [recording.part or recording.source for recording in recordings]
     has_parts = any(recording.part is not None for recording in recordings)

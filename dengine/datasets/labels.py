@@ -88,6 +88,11 @@ LETTER = r"[^\W\d_]"
 WORD_START = rf"(?:(?<!{LETTER})|(?<=[a-z])(?=[A-Z]))"
 WORD_END = rf"(?:(?!{LETTER})|(?<=[a-z])(?=[A-Z]))"
 NOT = r"(?P<not>(?i:not|non|no|nicht)[\W_]*)?"
+# Words before a label that may be a not in another language, or something else.
+MAYBE_NOT = re.compile(
+    rf"{WORD_START}(?i:ikke|inte|icke|ej|ei|pas|ne|niet|geen|nie|não|nao|keine?|není|neni|bez|sin|не"
+    r"|isn'?t|never|almost|ohne|without|sans)[\W_]+$"
+)
 USER_NOT = r"(?P<not>(?i:not|non|no|nicht|keine?)(?:[\W_]+|(?=[A-Z])))?"
 WORDS = "|".join(word for word in MEANING if not word.isdecimal())
 # i.O., o.k., and what n makes of them: n.i.O., nio, n-ok.
@@ -635,6 +640,8 @@ def _find_word(name: str, words: LabelMap) -> _FoundLabel:
             raise UnlabelledError(match[0].lower())
         raise NoLabelError([_last_word(text) for text, _ in _components(name)])
     first = deciding[0]
+    if maybe_not := MAYBE_NOT.search(name[name.rfind("/", 0, first.start) + 1 : first.start]):
+        raise UnknownWordError(f"{maybe_not[0]}{first.text}")
     for other in labels:
         if other.label != first.label:
             actual = f"{first.text} and {other.text} contradict each other in its name or folder"

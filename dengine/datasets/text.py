@@ -502,8 +502,8 @@ def rows_to_trace(
     trace = np.ascontiguousarray(values.T)
     try:
         clock = clock_of(rows, options.time, units_row)
-    except UnreadableError:
-        if options.rate_hz is None:
+    except UnreadableError as error:
+        if options.rate_hz is None or error.line:
             raise
         return TimedTrace(trace)  # a stated rate needs no clock
     if clock is not None:

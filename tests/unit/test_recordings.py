@@ -1332,3 +1332,31 @@ def test_booleans_of_excel_are_labels_in_any_language(pair: str, tmp_path: Path)
     assert load_dataset(source, **options).y.tolist() == [1, 0]
     source, options = as_folder([good, bad], "Ausschuss", tmp_path)
     assert load_dataset(source, **options).y.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("word", ["ikke", "pas", "niet", "não", "ei", "ohne", "не", "never"])
+def test_a_not_in_another_language_is_asked_for(word: str, small: Dataset, tmp_path: Path) -> None:
+    for i in range(15):
+        write_csv(tmp_path / f"{i}_{f'{word}_ok' if i % 3 == 0 else 'ok'}.csv", small.X[i])
+    with pytest.raises(DataError, match=f"label_map='{word}_ok=bad'"):
+        load_dataset(tmp_path)
+    data = load_dataset(tmp_path, label_map=f"{word}_ok=bad")
+    assert data.y.tolist() == [int(i % 3 > 0) for i in range(15)]
+
+
+def test_that_no_recording_is_bad_is_said(small: Dataset, tmp_path: Path) -> None:
+    for i in range(12):
+        write_csv(tmp_path / f"{i}_ok.csv", small.X[i])
+    assert "No recording is bad: check how labels are read." in load_dataset(tmp_path).notes
+
+
+@pytest.mark.parametrize("rate_hz", [None, 250.0])
+def test_a_word_among_the_times_is_a_fault_also_with_a_stated_rate(
+    rate_hz: float | None, few: Path
+) -> None:
+    path = min(few.iterdir())
+    header, *rows = path.read_text("utf-8").splitlines()
+    path.write_text("\n".join([header, "Max,9.0", "Min,0.0", *rows]) + "\n")
+    data = load_dataset(few, rate_hz=rate_hz)
+    assert [(f.source, f.line) for f in data.faults] == [(path.name, 2)]
+    assert "got 'Max'; time='none' and a stated rate (rate_hz) need none" in data.faults[0].message
