@@ -194,7 +194,9 @@ class EngineCore:
 
         Before it decides, the call takes a short step with a version that the executor has trained
         (where cells share a product, all steps), and counts earlier accepted parts without a report
-        as confirmed or unobserved. Afterwards it announces a safe mode that began or ended.
+        as confirmed or unobserved. Afterwards it announces a safe mode that began or ended. Raises
+        TraceError for a wrong trace or part's number, ReportError for what is no id, and StoreError
+        for an engine that is closed, only reads, or is in use by another thread.
         """
         self.outbox.check_usable()
         with self.exclusive:
@@ -393,11 +395,11 @@ class EngineCore:
         """Learn the outcome of a decision; return the report of a retrain done here for it, or
         None.
 
-        Arguments and errors are those of `DataEngine.report`; `trace` and `part` are used only
-        where the decision is unknown and `success` is False. It returns when the label is on disk,
-        and raises NotTakenError where that is not certain. Then a retrain that is due is done in
-        this thread, or begun in the executor. The label of a trace with a fault is stored, and sets
-        off no retrain.
+        `trace` and `part` are used only where the decision is unknown and `success` is False. It
+        returns when the label is on disk, and raises NotTakenError where that is not certain. Then
+        a retrain that is due is done in this thread, or begun in the executor. The label of a trace
+        with a fault is stored, and sets off no retrain. Raises ReportError, TraceError and
+        StoreError as `DataEngine.report`.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)

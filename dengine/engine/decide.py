@@ -85,6 +85,8 @@ class DecisionMaker:
         """Decide on one trace and return the record of it, which is not recorded yet; any thread
         may call it.
 
+        A trace contract must be in force, or `infer_trace_spec` must have been called before.
+
         Parameters
         ----------
         x : array of float32, shape (C, T)

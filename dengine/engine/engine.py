@@ -232,10 +232,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _start(
         self, settings: EngineSettings, template: EngineModel, store: SqlStore, **options: Any
     ) -> None:
-        """Compose the engine's objects on an opened store; options as of `EngineCore`.
+        """Compose the engine's objects on an opened store.
 
-        It sets `store`, `seed`, and `resumed` to False. From now on the store is closed when the
-        engine is garbage-collected.
+        The options are executor, replaying, clock, on_safe_mode and reading. It sets `store`,
+        `seed`, and `resumed` to False. From now on the store is closed when the engine is
+        garbage-collected.
         """
         self.store = store
         self.seed = settings.seed
@@ -326,8 +327,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             None: a new one in memory.
         seed : int, optional
             None: that of the used store, of a peer, or 0.
-        wait, allow_import
-            As for `open`; a class that the settings name is allowed.
+        wait : float, optional
+            Seconds that a call waits for the database; not used for an open store.
+        allow_import : bool
+            Whether any `module:Class` that the store names is imported. One that the settings name
+            is imported in any case.
         **settings
             As `DataEngine` takes them. For a used store those that are given must be those in
             force: the settings of a running cell do not change in silence. `model` is as for
@@ -447,7 +451,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         TraceError
             For a wrong trace or part's number of a lost decision.
         StoreError
-            Where the label is not known to be on disk: report the same again. Also as of `decide`.
+            Where the label is not known to be on disk: report the same again. Also for an engine
+            that is closed, was opened for reading, or is in use by another thread.
         """
         return self._core.report(decision_id, success, trace, part)
 
@@ -569,8 +574,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def certificate(self) -> Certificate:
         """Flush, and return bounds, at confidence 1 - alpha, on the errors of unchecked decisions.
 
-        Decisions since the last change of policy count. Raises NotTakenError as `flush`, and
-        StoreError where the store cannot be read.
+        Decisions since the last change of policy count. Raises NotTakenError where not everything
+        is on disk in time, and StoreError where the store cannot be read.
         """
         self.flush()
         policy = self.policy

@@ -189,7 +189,7 @@ class Feedback:
         the new label goes there too, and `remedy` is set to CORRECT. Otherwise its reference is
         removed, and `remedy` is set to REBUILD_RULE, as for a check that was counted as overdue.
         Returns whether there was such a confirmation, whatever the label is now. Raises ReportError
-        as `take_in`.
+        for any other second label.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)

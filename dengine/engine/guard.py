@@ -55,10 +55,11 @@ class GuardedModel:
             self.model.prepare(previous)
 
     def update_rule(self, *outcome: Any) -> None:
-        """Update the model's rule with the outcome of a part: the arguments of
-        `EngineModel.update_rule`.
+        """Update the model's rule with the outcome of a part.
 
-        Where it fails, that is logged, and the model refuses to predict.
+        `outcome` is what `EngineModel.update_rule` takes: lower, upper, success, novel, unobserved,
+        predicted (a position in `ACTIONS`), inclusion_probability. Where it fails, that is logged,
+        and the model refuses to predict.
         """
         with logged_failure(
             "an update of the rule failed; every part is verified until the engine is opened again"

@@ -136,9 +136,9 @@ class Learner:
 
         If silence had confirmed the part before, it also waits for the store, so that the rule is
         put right now; where the store does not answer, that happens later. A safe mode that began
-        or ended is announced. Raises ReportError as `Feedback.take_in`, and NotTakenError where the
-        label is not known to be on disk: it is learned all the same, and the same report may come
-        again.
+        or ended is announced. Raises ReportError for a second label, except that a line stop may
+        follow a confirmation, and NotTakenError where the label is not known to be on disk: it is
+        learned all the same, and the same report may come again.
         """
         self.catch_up()
         confirmed_wrongly = self._feedback.take_in(stored, success)
@@ -308,8 +308,8 @@ class Learner:
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
 
     def _begin_retrain(self) -> None:
-        """Prepare for a training: wait for what is computed in advance, take in news of peers as
-        `_take_in_all_news` does, and count new labels from zero.
+        """Prepare for a training: wait for what is computed in advance, take in the peers' news if
+        the store answers, and count new labels from zero.
         """
         if self._precomputed is not None:
             self._precomputed.result()
@@ -504,9 +504,9 @@ class Learner:
     def bring_up_to_date(self) -> None:
         """Finish what is under way before a person's change: a retrain, labels, news of peers.
 
-        A retrain that takes longer than `HUNG` seconds is given up; news is taken in as
-        `_take_in_all_news` does. Raises StoreError where the store is away, or where labels of
-        peers before one of this cell's are missing.
+        A retrain that takes longer than `HUNG` seconds is given up; of the news at most `ROUNDS`
+        times `MOST` labels are taken in. Raises StoreError where the store is away, or where labels
+        of peers before one of this cell's are missing.
         """
         self.collect(HUNG)
         self.store_labels()
@@ -541,8 +541,8 @@ class Learner:
         `event`.
 
         Later labels, up to the window's capacity, become its references, and the present rule goes
-        on. New labels count from zero. Raises StoreError for a version that is not kept, and where
-        a trace is damaged that the model must be fitted on again.
+        on. New labels count from zero. Raises StoreError for a version that is not kept, where a
+        trace is damaged that the model must be fitted on again, and where it cannot be stored.
         """
         self._outbox.check_integrity()
         begin = self._clock()
@@ -573,7 +573,7 @@ class Learner:
 
         With `policy` the rule starts anew and counts the decisions of `evidence`. With None only
         settings outside the model have changed, and its rule goes on. Before the first retrain only
-        the event is stored.
+        the event is stored. Raises StoreError where it cannot be stored: then nothing changes.
         """
         live = self.live
         template = live.template

@@ -327,7 +327,8 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     Returns
     -------
     Status
-        With `store_fault`, `retraining` and `store_lag` as of an engine that does not run.
+        Its `store_fault` is "", `retraining` False and `store_lag` 0.0: only a running engine knows
+        them.
 
     Raises
     ------

@@ -49,10 +49,10 @@ def check_peer_settings(
 ) -> None:
     """Check that two cells of a product would embed a trace in the same way.
 
-    Compared are the reducer with its parameters, folds, training window, novelty, seed, trace spec
-    and model. A policy, a radius, a schedule or a budget may differ: a version's arrays do not
-    depend on them. A cell without a recipe yet, and a trace spec that one of them has not set yet,
-    fit everything.
+    Compared are the reducer with its parameters, folds, training window, novelty, seed, trace spec,
+    model, and the description of an object that was handed in. A policy, a radius, a schedule or a
+    budget may differ: a version's arrays do not depend on them. A cell without a recipe yet, and a
+    trace spec that one of them has not set yet, fit everything.
 
     Parameters
     ----------

@@ -356,9 +356,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def news_since(self, seq: int, limit: int) -> ProductNews:
         """Return what the cells of the product, this one included, stored after label number `seq`.
 
-        Only labels that train are returned, as in `labelled`, with the numbers of the newest
-        version and correction. A trace that is not as it was stored is left out, and an event is
-        written to the store.
+        Only labels that train are returned, none that was forgotten or of a quarantined trace, with
+        the numbers of the newest version and correction. A trace that is not as it was stored is
+        left out, and an event is written to the store.
 
         Parameters
         ----------
@@ -690,8 +690,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _commit_version(self, *arguments: Any) -> int:
         """Commit the row of a retrain and delete stored states that are no longer kept.
 
-        The arguments are those of `_version_row`. Return the version's number, which is higher than
-        the one given if a peer has taken that.
+        The arguments are report, last_seq, state and now, as of `_version_row`. Return the
+        version's number, which is higher than the one given if a peer has taken that.
         """
         row = self._version_row(*arguments)
         return self.database.write(
@@ -714,8 +714,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     ) -> dict[str, Any]:
         """Return the row of a retrain for the table `model_version`, its arrays packed as npz.
 
-        `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError as
-        `check_state` does.
+        `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError for
+        an accepted version without arrays, and for an array of Python objects.
         """
         arrays = check_state(report, state)
         blob = None if arrays is None else to_npz(arrays)
