@@ -102,7 +102,7 @@ def _describe(value: Any, names: set[str], seen: set[int]) -> Any:
     return _describe_function(value, seen)
 
 
-def _describe_function(function: FunctionType, seen: set[int]) -> Any:
+def _describe_function(function: FunctionType, seen: set[int]) -> tuple[Any, str, list[Any]]:
     """Return (instructions, text of the defaults, referred values) of a function.
 
     The referred values are (name, description) of each global and closure variable that the code
@@ -126,7 +126,7 @@ def _names(code: CodeType) -> Iterator[str]:
             yield from _names(constant)
 
 
-def _instructions(code: CodeType) -> Any:
+def _instructions(code: CodeType) -> tuple[bytes, tuple[str, ...], list[Any]]:
     """Return (bytecode, names, constants) of code, to compare by.
 
     The constants are texts, and for a nested function again such a triple.

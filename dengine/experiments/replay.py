@@ -292,7 +292,7 @@ class Replay:
             first_cycle and last_cycle, counted from 1. verified_share, NaN without cycles. Numbers
             of cycles: verified, accepted, rejected, false_positive, false_negative, novel,
             safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts passed on,
-            None without a clock or without cycles.
+            None without a clock, without cycles, and where no time passed.
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}

@@ -376,6 +376,8 @@ class ModelPrediction(EngineModel):
             Where the reducer cannot be trained, as by one class or by too few traces.
         TraceError, DataError
             For traces of another shape, and for labels other than 1 and 0.
+        ValueError
+            For another number of labels or hashes than of traces.
         """
         X = as_traces(X)
         y = as_labels(y)
@@ -544,7 +546,7 @@ class ModelPrediction(EngineModel):
 
         `y` is 1 for success, 0 for failure. The content of the trace gives its fold and stands for
         its part. The reducer is not trained, and a full index drops its oldest reference. Returns
-        self; raises ValueError if nothing was fitted.
+        self; raises ValueError if nothing was fitted, and for another label.
         """
         X = as_traces(np.asarray(x)[None])
         hash_ = int(content_hash(X)[0])
@@ -701,7 +703,8 @@ class ModelPrediction(EngineModel):
 
         X has the shape (n, samples) or (n, channels, samples). Returns (n_success, n_failure), each
         an array of int64, shape (n,); 0 for a novel trace. No part is excluded, so a reference
-        counts itself. Raises RuntimeError where the rule is stale.
+        counts itself. Raises RuntimeError where the rule is stale, ValueError where nothing was
+        fitted.
         """
         predictions = self.predict_many(X)
         n_success = np.array([prediction.n_success for prediction in predictions], dtype=np.int64)
@@ -712,7 +715,7 @@ class ModelPrediction(EngineModel):
         """Return (lower, upper), each float64 (n,): the bounds of each trace's success probability.
 
         X has the shape (n, samples) or (n, channels, samples). The bound is (0, 1) for a novel
-        trace. Raises RuntimeError where the rule is stale.
+        trace. Raises RuntimeError where the rule is stale, ValueError where nothing was fitted.
         """
         predictions = self.predict_many(X)
         lower = np.array([prediction.lower for prediction in predictions])

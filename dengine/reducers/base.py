@@ -284,8 +284,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             If a value is not finite or not a number, if a table has other columns than in `fit`,
             and with `reset` if there is no trace.
         TraceError
-            If the shape is none of traces, or another than in `fit`; a plain ValueError for
-            another number of columns of X (n, T).
+            If the shape is none of traces, or another than in `fit`; a plain ValueError for a
+            single trace (T,) and for another number of columns of X (n, T).
         """
         if not reset:
             check_is_fitted(self)

@@ -225,7 +225,7 @@ class TorchReducer(Reducer):
         It takes `n_steps_due` steps, or fewer if `stop` ends them, from the present weights, or
         from initial ones the first time. `numbers` is not read. Returns the traces as references,
         float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20 traces in
-        the first training.
+        the first training, and for fewer than two outside a fold.
         """
         if "members_" not in vars(self):
             do = "verify more parts first"
