@@ -123,7 +123,7 @@ class LiveModel:
         Raises
         ------
         StoreError
-            Where the store cannot be read.
+            Where the store cannot be read, and for a model that this dengine cannot restore.
         """
         store = self.outbox.store
         since = self.evidence.since
@@ -289,7 +289,8 @@ class LiveModel:
     ) -> tuple[EngineModel, EngineModel | None]:
         """Return copies of template and answering model under another policy, with a new rule.
 
-        The second is None before the first retrain. Neither is in force yet.
+        The second is None before the first retrain; it shares the references of the answering
+        model. Neither is in force yet.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)

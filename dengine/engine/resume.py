@@ -29,7 +29,8 @@ def restore_model(
     """Return a new model, made from the template, in the state of a stored version.
 
     A model that is stored by its traces is trained on them again. Returns None where one of these
-    traces is damaged or missing.
+    traces is damaged or missing. The two models share one rule, so the template has the stored
+    rule, too. Raises StoreError for a state that this dengine cannot restore.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -123,9 +124,9 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     """Change the reference of a corrected label: relabel it, remove it or add it again.
 
     Returns False, and changes nothing, where the model has references and cannot change that one:
-    it must be trained again. Otherwise True, also where nothing is changed: for a quarantined part,
-    for a damaged trace that would have to be added again, and for a baseline, which has no
-    references.
+    it must be trained again. Otherwise True, also where nothing is changed: for a reference that
+    is not there, for a quarantined part, for a damaged trace that would have to be added again, and
+    for a baseline, which has no references.
     """
     if not model.keeps_references:
         return True

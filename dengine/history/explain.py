@@ -184,8 +184,9 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
 def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
     """Return the decision rule of a policy with the state that a version stored.
 
-    None if the state has none, has another rule than the policy's, or was stored while stale, and
-    if the rule is a class of the user's that is not imported.
+    None if the state lacks what the rule has learned, has another rule than the policy's, or was
+    stored while stale, and if the rule is a class of the user's that is not imported. A rule that
+    learns nothing needs no state.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # Nothing is imported because a store names it; a running engine has imported it.
