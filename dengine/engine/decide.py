@@ -159,7 +159,7 @@ class DecisionMaker:
         recorded.
 
         The decision has this id, `Reason.CERTAIN`, and no evidence: no labels and the bound (0, 1).
-        Its propensity is the present audit rate.
+        Its propensity is the present audit rate, 1 in shadow mode.
         """
         stored = self.decide(x, part, None, version, None, decision_id)
         decision = replace(
