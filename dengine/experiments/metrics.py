@@ -55,8 +55,8 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     Thirty shuffles of one set play the same traces thirty times, so they are not thirty samples of
     the world. The unit is therefore the trace: the variance of the ratio is that between traces,
     linearised, and the interval is Wilson's for the number of independent decisions that has this
-    variance. If that is 0, as where no decision was wrong, it is Wilson's for the number of different
-    traces. The interval speaks of other parts of the same kind, not of another cell.
+    variance. If that is 0, as where no decision was wrong, it is Wilson's for the number of
+    different traces. The interval speaks of other parts of the same kind, not of another cell.
 
     Parameters
     ----------
