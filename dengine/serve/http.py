@@ -176,8 +176,8 @@ class HttpApi:
         with that id gets 409.
 
         A body of bytes has the other fields in the query. A decision that is not begun before the
-        deadline is VERIFY, late. 503: the queue is full or the store cannot be written, nothing was
-        recorded, verify the part.
+        deadline is VERIFY, late; one that the store cannot take VERIFY, no_store. 503: the queue is
+        full or the server is closing, nothing was recorded, verify the part.
         """
         samples = api.as_samples(trace, channels)
         response = await self.service.decide(samples, request, part)

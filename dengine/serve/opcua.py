@@ -308,7 +308,7 @@ class AddressSpace:
 
         Returns a list of action (0 verify, 1 accept, 2 reject), id, reason, lower, upper, version.
 
-        If the queue is full or the store unavailable, the result is VERIFY with an empty id. Raises
+        If the queue is full or the service closing, the result is VERIFY with an empty id. Raises
         SettingError for an empty trace, one that the channels do not divide, and other than 1 to
         `MAX_CHANNELS` channels; TraceError for a trace, and ReportError for a request, that the
         engine does not take.

@@ -191,8 +191,8 @@ class RobotCalls:
         -------
         struct
             action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If the
-            queue is full or the store unavailable: verify, an id "" and the reason "busy"; nothing
-            is recorded.
+            queue is full or the service is closing: verify, an id "" and the reason "busy";
+            nothing is recorded.
 
         Raises
         ------
@@ -204,7 +204,7 @@ class RobotCalls:
     async def decide_added(self, request: Any, part: Any = "") -> Struct:
         """Decide on the pieces of a part's trace; return action, id, reason, bounds and version.
 
-        A part that has a decision gets it again. A recorded decision drops the pieces; after a
+        A part that has a decision gets it again. A decision with an id drops the pieces; after a
         VERIFY with an empty id they stay, so that the call can be repeated. Raises TraceError
         without pieces or for a trace, and ReportError for an id, that the engine does not take.
         """
@@ -239,7 +239,7 @@ class RobotCalls:
         -------
         struct
             action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If the
-            queue is full or the store unavailable, verify with an id "" and the reason "busy".
+            queue is full or the service is closing, verify with an id "" and the reason "busy".
 
         Raises
         ------
@@ -283,7 +283,7 @@ class RobotCalls:
     async def decide_array(self, trace: ArrayLike, request: Any, part: Any) -> Struct:
         """Decide on a trace of shape (T,) or (C, T); return action, id, reason, bounds and version.
 
-        If the queue is full or the store unavailable, that is logged, and the struct is an
+        If the queue is full or the service is closing, that is logged, and the struct is an
         unrecorded VERIFY with an id "" and the reason "busy". A request "" gets a new id, a part ""
         means none. Raises TraceError for a trace, and ReportError for an id, that the engine does
         not take.

@@ -203,8 +203,10 @@ class CellService:
         Returns
         -------
         ServiceResponse
-            If the engine has not begun by the deadline, a recorded decision VERIFY, `Reason.LATE`,
-            which is counted in `late`. One that it has begun is waited for.
+            If the engine has not begun by the deadline, VERIFY with `Reason.LATE`, or with the
+            fault of the trace or the store, which is counted in `late`. One that it has begun is
+            waited for. If the store cannot be written, or the id not be looked up, VERIFY with
+            `Reason.NO_STORE`, which may not be recorded.
 
         Raises
         ------
@@ -213,7 +215,7 @@ class CellService:
         ReportError
             For an id that is no id.
         StoreError
-            If the engine cannot record it.
+            For an engine that is closed or in use by another thread.
         BusyError
             If the queue is full or the service is closing; nothing is recorded.
         """
@@ -302,8 +304,8 @@ class CellService:
     async def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision with its trace and label, after waiting for the engine's thread.
 
-        None for an unknown id. Raises BusyError if the queue is full or the service is closing, and
-        StoreError where the id cannot be looked up.
+        None for an unknown id. Raises BusyError if the queue is full or the service is closing,
+        StoreError where the id cannot be looked up, and ReportError for what is no id.
         """
         return await self.call(lambda engine: engine.find(decision_id), read_only=True)
 
