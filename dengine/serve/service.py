@@ -4,9 +4,10 @@ the queue of requests to it.
     service = CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db")
     response = await service.decide(trace, "order-7")
 
-A request waits for the thread in a queue, at most until the deadline, after which the part is
-verified. What only reads the store does so over a second connection (`CellService.read`), so that
-no decision waits for it. HTTP, XML-RPC, OPC UA and the demonstration are built on this module.
+A request for a decision waits for the thread in a queue, at most until the deadline, after which
+the part is verified. What only reads the store does so over a second connection
+(`CellService.read`), so that no decision waits for it. HTTP, XML-RPC, OPC UA and the demonstration
+are built on this module.
 """
 
 from __future__ import annotations
