@@ -106,7 +106,8 @@ def _describe_function(function: FunctionType, seen: set[int]) -> tuple[Any, str
     """Return (instructions, text of the defaults, referred values) of a function.
 
     The referred values are (name, description) of each global and closure variable that the code
-    mentions, by name. `seen` is added to, as by `_describe`.
+    mentions, by name. Defaults of keyword-only parameters are left out: TorchScript takes none.
+    `seen` is added to, as by `_describe`.
     """
     mentioned = set(_names(function.__code__))
     namespace = function.__globals__
