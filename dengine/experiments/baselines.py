@@ -124,7 +124,7 @@ class Baseline(ABC):
         return self
 
     def add(self, x: ArrayLike, y: Any) -> Self:
-        """Learn one labelled trace (C, T) and return self.
+        """Learn one trace (C, T) with its label, 1 for success, and return self.
 
         Nothing is learned before a training has succeeded, or if the method has no such step.
         """

@@ -92,8 +92,10 @@ def export_onnx(
     ------
     ExportError
         If the engine audits, has force limits or a rule that learns, or a part came again; if
-        nothing was trained yet; if the reducer or the interval has no module; if a package is
-        missing; and if onnxruntime does not decide as the model does.
+        nothing was trained yet; for a baseline; if the reducer or the interval has no module; for
+        code that was changed after it was compiled; if the rule has missed an outcome; if the key
+        cannot be read, or a package is missing; and if onnxruntime does not decide as the model
+        does.
     OutputError
         If `path` cannot be written.
     """

@@ -226,8 +226,8 @@ class ExportedModel:
         """Learn the outcome of a part, after its `decide` and before the next.
 
         The trace becomes a reference, the rule is updated, and `metadata["references"]` follows.
-        The file is not written; see `save`. A faulty trace is ignored. Another trace than that of
-        the last `decide` is decided on first.
+        The file is not written; see `save`. A faulty trace is ignored. A trace or part other than
+        the pending decision's is decided on first; that decision stays pending.
 
         Parameters
         ----------
