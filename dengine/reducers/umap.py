@@ -298,7 +298,8 @@ class UmapReducer(Reducer):
     def _start(self, traces: Floats) -> None:
         """Forget all trainings, draw the seed, and fit the frames to traces (n, C, T).
 
-        Of many traces 256 at most, evenly spaced, are read.
+        Of many traces 256 at most, evenly spaced, are read. An earlier `encoder_` stays until the
+        next layout replaces it.
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)
