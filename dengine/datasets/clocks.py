@@ -322,6 +322,26 @@ def holds_dates(column: pd.Series) -> bool:
     return bool(text.str.match(DATE_FORM).mean() > 0.5)
 
 
+def start_of(column: pd.Series) -> float | None:
+    """Return the first time of a clock that holds dates, in seconds since 1970; None for others.
+
+    None also for 3/2/2026, in which the month may be the first or the second number.
+    """
+    import pandas as pd
+
+    if not len(column) or not holds_dates(column):
+        return None
+    times, wrong = floats(column)
+    if pd.api.types.is_datetime64_any_dtype(column) or 2 * len(wrong) >= len(times):
+        text = str(column.iloc[0]).strip()
+        if SLASHED_DATE.match(text):
+            return None
+        seconds, _ = _parse_timestamps(pd.Series(["1970-01-01T00:00:00Z", text]))
+        return float(seconds[1])
+    unit = _epoch_unit(times)
+    return None if unit is None else float(times[0]) * unit
+
+
 def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return seconds since the first time of a column, shape (n,), and which cells are no time.
 

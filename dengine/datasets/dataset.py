@@ -344,6 +344,8 @@ class Recording(NamedTuple):
         Unit of each channel, "" where unknown.
     length : int
         Samples as recorded, if the trace has others by now; else 0.
+    start : float or None
+        Its first time in seconds since 1970, if its clock holds dates.
     """
 
     trace: NDArray[np.float32]
@@ -353,6 +355,7 @@ class Recording(NamedTuple):
     rate_hz: float | None = None
     units: tuple[str, ...] = ()
     length: int = 0
+    start: float | None = None
 
 
 @dataclass
@@ -420,6 +423,20 @@ class RecordingCollector:
                 self.label_forms = error.forms
             line = line or getattr(error, "line", 0)
             self.faults.append(Fault(source, line, str(error).rstrip(".")))
+
+    def order_by_start(self) -> None:
+        """Put the recordings in the order of their first times, if all of these are known.
+
+        A note says so if their order changes.
+        """
+        starts = [r.start for r in self.recordings if r.start is not None]
+        if len(set(starts)) < len(self.recordings):
+            return
+        self.ordered = True
+        in_order = sorted(self.recordings, key=lambda recording: recording.start or 0.0)
+        if [r.source for r in in_order] != [r.source for r in self.recordings]:
+            self.notes["Recordings are in the order of their times, not of their names"] = 1
+            self.recordings = in_order
 
     def check_label_words(self) -> None:
         """Raise DataError if too many labels are words whose meaning is unknown.

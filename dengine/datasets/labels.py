@@ -921,7 +921,8 @@ def read_ordered_labels(
     in_order = numbers == list(range(numbers[0], numbers[0] + len(rows))) if numbers else False
     in_order = in_order and len(label_of_key) == len(rows)
     if faults or not in_order:
-        actual = faults[0] if faults else [row.file for row in rows[:9]]
+        texts = [row.file for row in rows[:9]]
+        actual = faults[0] if faults else f"[{listed(texts)}]"
         wanted = f"a label of each trace in {path}, numbered in their order"
         do = f" or by an array of them ({listed(keys)})" if keys else ""
         raise DataError(f"Expected {wanted}{do}, got {actual}.")
@@ -1062,7 +1063,8 @@ def collect_recordings(
             n_contradictions += isinstance(error, SeveralLabelsError)
             raise
         timed = read(place)
-        return Recording(timed.trace, label.label, name, label.part, timed.rate_hz, timed.units)
+        about = (name, label.part, timed.rate_hz, timed.units)
+        return Recording(timed.trace, label.label, *about, start=timed.start)
 
     for name, place in places.items():
         collector.add(name, partial(read_labelled, name, place))

@@ -212,6 +212,7 @@ def read_folder(
         if advice is None:
             raise
         raise DataError(f"{str(error).rpartition(';')[0]}; {advice}.") from error
+    collector.order_by_start()
     return as_dataset(collector, options)
 
 

@@ -35,6 +35,7 @@ from .clocks import (
     rate_of,
     resample_evenly,
     rising_columns,
+    start_of,
 )
 from .dataset import Fault, LoadOptions, UnreadableError
 from .encodings import decode
@@ -69,11 +70,14 @@ class TimedTrace(NamedTuple):
         Sampling rate by its timestamps.
     units : tuple of str
         Unit of each channel, "" where unknown.
+    start : float or None
+        Its first time in seconds since 1970, if its clock holds dates.
     """
 
     trace: NDArray[np.float32]
     rate_hz: float | None = None
     units: tuple[str, ...] = ()
+    start: float | None = None
 
 
 class TextCells(NamedTuple):
@@ -431,7 +435,11 @@ def read_recording(
     rows = _without_summary(table.frame, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
     timed = rows_to_trace(rows, places, options, notes, table.units)
-    return timed._replace(units=channel_units)
+    start = None
+    with suppress(UnreadableError):
+        place = place_of_clock(rows, options.time)
+        start = None if place is None else start_of(rows.iloc[:, place])
+    return timed._replace(units=channel_units, start=start)
 
 
 def _without_summary(

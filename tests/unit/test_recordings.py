@@ -1238,7 +1238,7 @@ def test_labels_of_an_archive_are_joined_by_its_serial_numbers(
     data = load_dataset(tmp_path / "x.npz", labels=tmp_path / "l.csv")
     np.testing.assert_array_equal(data.y, small.y)
     np.savez(tmp_path / "x.npz", X=small.X)
-    with pytest.raises(DataError, match=r"numbered in their order, got \['SN"):
+    with pytest.raises(DataError, match=r"numbered in their order, got \[SN"):
         load_dataset(tmp_path / "x.npz", labels=tmp_path / "l.csv")
 
 
@@ -1360,3 +1360,23 @@ def test_a_word_among_the_times_is_a_fault_also_with_a_stated_rate(
     data = load_dataset(few, rate_hz=rate_hz)
     assert [(f.source, f.line) for f in data.faults] == [(path.name, 2)]
     assert "got 'Max'; time='none' and a stated rate (rate_hz) need none" in data.faults[0].message
+
+
+@pytest.mark.parametrize("form", ["%d.%m.%Y %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%fZ", "epoch"])
+def test_recordings_with_dates_are_in_the_order_of_their_times(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, y) in enumerate(zip(small.X[:6], small.y, strict=False)):
+        start = pd.Timestamp("2026-03-02 06:00") + pd.Timedelta(hours=4 * i)
+        stamps = start + pd.to_timedelta(4 * np.arange(50), unit="ms")
+        clock = (
+            stamps.as_unit("ns").astype("int64") / 1e9 if form == "epoch" else stamps.strftime(form)
+        )
+        folder = tmp_path / ["b_early", "c_late", "a_night"][i // 2]
+        folder.mkdir(exist_ok=True)
+        frame = pd.DataFrame({"time": clock, "FZ_Base": x})
+        frame.to_csv(folder / f"{i}_{'OK' if y else 'NOK'}.csv", index=False)
+    data = load_dataset(tmp_path)
+    np.testing.assert_array_equal(data.X, small.X[:6])
+    note = "Recordings are in the order of their times, not of their names."
+    assert (data.ordered, note in data.notes) == (True, True)
