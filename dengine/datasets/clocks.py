@@ -236,6 +236,8 @@ def clock_of(
         wanted = f"a time in column {name}, in seconds or as 2026-03-01T12:00:00.002"
         actual = excerpt(str(column[wrong[0]]))
         do = f"time={NO_CLOCK!r} and a stated rate (rate_hz) need none"
+        if 2 * len(wrong) < len(frame):
+            do = "leave such rows out of the file if they are no samples"
         raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", wrong[0])
     if time is None and not is_time_column(name):
         assumed = f"Column {name or place + 1} is taken as the clock by its values"

@@ -515,6 +515,11 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     collector.leave_out(reasons)
     recordings = collector.recordings
     _note_scales(collector)
+    if fit == "resample" and lengths.max() - lengths.min() > RATE_TOLERANCE * samples:
+        text = (
+            f"Recordings of {lengths.min()} to {lengths.max()} samples are stretched to {samples}"
+        )
+        collector.notes[f"{text}: the rate is that of their median length"] += 1
     X = np.stack([_fit_array(recording.trace, samples, fit) for recording in recordings])
     rates = np.array([recording.rate_hz or np.nan for recording in recordings])
     notes = [f"{text}{f' ({n} times)' if n > 1 else ''}." for text, n in collector.notes.items()]
@@ -550,9 +555,18 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
 
 
 def _note_scales(collector: RecordingCollector) -> None:
-    """Note recordings whose largest value is far from that of most: their unit may be another."""
+    """Note recordings whose largest value is far from that of most: their unit may be another.
+
+    Also note one first sample of all that is larger than the others, as a row of rates is.
+    """
     with np.errstate(invalid="ignore"):
         peaks = np.array([np.nan_to_num(np.abs(r.trace)).max() for r in collector.recordings])
+    firsts = {tuple(recording.trace[:, 0].tolist()) for recording in collector.recordings}
+    is_first = all(
+        (np.abs(r.trace[:, :1]) > np.abs(r.trace[:, 1:])).all() for r in collector.recordings
+    )
+    if len(firsts) == 1 and is_first and len(peaks) >= MANY:
+        collector.notes["All begin with the same largest sample, which may be no measurement"] = 1
     usual = float(np.median(peaks))
     is_far = (peaks > 0) & ((peaks > FAR * usual) | (peaks * FAR < usual))
     if usual > 0 and is_far.any():

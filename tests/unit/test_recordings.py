@@ -1359,7 +1359,23 @@ def test_a_word_among_the_times_is_a_fault_also_with_a_stated_rate(
     path.write_text("\n".join([header, "Max,9.0", "Min,0.0", *rows]) + "\n")
     data = load_dataset(few, rate_hz=rate_hz)
     assert [(f.source, f.line) for f in data.faults] == [(path.name, 2)]
-    assert "got 'Max'; time='none' and a stated rate (rate_hz) need none" in data.faults[0].message
+    assert "got 'Max'; leave such rows out of the file" in data.faults[0].message
+
+
+def test_a_row_of_rates_above_the_samples_is_noted(small: Dataset, tmp_path: Path) -> None:
+    for i in range(12):
+        frame = pd.DataFrame({"Kraft": [500.0, *small.X[i].tolist()]})
+        frame.to_csv(tmp_path / f"{i}_{'ok' if i % 3 else 'nok'}.csv", index=False)
+    notes = load_dataset(tmp_path).notes
+    assert "All begin with the same largest sample, which may be no measurement." in notes
+
+
+def test_recordings_that_are_stretched_are_noted(
+    uneven: tuple[list[np.ndarray], list[int]],
+) -> None:
+    notes = load_dataset(uneven, fit="resample").notes
+    assert any("samples are stretched to" in note for note in notes)
+    assert not any("stretched" in note for note in load_dataset(uneven).notes)
 
 
 @pytest.mark.parametrize("form", ["%d.%m.%Y %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%fZ", "epoch"])
