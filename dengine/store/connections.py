@@ -374,7 +374,8 @@ class Database:
         self.url = self._engine.url  # its password included
         self.name = self.url.render_as_string(hide_password=True)
         self.scope = self._open(product)
-        file = sqlite_file(self.url) if self.url.get_backend_name() == "sqlite" else None
+        in_file = self.url.get_backend_name() == "sqlite" and self.url.database is not None
+        file = sqlite_file(self.url) if in_file else None
         # None: in memory, or a server
         self._file = file if file is not None and file.is_file() else None
         self._opened = None if self._file is None else self._file.stat()

@@ -544,3 +544,14 @@ def test_a_pickle_in_the_database_is_never_loaded(tmp_path: Path) -> None:
             store.load_version(1)
         assert store.last_version() is None
         assert "plain arrays" in store.events()[0].text
+
+
+def test_a_store_in_memory_does_not_depend_on_a_file_called_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "None").touch()
+    with SqlStore() as store:
+        (tmp_path / "None").unlink()
+        store.put_event("note", "still written")
+        assert [event.text for event in store.events()] == ["still written"]
