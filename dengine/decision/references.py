@@ -95,9 +95,9 @@ def _success_rate_around(
 ) -> NDArray[np.float64]:
     """Return for each point the success rate among the nearest points of other parts, float64 (n,).
 
-    `N_NEIGHBOURS` nearest are taken, or n - 1 if that is less; if other parts have fewer points,
-    some of the point's own part fill the number up. Half a success in one trial is added to the
-    counts: the rate is one half for n = 1. Unknown parts, which have one `part`, are one part.
+    The `N_NEIGHBOURS` nearest are taken, or all if there are fewer. Half a success in one trial is
+    added to the counts: the rate is one half without points of other parts. Unknown parts, which
+    have one `part`, are one part.
     """
     from scipy.spatial.distance import cdist
 
@@ -105,7 +105,8 @@ def _success_rate_around(
     distances[part[:, None] == part] = np.inf
     k = min(N_NEIGHBOURS, len(points) - 1)
     nearest = np.argpartition(distances, k - 1, axis=1)[:, :k]
-    return np.asarray((labels[nearest].sum(1) + 0.5) / (k + 1.0))
+    others = np.take_along_axis(distances, nearest, axis=1) < np.inf
+    return np.asarray(((labels[nearest] * others).sum(1) + 0.5) / (others.sum(1) + 1.0))
 
 
 class RadiusIndex(nn.Module):

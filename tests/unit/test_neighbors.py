@@ -127,9 +127,13 @@ def test_agreement_is_what_it_was_planted_as_and_one_where_few_parts_came_again(
     assert label_agreement(points, labels, spaces, np.zeros_like(part)) == 1.0  # of no known part
 
 
-def test_the_bound_lies_above_the_truth_in_nearly_all_draws() -> None:
+@pytest.mark.parametrize(("n_parts", "n_spaces"), [(60, 3), (FEWEST_PARTS, 5)])
+def test_the_bound_lies_above_the_truth_in_nearly_all_draws(n_parts: int, n_spaces: int) -> None:
     # Both labels of a pair are the common draw with probability agree squared: that is their correlation.
-    bounds = [label_agreement(*repeats(60, 4, agree=0.6, seed=seed)) for seed in range(40)]
+    draws = [repeats(n_parts, 4, agree=0.6, seed=seed) for seed in range(40)]
+    bounds = [
+        label_agreement(points, labels, part % n_spaces, part) for points, labels, _, part in draws
+    ]
     assert np.mean(np.array(bounds) >= 0.6**2) >= 0.85
 
 
