@@ -10,6 +10,7 @@ torch answers with the code of before.
 
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -73,15 +74,15 @@ def _describe(value: Any, names: set[str], seen: set[int]) -> Any:
     """Describe all code that a value refers to, and the constants in it, for comparison by `repr`.
 
     A class gives a list of (name, description) of its members and of its bases' members, a module
-    the same of the variables in `names`, a function what `_describe_function` returns, a property
-    its getter, a constant its text. Anything else, a library's code, and what was described before
-    give a name only. `names` are the names that the referring code mentions. `seen` holds the ids
-    of values that were described already; it is added to.
+    the same of the variables in `names`, a function what `_describe_function` returns, a property a
+    list of its getter and its setter, a constant its text. Anything else, a library's code, and
+    what was described before give a name only. `names` are the names that the referring code
+    mentions. `seen` holds the ids of values that were described already; it is added to.
     """
     if isinstance(value, staticmethod | classmethod):
         return _describe(value.__func__, names, seen)
     if isinstance(value, property):
-        return _describe(value.fget, names, seen)
+        return [_describe(function, names, seen) for function in (value.fget, value.fset)]
     if isinstance(value, PLAIN):
         return repr(value)
     is_code = isinstance(value, FunctionType | type | ModuleType)
@@ -114,7 +115,8 @@ def _describe_function(function: FunctionType, seen: set[int]) -> tuple[Any, str
     values = {name: namespace[name] for name in mentioned & namespace.keys()}
     cells = function.__closure__ or ()
     for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
-        values[name] = cell.cell_contents
+        with suppress(ValueError):  # an empty cell: the variable has no value yet, or was deleted
+            values[name] = cell.cell_contents
     referred = [(name, _describe(values[name], mentioned, seen)) for name in sorted(values)]
     return _instructions(function.__code__), repr(function.__defaults__), referred
 

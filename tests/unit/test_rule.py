@@ -213,6 +213,10 @@ class MyRule(DecisionRule):
         super().__init__(alpha, lower_bound, interval)
         self.part = Part()
 
+    @property
+    def level(self) -> float:
+        return 0.5
+
     def action(self, lower: float, upper: float) -> int:
         return {accept} if helper(self.part(lower)) >= {limits}.LIMIT else 0
 """
@@ -220,6 +224,10 @@ class MyRule(DecisionRule):
 
 def lower_by_one(self: object, x: float) -> float:
     return x - 1.0
+
+
+def level(self: object) -> float:
+    return 0.5
 
 
 def rejects(self: object, lower: float, upper: float) -> int:
@@ -231,6 +239,7 @@ CHANGES = {  # of a rule's module, whose rule accepts: what is replaced, by what
     "a function": (lambda rules: rules, "helper", lambda x: x - 1.0, Action.VERIFY),
     "a helper's method": (lambda rules: rules.Part, "forward", lower_by_one, Action.VERIFY),
     "its own method": (lambda rules: rules.MyRule, "action", rejects, Action.REJECT),
+    "a setter": (lambda rules: rules.MyRule, "level", property(level, lower_by_one), Action.ACCEPT),
 }
 
 
@@ -270,6 +279,19 @@ def test_a_rule_whose_code_was_changed_in_this_process_is_asked_as_it_is_now_and
         ExportError, match="MyRule was changed after it was compiled; start Python anew"
     ):
         export_torchscript(model, tmp_path / "model.ts")
+
+
+def test_a_rule_with_a_variable_that_has_no_value_is_compiled(data: Dataset) -> None:
+    folder = Path()
+
+    class MyRule(DecisionRule):
+        @torch.jit.unused
+        def note(self) -> str:
+            return str(folder)  # noqa: F821  # it is deleted below
+
+    del folder
+    result, model = says(MyRule, data)
+    assert (result, model.is_compiled) == (Action.ACCEPT, True)
 
 
 def test_two_rules_of_one_name_and_a_notebook_cell_that_is_run_again_are_each_asked_for_themselves(
