@@ -168,7 +168,7 @@ def check_output(path: str | os.PathLike[str], force: bool = False) -> None:
         Whether another file that exists may be replaced.
     """
     target = Path(path)
-    with _write_errors(target):
+    with _write_errors(target, ValueError):  # which a name with a NUL raises
         try:
             mode = os.lstat(target).st_mode
         except FileNotFoundError:
@@ -218,14 +218,13 @@ def output_file(
     Raises
     ------
     OutputError
-        If `check_output` refuses the path, or for an OSError or ValueError, also one that the block
-        raises.
+        If `check_output` refuses the path, or for an OSError, also one that the block raises.
     """
     target = Path(path)
+    check_output(target, force)
     with _write_errors(target):
         if make_folder:
             target.parent.mkdir(parents=True, exist_ok=True)
-        check_output(target, force)
         partial = target.with_name(f".dengine-{secrets.token_hex(8)}.partial")
         # Exclusively, so that no link that somebody put there is followed.
         os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
@@ -261,10 +260,9 @@ def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> 
     return write_output(target, content.encode(), force)
 
 
-def _write_errors(target: Path) -> AbstractContextManager[None]:
-    """Return a context manager that raises OutputError with advice for OSError and ValueError."""
+def _write_errors(target: Path, *also: type[Exception]) -> AbstractContextManager[None]:
+    """Return a context manager that raises OutputError with advice for OSError and `also`."""
     do = (
         "choose a folder that exists, is writable and has room, and a file that no program has open"
     )
-    # ValueError is raised for a name with a NUL.
-    return instead(OutputError, f"Cannot write {target}", OSError, ValueError, do=do)
+    return instead(OutputError, f"Cannot write {target}", OSError, *also, do=do)

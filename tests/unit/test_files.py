@@ -1,5 +1,6 @@
 """Outputs: whole or not at all, and never over what is there."""
 
+import errno
 import hashlib
 import json
 import os
@@ -12,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from dengine import DataEngine, export_torchscript, load_exported
-from dengine.errors import ExportError, OutputError
+from dengine.errors import DataError, ExportError, OutputError
 from dengine.export.bundle import sibling_path
-from dengine.files import DATABASES, check_output, write_manifest, write_output
+from dengine.files import DATABASES, check_output, output_file, write_manifest, write_output
 from tests.support.command_line import dengine
 from tests.support.driving import learn
 
@@ -67,6 +68,14 @@ def test_no_part_of_a_database_is_replaced_even_by_force(tmp_path: Path) -> None
 def test_a_name_that_no_file_can_have_is_an_error_of_ours(name: str, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="choose a folder that exists, is writable and has room"):
         write_output(tmp_path / name, b"new")
+
+
+def test_an_error_of_what_is_written_stays_what_it_is_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no labels"), output_file(tmp_path / "a.csv"):
+        raise DataError("Expected labels, got no labels.")
+    with pytest.raises(OutputError, match="No space left"), output_file(tmp_path / "a.csv"):
+        raise OSError(errno.ENOSPC, "No space left")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_path: Path) -> None:
