@@ -19,6 +19,7 @@ import logging
 import os
 import zlib
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -284,8 +285,8 @@ def import_journal(
     """Import what an exported cell learned into the store of its engine.
 
     Each part is imported once, however often its journal is. Rule and certificate count the parts
-    as the engine's own. If a journal lacks a line, what stands before it is imported. The store is
-    closed at the end, also one that was passed open; after an error only one that was opened here.
+    as the engine's own. If a journal lacks a line, what stands before it is imported. A store that
+    was passed open stays open; on PostgreSQL it owns the cell until it is closed.
 
     Parameters
     ----------
@@ -312,8 +313,10 @@ def import_journal(
     OSError
         If the journal cannot be read.
     """
-    with opening(store, must_exist=True) as opened:
-        opened.claim_cell()  # an engine that runs would never learn these labels
+    with opening(store, must_exist=True) as opened, ExitStack() as claim:
+        # An engine that runs would never learn these labels.
+        if (owned := opened.claim_cell()) is not None:
+            claim.callback(owned.close)
         settings = opened.settings()
         spec = stored_trace_spec(settings)
         if spec is None or "recipe" not in settings:
@@ -330,7 +333,8 @@ def import_journal(
         lines = _with_known_outcomes(journal, policy.stops)
         parts = [(line.decision, line.trace, line.label) for line in lines]
         report = import_parts(opened, parts, spec, policy)
-    opened.close()
+    if opened is not store:
+        opened.close()
     return replace(report, cut=journal.cut, set_aside=journal.set_aside)
 
 

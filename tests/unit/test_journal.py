@@ -14,6 +14,7 @@ from dengine.export import import_journal
 from dengine.export.cell_journal import read_journal
 from dengine.folds import part_hash
 from dengine.records import Reason
+from dengine.store.opening import open_store
 from tests.support.command_line import line_of, succeed
 from tests.support.exports import cell_journal, trained
 
@@ -66,6 +67,21 @@ def test_each_line_counts_once(
     assert (whole.imported, whole.quarantined, whole.repeated) == (10, 0, 20)
     with DataEngine.open(store) as engine:
         assert engine.retrain().n_traces == 200 + 29
+
+
+def test_a_store_that_was_passed_open_stays_open_and_gives_the_cell_up(
+    store: str, data: Dataset, tmp_path: Path
+) -> None:
+    journal = write(tmp_path / "cell.csv", data.X[:20] + 1.0, data.y[:20])
+    (tmp_path / "none.csv").write_text("no journal")
+    with open_store(store) as opened:
+        with pytest.raises(DataError, match="Expected a journal"):
+            import_journal(opened, tmp_path / "none.csv")
+        assert import_journal(opened, journal).imported == 20
+        assert import_journal(opened, journal).repeated == 20
+        assert len(opened.labelled().labels) == 220
+        with DataEngine.open(opened) as engine:
+            assert engine.retrain().n_traces == 220
 
 
 def test_a_journal_reads_as_it_was_written(
