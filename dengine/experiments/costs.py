@@ -6,7 +6,8 @@
 
 A part's mean cost is check x verified + escape x (accepted and bad) + false_reject x (rejected and
 good), in one unit of the user's, over all parts of a replay, its beginning included. Verifying
-everything costs `check` per part.
+everything costs `check` per part. A part that an operator's limits reject costs `check`, too, so
+that no policy pays by the limits, which are the same under each.
 
 The cheapest of many candidates is partly the luckiest. So the policy is chosen on one half of the
 shuffles, with half an error added to each count of errors, and reported on the other half. That
@@ -56,7 +57,8 @@ class PolicyCost:
     late : float
         Mean cost per part over the last third of each shuffle, when something has been learned.
     verified, certain : float
-        Shares of the parts that were checked, and that were not.
+        Shares of the parts that were checked, and that the model accepted or rejected. The rest are
+        those that an operator's limits rejected.
     bad, good : ErrorRate
         Bad parts among the accepted ones, good parts among the rejected ones.
     """
@@ -326,7 +328,7 @@ def _policy_cost(
         lower=costs.check - costs.saved(certain, accepted * bad.lower, rejected * good.lower),
         upper=costs.check - costs.saved(certain, accepted * bad.upper, rejected * good.upper),
         late=float(np.mean(late_costs)),
-        verified=1.0 - accepted - rejected,
+        verified=float(np.mean([replay.verified for replay in reporting])),
         certain=certain,
         bad=bad,
         good=good,

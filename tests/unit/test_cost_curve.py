@@ -1,6 +1,7 @@
 """What a part costs under each policy: sums by hand, the choice, what it says, its picture and its verb."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,18 @@ def test_a_parts_cost_is_checks_and_errors_over_all_parts() -> None:
     first = played(LAX, 0, verified=60, accepted=25, bad=2, rejected=15, good=3)
     assert cost_per_part(first, COSTS) == pytest.approx((60 * 5 + 2 * 100 + 3 * 20) / 100)
     assert cost_per_part(first, COSTS, slice(60, 85)) == pytest.approx(2 * 100 / 25)
+
+
+def test_a_part_that_an_operators_limits_reject_was_not_checked_and_pays_for_no_policy() -> None:
+    reason = np.array(["certain"] * 80 + ["outside"] * 20)
+    replays = [
+        replace(played(policy, seed, 60, 15, 0, rejected=25), reason=reason)
+        for policy in (LAX, STRICT)
+        for seed in range(4)
+    ]
+    for row in curve_of(replays, COSTS).rows:
+        assert (row.verified, row.certain) == pytest.approx((0.6, 0.2))
+        assert row.cost == pytest.approx(5 * 0.8)
 
 
 def test_one_half_of_the_shuffles_chooses_and_the_other_reports() -> None:
