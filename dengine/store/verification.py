@@ -281,6 +281,8 @@ class CellCheck:
                 faults += self._catch_database_errors(
                     table.name, self._check_pairs(table, required)
                 )
+        if self.on_rows is not None:
+            self.on_rows(self.rows % CHUNK)
         return faults
 
     def _catch_database_errors(
@@ -316,7 +318,7 @@ class CellCheck:
         """Yield a fault for each row of a table, or version state, that was changed or not chained.
 
         Keep the sums of all chained rows for `_check_ledger`, count `rows`, and call `on_rows`
-        after each CHUNK rows.
+        after each CHUNK rows; `run` calls it for the rest.
         """
         for row in self._read_raw(table):
             self.rows += 1
