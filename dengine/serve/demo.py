@@ -58,8 +58,8 @@ async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
 
     Reported are the recorded results of verified parts, and failures of accepted ones. The first
     `N_FAST` parts have no pause, but each waits for a retrain under way; the later ones come at
-    `speed` parts per second. A part for which the queue is full is left out. An exception is logged
-    and ends the demonstration, not the server.
+    `speed` parts per second. A part, or a report, for which the queue is full is left out. Any
+    other exception is logged and ends the demonstration, not the server.
     """
     loop = asyncio.get_running_loop()
     run = uuid.uuid4().hex[:8]
@@ -72,13 +72,13 @@ async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
             request = f"{run}-{cycle + 1}"
             try:
                 response = await service.decide(trace, request, f"{cycle + 1:04d}")
-            except BusyError:  # a robot would verify the part, and nothing of it is recorded
+                action = response.decision.action
+                await asyncio.sleep(seconds * CHECK_SHARE)
+                stopped = action is Action.ACCEPT and cell.proceed() is Outcome.STOPPED
+                if action is Action.VERIFY or stopped:
+                    await service.report(request, cell.verify())
+            except BusyError:  # a robot would verify the part, or report it again
                 continue
-            action = response.decision.action
-            await asyncio.sleep(seconds * CHECK_SHARE)
-            stopped = action is Action.ACCEPT and cell.proceed() is Outcome.STOPPED
-            if action is Action.VERIFY or stopped:
-                await service.report(request, cell.verify())
             await asyncio.sleep(next_start - loop.time())
             while cycle < N_FAST and service.core.is_retraining:
                 await asyncio.sleep(POLL_SECONDS)

@@ -7,10 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Reason
-from dengine.errors import TraceError
+from dengine import DataEngine, Dataset, Reason, ReplayCell
+from dengine.errors import BusyError, TraceError
+from dengine.serve.demo import drive
 from dengine.serve.service import CellService
 from tests.support.driving import Counting, evidence
 from tests.support.serving import RECIPE, WAIT, a_service, busy_engine
@@ -115,3 +117,21 @@ def test_a_decision_without_an_id_is_what_the_thread_would_say_and_verify_where_
 
     with a_service() as service:
         asyncio.run(cell(service))
+
+
+def test_a_demonstration_goes_on_after_a_report_that_found_the_queue_full(
+    stream: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with a_service() as service:
+        report = service.report
+        full = iter([True])
+
+        async def busy_once(decision_id: str, success: bool) -> object:
+            if next(full, False):
+                raise BusyError("The queue is full.")
+            return await report(decision_id, success)
+
+        monkeypatch.setattr(service, "report", busy_once)
+        asyncio.run(drive(service, ReplayCell(stream, np.arange(5)), speed=1.0))
+        status = asyncio.run(service.read(lambda store: store.status()))
+        assert (status["decisions"], status["labels"]) == (5, 4)
