@@ -90,6 +90,7 @@ class RobotCalls:
         self._recorder = recorder
         self._pieces: OrderedDict[str, list[NDArray[np.float32]]] = OrderedDict()
         self._armed: str | None = None  # id of the part that is recorded
+        self._recording: Any = None  # of that part, if its decision could not be recorded
         self._recorder_lock = asyncio.Lock()
 
     def table(self) -> dict[str, Call]:
@@ -126,6 +127,7 @@ class RobotCalls:
         if self._recorder is not None:
             async with self._recorder_lock:
                 self._armed = None
+                self._recording = None
                 try:
                     await asyncio.to_thread(self._recorder.arm)
                     self._armed = id_
@@ -224,9 +226,10 @@ class RobotCalls:
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
         """Decide on the insertion since `begin`, as recorded.
 
-        It waits up to `RECORD_SECONDS` for the recording, which one call uses up. A part that has a
-        decision gets it again. Without a recording, as for any part but that of the newest `begin`,
-        the result is verify, with an id "" and the reason "not_recorded"; nothing is stored then.
+        It waits up to `RECORD_SECONDS` for the recording, which one call uses up, unless its result
+        is "busy", so that the call can be repeated. A part that has a decision gets it again.
+        Without a recording, as for any part but that of the newest `begin`, the result is verify,
+        with an id "" and the reason "not_recorded"; nothing is stored then.
 
         Parameters
         ----------
@@ -259,14 +262,20 @@ class RobotCalls:
             # Another part was begun, or the server was restarted meanwhile.
             if id_ is None or id_ != self._armed:
                 return _unrecorded_verify(NOT_RECORDED)
-            try:
-                recording = await asyncio.to_thread(self._recorder.record, RECORD_SECONDS)
-            except (DengineError, OSError) as error:
-                log.warning("no recording of %s: %s", shortened(id_), error)
-                return _unrecorded_verify(NOT_RECORDED)
-            finally:
-                self._armed = None
-            return await self.decide_array(recording.trace, id_, part)
+            recording = self._recording
+            self._recording = None
+            self._armed = None
+            if recording is None:
+                try:
+                    recording = await asyncio.to_thread(self._recorder.record, RECORD_SECONDS)
+                except (DengineError, OSError) as error:
+                    log.warning("no recording of %s: %s", shortened(id_), error)
+                    return _unrecorded_verify(NOT_RECORDED)
+            result = await self.decide_array(recording.trace, id_, part)
+            if not result["id"]:  # the call can be repeated
+                self._armed = id_
+                self._recording = recording
+            return result
 
     async def action(self, trace: Any, request: Any, part: Any = "") -> int:
         """Return only the action of `decide`, for a controller without structs."""

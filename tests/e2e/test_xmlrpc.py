@@ -165,15 +165,20 @@ def test_what_was_not_recorded_is_verified_and_no_fault(
 
 def test_a_busy_server_answers_verify_and_keeps_no_report(cell: Cell, stream: Dataset) -> None:
     robot, waiting = cell.robot(), []
+    recorded = robot.begin()
+    cell.recorder.traces.append(stream.X[5])
     with busy_engine(cell.service):
         with suppress(BusyError):
             while True:
                 waiting.append(cell.service.submit(lambda engine: None))
         answer = robot.decide(stream.X[0].tolist(), "too much")
         assert (answer["action"], answer["id"], answer["reason"]) == (VERIFY, "", "busy")
+        assert robot.decide_recorded(recorded) == answer
         assert robot.report("order-1", True) is False
     waiting[-1].result(60)
     assert cell.find("too much") is None
+    assert robot.decide_recorded(recorded)["id"] == recorded  # its recording was kept
+    assert np.array_equal(cell.find(recorded).trace[0], stream.X[5])
 
 
 def test_reports_are_a_bool_and_one_a_decision(cell: Cell, stream: Dataset) -> None:
