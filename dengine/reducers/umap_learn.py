@@ -107,12 +107,14 @@ class UmapLearnReducer(Reducer):
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, C, T) one by one; return float32 (n, 1, d), in the only space.
 
-        Raises NotFittedError before `fit`, and ValueError for n = 0.
+        Raises NotFittedError before `fit`.
         """
         check_is_fitted(self, "umap_")
         traces = self.check_traces(X)
-        points = [self._transform_batch(traces[i : i + 1]) for i in range(len(traces))]
-        return np.concatenate(points)[:, None, :]
+        points = np.empty((len(traces), 1, self.n_components), dtype=np.float32)
+        for i in range(len(traces)):
+            points[i] = self._transform_batch(traces[i : i + 1])
+        return points
 
     def _transform_batch(self, traces: Floats) -> Floats:
         """Place traces (n, C, T) by umap-learn, together: float32 (n, d)."""
