@@ -432,7 +432,11 @@ def read_recording(
         raise UnreadableError(table.faults[0].message, table.faults[0].line)
     if table.frame.empty:
         raise UnreadableError("Expected samples below the header, found none", table.line)
-    rows = _without_summary(table.frame, options, notes)
+    frame, kept = _beside_their_clock(table.frame, places)
+    places = [kept.index(place) for place in places]
+    table = table._replace(frame=frame, units=[table.units[i] for i in kept])
+    header = list(frame.columns)
+    rows = _without_summary(frame, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
     timed = rows_to_trace(rows, places, options, notes, table.units)
     start = None
@@ -440,6 +444,29 @@ def read_recording(
         place = place_of_clock(rows, options.time)
         start = None if place is None else start_of(rows.iloc[:, place])
     return timed._replace(units=channel_units, start=start)
+
+
+def _beside_their_clock(
+    frame: pd.DataFrame, places: Sequence[int]
+) -> tuple[pd.DataFrame, list[int]]:
+    """Return a recording without the clocks of other channels, and the places of what is kept.
+
+    Only clocks of one name are several, as in Time;Way;Time;Force, where each stands to the left of
+    its channels. Rows at the end in which clock and channels are empty are left out. Raises
+    UnreadableError if channels have different clocks.
+    """
+    names = [str(name).lower() for name in frame.columns]
+    clocks = [i for i, name in enumerate(names) if is_time_column(name) and names.count(name) > 1]
+    nearest = {max((i for i in clocks if i < place), default=-1) for place in places}
+    kept = list(range(len(names)))
+    if clocks and nearest != {-1}:
+        if len(nearest) > 1:
+            raise UnreadableError("Expected channels beside one clock, got several clocks")
+        kept = [i for i in kept if i not in clocks or i in nearest]
+        cells = frame.iloc[:, [*nearest, *places]]
+        is_used = (cells.astype(str).apply(lambda column: column.str.strip()) != "").any(axis=1)
+        frame = frame.iloc[: int(np.flatnonzero(is_used)[-1]) + 1] if is_used.any() else frame
+    return frame.iloc[:, kept], kept
 
 
 def _without_summary(

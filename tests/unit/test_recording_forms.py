@@ -810,3 +810,17 @@ def test_a_clock_that_is_wrong_is_left_out_by_name(tmp_path: Path) -> None:
     assert "--time none with a stated rate (--rate-hz) leaves them as they are" in refused.stderr
     data = load_dataset(tmp_path, rate_hz=250.0, time="none")
     np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+
+
+def test_a_channel_is_read_by_the_clock_to_its_left(tmp_path: Path) -> None:
+    slow = [*times(30, 4 * STEP), *[""] * (N - 30)]
+    way = [*texts(np.arange(30.0)), *[""] * (N - 30)]
+    header = ["Time", "Way", "Time", "Force"]
+    write(tmp_path / "a_OK.csv", header, slow, way, times(), texts(), delimiter=";")
+    force = load_dataset(tmp_path, channel="Force")
+    np.testing.assert_array_equal(force.X[0], VALUES.astype(np.float32))
+    assert force.rate_hz == 250.0
+    data = load_dataset(tmp_path, channel="Way")
+    assert (data.X.tolist(), data.rate_hz) == ([list(range(30))], 62.5)
+    with pytest.raises(DataError, match="Expected channels beside one clock"):
+        load_dataset(tmp_path, channel="Way,Force")
