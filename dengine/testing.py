@@ -84,6 +84,7 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     `embed` must return finite float32 of shape (n, K, d), the same from two trained clones, with K
     of 2 or more if labels are used; `transform` must return (n, d); `embed_references` must return
     of each row of `embed` the space of its fold. The caller's traces must not be written to.
+    `reducer` may be unfitted and stays unchanged.
     """
     is_estimator = isinstance(reducer, BaseEstimator)
     assert is_estimator, f"{type(reducer).__name__} is no scikit-learn estimator"
@@ -110,7 +111,8 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
     """Assert honest counting: the labels of fold k change no bit of space k.
 
     For each k a clone is trained twice in a row with the labels of fold k flipped and shuffled; the
-    embeddings of new traces in space k must equal those with the true labels.
+    embeddings of new traces in space k must equal those with the true labels. `reducer` may be
+    unfitted and stays unchanged.
     """
     X, y = toy_traces()
     trained = _train_clone(reducer, times=2)
@@ -127,8 +129,9 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
 def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
     """Assert that a reducer whose `fit` needs labels has `uses_labels = True`.
 
-    Otherwise it gets none, and every retrain would fail. An error of its `fit` that is not due to
-    missing labels is raised as it is.
+    Otherwise it gets none, and every retrain would fail. A clone is trained on test traces: an
+    error of its `fit` that is not due to missing labels is raised as it is, and `reducer` stays
+    unchanged.
     """
     X, y = toy_traces()
     try:
@@ -145,7 +148,8 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
 def fit_starts_afresh(reducer: Any) -> None:
     """Assert that `fit` on A and then on B gives the same `transform` as `fit` on B alone does.
 
-    The points must be equal bit for bit.
+    Two clones are fitted to test traces, so `reducer` may be unfitted and stays unchanged. The
+    points must be equal bit for bit.
     """
     A, labels_a = toy_traces(seed=1)
     B, labels_b = toy_traces(seed=2)
@@ -158,7 +162,8 @@ def fit_starts_afresh(reducer: Any) -> None:
 def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
     """Assert that a trace embedded alone, as in a cell, lies where it lies in a batch.
 
-    The two points may differ by a ten-thousandth of the embedding's root mean square radius.
+    A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged. The two
+    points may differ by a ten-thousandth of the embedding's root mean square radius.
     """
     trained = _train_clone(reducer)
     together = trained.embed(QUERIES)
@@ -171,7 +176,11 @@ def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
 
 
 def any_length_and_several_channels_work(reducer: Any) -> None:
-    """Assert that traces of other lengths, and of three channels, are embedded to finite points."""
+    """Assert that traces of other lengths, and of three channels, are embedded to finite points.
+
+    For each shape a clone is trained on test traces, so `reducer` may be unfitted and stays
+    unchanged.
+    """
     for channels, samples in SHAPES:
         X, y = toy_traces(70, samples, channels)
         trained = as_reducer(clone(reducer), FOLDS)
@@ -183,7 +192,11 @@ def any_length_and_several_channels_work(reducer: Any) -> None:
 
 
 def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
-    """Assert that `fit` and `transform` raise ValueError for a trace with a NaN."""
+    """Assert that `fit` and `transform` raise ValueError for a trace with a NaN.
+
+    Clones are called, the second after a training on test traces, so `reducer` may be unfitted and
+    stays unchanged.
+    """
     X, y = toy_traces()
     X[3, 0, 7] = np.nan
     unfitted = as_reducer(clone(reducer), FOLDS)
@@ -199,7 +212,8 @@ def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
 def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
     """Assert that its `module()` compiles to TorchScript and embeds as `embed` does, within 1e-4.
 
-    Passes if the reducer has no module, None.
+    A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged. Passes if
+    the clone has no module, None.
     """
     trained = _train_clone(reducer)
     module = trained.module()
@@ -212,7 +226,8 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
 def its_state_restores_it_bit_for_bit(reducer: Any) -> None:
     """Assert that its state holds plain arrays, and that a clone restored from it embeds the same.
 
-    Passes if the reducer has no state, None.
+    A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged. Passes if
+    the clone has no state, None.
     """
     trained = _train_clone(reducer)
     state = trained.get_state()
@@ -227,8 +242,8 @@ def its_state_restores_it_bit_for_bit(reducer: Any) -> None:
 def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
     """Assert that an engine that is closed and opened again decides the same, bit for bit.
 
-    The engine runs 90 cycles with a store in a temporary folder. Its first retrain must be
-    accepted.
+    It runs 90 cycles on test traces, with a clone of `reducer` and a store in a temporary folder.
+    Its first retrain must be accepted.
     """
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)

@@ -64,8 +64,8 @@ def export(
     file.
 
     STORE is the engine's store, as given to `dengine train` or `dengine run`. --make-key and --cpp
-    need neither STORE nor --out. Whoever has the key can check an exported file, and can also sign
-    one.
+    need neither STORE nor --out; with these, the new key signs FILE too. Whoever has the key can
+    check an exported file, and can also sign one.
     """
     if (store is None) is not (out is None) or not (store or new_key or cpp):
         raise click.UsageError(

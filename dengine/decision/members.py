@@ -230,12 +230,13 @@ class MemberEvidence(nn.Module):
     ) -> None:
         """Count a part's outcome on both sides, choose the thresholds, and end a safe mode if due.
 
-        `lower` and `upper` are the bound that the part was decided by, `success` is its label,
-        `predicted` (position in `Action`) what the model alone would have done, and
-        `inclusion_probability` that with which the outcome would be asked for. A wrong outcome may
-        raise an alarm, which starts the safe mode. This ends when the side that raised the alarm
-        has an open level again; after too many novel traces, when novel ones are few again and
-        either side has one.
+        `lower` and `upper` are the bound that the part was decided by, `success` is its label, and
+        `predicted` (position in `Action`) what the model alone would have done.
+        `inclusion_probability`, with which the outcome would be asked for, says how the part
+        counts: 1 as checked, above 0 as audited. At 0 only the drift detectors see it, unless all
+        outcomes are known. A wrong outcome may raise an alarm, which starts the safe mode. This
+        ends when the side that raised the alarm has an open level again; after too many novel
+        traces, when novel ones are few again and either side has one.
         """
         self.count_outcome(0, lower, not success, predicted, inclusion_probability)
         self.count_outcome(1, 1.0 - upper, success, predicted, inclusion_probability)

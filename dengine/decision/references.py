@@ -228,8 +228,8 @@ class RadiusIndex(nn.Module):
     def set_part(self, slot: int, part: int) -> None:
         """Replace the part of a slot by the hash `part`; 0 is an unknown part.
 
-        `first`, `repeats` and `part_filter` are updated for the part that leaves and the one that
-        comes.
+        `first` and `repeats` are updated for the part that leaves and the one that comes,
+        `part_filter` for the latter.
         """
         leaving = int(self.parts[slot].item())
         if leaving != 0 and int(self.repeats.item()) > 0:
@@ -473,8 +473,9 @@ class RadiusIndex(nn.Module):
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
         """Return a new index with the points of a state; with the same capacity in the same slots.
 
-        `state` is what `get_state` returned. With a smaller `capacity` the newest points stay, and
-        with a larger one they are counted from the oldest.
+        `state` is what `get_state` returned. With a smaller `capacity` the newest points stay;
+        with a larger one the oldest is in the first slot, and `total` no longer counts points that
+        left.
         """
         n = state["points"].shape[1]
         index = cls(len(state["points"]), capacity)

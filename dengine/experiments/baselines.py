@@ -115,7 +115,7 @@ class Baseline(ABC):
         X : array, shape (n, C, T)
             Traces.
         y : array, shape (n,)
-            1 = success, 0 = failure.
+            1 is success, any other value failure.
         """
         traces = as_traces(X)
         good = np.asarray(y) == 1

@@ -322,6 +322,7 @@ def curves(
     Parameters
     ----------
     by_recipe : mapping of str to sequence of Replay
+        Those of one recipe are equally long.
     title : str, default ""
     window : int, default 300
         Cycles of the sliding window; at most a third of the longest replay.

@@ -61,7 +61,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     Parameters
     ----------
     replays : sequence of Replay
-        All of one data set.
+        All of one data set, none of a live run.
     side : {"accepted", "rejected"}, default "accepted"
         Which decisions are judged.
     alpha : float, default 0.05

@@ -284,15 +284,15 @@ class Replay:
         Parameters
         ----------
         cycles : slice, default all
-            Those that count, by their position from 0.
+            Those that count, by their position from 0, without a step.
 
         Returns
         -------
         counts : dict
             first_cycle and last_cycle, counted from 1. verified_share, NaN without cycles. Numbers
-            of cycles: verified, accepted, rejected, false_positive, false_negative, novel,
-            safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts passed on,
-            None without a clock, without cycles, and where no time passed.
+            of cycles: verified, accepted, rejected (by the model), false_positive, false_negative,
+            novel, safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts
+            passed on, None without a clock, without cycles, and where no time passed.
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}

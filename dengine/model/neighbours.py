@@ -430,7 +430,7 @@ class ModelPrediction(EngineModel):
 
         Before the first training, if reducer and rule can be compiled, a template of the decider is
         compiled meanwhile: the first retrain has no time for that. The call returns when both are
-        done, and raises what the reducer raised.
+        done, and raises what one of them raised.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -458,7 +458,7 @@ class ModelPrediction(EngineModel):
         template_of(decider.eval(), trace_shape)
 
     def prepare(self, previous: EngineModel) -> None:
-        """Take over the rule of the previous model, stale or not, and build the decider.
+        """Share the rule of the previous model, stale or not, and build the decider.
 
         It is built for the conditions under which the previous model decided, or if it never did,
         for this one's. A decider that was built with that rule for these is kept. Nothing happens

@@ -91,6 +91,7 @@ def save_insertions(
     ----------
     path : str or path
     insertions : sequence of SimulatedInsertion
+        At least one.
     seed : int
     scenario : str, default "nominal"
         Seed and scenario are stored, so that the file can be made again.

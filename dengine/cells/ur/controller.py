@@ -341,7 +341,8 @@ class FakeController(AbstractContextManager["FakeController"]):
         Parameters
         ----------
         anew : bool, default False
-            Act as switched off and on: the clock starts anew, and all inputs are forgotten.
+            Act as switched off and on: the clock starts anew, and all inputs are forgotten. The
+            program goes on.
         """
         with self._lock:
             if anew:
