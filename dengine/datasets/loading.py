@@ -49,7 +49,7 @@ from .labels import (
     parse_label_map,
     read_ordered_labels,
 )
-from .tables import FORCE, find_recordings, from_frame, hold_many, read_folder, read_tables
+from .tables import FORCE, are_tables, find_recordings, from_frame, read_folder, read_tables
 from .text import SUFFIXES as TEXTS
 from .triggers import Trigger
 
@@ -244,7 +244,7 @@ def _find_file_reader(
     named = {path.name: path}
     if path.is_dir():
         named = find_recordings(path, options)
-        if not hold_many(named, options):
+        if not are_tables(named, options):
             read = partial(read_folder, path, named, name, options)
             return ("label", "labels", "time", *TEXT_FORMAT), read
     if len(named) == 1:

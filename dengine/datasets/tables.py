@@ -106,11 +106,14 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     return {name: named[name] for name in sorted(others or texts, key=natural_key)}
 
 
-def hold_many(named: Mapping[str, Path], options: LoadOptions) -> bool:
-    """Return whether each file of a folder is a table of many insertions, and not one recording.
+def are_tables(named: Mapping[str, Path], options: LoadOptions) -> bool:
+    """Return whether a folder's files are to be read as tables of many insertions, not as one
+    recording each.
 
-    Parquet and .npz files are such tables; of text files the names and columns tell. Raises
-    DataError for text files in another encoding.
+    The first file's type and columns tell, with the names of all and the user's options. True for
+    Parquet and .npz files, unread: whether an archive holds one insertion, `hold_one_each` tells
+    later. Raises DataError if text files cannot be decoded by `options.encoding`, or the first one
+    cannot be read.
     """
     path = next(iter(named.values()))
     if path.suffix.lower() not in TEXTS:
@@ -506,7 +509,10 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
 
 
 def _read_parquet(path: Path) -> TextTable:
-    """Return a Parquet file as a table whose rows count from 1; DataError if it is damaged."""
+    """Return a Parquet file as a table whose rows count from 1.
+
+    Raises DataError if it cannot be read or is damaged, or pyarrow is not installed.
+    """
     import pandas as pd
 
     with read_errors(path, "a Parquet file", "pyarrow", "files"):

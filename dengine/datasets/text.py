@@ -203,7 +203,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _without_trailing_empty(row: list[str]) -> list[str]:
-    """Return a row without the empty cells at its end."""
+    """Return a row without the empty cells ("") at its end."""
     n = len(row)
     while n and not row[n - 1]:
         n -= 1

@@ -167,7 +167,7 @@ class Feedback:
         The same report once more, before `note_synced`, does nothing and returns False. Returns
         whether silence had confirmed the part before this report, whatever its label is now. Raises
         ReportError if the decision has a label already, except that a line stop may follow a
-        confirmation.
+        confirmation. `remedy` is set where the rule must be rebuilt, which is not done here.
         """
         id_ = stored.decision.id
         was_confirmed = False
@@ -185,9 +185,10 @@ class Feedback:
     def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
         """Learn a label that is no repetition and hand it to the outbox, after labels that wait.
 
-        A confirmation by silence is taken back first. If its label went to the outbox before, only
-        the new label goes there too, and `remedy` is set to CORRECT. Otherwise its reference is
-        removed, and `remedy` is set to REBUILD_RULE, as for a check that was counted as overdue.
+        A confirmation by silence is taken back first. If its label went to the outbox before, the
+        new label goes there too, but is not learned yet: `remedy` is set to CORRECT. Otherwise its
+        reference is removed, and `remedy` is set to REBUILD_RULE, as for a check that was counted
+        as overdue.
         Returns whether there was such a confirmation, whatever the label is now. Raises ReportError
         for any other second label.
         """
@@ -244,8 +245,8 @@ class Feedback:
     def _was_unobserved(self, stored: StoredDecision) -> bool:
         """Return whether this part is one of those counted as unobserved.
 
-        It is, if it was accepted under the present policy with stops="some", and went on without an
-        outcome until now.
+        It is, if it was accepted under the present policy with stops="some", and the next trace
+        came before its outcome.
         """
         decision = stored.decision
         if decision.action is not Action.ACCEPT or self._stops_all:

@@ -1,5 +1,5 @@
-"""`Peers`: reads from the store what the other cells of a product have learned: labels, and the
-newest version of the model.
+"""`Peers`: reads from the store what the other cells of a product have learned, labels and the
+newest version of the model, and takes it over: labels become references, a newer version answers.
 
 The cells of a product share one store. News is asked for between two cycles, never by `decide`. A
 cell whose connection is lost goes on with what it has. `learner.Learner` asks for news in the order
@@ -117,8 +117,9 @@ class Peers:
         self.is_lost = False
 
     def take_in(self, news: ProductNews) -> None:
-        """Add the labels of the news to the window, in their order, and make peers' labels
-        references.
+        """Add the labels of the news to the window, in their order, and count them for the next
+        retrain; a peer's label becomes a reference of the answering model, unless it is one
+        already.
         """
         labelled = news.labelled
         rows = zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True)

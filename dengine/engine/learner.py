@@ -156,8 +156,8 @@ class Learner:
 
         The remedy, a rebuild of the rule and perhaps a correction, is left to a later call while
         the store lacks records or has a fault. A correction first finishes a retrain under way, or
-        gives it up after `HUNG` seconds. Where the store fails meanwhile, that is logged, and a
-        later call tries again.
+        gives it up after `HUNG` seconds, and retrains a model that cannot change its references.
+        Where the store fails meanwhile, that is logged, and a later call tries again.
         """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:

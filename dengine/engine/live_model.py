@@ -241,7 +241,8 @@ class LiveModel:
         return True
 
     def rebuild_rule(self) -> None:
-        """Reset the newest model's rule, and update it with `SqlStore.outcomes_since` it began.
+        """Reset the rule of the answering model, or of the template before the first retrain, and
+        update it with `SqlStore.outcomes_since` it began.
 
         Overdue checks are among these. Labels that are not in the store yet are not, so the rule
         forgets them: store them before. The ledger is not checked here. Raises StoreError, and

@@ -30,7 +30,7 @@ def restore_model(
 
     A model that is stored by its traces is trained on them again. Returns None where one of these
     traces is damaged or missing. The two models share one rule, so the template has the stored
-    rule, too. Raises StoreError for a state that this dengine cannot restore.
+    rule, too. Raises StoreError for a state that this dengine cannot restore, and as `refit`.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -41,9 +41,10 @@ def restore_model(
 def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on the traces of a stored version, with the labels that these had then.
 
-    Labels are first checked against the ledger, which may set the outbox's `integrity_error`.
-    Returns False, with the model untrained, where a trace is damaged or missing. A label that was
-    forgotten by then is left out, and is not missing.
+    Labels are first checked against the ledger, which may set the outbox's `integrity_error`; the
+    model is trained nevertheless. Returns False, with the model untrained, where a trace is damaged
+    or missing. A label that was forgotten by then is left out, and is not missing. Raises
+    StoreError for a damaged label, or if the store does not answer.
     """
     store = outbox.store
     first = int(trained_on.seq[0])

@@ -190,8 +190,9 @@ def host_in_url(host: str) -> str:
 def is_own_host(host: str | None, names: tuple[str, ...]) -> bool:
     """Return whether a request's `Host` header names this server.
 
-    It must be localhost, an IP address, or one of `names`, in any case, with or without a port. A
-    web page whose own name was made to resolve to this machine (DNS rebinding) sends another name.
+    It must be localhost, any IP address, or one of `names`, in upper or lower case, with or without
+    a port. A web page whose own name was made to resolve to this machine (DNS rebinding) sends
+    another name.
     """
     if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
         return False

@@ -426,7 +426,7 @@ def _argument_error(
 ) -> tuple[int | None, str]:
     """Return a status code and a text for wrong arguments of a call; None and "" for right ones.
 
-    Number, types and arrays are checked; null is right for a text alone.
+    Number, types and arrays are checked; only a text may be null.
     """
     n = len(variants)
     if n < len(arguments):

@@ -318,7 +318,7 @@ class RobotCalls:
         ------
         ReportError
             For a report that contradicts an earlier one, unless it is a line stop after a
-            confirmation; and for what is no label.
+            confirmation; and for what is no label or no id.
         """
         if decision_id == "":  # of an unrecorded VERIFY
             return False
