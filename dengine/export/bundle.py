@@ -126,8 +126,8 @@ def prepare_export(
     ------
     ExportError
         For a baseline, before the first training, for a rule, an interval or a reducer that
-        TorchScript cannot compile, for code that was changed after it was compiled, and if the rule
-        has missed an outcome.
+        TorchScript cannot compile, for code that was changed after it was compiled, if the rule is
+        stale, because an update of it failed, and if the store was changed from outside.
     OutputError
         If `path`, its checksum or its signature must not be written; this is checked first.
     """

@@ -265,8 +265,10 @@ def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
 def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
     """Return samples, channel after channel, as a trace of the contract, float32 (C, T).
 
-    Another number of samples is fitted as `spec.fit` says. Raises DataError, naming `where`, for
-    words that are no numbers or of a number that cannot be fitted.
+    Another number of samples is fitted as `spec.fit` says; where it is too short or too long for
+    that, the trace ends in NaN (see `fit_length`). Raises DataError, naming `where`, for words that
+    are no numbers, for another number than "strict" asks, for none, and for one that is no multiple
+    of the channels.
     """
     n = spec.channels * spec.samples
     can_fit = spec.fit != "strict" and len(words) > 0 and len(words) % spec.channels == 0

@@ -327,9 +327,9 @@ class DecisionModule(nn.Module):
     def as_trace(self, trace: Tensor) -> Tensor:
         """Return the trace as (C, T) float32 with the number of samples of the contract.
 
-        Another number of samples is fitted as the contract's `fit` says. Raises ValueError,
-        compiled torch.jit.Error, for another shape, and for another number of samples if `fit` is
-        "strict".
+        Another number of samples is fitted as the contract's `fit` says; where it is too short or
+        too long for that, the trace ends in NaN. Raises ValueError, compiled torch.jit.Error, for
+        another shape, and for another number of samples if `fit` is "strict".
         """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
         fits = x.size(-1) == self.samples or (self.fit != 0 and x.numel() > 0)

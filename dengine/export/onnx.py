@@ -93,9 +93,9 @@ def export_onnx(
     ExportError
         If the engine audits, has force limits or a rule that learns, or a part came again; if
         nothing was trained yet; for a baseline; if the reducer or the interval has no module; for
-        code that was changed after it was compiled; if the rule has missed an outcome; if the key
-        cannot be read, or a package is missing; and if onnxruntime does not decide as the model
-        does.
+        code that was changed after it was compiled; if the rule is stale, because an update of it
+        failed; if the store was changed from outside; if the key cannot be read, or a package is
+        missing; and if onnxruntime does not decide as the model does.
     OutputError
         If `path` cannot be written.
     """

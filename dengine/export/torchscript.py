@@ -89,7 +89,8 @@ def export_torchscript(
 ) -> Path:
     """Write the decision of an engine, or of a model, as TorchScript, with its checksum beside it.
 
-    An accepted part of unknown outcome stays with the engine: export when none is under way. An
+    A part that the engine has accepted and whose outcome is not known yet is missing from the file,
+    which never learns that outcome. This is not checked: export when no part is under way. An
     engine's store records the export as an event.
 
     Parameters
@@ -115,8 +116,9 @@ def export_torchscript(
     ------
     ExportError
         If nothing was trained yet, for a baseline, if the reducer, the interval or the rule cannot
-        be compiled, for code that was changed after it was compiled, if the rule has missed an
-        outcome, and if the key cannot be read.
+        be compiled, for code that was changed after it was compiled, if the rule is stale, because
+        an update of it failed, if the store was changed from outside, and if the key cannot be
+        read.
     OutputError
         If `path` cannot be written; a file that was there is then unchanged.
     """

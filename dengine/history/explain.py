@@ -148,7 +148,7 @@ def _was_known(label: PastLabel, item: StoredDecision, stops_all: bool) -> bool:
 
 
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
-    """Return the index of a stored version's references, and add the labels that came later to it.
+    """Return the index of a stored version's references and of the labels that came later.
 
     A label without a point is left out. In a full index each replaces the oldest reference.
     """
@@ -255,7 +255,7 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
 
 
 def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
-    """Update a rule, in place, with the outcome of one part."""
+    """Update a rule, in place, with the outcome of one part and the silent parts before it."""
     rule.observe(outcome.silent, outcome.novel)
     rule.update(
         outcome.lower,

@@ -84,8 +84,9 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     Returns
     -------
     PartMap
-        With the newest 250 references, and those of the newest 10 decisions that this version made
-        and embedded. A part that is both is drawn once, as a newest one.
+        With the newest 250 references of known label and, of the newest 10 decisions of the cell,
+        those that this version made and embedded. A part that is both is drawn once, as a newest
+        one.
     """
     recent = [item.decision for item in store.decisions(HistoryFilter(), N_NAMED)]
     ids = [decision.id for decision in recent[-N_NEWEST:] if decision.model_version == version]

@@ -145,7 +145,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
 
     def transform(self, X: ArrayLike) -> Floats:
-        """Embed traces for pictures: the mean of all spaces. Labels are never counted in it.
+        """Embed traces for pictures: the mean of all spaces. Decide by `embed` instead.
 
         A subclass defines this method or `embed`. Traces are embedded one by one, as a cell does,
         since in a batch the last bits of a result depend on the other traces.
@@ -575,7 +575,7 @@ class CrossFitted(_Wrapping):
         y : array, shape (n,)
             Labels of two classes, of which the larger is given to the clones as 1, the other as 0.
         folds : array of int64, shape (n,), optional
-            Fold of each trace, 0 to K - 1. None: by its content.
+            Fold of each trace, 0 to K - 1, not checked. None: by its content.
 
         Returns
         -------

@@ -30,7 +30,8 @@ class HeadsFit(NamedTuple):
     w : Tensor of float64, shape (K, W + 1)
         Weights, the bias last.
     left_out : Tensor of float64, shape (K, n)
-        Leave-one-out logit of each row by each head.
+        Leave-one-out logit of each row by each head, valid where the row trains the head; the logit
+        of the base rate for heads in `at_base_rate`.
     at_base_rate : list of int
         Heads that predict their base rate.
     n_steps : int
@@ -185,7 +186,10 @@ def fit_heads(
 def base_rate_if_better(
     w: Tensor, left_out: Tensor, y: Tensor, mask: Tensor
 ) -> tuple[Tensor, Tensor, list[int]]:
-    """Set heads to their base rate where that has the smaller log loss on held-out labels.
+    """Return heads, each replaced by its base rate where its leave-one-out log loss is larger.
+
+    It is compared with the log loss of the base rate, the share of successes among all rows that
+    train the head. So the base rate's loss is not left out, and a little small.
 
     Parameters
     ----------
@@ -201,7 +205,8 @@ def base_rate_if_better(
     Returns
     -------
     w, left_out : Tensor
-        As the arguments, with the base rate where it is better.
+        As the arguments; in rows of heads at base rate the bias alone, and its logit, the same for
+        each label, not left out.
     at_base_rate : list of int
         The heads that were set to it.
     """
@@ -228,7 +233,7 @@ def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Ten
     Returns
     -------
     Tensor of float64, shape (K, n)
-        Exact to first order.
+        Exact to first order for rows that train the head; of no use for others.
 
     References
     ----------

@@ -202,18 +202,19 @@ class Tower(NamedTuple):
 def weigh_towers(
     left_out: list[Tensor], penalties: list[float], y: Tensor, outside: Tensor
 ) -> tuple[list[Tensor], Tensor]:
-    """Weigh the logits of towers to one logit for each head, tower by tower.
+    """Choose for each head the shares by which the logits of towers are mixed to one logit.
 
-    The shares of a tower, and of the mean of those before it, are the candidates, eleven from 0 to
-    1, with the smallest log loss on the rows outside fold k, so that labels of fold k do not reach
-    head k.
+    Tower by tower, the mix becomes 1 - s of the mix before it and s of the tower. s is that of
+    eleven values from 0 to 1 with the smallest penalised log loss on the rows outside fold k, so
+    that labels of fold k do not reach head k.
 
     Parameters
     ----------
     left_out : list of Tensor of float64, shape (K, n)
         Leave-one-out logits of each tower.
     penalties : list of float
-        Nats that the whole logit of a tower must save in all; that of the first tower is not read.
+        Nats that a tower's logit with s = 1 must save over all rows, with a smaller s that part of
+        them; that of the first tower is not read.
     y : Tensor of int64, shape (n,)
         Labels.
     outside : Tensor of bool, shape (K, n)

@@ -244,7 +244,7 @@ def negative_samples(
     Returns
     -------
     order : Tensor of int64, shape (n,)
-        Rows of the points in the order of the circle.
+        Columns of `points` in the order of the circle.
     samples : Tensor of float32, shape (d, n, count)
         The points that were drawn for point ``order[i]`` are ``samples[:, i]``.
     """

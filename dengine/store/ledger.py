@@ -174,7 +174,10 @@ def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
 
 
 def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
-    """Return the SHA-256, 32 bytes, over the sums of rows, given by table; in whatever order."""
+    """Return the SHA-256 (32 bytes) over the sums of rows, given by table.
+
+    The order of tables and of rows does not matter.
+    """
     digest = hashlib.sha256()
     for table in sorted(sums):
         ordered = sorted(sums[table])

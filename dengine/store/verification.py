@@ -386,9 +386,10 @@ class CellCheck:
             yield self._fault(LEDGER.name, f"entry {number}", "is missing")
 
     def _check_settings(self) -> Iterator[HistoryFault]:
-        """Yield a fault for each setting that differs from the ledger's copy.
+        """Yield a fault for each setting that was changed, or is missing here or in the ledger.
 
-        A cell without the setting of its schema is a fault, too.
+        If the setting with the schema's version is missing (no engine has opened the cell), that is
+        a fault, too.
         """
         for key, problem in find_settings_faults(self.connection, self.cell_id).items():
             yield self._fault(SETTING.name, key, problem)
