@@ -478,7 +478,7 @@ class Database:
         """Compare what an engine reads of this cell, and its product's others, with their ledgers.
 
         These are settings, corrections, labels and model versions. Of the labels only the newest
-        are checked, everything else in full.
+        are checked, everything else in full but for the versions' arrays.
 
         Parameters
         ----------

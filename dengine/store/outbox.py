@@ -589,7 +589,9 @@ class Outbox:
         return item
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
-        """Return the decision that an id already has, with its label; None if the id is new.
+        """Return the decision that an id already has, or None if the id is new.
+
+        It comes with its label if that is on disk.
 
         Raises
         ------
@@ -892,8 +894,9 @@ class Outbox:
     def _drain_loop(self, journal: Journal) -> None:
         """Drain synced records and run submitted calls until closed: the store's thread runs it.
 
-        Before a call everything synced is drained. After an error of the store it is logged once,
-        kept for `fault`, and tried again a second later.
+        Before a call everything synced is drained, if the store takes it; the call runs in either
+        case. An error of the store is logged once and kept for `fault`; a second later the store is
+        tried again.
         """
         while True:
             with self._changed:

@@ -298,6 +298,7 @@ def stretches_query(
     batch : str, default ""
         Group decisions by the beginnings of their parts' numbers instead: a number n in digits
         takes the first n characters, separators such as "-/" take all up to the last of them.
+        Decisions without a part's number are one group.
 
     Returns
     -------

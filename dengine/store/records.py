@@ -531,7 +531,8 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
     Raises
     ------
     StoreError
-        For a row that `to_row` did not write.
+        For a row that lacks a field, or has a value that cannot be converted. Texts and numbers are
+        taken as they are, unchecked.
     """
     wanted = {
         name: type_

@@ -324,7 +324,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Raises
         ------
         StoreError
-            If the traces have different shapes, or a label is damaged.
+            If the traces have different shapes, or a label is not 0 or 1; other damage of a label
+            is not noticed here.
         """
         scope = Scope(self.cell_id) if cell_only else self._scope
         query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
@@ -373,7 +374,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Raises
         ------
         StoreError
-            If the traces have different shapes, or a label is damaged.
+            If the traces have different shapes, or a label is not 0 or 1; other damage of a label
+            is not noticed here.
         """
         query = (
             training_query(self._scope)
