@@ -34,6 +34,7 @@ def hold_one_each(named: Mapping[str, Path], options: LoadOptions) -> bool:
 
     These two have arrays of the same names, and the first a label of one value if any, and traces
     of one row, or of several channels beside such a label. False for a single archive.
+    Raises DataError if one of the two cannot be read.
     """
     paths = list(named.values())
     if len(paths) < 2:
@@ -90,9 +91,10 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
 
 
 def _to_frame(arrays: Mapping[str, NDArray[Any]], options: LoadOptions) -> pd.DataFrame:
-    """Return the arrays of an archive that have its most frequent length, a column each.
+    """Return the arrays of numbers or times that have an archive's most frequent length, a column
+    each.
 
-    An array (C, T) has C columns, `X_0`, `X_1`, ...
+    An array (C, T), or (T, C) with C < T, has C columns, `X_0`, `X_1`, ...
     """
     import pandas as pd
 
@@ -109,9 +111,10 @@ def _to_frame(arrays: Mapping[str, NDArray[Any]], options: LoadOptions) -> pd.Da
 
 
 def _label_source(named: Mapping[str, Path], options: LoadOptions) -> labels.LabelSource:
-    """Return the source of the labels: a file of them, an array of one value, or the names.
+    """Return the source of the labels: a file of them, an array if the first archive has it, or the
+    names.
 
-    What the user does not state is compared with the others.
+    Unless the user states the array, the names must not contradict the file or the array.
     """
     in_names = labels.labels_in_names(None, options.words)
     if options.labels is not None:

@@ -644,7 +644,9 @@ def _add_wide_rows(
 
 
 def _values_of(frame: pd.DataFrame, name: str) -> str:
-    """Return the name of a column, with its values and their counts if these are few and equal."""
+    """Return the name of a column, with its values and their count if they are few and equally
+    frequent.
+    """
     counts = frame[name].value_counts()
     if not 2 <= len(counts) <= MAX_STATIONS or counts.min() < counts.max():
         return name
@@ -675,7 +677,7 @@ def _without_repeated_parts(
     """Return long tables without the parts that an earlier one has with equal rows and dates.
 
     So they count once if two exports overlap; a note of the collector says how many do. A table
-    without other parts is left out.
+    without other parts is left out. One whose times are no dates keeps all its parts.
     """
     import pandas as pd
 
@@ -836,10 +838,12 @@ def _compared_columns(frame: pd.DataFrame, label: str | None, options: LoadOptio
 
 
 def _check_single_station(rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str]) -> None:
-    """Raise DataError if the rows of a part are those of several, which were made elsewhere.
+    """Raise DataError if the rows of a part's number are those of several parts, made at the same
+    times at different places.
 
-    Such rows would be merged to one zigzag trace. A column tells them apart if the times of its
-    values overlap, and each value by itself has times without gaps.
+    Such rows would be merged to one zigzag trace. A column, or the runs of rows in the order of
+    time, tells them apart if the times of its values overlap, and each value by itself has times
+    without gaps.
 
     columns : that may tell where a part was made.
     """
@@ -910,7 +914,8 @@ def _order_by_time(
 
 
 def _time_column(frame: pd.DataFrame, options: LoadOptions) -> str:
-    """Return the column of times: the one that the user states, in any case, else by its name.
+    """Return the column of times: the one that the user states, in upper or lower case, else by
+    its name.
 
     A stated column that is not there is returned as stated; "" if no name is a clock's.
     """

@@ -270,6 +270,7 @@ def _true_header(
     A row in which some cells are numbers, and one above it of as many names, is damaged data.
 
     above, is_units : the rows above the data, and whether they are of units.
+    header, data : the positions found so far, which are returned where no such row is.
     """
     row = above[header]
     if len(_numeric_columns(row)) == len(row):
@@ -338,7 +339,8 @@ def read_table(
     Returns
     -------
     TextTable
-        Rows of too few or too many cells, and with numbers in another format, are among its faults.
+        Rows of too few or too many cells, or with numbers in another format, are left out, and are
+        among its faults.
 
     Raises
     ------
