@@ -397,8 +397,8 @@ def read_table(
 def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
     """Convert a table to numbers.
 
-    Returns an array of float32, shape (n, columns), in which empty cells are NaN, and a message for
-    the index of each row that has a cell that is no number.
+    Returns an array of float32, shape (n, columns), in which empty cells and those that are no
+    numbers are NaN, and a message for the index of each row that has a cell that is no number.
     """
     values = np.empty(frame.shape)
     wrong = dict[int, str]()
