@@ -175,8 +175,8 @@ class Recipe:
         ----------
         recipe : str, path, Recipe or estimator
             A name in `RECIPES`, the path of a TOML file, a Recipe, which is returned unchanged, or
-            a reducer of your own, `module:Class` or a scikit-learn transformer, which gets the
-            default settings. A text is tried in this order.
+            a reducer of your own, `module:Class` (not imported here) or a scikit-learn transformer,
+            which gets the default settings. A text is tried in this order.
 
         Raises
         ------

@@ -50,7 +50,10 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """Return the time in seconds since 1970; a usage error for a text that is no time."""
+        """Return the time in seconds since 1970; a usage error for a text that is no time.
+
+        "30m" is that long ago (s, m, h or d); a date without an offset is in UTC.
+        """
         ago = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value)
         if ago:
             return time.time() - float(ago[1]) * SECONDS_OF[ago[2]]

@@ -265,7 +265,8 @@ class RecipeChoice:
         Raises
         ------
         SettingError
-            The recipe or its reducer is not found. This is checked here, before a store is created.
+            The recipe or its reducer is not found. This is checked here, before a store is created;
+            a reducer of the user's own is imported for that.
         """
         from ..recipe import Recipe
         from ..reducers import REDUCERS, reducer_class

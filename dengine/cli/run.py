@@ -117,9 +117,9 @@ def run(
     learned from twice. A robot runs dengine/cells/ur/ur_cell.script, or a program with the same
     handshake; --trigger and --samples say what is recorded of it. If too much goes wrong, or if
     traces look like nothing known, every part is verified until fresh evidence shows otherwise:
-    safe mode. At the end a table shows what was decided, what was wrong and what was saved. Ctrl-C
-    or SIGTERM ends the run after the current cycle and shows what was done; a second one ends it at
-    once.
+    safe mode. --shadow stays in force in the store, until `dengine policy STORE --shadow off`. At
+    the end a table shows what was decided, what was wrong and what was saved. Ctrl-C or SIGTERM
+    ends the run after the current cycle and shows what was done; a second one ends it at once.
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")

@@ -177,9 +177,9 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
     """Show the policy in force, or change it.
 
     What is not given stays as it is. Earlier decisions keep their bounds. The certificate starts
-    again after any change, and what the rule learned after one of the tolerance, such as --alpha:
-    a tolerance that is chosen after the data was seen needs fresh evidence. Shadow mode lasts over
-    restarts; `dengine status` counts what the model would have done, and how much was wrong.
+    again after any change; the rule forgets what it learned after one of the tolerance, such as
+    --alpha, for one that is chosen after the data was seen needs fresh evidence. Shadow mode lasts
+    over restarts; `dengine status` counts what the model would have done, and how much was wrong.
     """
     if settings:
         _change_and_print(
