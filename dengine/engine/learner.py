@@ -444,9 +444,9 @@ class Learner:
     def _is_due_after_news(self, retrain_every: int) -> bool:
         """Return whether a retrain is due by the number of new labels, and this cell's to do.
 
-        Where cells share a product, news is taken in first, if none was asked for lately. If a
-        retrain is due then, all news is taken in, and it is asked again: a peer's version may have
-        come.
+        Where cells share a product, news is taken in first, if none was asked for lately: a peer's
+        version may answer afterwards. If a retrain is due then, all news is taken in, and it is
+        counted again.
         """
         if self._peers is not None and self._peers.is_news_due:
             self._take_in_news(self._peers)

@@ -292,10 +292,10 @@ class RobotCalls:
     async def decide_array(self, trace: ArrayLike, request: Any, part: Any) -> Struct:
         """Decide on a trace of shape (T,) or (C, T); return action, id, reason, bounds and version.
 
-        If the queue is full or the service is closing, that is logged, and the struct is an
-        unrecorded VERIFY with an id "" and the reason "busy". A request "" gets a new id, a part ""
-        means none. Raises TraceError for a trace, and ReportError for an id, that the engine does
-        not take.
+        If the queue is full, or the service or its engine is closed, that is logged, and the struct
+        is an unrecorded VERIFY with an id "" and the reason "busy". A request "" gets a new id, a
+        part "" means none. Raises TraceError for a trace, and ReportError for an id, that the
+        engine does not take.
         """
         id_ = as_id(request) if request != "" else None
         try:
