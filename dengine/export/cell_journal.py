@@ -267,8 +267,8 @@ def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.fl
 
     Another number of samples is fitted as `spec.fit` says; where it is too short or too long for
     that, the trace ends in NaN (see `fit_length`). Raises DataError, naming `where`, for words that
-    are no numbers, for another number than "strict" asks, for none, and for one that is no multiple
-    of the channels.
+    are no numbers ("nan" and "inf" are), for another number of them than "strict" asks, for none,
+    and for one that is no multiple of the channels.
     """
     n = spec.channels * spec.samples
     can_fit = spec.fit != "strict" and len(words) > 0 and len(words) % spec.channels == 0

@@ -466,10 +466,10 @@ def _verdict(lower: float, upper: float, tolerance: float) -> str:
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     """Estimate how many of the accepted parts were bad, audited ones included.
 
-    If every outcome is known it is by these, else by audits, whose coin knows no outcome, so that
-    they speak for all. Under `stops="all"` a part whose outcome is still open is left out. Line
-    stops count besides the audits: the lower end is at least the one that follows if all other
-    parts were good, and the upper end at least their share.
+    If every outcome of the unaudited is known it is by these alone, else by audits, whose coin
+    knows no outcome, so that they speak for all. Under `stops="all"` a part whose outcome is still
+    open is left out. Line stops count besides the audits: the lower end is at least the one that
+    follows if all other parts were good, and the upper end at least their share.
 
     Parameters
     ----------

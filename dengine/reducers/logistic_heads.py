@@ -186,10 +186,11 @@ def fit_heads(
 def base_rate_if_better(
     w: Tensor, left_out: Tensor, y: Tensor, mask: Tensor
 ) -> tuple[Tensor, Tensor, list[int]]:
-    """Return heads, each replaced by its base rate where its leave-one-out log loss is larger.
+    """Return heads, each that does worse than its base rate replaced by that rate.
 
-    It is compared with the log loss of the base rate, the share of successes among all rows that
-    train the head. So the base rate's loss is not left out, and a little small.
+    A head does worse if its leave-one-out log loss is larger than that rate's loss. The base rate
+    is the share of successes among all rows that train the head, so its loss is not left out, and a
+    little small.
 
     Parameters
     ----------

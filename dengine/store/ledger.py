@@ -142,6 +142,7 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
     ------
     StoreError
         If the ledger was begun with another key, or with a key and b"" is given, or the reverse.
+        Without `begin` a cell that has no entry yet counts as begun without a key.
     """
     tag = hmac.new(key, b"dengine ledger", "sha256").hexdigest() if key else None
     is_tag = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == LEDGER_KEY)
