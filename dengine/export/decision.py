@@ -100,11 +100,12 @@ class DecisionModule(nn.Module):
         """Decide on one trace, and make this the pending decision.
 
         Before that, a pending accept is settled, see `settle`: it is learned as good or counted as
-        silent. After a faulty trace no decision is pending.
+        silent; another pending decision is forgotten. After a faulty trace no decision is pending.
 
         Parameters
         ----------
         trace : Tensor of any real dtype, shape (T,) or (C, T)
+            As `as_trace` takes it.
         part : int, default 0
             Hash of its part's number (`folds.part_hash`); 0 for an unknown part.
 
@@ -175,6 +176,7 @@ class DecisionModule(nn.Module):
         Parameters
         ----------
         trace : Tensor of any real dtype, shape (T,) or (C, T)
+            As `as_trace` takes it.
         success : bool
             The label.
         part : int, default 0
@@ -243,7 +245,7 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Make an earlier decision, as a journal has it, the pending one again.
 
-        The present pending decision is settled first. The trace (T,) or (C, T) is embedded anew,
+        A pending accept is settled first. The trace (T,) or (C, T) is embedded anew,
         with the fields of the decision as they are given; `part` is a hash, 0 if unknown, and
         `predicted` follows from the others. A faulty trace leaves none pending. Raises ValueError,
         compiled torch.jit.Error, for another shape.

@@ -193,7 +193,7 @@ class OnnxModel:
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), and keep nothing of it.
 
-        Raises TraceError for a wrong shape.
+        Another T is fitted as the contract's `fit` says. Raises TraceError for a wrong shape.
         """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         action, reason, lower, upper, n_success, n_failure, z = outputs

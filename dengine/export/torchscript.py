@@ -200,6 +200,7 @@ class ExportedModel:
         Parameters
         ----------
         trace : array, shape (T,) or (C, T)
+            Another T is fitted as the contract's `fit` says.
         part : str or int, optional
             Number of the part, whose own references then do not count.
 
@@ -234,6 +235,7 @@ class ExportedModel:
         Parameters
         ----------
         trace : array, shape (T,) or (C, T)
+            Another T is fitted as the contract's `fit` says.
         success : bool
             The label.
         part : str or int, optional

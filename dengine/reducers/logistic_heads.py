@@ -206,8 +206,8 @@ def base_rate_if_better(
     Returns
     -------
     w, left_out : Tensor
-        As the arguments; in rows of heads at base rate the bias alone, and its logit, the same for
-        each label, not left out.
+        As the arguments; for a head at base rate `w` has the bias alone, and `left_out` its logit,
+        the same for each label, not left out.
     at_base_rate : list of int
         The heads that were set to it.
     """
