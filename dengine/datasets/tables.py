@@ -597,7 +597,7 @@ def _column_forms(frame: pd.DataFrame) -> set[str]:
 def _add_wide_rows(
     frame: pd.DataFrame, options: LoadOptions, collector: RecordingCollector, source: str
 ) -> None:
-    """Add each row of a wide table to a collector as a recording.
+    """Add each row of a wide table to a collector as a recording, and set its channels.
 
     An empty cell before others is NaN, which the engine finds. A row whose last cells are empty is
     a shorter trace. A row with text among its samples, or with an unknown label, is a fault; one

@@ -103,8 +103,9 @@ class Feedback:
         """Restore from the store which checks are pending, and which accepted parts have no
         outcome.
 
-        With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
-        "some" they are only counted, as unobserved since the last label.
+        The live model must be restored before. With `stops="all"` the accepted parts are kept, so
+        that the next trace confirms them. With "some" they are only counted, as unobserved since
+        the last label.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store

@@ -153,7 +153,10 @@ class LiveModel:
             self._rebuild_rule_of(model, self._read_outcomes)
 
     def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn | None) -> None:
-        """Let a model answer from now on, as the version of this number; nothing is stored."""
+        """Let a model answer from now on, as the version of this number; nothing is stored.
+
+        The caller hands the rule in force over to it (`GuardedModel.prepare`), before or after.
+        """
         self.answering = model
         self.version = version
         self.newest_version = max(version, self.newest_version)

@@ -156,10 +156,10 @@ class EngineSettings:
         Raises
         ------
         StoreError
-            For an unused store, and for a seed that is damaged.
+            For an unused store, a damaged seed, and a recipe that lacks settings.
         SettingError
-            Where an object is missing or another than the engine was made with, or a model is not
-            needed.
+            For a text that is no recipe; where an object is missing or another than the engine was
+            made with, or a model is not needed.
         ImportRefusedError
             Where the recipe names a class that may not be imported.
         """

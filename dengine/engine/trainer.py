@@ -68,7 +68,7 @@ class TrainingWindow:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
         `label` is 1 or 0, `hash_` the hash of part or content, `seq` the label's number, larger
-        than any before.
+        than any before, which is not checked.
         """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)

@@ -330,10 +330,11 @@ class CellService:
     async def read(self, work: Callable[[SqlStore], T]) -> T:
         """Call a function with a store that has every decision so far, and return its result.
 
-        The engine is flushed first, so this waits in the queue. The function runs in a thread of
-        its own, over the second connection, or in the engine's thread if the store is in memory.
-        Raises BusyError if the queue is full or the service is closing, and what the flush or the
-        function raises.
+        The engine is flushed first, so this waits in the queue; decisions that the store does not
+        take in time are missing. The function, which must only read, runs in a thread of its own,
+        over the second connection, or in the engine's thread if the store is in memory. Raises
+        BusyError if the queue is full or the service is closing, and what the flush or the function
+        raises.
         """
         await self.call(lambda engine: engine.flush(), read_only=True)
         if self.read_store is self.engine.store:
