@@ -65,7 +65,8 @@ class Messages(NamedTuple):
     def signal(self, name: str) -> NDArray[np.float64]:
         """Return an axis of the wrench, or the value of a topic at each wrench, shape (n,).
 
-        The value of a topic is its newest one when the wrench was logged, NaN before its first.
+        The value of a topic is its newest one when the wrench was logged, NaN before its first. The
+        name is not checked: one that is neither gives MZ.
         """
         if name not in self.others:
             return self.wrench[:, axis_of(name)]

@@ -311,7 +311,10 @@ def seconds_of(
 
 
 def holds_dates(column: pd.Series) -> bool:
-    """Return whether a column of times states dates, so that times of several parts compare."""
+    """Return whether a column of times states dates, so that times of several parts compare.
+
+    Of numbers the first known one tells it, of texts most of them.
+    """
     import pandas as pd
 
     if pd.api.types.is_datetime64_any_dtype(column):
@@ -327,7 +330,8 @@ def holds_dates(column: pd.Series) -> bool:
 def start_of(column: pd.Series) -> float | None:
     """Return the first time of a clock that holds dates, in seconds since 1970; None for others.
 
-    None also for 3/2/2026, in which the month may be the first or the second number.
+    None also for 3/2/2026, in which the month may be the first or the second number. A FILETIME or
+    .NET ticks give seconds since their own epoch; a first text that is no time gives NaN.
     """
     import pandas as pd
 

@@ -425,9 +425,9 @@ class RecordingCollector:
             self.faults.append(Fault(source, line, str(error).rstrip(".")))
 
     def order_by_start(self) -> None:
-        """Put the recordings in the order of their first times, if all of these are known.
+        """Put the recordings in the order of their first times, if all are known and differ.
 
-        A note says so if their order changes.
+        Then `ordered` is True, and a note says so if their order changes.
         """
         starts = [r.start for r in self.recordings if r.start is not None]
         if len(set(starts)) < len(self.recordings):

@@ -619,7 +619,8 @@ def _find_label(name: str, words: LabelMap) -> SourcedLabel:
     """Return the label in a path.
 
     Raises NoLabelError if there is none, UnlabelledError if there is only a word of `UNCHECKED`,
-    and UnreadableError if several labels contradict each other.
+    UnknownWordError if a word before it may be a not, as in ikke_ok, and UnreadableError if several
+    labels contradict each other.
     """
     word = _find_word(name, words)
     place = "its folder" if word.start <= name.rfind("/") else "its name"
@@ -630,7 +631,8 @@ def _find_word(name: str, words: LabelMap) -> _FoundLabel:
     """Return the word in a path that is its label.
 
     Raises NoLabelError if there is none, UnlabelledError if there is only a word of `UNCHECKED`,
-    and UnreadableError if several labels contradict each other.
+    UnknownWordError if a word before it may be a not, as in ikke_ok, and UnreadableError if several
+    labels contradict each other.
     """
     labels = _found_labels(name, words)
     deciding = [label for label in labels if label.decides]

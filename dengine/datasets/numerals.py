@@ -106,14 +106,15 @@ def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None
     columns : sequence of (name, text)
         The numeric columns; the text has a cell on each line.
     delimiter : str
-        Between the cells of the file.
+        Between the cells of the file. Where it is a comma or a blank, an undecided point is taken
+        as the decimal mark.
 
     Returns
     -------
     str or None
         "." or ","; None if the values do not depend on it. If some cells prove one mark and some
         the other, the one of most cells. If none proves one, the mark that groups no thousands, if
-        the other one seems to.
+        the other one seems to, or thousands without a mark show that none are grouped.
 
     Raises
     ------

@@ -121,7 +121,8 @@ class RtdeRecipe:
     def pack(self, values: Mapping[str, float]) -> bytes:
         """Return a data package, with its header, of these values by column.
 
-        Columns that are left out are 0. Numbers for an integer field are cut to integers.
+        Columns that are left out are 0, and names that are no columns are ignored. Numbers for an
+        integer field are cut to integers.
         """
         numbers = [
             values.get(name, 0) if letter == "d" else int(values.get(name, 0))
