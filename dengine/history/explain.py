@@ -1054,9 +1054,9 @@ def _find_envelope(
 ) -> Envelope | None:
     """Return the envelope of the successes among the newest labels that the version could know.
 
-    Traces of the decision's own part or content are left out. Without a version, or if these
-    successes are too few, the newest labels known now are taken; None if these are too few, too, or
-    of another shape.
+    Labels are as corrected by now. Traces of the decision's own part or content are left out.
+    Without a version, or if these successes are too few, the newest labels known now are taken;
+    None if these are too few, too, or of another shape.
     """
     for last in (None if version is None else version.last_seq, None):
         labelled = store.labelled(MAX_ENVELOPE_LABELS, last=last)

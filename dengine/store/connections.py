@@ -592,7 +592,7 @@ class Database:
         StoreError
             If the database fails or is closed, and for a ValueError, TypeError or OSError of
             `add_rows` that is not dengine's own. Other errors pass unchanged. Whatever is raised,
-            nothing is written.
+            nothing is written, except to an SQLite file that was replaced meanwhile.
         """
         self.check_open()
         if flush_first:
