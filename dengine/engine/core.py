@@ -501,10 +501,11 @@ class EngineCore:
             self.outbox.close()
 
     def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """Return the newest model with its settings, as an exporter takes it.
+        """Return the model that answers, with its settings, as an exporter takes it.
 
-        `trace` replaces the trace contract in force. Raises ExportError before the first retrain,
-        for a baseline, and where the store was changed from outside.
+        It is no copy: the model goes on learning. `trace` replaces the trace contract in force.
+        Raises ExportError before the first retrain, for a baseline, and where the store was changed
+        from outside.
         """
         if self.outbox.integrity_error:
             error = self.outbox.integrity_error
