@@ -184,6 +184,8 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
     DataError
         If options are missing or name topics that are not there, a file is damaged, or no insertion
         is found.
+    SettingError
+        For a trigger that is none.
     """
     channels = options.channels or ("FZ",)
     for channel in channels:

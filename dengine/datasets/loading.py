@@ -163,6 +163,8 @@ def load_dataset(
     ------
     DataError
         If nothing can be read, or an option does not apply to the source.
+    SettingError
+        For a trigger that is none.
     """
     expect_data(channel is None or channels is None, "channel or channels", (channel, channels))
     options = LoadOptions(

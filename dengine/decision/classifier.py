@@ -77,7 +77,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         ValueError
             For more than two classes, and for arrays that scikit-learn refuses.
         SettingError
-            For a setting of the classifier out of its range.
+            For a radius or a setting of the policy out of its range; `capacity` is not checked.
         """
         Z, y = validate_data(self, Z, y)
         self.classes_ = classes_of(y)
@@ -107,7 +107,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
             For a label that is not in `classes_`, more than two classes, and arrays that
             scikit-learn refuses.
         SettingError
-            On the first call, for a setting out of its range.
+            On the first call, for a radius or a setting of the policy out of its range.
         """
         is_first = "index_" not in vars(self)
         Z, y = validate_data(self, Z, y, reset=is_first)

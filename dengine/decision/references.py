@@ -343,7 +343,7 @@ class RadiusIndex(nn.Module):
         points : array, shape (n, d)
             Of more than `capacity` rows the last ones are added.
         labels : array, shape (n,)
-            1 is success, 0 is failure.
+            1 is success, 0 is failure; not checked.
         spaces : array of int, shape (n,), optional
             0 if None.
         parts : array of int64, shape (n,), optional

@@ -697,7 +697,8 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
     Raises
     ------
     SettingError
-        An unknown name or parameter, a value out of range, or a library that is not installed.
+        An unknown name or parameter, a value out of range (but `n_components` and `C`, which only
+        the training checks), or a library that is not installed.
     """
     require_baseline(name)
     kind = BASELINES[name]

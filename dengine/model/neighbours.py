@@ -373,11 +373,13 @@ class ModelPrediction(EngineModel):
         Raises
         ------
         SettingError
-            Where the reducer cannot be trained, as by one class or by too few traces.
+            Where the reducer cannot be trained, as by too few traces, or some reducers by one
+            class.
         TraceError, DataError
-            For traces of another shape, and for labels other than 1 and 0.
+            For an array of another shape, and for labels other than 1 and 0.
         ValueError
-            For another number of labels or hashes than of traces.
+            For another number of labels than of traces, and for samples that are not finite. The
+            number of hashes is not checked.
         """
         X = as_traces(X)
         y = as_labels(y)
@@ -546,7 +548,8 @@ class ModelPrediction(EngineModel):
 
         `y` is 1 for success, 0 for failure. The content of the trace gives its fold and stands for
         its part. The reducer is not trained, and a full index drops its oldest reference. Returns
-        self; raises ValueError if nothing was fitted, and for another label.
+        self; raises ValueError if nothing was fitted, and for another label, RuntimeError for a
+        trace of another shape. Samples are not checked: a NaN makes a reference of NaN.
         """
         X = as_traces(np.asarray(x)[None])
         hash_ = int(content_hash(X)[0])
@@ -662,7 +665,7 @@ class ModelPrediction(EngineModel):
         """Predict one trace (channels, samples) without force limits, fault checks and audits.
 
         References of the part with this hash have no vote; 0 excludes none. Raises RuntimeError
-        where the rule is stale, ValueError where nothing was fitted.
+        where the rule is stale or the trace has another shape, ValueError where nothing was fitted.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
