@@ -188,8 +188,8 @@ class Dataset:
         """Return a DataFrame with a row for each trace.
 
         Its columns are `label`, `part` and `cause` where known, and one for each sample of each
-        channel, `FZ_0`, `FZ_1`, ... `load_dataset` reads what
-        `data.to_frame().to_parquet("data.parquet")` writes.
+        channel, `FZ_0`, `FZ_1`, ..., or without names `x_0`, of several channels `x0_0`.
+        `load_dataset` reads what `data.to_frame().to_parquet("data.parquet")` writes.
         """
         import pandas as pd
 

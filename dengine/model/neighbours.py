@@ -647,7 +647,7 @@ class ModelPrediction(EngineModel):
         """Return a model under another policy, to be compiled anew around the same references.
 
         Its rule has learned nothing and is not stale. This model does not change, but both share
-        the references.
+        the references and the reducer.
         """
         settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         model = copy.copy(self)
