@@ -406,7 +406,8 @@ class BaselineAdapter(EngineModel):
 
         The reason is UNCERTAIN for VERIFY, otherwise CERTAIN; there is no embedding. `hash_` has no
         effect, because a baseline knows nothing of parts. Raises ValueError for an unknown action
-        and for counts that are not whole numbers from 0 to 2**63 - 1; bounds are not checked.
+        and for counts that are not whole numbers from 0 to 2**63 - 1 (OverflowError for an infinite
+        one); bounds are not checked.
         """
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)

@@ -767,10 +767,11 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        References, scale, rule and gate are restored, and the reducer if its state is there; the
-        decider is dropped. A state of a stale rule leaves the rule, and `rule_is_stale`, as they
-        are. Raises StoreError if the reducer keeps a state but this one lacks it, and for arrays of
-        other sizes.
+        References, scale, rule and gate are restored, and the reducer if its state is there, else
+        it must be fitted (`needs_refit`); the decider is dropped. A state of a stale rule leaves
+        the rule, and `rule_is_stale`, as they are. Raises StoreError if the fitted reducer keeps a
+        state but this one lacks it, and for a rule or gate of other sizes; KeyError or ValueError
+        for the state of another reducer.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
