@@ -37,7 +37,7 @@ class ReplayCell:
 
     @property
     def truth(self) -> bool:
-        """Whether the newest part is good, by its recorded label."""
+        """Whether the newest part is good, by its label; that of the last before any `insert`."""
         return bool(self.data.y[self.order[self.position]])
 
     @property

@@ -278,7 +278,7 @@ def _make_robot_cell(source: DataChoice, host: str | None, **others: Any) -> Cel
     Raises
     ------
     SettingError
-        No host, or a port that is none.
+        No host, or a port that is no number.
     CellError
         The controller cannot be reached, or its program is not ready in time.
     """
@@ -302,7 +302,7 @@ def host_and_port(address: str) -> tuple[str, int]:
     Raises
     ------
     SettingError
-        The port is not a number.
+        The port is not a number; whether it is in range is not checked.
     """
     from ..cells.ur.protocol import PORT
 
