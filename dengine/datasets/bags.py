@@ -76,7 +76,10 @@ class Messages(NamedTuple):
 
 
 def is_stream(path: Path) -> bool:
-    """Return whether a path is an MCAP file, or a folder with MCAP files or a rosbag2 database."""
+    """Return whether a path is for `read_bag`: an MCAP file or a folder with such files.
+
+    So is a rosbag2 folder of .db3 files, which `read_bag` refuses with advice to convert it.
+    """
     if not path.is_dir():
         return path.is_file() and path.suffix.lower() == SUFFIX
     has_files = any(path.glob(f"*{SUFFIX}"))

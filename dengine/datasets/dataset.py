@@ -705,9 +705,9 @@ def _resample(
 
 
 def _guess_unit(channels: Sequence[str]) -> str:
-    """Return the unit of channels by their names, for people.
+    """Return "N·m", "N" or "mixed units" for channels, by their names; for people.
 
-    Newton metres for the torques of UR cells, newtons for all else, "mixed units" for both.
+    Names that begin with mx, mux or tx (or y, z) are torques, all others are forces.
     """
     is_torque = {re.match(r"(mu?|t)[xyz](_|$)", name.lower()) is not None for name in channels}
     if is_torque == {True, False}:

@@ -145,9 +145,10 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
 
 
 def _split_line(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line, without quotes and blanks around them.
+    """Return the cells of a line, stripped of blanks and quotes (of double ones alone for " ").
 
-    The delimiter " " means any blanks, and "" a line that is one cell.
+    The delimiter " " means any blanks, but a name and a bracketed unit after it, as in "Force [N]",
+    are one cell; "" means that the line is one cell.
     """
     if delimiter == "":
         return [line.strip().strip("\"'")]

@@ -275,7 +275,7 @@ class RadiusIndex(nn.Module):
 
     @torch.jit.export
     def count_near(self, distances: Tensor, radius: float) -> tuple[int, int]:
-        """Count the labels within a radius.
+        """Count the labels within a radius; where parts came more than once, count their votes.
 
         Parameters
         ----------
@@ -287,8 +287,9 @@ class RadiusIndex(nn.Module):
         Returns
         -------
         n_success, n_failure : int
-            (0, 0) for an empty index. If any part came more than once, several points of one part
-            may be worth less than as many parts, see `count_votes`.
+            (0, 0) for an empty index. If any part in the index came more than once, these are the
+            rounded votes of `count_votes`, in which several points of one part may count less than
+            as many parts.
         """
         n = distances.size(0)
         if n == 0:

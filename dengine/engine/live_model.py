@@ -103,11 +103,12 @@ class LiveModel:
         label_within: int,
         policy_since: int,
     ) -> None:
-        """Restore a stored version, bit for bit, and learn the outcomes that came after it.
+        """Restore a stored version and learn the outcomes that came after it.
 
-        Without a version, or where its model cannot be restored, the template stays, and its rule
-        is updated with the stored outcomes since it began. Stored reference points are read, not
-        computed again.
+        A model that is stored by its traces is trained on them again; any other is restored bit for
+        bit, with its reference points. Without a version, or where one of those traces is damaged
+        or missing, the template stays, and its rule is updated with the stored outcomes since it
+        began.
 
         Parameters
         ----------

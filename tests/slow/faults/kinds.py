@@ -122,7 +122,8 @@ def lost_journal(outcome: Outcome, place: Place) -> None:
             outcome.must(journal.exists(), "the journal was not made anew")
     cell.until_back()
     outcome.must(
-        any("created again" in event.text for event in cell.engine.store.events()), "nobody was told"
+        any("created again" in event.text for event in cell.engine.store.events()),
+        "nobody was told",
     )
     cell.finish()
 
