@@ -194,7 +194,8 @@ def import_parts(
     """Put parts with their decisions into a store, in chunks that are stored all or none.
 
     A decision whose id has a label in the store stays as it is, and its label here is counted as
-    repeated or contradicted. A trace with a fault is stored, but never trains.
+    repeated or contradicted. A trace with a fault is stored, with the fault as its decision's
+    reason, but never trains.
 
     Parameters
     ----------
@@ -205,7 +206,8 @@ def import_parts(
     trace_spec : TraceSpec
         Of the traces.
     policy : Policy
-        Under which the decisions were made.
+        Under which the decisions were made. It sets the propensity of each stored decision; the one
+        that was passed is ignored.
     on_traces : callable, optional
         Called with the number of parts of each chunk.
 

@@ -146,7 +146,10 @@ class TrainedOn:
     counts_from: int
 
     def to_state(self) -> dict[str, NDArray[Any]]:
-        """Return the fields as arrays by name, for the store; `from_state` reads them."""
+        """Return the arrays "trained_on", "trained_as" and "counts_from", for the store.
+
+        `from_state` reads them.
+        """
         return {
             "trained_on": self.seq,
             "trained_as": np.array(self.corrected_to),

@@ -1,5 +1,6 @@
 """Pictures as matplotlib figures: of replays, grids, costs, runs, data sets and single decisions.
-Each function returns a figure, and `save` writes it. The command line draws them.
+Each picture is a function that returns a figure, and `save` writes it. The command line draws
+them.
 
     save(curves({"conv": replays}), "out/curves.png")
 
@@ -158,7 +159,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     ----------
     figure : Figure
     path : path
-        Without a suffix the format is PNG.
+        Written as it is: without a suffix the format is PNG, and none is appended.
     dpi : int, default 120
     force : bool, default False
         Whether a file that exists is replaced.
@@ -166,6 +167,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     Returns
     -------
     path : Path
+        The file, as given.
 
     Raises
     ------

@@ -1,6 +1,7 @@
-"""Cross-fitted logistic heads for `RocketReducer`: `fit_heads` fits K ridge regressions at once,
-head k on the rows outside fold k. With the heads come their leave-one-out logits, by which
-`RocketReducer` weighs its towers, without a row having trained the logit that it gets.
+"""Cross-fitted logistic heads for `RocketReducer`: `fit_heads` fits K logistic regressions with a
+ridge penalty at once, head k on the rows outside fold k. With the heads come their leave-one-out
+logits, by which `RocketReducer` weighs its towers, without a row having trained the logit that it
+gets.
 
 References
 ----------

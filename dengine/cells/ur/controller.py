@@ -456,8 +456,8 @@ class FakeController(AbstractContextManager["FakeController"]):
     def _step(self) -> bool:
         """Run one control cycle: the program, troubles, and a package to each client that is due.
 
-        Return whether a client was to receive one. A sample of an insertion that no client was sent
-        is added to `lost`.
+        Return whether a client was to receive one. Part and sample of an insertion's package that
+        no client was sent are added to the set `lost`.
         """
         values = {
             **STATE,
