@@ -263,6 +263,8 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
             threading.Timer(0.2, start_anew).start()
         with pytest.raises(CellError, match=text):
             cell.insert()
+        while ORDER not in fake.inputs:  # it may still be on its way
+            cell.recorder.stream.take(0.05)
         before = cell.report().reconnects
         fake.inputs.clear()
         fake.hang_up(False)
