@@ -160,10 +160,16 @@ class EngineCore:
         )
         self._maker = DecisionMaker(self.settings, store.clock)
         self._is_first_trace = True
+        self._warm_up = threading.Thread(target=template.warm_up, name="dengine-warm-up")
         if replaying:
             template.warm_up()  # no cell waits, and the first retrain is timed without it
         elif not reading:
-            threading.Thread(target=template.warm_up, name="dengine-warm-up").start()
+            self._warm_up.start()
+
+    def wait_until_warm(self) -> None:
+        """Wait until what the first retrain imports is loaded, some two seconds after the start."""
+        if self._warm_up.ident is not None:
+            self._warm_up.join()
 
     def resume(self) -> None:
         """Restore what a used store holds: version, references, rule, labels and pending checks.

@@ -474,7 +474,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Returns
         -------
         iterator of Cycle
-            The first part is inserted with its first `next`.
+            The first part is inserted with its first `next`, once what retrains import is loaded.
 
         Raises
         ------
@@ -487,9 +487,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Yield a record of each cycle; at the end, also after an error, write everything to disk.
 
+        The first cycle waits for the imports of a retrain, which would otherwise delay a later one.
         After `WARM_UP` cycles the garbage collector ignores the objects that exist then, until the
         end. Raises NotTakenError where the disk does not take everything in time.
         """
+        self._core.wait_until_warm()
         with ExitStack() as ending:
             ending.callback(self.flush, LONG_WAIT if self.store.wait is not None else None)
             for index in range(cycles):

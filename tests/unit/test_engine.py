@@ -7,6 +7,7 @@ from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from threading import Event
+from threading import enumerate as living_threads
 
 import numpy as np
 import pytest
@@ -486,3 +487,9 @@ def test_a_second_thread_in_an_engine_is_refused(data: Dataset) -> None:
             engine.decide(data.X[2])
         leave.set()
         assert deciding.result().action is Action.VERIFY
+
+
+def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data: Dataset) -> None:
+    with DataEngine("conv") as engine:
+        next(engine.run(ReplayCell(data), 1))
+        assert "dengine-warm-up" not in {thread.name for thread in living_threads()}
