@@ -158,11 +158,11 @@ def _is_clock(cells: pd.Series, name: str) -> bool:
         return False
     is_counter = bool((np.diff(times) == 1).all())
     is_unnamed = name in ("", "index") or re.fullmatch(r"Unnamed: \d+", name) is not None
-    return (is_unnamed and not is_counter) or _epoch_unit(times) is not None
+    return (is_unnamed and not is_counter) or _epoch_of(times) is not None
 
 
-def _epoch_unit(times: NDArray[np.float64]) -> float | None:
-    """Return the seconds in one count if numbers count since an epoch; None if they do not.
+def _epoch_of(times: NDArray[np.float64]) -> tuple[float, float] | None:
+    """Return the item of `EPOCHS` that numbers count by; None if they count since no epoch.
 
     They do if the first one then is a date from 2000 to 2100, which at most one epoch makes of a
     number.
@@ -170,7 +170,7 @@ def _epoch_unit(times: NDArray[np.float64]) -> float | None:
     earliest, latest = PLAUSIBLE_DATES
     for unit, before_1970 in EPOCHS:
         if earliest <= times[0] * unit - before_1970 < latest:
-            return unit
+            return unit, before_1970
     return None
 
 
@@ -322,7 +322,7 @@ def holds_dates(column: pd.Series) -> bool:
     times, wrong = floats(column)
     if 2 * len(wrong) < max(len(times), 1):
         times = times[~np.isnan(times)]
-        return bool(len(times)) and _epoch_unit(times) is not None
+        return bool(len(times)) and _epoch_of(times) is not None
     text = column.astype(str).str.strip()
     return bool(text.str.match(DATE_FORM).mean() > 0.5)
 
@@ -330,8 +330,8 @@ def holds_dates(column: pd.Series) -> bool:
 def start_of(column: pd.Series) -> float | None:
     """Return the first time of a clock that holds dates, in seconds since 1970; None for others.
 
-    None also for 3/2/2026, in which the month may be the first or the second number. A FILETIME or
-    .NET ticks give seconds since their own epoch; a first text that is no time gives NaN.
+    None also for 3/2/2026, in which the month may be the first or the second number. A first text
+    that is no time gives NaN.
     """
     import pandas as pd
 
@@ -344,8 +344,8 @@ def start_of(column: pd.Series) -> float | None:
             return None
         seconds, _ = _parse_timestamps(pd.Series(["1970-01-01T00:00:00Z", text]))
         return float(seconds[1])
-    unit = _epoch_unit(times)
-    return None if unit is None else float(times[0]) * unit
+    epoch = _epoch_of(times)
+    return None if epoch is None else float(times[0]) * epoch[0] - epoch[1]
 
 
 def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -399,9 +399,9 @@ def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tupl
     times = times[~np.isnan(times)]
     if len(times) < 2:
         return 1.0, ""
-    epoch_unit = _epoch_unit(times)
-    if epoch_unit is not None:
-        return epoch_unit, ""
+    epoch = _epoch_of(times)
+    if epoch is not None:
+        return epoch[0], ""
     if abs(times[0]) >= LEAST_DATE:
         wanted = f"dates from 2000 to 2100 in the clock {name}"
         epochs = "since 1970, as a FILETIME or as .NET ticks"
@@ -458,8 +458,7 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     step = float(np.median(steps))
     gaps = np.flatnonzero(steps > MAX_GAP * step)
     if len(gaps):
-        message = f"Expected a step of {step:.3g} s in time, got a gap of {steps[gaps[0]]:.3g} s"
-        raise UnreadableError(message, lines[int(gaps[0]) + 1])
+        raise _gap_error(step, steps[gaps[0]], lines[int(gaps[0]) + 1])
     # A clock of whole milliseconds steps 4, 4, 5: its mean step tells the rate.
     mean = float(steps[steps <= LATE_STEP * step].mean())
     rate = 1.0 / (step if abs(mean - step) < 0.005 * step else mean)
@@ -491,8 +490,8 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
     UnreadableError
         If the clock goes back, or rows are missing in a gap, by more than five usual steps.
     """
-    known = np.flatnonzero(~np.isnan(clock.seconds))
-    steps = np.diff(clock.seconds[known])
+    rows = np.flatnonzero(~np.isnan(clock.seconds))
+    steps = np.diff(clock.seconds[rows])
     forward = steps[steps > 0]
     if len(forward) < 2:
         return
@@ -503,13 +502,19 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
             actual = f"{-steps[i]:.3g} s earlier"
             do = f"time={clock.name!r} puts rows in the order of their times, if they differ"
             do = f"{do}; time={NO_CLOCK!r} with a stated rate (rate_hz) leaves them as they are"
-            raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", lines[known[i + 1]])
+            raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", lines[rows[i + 1]])
     gaps = np.flatnonzero(steps > MAX_GAP * usual)
     # After a late row others come sooner, so that none are missing.
     missing = float(forward.sum()) - len(forward) * usual
     if len(gaps) and missing > (MAX_GAP - 1) * usual:
-        message = f"Expected a step of {usual:.3g} s in time, got a gap of {steps[gaps[0]]:.3g} s"
-        raise UnreadableError(message, lines[known[gaps[0] + 1]])
+        raise _gap_error(usual, steps[gaps[0]], lines[rows[gaps[0] + 1]])
+
+
+def _gap_error(usual: float, gap: float, line: int) -> UnreadableError:
+    """Return the error for a step of `gap` s in time before a line, where others are `usual` s."""
+    return UnreadableError(
+        f"Expected a step of {usual:.3g} s in time, got a gap of {gap:.3g} s", line
+    )
 
 
 def _is_counter_full(seconds: float, step: float) -> bool:

@@ -1396,3 +1396,17 @@ def test_recordings_with_dates_are_in_the_order_of_their_times(
     np.testing.assert_array_equal(data.X, small.X[:6])
     note = "Recordings are in the order of their times, not of their names."
     assert (data.ordered, note in data.notes) == (True, True)
+
+
+def test_clocks_of_two_epochs_are_in_one_order(small: Dataset, tmp_path: Path) -> None:
+    """A logger of Windows counts 100 ns since 1601, another one seconds since 1970."""
+    for i, (x, y) in enumerate(zip(small.X[:6], small.y, strict=False)):
+        start = 1_772_431_200 + 600 * i
+        seconds = [f"{start}.{4 * sample:03d}" for sample in range(50)]
+        filetimes = [(start + 11_644_473_600) * 10**7 + 40_000 * sample for sample in range(50)]
+        frame = pd.DataFrame({"time": filetimes if i % 2 == 0 else seconds, "FZ_Base": x})
+        logger = "a" if i % 2 else "b"
+        frame.to_csv(tmp_path / f"{logger}_{i}_{'OK' if y else 'NOK'}.csv", index=False)
+    data = load_dataset(tmp_path)
+    np.testing.assert_array_equal(data.X, small.X[:6])
+    assert (data.ordered, data.rate_hz) == (True, 250.0)
