@@ -17,7 +17,8 @@ import numpy as np
 from common import POLICY, noisy, options, print_table, wall_time
 from rich.progress import track
 
-from dengine import Action, DataEngine, Dataset, Decision, Reason, Recipe, Source, load_dataset
+from dengine import Action, DataEngine, Dataset, Reason, Recipe, Source, load_dataset
+from dengine.engine.decide import verify_decision
 from dengine.folds import content_hash
 from dengine.store.records import NewLabel, StoredDecision
 
@@ -34,31 +35,13 @@ def fill_store(engine: DataEngine, data: Dataset, n: int) -> None:
         records: list[Any] = []
         hashes = content_hash(X)
         for i, (trace, label, hash_) in enumerate(zip(X, y, hashes, strict=True), start):
-            decision = verified_decision(f"import-{i}")
+            decision = verify_decision(f"import-{i}", None, 0, Reason.NO_MODEL)
             trace = np.array(trace, np.float32, ndmin=2)
             records.append(StoredDecision(decision, trace, hash_, False, 0.0))
             records.append(
                 NewLabel(decision.id, bool(label), Source.VERIFICATION, 0, None, content_hash=hash_)
             )
         engine.store.apply_records(records)
-
-
-def verified_decision(decision_id: str) -> Decision:
-    """Return the decision to verify a part, made without a model."""
-    return Decision(
-        id=decision_id,
-        action=Action.VERIFY,
-        predicted=Action.VERIFY,
-        lower=0.0,
-        upper=1.0,
-        n_success=0,
-        n_failure=0,
-        embedding=None,
-        model_version=0,
-        reason=Reason.NO_MODEL,
-        audit=False,
-        propensity=1.0,
-    )
 
 
 def measure_store(

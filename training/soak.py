@@ -39,6 +39,7 @@ class Stretch:
     def row(self, cycle: int, labels: int, memory: dict[str, int]) -> dict[str, Any]:
         """Return a row of the table: cycle is the last one, labels those acknowledged so far."""
         decide = quantiles(self.decide)
+        report = quantiles(self.report)
         page = quantiles(self.page)
         return {
             "cycle": cycle,
@@ -48,6 +49,7 @@ class Stretch:
             "decide_p50_s": decide["p50_s"],
             "decide_p99_s": decide["p99_s"],
             "decide_worst_s": decide["worst_s"],
+            "report_p99_s": report["p99_s"],
             "page_worst_s": page["worst_s"],
             **memory,
         }

@@ -64,9 +64,9 @@ def decode(content: bytes, stated: str | None = None) -> tuple[str, str]:
                 return text, encoding
     if stated is not None:
         raise UnreadableError(
-            f"Expected text in {stated}, as stated, or UTF-8, got another{_do(content)}"
+            f"Expected text in {stated}, as stated, or UTF-8, got another{_advice(content)}"
         )
-    if advice := _do(content):
+    if advice := _advice(content):
         raise UnreadableError(f"Expected text in UTF-8 or {WESTERN}, got another encoding{advice}")
     return content.decode("latin-1"), "Latin-1"
 
@@ -88,7 +88,7 @@ def _is_western(text: str) -> bool:
     return len(odd) <= len(runs) / 4
 
 
-def _do(content: bytes) -> str:
+def _advice(content: bytes) -> str:
     """Return advice for an error: up to three encodings that a text may be in, with a line in each.
 
     The likeliest comes first; "" if there is none.

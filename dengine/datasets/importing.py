@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..decision.policy import Policy
-from ..engine.decide import as_part
+from ..engine.decide import as_part, verify_decision
 from ..engine.engine import DataEngine, core_of
 from ..errors import StoreError, TraceError
 from ..folds import content_hash, trace_hash
@@ -289,19 +289,6 @@ def _verifying_decisions(traces: NDArray[np.float32], data: Dataset) -> Iterator
     if data.part is not None:
         parts = [as_part(part) for part in data.part.tolist()]
     for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
-        yield Decision(
-            id=f"import-{hash_ & (2**64 - 1):016x}-{n_equal[hash_]}",
-            action=Action.VERIFY,
-            predicted=Action.VERIFY,
-            lower=0.0,
-            upper=1.0,
-            n_success=0,
-            n_failure=0,
-            embedding=None,
-            model_version=0,
-            reason=Reason.NO_MODEL,
-            audit=False,
-            propensity=1.0,
-            part=part,
-        )
+        decision_id = f"import-{hash_ & (2**64 - 1):016x}-{n_equal[hash_]}"
+        yield verify_decision(decision_id, part, 0, Reason.NO_MODEL)
         n_equal[hash_] += 1

@@ -90,8 +90,8 @@ WORD_END = rf"(?:(?!{LETTER})|(?<=[a-z])(?=[A-Z]))"
 NOT = r"(?P<not>(?i:not|non|no|nicht)[\W_]*)?"
 # Words before a label that may be a not in another language, or something else.
 MAYBE_NOT = re.compile(
-    rf"{WORD_START}(?i:ikke|inte|icke|ej|ei|pas|ne|niet|geen|nie|não|nao|keine?|není|neni|bez|sin|не"
-    r"|isn'?t|never|almost|ohne|without|sans)[\W_]+$"
+    rf"{WORD_START}(?i:ikke|inte|icke|ej|ei|pas|ne|niet|geen|nie|não|nao|keine?|není|neni|bez|sin"
+    r"|не|isn'?t|never|almost|ohne|without|sans)[\W_]+$"
 )
 USER_NOT = r"(?P<not>(?i:not|non|no|nicht|keine?)(?:[\W_]+|(?=[A-Z])))?"
 WORDS = "|".join(word for word in MEANING if not word.isdecimal())
@@ -405,6 +405,7 @@ class LabelColumn:
         self.notes = notes
         self.is_inverted = means_bad(name) and FLAGS.keys().isdisjoint(words)
         self.is_ambiguous = not (means_bad(name) or means_good(name))
+        self.unchecked = set(UNCHECKED) - set(words)
 
     def label_of(self, cell: Any) -> int:
         """Return the label that a cell means, 1 or 0.
@@ -435,8 +436,7 @@ class LabelColumn:
         """
         place = place or f"column {self.name}"
         texts = list(dict.fromkeys(str(cell).strip() for cell in cells))
-        unchecked = set(UNCHECKED) - set(self.words)
-        stated = [text for text in texts if text.lower() not in unchecked]
+        stated = [text for text in texts if text.lower() not in self.unchecked]
         if len(stated) < 2:
             word = next(filter(None, stated or texts), "")
             return _sourced(self.label_of(word), place, word)
@@ -521,7 +521,7 @@ def agreed_label(
     ----------
     finders : mapping of str to callable
         Returns the label, by the place where it stands. Errors are those of `LabelSource.find`.
-    do
+    do : str
         What to do about a contradiction, for the error.
     notes : Counter
         If a label is returned, counts each place before its own, which has none, and each later one
@@ -622,23 +622,11 @@ def _find_label(name: str, words: LabelMap) -> SourcedLabel:
     UnknownWordError if a word before it may be a not, as in ikke_ok, and UnreadableError if several
     labels contradict each other.
     """
-    word = _find_word(name, words)
-    place = "its folder" if word.start <= name.rfind("/") else "its name"
-    return _sourced(word.label, place, word.text)
-
-
-def _find_word(name: str, words: LabelMap) -> _FoundLabel:
-    """Return the word in a path that is its label.
-
-    Raises NoLabelError if there is none, UnlabelledError if there is only a word of `UNCHECKED`,
-    UnknownWordError if a word before it may be a not, as in ikke_ok, and UnreadableError if several
-    labels contradict each other.
-    """
     labels = _found_labels(name, words)
     deciding = [label for label in labels if label.decides]
     if not deciding:
-        endings = (ending for text, _ in _components(name) for ending in _endings(text))
-        for match in filter(None, map(UNCHECKED_AT_END.search, endings)):
+        beginnings = (start for text, _ in _components(name) for start in _name_beginnings(text))
+        for match in filter(None, map(UNCHECKED_AT_END.search, beginnings)):
             raise UnlabelledError(match[0].lower())
         raise NoLabelError([_last_word(text) for text, _ in _components(name)])
     first = deciding[0]
@@ -649,7 +637,8 @@ def _find_word(name: str, words: LabelMap) -> _FoundLabel:
             actual = f"{first.text} and {other.text} contradict each other in its name or folder"
             do = "say which it is by a pattern with a group for it (label)"
             raise UnreadableError(f"Expected one label, {actual}; {do}")
-    return first
+    place = "its folder" if first.start <= name.rfind("/") else "its name"
+    return _sourced(first.label, place, first.text)
 
 
 def suggest_label_sources(
@@ -730,7 +719,7 @@ def _labels_in_file(file: str, start: int, words: LabelMap) -> list[_FoundLabel]
         for match in IN_NAME.finditer(file)
         if _letters(match["word"]) in (*GOOD, *BAD)
     ]
-    for i, text in enumerate(_endings(file)):
+    for i, text in enumerate(_name_beginnings(file)):
         match = AT_END.search(text)
         is_number_sign = i > 0 and match is not None and _letters(match[0]) == "no"  # part_no_7
         if match and not is_number_sign:
@@ -762,18 +751,18 @@ def _find_user_word(text: str, start: int, words: LabelMap) -> _FoundLabel | Non
     start : position of the name in the path.
     """
     longest_first = sorted((word for word in words if not word.isdecimal()), key=len, reverse=True)
-    for ending in _endings(text):
+    for beginning in _name_beginnings(text):
         for word in longest_first:
             bare = re.sub(r"[\W_]+$", "", word)
             pattern = r"[\W_]*".join(map(re.escape, re.split(r"[\W_]+", bare)))
-            match = re.search(f"{WORD_START}{USER_NOT}(?i:{pattern})$", ending)
+            match = re.search(f"{WORD_START}{USER_NOT}(?i:{pattern})$", beginning)
             if bare and match:
                 label = int(words[word] != bool(match["not"]))
                 return _FoundLabel(match[0], label, start + match.start(), is_user_word=True)
     return None
 
 
-def _endings(text: str) -> Iterator[str]:
+def _name_beginnings(text: str) -> Iterator[str]:
     """Yield the beginnings of a name at whose end a label may stand.
 
     First the whole name, then the name without its last word as long as that has a number in it:
@@ -789,7 +778,7 @@ def _endings(text: str) -> Iterator[str]:
 
 def _last_word(text: str) -> str:
     """Return the last word of a name without numbers, "" if there is none."""
-    *_, shortest = _endings(text)
+    *_, shortest = _name_beginnings(text)
     match = LAST_WORD.search(shortest)
     return "" if match is None else match[1]
 

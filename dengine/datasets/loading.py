@@ -55,12 +55,8 @@ from .triggers import Trigger
 
 BUNDLED = {"insertion": "insertion.npz"}
 ARRAYS = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")  # beside the parts' numbers
-TEXT_FORMAT = (
-    "columns",
-    "decimal",
-    "thousands",
-    "encoding",
-)  # options about how a text file is written
+# Options about how a text file is written.
+TEXT_FORMAT = ("columns", "decimal", "thousands", "encoding")
 # What `dengine simulate` writes beside them, for `experiments`.
 SIMULATED = ("height_mm", "cycle", "conditions", "condition_names", "seed", "scenario", "simulated")
 Files = Mapping[str, Path]
@@ -491,9 +487,9 @@ def _missing_arrays(named: Files, options: LoadOptions) -> str:
         fewest_values = min(single, key=lambda name: len(set(arrays[name].tolist())))
         label = f"label={fewest_values!r}"
     elif traces:
+        keys = _keys_of_traces(arrays)
         for path in sorted(next(iter(named.values())).parent.glob("*.csv")):
             with suppress(DataError):
-                keys = _keys_of_traces(arrays)
                 if not label and len(read_ordered_labels(path, options, keys)[0]) in lengths:
                     label = f"labels={str(path)!r}, in the order of the traces"
     shapes = ", ".join(f"{name} {arrays[name].shape}" for name in all_names) or "none"

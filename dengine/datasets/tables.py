@@ -293,13 +293,13 @@ def _verdict_columns(named: Mapping[str, Path], options: LoadOptions) -> list[st
         for name in [name for name in by_column if name in header]:
             column = labels.LabelColumn(name, options.words, Counter())
             try:
-                found = column.find(_column_cells(rows, header.index(name)))
-                by_column[name].add(found.label)
+                label = column.find(_column_cells(rows, header.index(name)))
+                by_column[name].add(label.label)
             except UnlabelledError:
                 continue
             except UnreadableError:
                 del by_column[name]
-    return columns + [name for name, found in by_column.items() if found == {0, 1}]
+    return columns + [name for name, values in by_column.items() if values == {0, 1}]
 
 
 def _column_cells(rows: Iterable[Sequence[str]], i: int) -> list[str]:
@@ -693,8 +693,9 @@ def _without_repeated_parts(
         repeated = [part for part, content in contents.items() if content in seen]
         seen.update(contents.values())
         result[source] = frame[~frame[options.part].astype(str).isin(repeated)]
-        text = "Parts are in two files with equal rows and times: they count once"
-        collector.notes.update(dict.fromkeys([text] * bool(repeated), len(repeated)))
+        if repeated:
+            text = "Parts are in two files with equal rows and times: they count once"
+            collector.notes[text] += len(repeated)
     return {source: frame for source, frame in result.items() if len(frame)}
 
 
@@ -786,11 +787,11 @@ def _label_source_of_parts(
     The other columns of labels are compared with it.
     """
     sources = [_labels_of_parts(rows_of_part, name, options) for name in label_columns]
-    do = f"name the column to trust: label={(*label_columns, '')[0]!r}"
     if options.labels is not None:
         listed_by = replace(options, part="part")
-        sources.insert(0, labels.labels_in_file(options.labels, list(rows_of_part), listed_by))
-        do = sources[0].trust
+        listing = labels.labels_in_file(options.labels, list(rows_of_part), listed_by)
+        return labels.labels_that_agree(listing, sources, listing.trust)
+    do = f"name the column to trust: label={label_columns[0]!r}"
     return labels.labels_that_agree(sources[0], sources[1:], do)
 
 
@@ -825,15 +826,14 @@ def _compared_columns(frame: pd.DataFrame, label: str | None, options: LoadOptio
         if name == label or not is_usual:
             continue
         column = labels.LabelColumn(name, options.words, Counter())
-        found = Counter[int]()
-        for cell in frame[name].unique().tolist():
-            with suppress(UnlabelledError):
-                try:
-                    found[column.label_of(cell)] += 1
-                except UnknownWordError:
-                    found[-1] += 1
-        if found and -1 not in found:
-            columns.append(name)
+        has_labels = False
+        with suppress(UnknownWordError):
+            for cell in frame[name].unique().tolist():
+                with suppress(UnlabelledError):
+                    column.label_of(cell)
+                    has_labels = True
+            if has_labels:
+                columns.append(name)
     return columns
 
 

@@ -389,7 +389,7 @@ def read_table(
         if not (column_units[i] or units.split(name)[1] or is_time_column(name))
     ]
     preamble = "\n".join(text.splitlines()[: max(cells.line - 1, 0)])
-    stated = units.in_preamble(preamble, header, without)
+    stated = units.stated_in_preamble(preamble, header, without)
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
     return TextTable(frame, faults, cells.line, column_units, mark)

@@ -127,7 +127,7 @@ def spelling(unit: str) -> str:
     return alike[0] if len({parse(name) for name in alike}) == 1 else unit
 
 
-def in_preamble(text: str, header: Sequence[str], places: Sequence[int]) -> list[str]:
+def stated_in_preamble(text: str, header: Sequence[str], places: Sequence[int]) -> list[str]:
     """Return the unit that the text above a header states for each of some columns; "" for none.
 
     A line is of the columns that it names; one that names none is of the only column, or a unit of
@@ -147,12 +147,12 @@ def in_preamble(text: str, header: Sequence[str], places: Sequence[int]) -> list
             continue
         stated = set(re.findall(r"\w+", f"{match['before']} {match['behind']}".lower()))
         words = [set(re.findall(r"[^\W_]+", name.lower())) for name in names]
-        of = [i for i, own in enumerate(words) if own & stated]
-        if not of and len(names) == 1:
-            of = [0]
-        elif not of and factor(unit, "N") is not None:
-            of = [i for i, name in enumerate(names) if FORCE_NAME.fullmatch(name)]
-        for i in of:
+        chosen = [i for i, name_words in enumerate(words) if name_words & stated]
+        if not chosen and len(names) == 1:
+            chosen = [0]
+        elif not chosen and factor(unit, "N") is not None:
+            chosen = [i for i, name in enumerate(names) if FORCE_NAME.fullmatch(name)]
+        for i in chosen:
             result[i] = unit
     return result
 

@@ -108,7 +108,9 @@ class Connection(AutoHTTPProtocol):
             "verify the part, and try again.",
         )
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as of uvicorn's
+    def connection_made(  # type: ignore[override]  # as of uvicorn's
+        self, transport: asyncio.Transport
+    ) -> None:
         """Take a place in the pool and start the time of the first head; or respond 503, close.
 
         A full pool may first close an idle connection that was never authorized (`add`).
