@@ -131,9 +131,10 @@ def _rising_share(cells: pd.Series) -> float:
 
 
 def is_rising(times: NDArray[np.float64]) -> bool:
-    """Return whether numbers rise steadily: all steps, of which 90 % are about equal.
+    """Return whether numbers rise steadily.
 
-    About equal are those within half of their median. False for fewer than three numbers.
+    They do if every step is positive, and at least 90 % of the steps differ from the median step by
+    at most half of it. False for fewer than three numbers.
     """
     steps = np.diff(times)
     if len(steps) < 2 or not (steps > 0).all():

@@ -223,7 +223,7 @@ def label_of(word: Any, words: LabelMap = NO_WORDS) -> int:
     Parameters
     ----------
     word : object
-        A cell or a text, in any case.
+        Text in upper or lower case, a number or a boolean: OK, n.i.O., not ok, 1.0.
     words : mapping of str to bool
         The user's own words in lower case, and whether they are good; they go first.
 
@@ -345,10 +345,13 @@ def means_bad(column: str) -> bool:
 
 
 def means_good(column: str) -> bool:
-    """Return whether the name of a column means the good outcome: `passed`, `is_ok`, `not_failed`.
+    """Return whether true in a column of this name means good: `passed`, `is_ok`, `not_failed`.
 
-    False where that is not known, as of `crack` or `pass_fail`.
+    So it does in a column with the usual name of a label, as `result` or `y`. False for the bad
+    outcome, and where the meaning is not known, as of `crack` or `pass_fail`.
     """
+    if means_bad(column):
+        return False
     words = _name_words(column)
     is_negated = not set(NEGATIONS).isdisjoint(words)
     names = {*words[-1:], "".join(words), column.lower()}

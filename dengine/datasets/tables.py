@@ -616,7 +616,7 @@ def _add_wide_rows(
     traces = values.reshape(len(frame), len(columns), -1)
     collector.channels = tuple(filter(None, columns))
     _check_single_signal(frame, others, options)
-    if unread := [_values_of(frame, name) for name in others if name not in all_columns]:
+    if unread := [_describe_column(frame, name) for name in others if name not in all_columns]:
         collector.notes[f"Not read: the columns {listed(unread)}"] = 1
     label_cells = [
         labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
@@ -643,9 +643,9 @@ def _add_wide_rows(
         collector.add(source, partial(read, *row), row[0])
 
 
-def _values_of(frame: pd.DataFrame, name: str) -> str:
-    """Return the name of a column, with its values and their count if they are few and equally
-    frequent.
+def _describe_column(frame: pd.DataFrame, name: str) -> str:
+    """Return the name of a column for a note, with its values if these are 2 to 12 and equally
+    frequent: `station (A, B, 100 times each)`.
     """
     counts = frame[name].value_counts()
     if not 2 <= len(counts) <= MAX_STATIONS or counts.min() < counts.max():
@@ -1110,8 +1110,8 @@ def _sample_columns(names: list[str], options: LoadOptions) -> dict[str, list[st
     """Return the columns of each channel of a wide table, in the order of their numbers.
 
     The channels are those that the user stated, else the force, else the only one. Raises DataError
-    if one is not there or must be named, if a number is missing, for what comes after it would be
-    shifted, or if the channels have different numbers of samples.
+    if no column is numbered, a channel is not there or must be named, the numbers of any channel
+    are unevenly spaced, or the chosen channels have different numbers of samples.
     """
     channels = {
         channel: sorted(columns)

@@ -475,10 +475,11 @@ def _beside_their_clock(
 def _without_summary(
     frame: pd.DataFrame, options: LoadOptions, notes: Counter[str]
 ) -> pd.DataFrame:
-    """Return a recording without the last rows that have no time, as Max;48.2 below samples.
+    """Return a recording without rows at its end that are no samples, as `Max;48.2`.
 
-    These are left out only if all rows above them have a time and are at least ten times as many; a
-    note says so. Without a clock any column of numbers stands for it.
+    Such rows have no time. They are left out, with a note, only if all rows above them have a time
+    and are at least ten times as many. Without a clock the first column of numbers to which this
+    applies takes its place; then one of the cells left out must hold text.
     """
     place = None
     with suppress(UnreadableError):

@@ -381,7 +381,7 @@ def _round_up(bound: float) -> str:
 def certify(
     outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audit_rate: float
 ) -> Certificate:
-    """Compute the certificate from the outcomes of all certain decisions so far.
+    """Bound how often accepted parts were bad and rejected parts good, in all certain decisions.
 
     Parameters
     ----------

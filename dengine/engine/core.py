@@ -351,10 +351,10 @@ class EngineCore:
         """Set the trace contract (shape, rate and unit of all traces) and return the one in force.
 
         One that is set already stays and is returned. Where the cell shares a product with others,
-        a contract that these have set is taken in place of `spec`. `inferred` says that `spec`
-        comes from a first trace. The settings are saved in the store; where that fails, they are
-        saved with a later trace. Raises SettingError where the force limits do not fit the
-        contract.
+        a contract that these have set is taken in place of `spec`, unless it cannot be read.
+        `inferred` says that `spec` comes from a first trace. The settings are saved in the store;
+        where that fails, they are saved with a later trace. Raises SettingError where the force
+        limits do not fit the contract.
         """
         if self.settings.now.trace is not None:
             return self.settings.now.trace
