@@ -193,7 +193,7 @@ def train(
             )
             print_result(record | {"retrain": None}, text)
             return
-        core_of(engine).wait_until_warm()  # or the first retrain would be timed with its imports
+        core_of(engine).wait_until_warm()  # or the first retrain's time would include that
         with progress_bar("training", None):
             reports = [engine.retrain()]
             while reports[-1].accepted and engine.model.report.n_steps_left:

@@ -167,9 +167,13 @@ class EngineCore:
             self._warm_up.start()
 
     def wait_until_warm(self) -> None:
-        """Wait until what the first retrain imports is loaded, some two seconds after the start."""
+        """Wait until the first retrain can begin at once, some two seconds after the start.
+
+        What it imports is loaded then, and what it needs of stored traces is computed.
+        """
         if self._warm_up.ident is not None:
             self._warm_up.join()
+        self.learner.wait_until_precomputed()
 
     def resume(self) -> None:
         """Restore what a used store holds: version, references, rule, labels and pending checks.

@@ -121,9 +121,7 @@ class Learner:
         return 0 if trained_on is None else trained_on.counts_from
 
     def _precompute(self, labelled: LabelledTraces) -> None:
-        """Start a thread that computes what the next retrain begins with; `_begin_retrain` waits
-        for it.
-        """
+        """Start a thread that computes what the next retrain begins with, and do not wait for it."""
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
         model = GuardedModel(self.live.newest)
         self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)
@@ -307,13 +305,20 @@ class Learner:
         """
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
 
-    def _begin_retrain(self) -> None:
-        """Prepare for a training: wait for what is computed in advance, take in the peers' news if
-        the store answers, and count new labels from zero.
+    def wait_until_precomputed(self) -> None:
+        """Wait until what the next retrain needs of the stored labels' traces is computed.
+
+        This began when the store was opened. Without stored labels nothing is waited for.
         """
         if self._precomputed is not None:
             self._precomputed.result()
             self._precomputed = None
+
+    def _begin_retrain(self) -> None:
+        """Prepare for a training: wait for what is computed in advance, take in the peers' news if
+        the store answers, and count new labels from zero.
+        """
+        self.wait_until_precomputed()
         self._take_in_all_news()
         self.labels.begin_retrain()
 
