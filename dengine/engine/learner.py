@@ -121,7 +121,7 @@ class Learner:
         return 0 if trained_on is None else trained_on.counts_from
 
     def _precompute(self, labelled: LabelledTraces) -> None:
-        """Start a thread that computes what the next retrain begins with, and do not wait for it."""
+        """Start a thread that computes what the next retrain begins with; do not wait for it."""
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
         model = GuardedModel(self.live.newest)
         self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)
