@@ -1,13 +1,14 @@
 """Run a served cell for 50,000 cycles: does its memory stay flat, and is every label kept?
 
-    python training/soak.py --out out                  # some 15 minutes on two idle cores
+    python training/soak.py --out out                  # some 25 minutes on two idle cores
     python training/soak.py --cycles 5000 --window 1000
 
 Starts `dengine serve` with a SQLite store and retrains in a process of its own, and plays a robot:
 each trace is a recorded one with fresh noise, each part that the engine verifies is reported, and
-so is each bad part that it accepted (a line stop). Meanwhile the page is asked for as a browser
-would. At the end the store is opened again and compared with what was acknowledged. Writes
-OUT/soak.csv, one row per stretch of cycles, and prints the totals.
+so is each bad part that it accepted (a line stop). Audits bring further labels, so that the window
+is full before the end. Meanwhile the page is asked for as a browser would. At the end the store is
+opened again and compared with what was acknowledged. Writes OUT/soak.csv, one row per stretch of
+cycles, and prints the totals.
 """
 
 import sys
@@ -176,13 +177,17 @@ def main() -> None:
     )
     parser.add_argument("--cycles", type=int, default=50_000, help="parts")
     parser.add_argument("--window", type=int, default=10_000, help="labels that train a version")
-    parser.add_argument("--pace", type=float, default=0.01, help="seconds between two cycles")
+    parser.add_argument(
+        "--audit-rate", type=float, default=0.25, help="share of the certain parts that are checked"
+    )
+    parser.add_argument("--pace", type=float, default=0.02, help="seconds between two cycles")
     parser.add_argument("--every", type=int, default=1000, help="cycles of a row")
     args = parser.parse_args()
     data = load_dataset(args.data, args.samples)
     with tempfile.TemporaryDirectory(dir=args.folder) as name:
         folder = Path(name)
-        recipe = Recipe.load(args.recipe).with_policy(**POLICY).with_settings(window=args.window)
+        recipe = Recipe.load(args.recipe).with_settings(window=args.window)
+        recipe = recipe.with_policy(**POLICY, audit_rate=args.audit_rate)
         (folder / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
         server = Server(folder, "--recipe", "recipe.toml")
         soak = Soak(server, data, args.pace, args.every)
