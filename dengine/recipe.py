@@ -229,8 +229,9 @@ class Recipe:
     def from_store(
         cls, settings: Mapping[str, str], where: str = "the recipe in the store"
     ) -> Recipe:
-        """Parse the recipe among the settings of a store, without importing a class that it names.
+        """Parse ``settings["recipe"]`` of a store's settings, and return the recipe.
 
+        No class that it names is imported.
         Raises StoreError if `radius` or `retrain_every` is missing and a user's class would have to
         be imported for its default: the store is damaged. Raises SettingError for a text
         that is no recipe.
@@ -366,7 +367,10 @@ def _table_text(name: str, values: Mapping[str, Any]) -> str:
 
 
 def _value_text(value: Any) -> str:
-    """Return a plain value, None, or a tuple of values as TOML writes it."""
+    """Return a plain value, None, or a tuple as TOML writes it.
+
+    None becomes "none", and an item of a tuple that is not plain the text that `str` gives.
+    """
     if value is None:
         return '"none"'
     if isinstance(value, str):  # written as in JSON, except for one character

@@ -213,8 +213,8 @@ def _frame_to_array(trace: Any, trace_spec: TraceSpec | None) -> Any:
     """Return the channels of a DataFrame as an array (C, T), anything else unchanged.
 
     The channels are the columns that the `TraceSpec` names, else all but those of time. Raises
-    TraceError if columns are missing, or without names if there is none, or another number of them
-    than its channels.
+    TraceError if a named column is missing; without names, if there is no channel, or not as many
+    as the `TraceSpec` has.
     """
     if not _is_frame(trace):
         return trace
@@ -367,7 +367,7 @@ class TraceGate(nn.Module):
 
     @torch.jit.export
     def check(self, x: Tensor, limit: float) -> tuple[int, int]:
-        """Check a trace as `forward` does, with `limit` as the sensor's range.
+        """Find the first fault of a trace, with `limit` as the sensor's range, and its hash.
 
         Parameters
         ----------
@@ -378,9 +378,10 @@ class TraceGate(nn.Module):
         Returns
         -------
         reason : int
-            Position in `REASONS` of the first fault found, 0 if there is none.
+            Position in `REASONS` of the first fault found: not finite, constant, saturated (a
+            sample as large as `limit`) or too large; 0 if there is none.
         content_hash : int
-            As `folds.content_hash`.
+            As `folds.content_hash`; also of a faulty trace.
         """
         lowest, highest = torch.aminmax(x)
         low = float(lowest.item())  # NaN if there is one anywhere in the trace

@@ -322,8 +322,8 @@ class ScaledComponents:
         Returns
         -------
         Z : array, shape (n, d), or None
-            The scaled components of these traces. None, and the scale stays, if there are no more
-            traces than components, or fewer samples in a trace than components.
+            The scaled components of these traces. None if there are no more traces than components,
+            or fewer samples in a trace than components; components and scale are not changed then.
         """
         try:
             components = np.asarray(self._pca.fit(X).transform(X), dtype=np.float64)

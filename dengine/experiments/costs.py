@@ -173,7 +173,8 @@ class CostCurve:
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each policy, its costs, shares and error rates.
 
-        The column `chosen` is True for `policy`. Shares are from 0 to 1, costs in the user's unit.
+        The column `chosen` is True in the row of the policy that pays or may pay, False in all rows
+        if none does. Shares are from 0 to 1, costs in the user's unit.
         """
         import pandas as pd
 
@@ -234,7 +235,7 @@ def cost_curve(
     Raises
     ------
     SettingError
-        A cost, a policy or a number of repeats out of range.
+        A cost, a policy, a number of repeats or a number of cycles out of range.
     """
     costs = Costs(check, escape, false_reject)
     expect(repeats >= 2, "2 or more repeats", repeats, "one half chooses, the other one reports")
@@ -255,7 +256,7 @@ def priced_tasks(
 
     There is one for every alpha, lower bound and seed, and one for every seed under the guarantee
     of costs, unless the contender is a baseline or that guarantee refuses these costs or the
-    policy's feedback.
+    policy's feedback. Raises SettingError for an alpha or a lower bound out of range.
     """
     contender = Contender.load(recipe)
     tasks = grid_tasks([contender], alphas, lower_bounds, seeds=seeds, cycles=cycles)
@@ -355,6 +356,8 @@ def _expected_cost(replays: Sequence[Replay], costs: Costs) -> float:
 
 def cost_per_part(replay: Replay, costs: Costs, cycles: slice = slice(None)) -> float:
     """Return the mean cost per part over some cycles of a replay: checks and wrong decisions.
+
+    A part that an operator's limits rejected costs as much as a checked one.
 
     Parameters
     ----------

@@ -196,7 +196,8 @@ def _source_of(class_or_function: Any) -> str:
 def _classes_and_functions(reducer: Any) -> list[Any]:
     """Return what a transformer's code consists of, without repeats.
 
-    These are its class, those of the estimators among its parameters, and the functions there.
+    These are its class, the classes of the estimators among its parameters, and the functions among
+    its parameters.
     """
     params = reducer.get_params(deep=True).values()
     estimators = [reducer, *(param for param in params if hasattr(param, "fit"))]
@@ -390,6 +391,11 @@ def grid_tasks(
     -------
     tasks : list of Task
         By contender, interval, alpha, lower bound, guarantee, confirm and seed.
+
+    Raises
+    ------
+    SettingError
+        Two contenders have the same name and policy, or a setting is out of range.
     """
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound", "guarantee")

@@ -89,9 +89,9 @@ def findings(frame: "pd.DataFrame") -> list[str]:
     They are about how certain predictions, false positives and the first certain prediction depend
     on alpha and LB, and that a retrain takes less than 0.45 s.
 
-    A finding that the replays say nothing about is left out, for want of retrains, settings or
-    certain predictions to compare, and for baselines, which have their own rules, the findings
-    about intervals.
+    A finding is left out if the replays say nothing about it, for want of retrains, settings or
+    certain predictions to compare. Of a baseline, which has its own rule, only the findings about
+    false positives and retrains are checked.
 
     Parameters
     ----------

@@ -245,7 +245,7 @@ class Replay:
 
     @property
     def outside(self) -> Bools:
-        """Left an operator's window, and was verified or rejected without the model; (n,) bool."""
+        """The trace left an operator's limits: the model was not asked; (n,) bool."""
         return np.asarray(self.reason == Reason.OUTSIDE)
 
     @property

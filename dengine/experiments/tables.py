@@ -159,7 +159,8 @@ def pooled_table(
 ) -> Table:
     """Return the rows of `pool` as a rich Table for the screen.
 
-    The first column has recipe, guarantee and feedback, and the interval if the rows differ in it.
+    There must be at least one row. The first column has recipe, guarantee and feedback, and the
+    interval if the rows differ in it.
     """
     several_intervals = len({row["interval"] for row in rows}) > 1
     shown = []

@@ -190,8 +190,8 @@ def base_rate_if_better(
     """Return heads, each that does worse than its base rate replaced by that rate.
 
     A head does worse if its leave-one-out log loss is larger than that rate's loss. The base rate
-    is the share of successes among all rows that train the head, so its loss is not left out, and a
-    little small.
+    is the share of successes among all rows that train the head. Its loss is not a leave-one-out
+    loss, and therefore slightly too small.
 
     Parameters
     ----------
@@ -207,8 +207,8 @@ def base_rate_if_better(
     Returns
     -------
     w, left_out : Tensor
-        As the arguments; for a head at base rate `w` has the bias alone, and `left_out` its logit,
-        the same for each label, not left out.
+        New tensors like the arguments. For a head at its base rate, all weights are 0 but the bias,
+        and its row of `left_out` is the logit of that rate.
     at_base_rate : list of int
         The heads that were set to it.
     """

@@ -565,9 +565,9 @@ class RocketReducer(Reducer):
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """Return the raw features (n, P) of traces (n, C, T), from the cache where they are in it.
 
-        `numbers` (n,), increasing, identify the traces. The cache then holds the traces of these
-        numbers and no others, and is what is returned, not a copy. Without numbers it is neither
-        read nor written.
+        `numbers` (n,), increasing, identify the traces. The cache then holds the features of these
+        traces and no others, and is itself returned, not a copy. Without numbers it is neither read
+        nor written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():

@@ -418,7 +418,7 @@ class TorchReducer(Reducer):
     def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
         """Embed preprocessed traces (n, C', L): float32 (n, d), row i in space ``folds[i]``.
 
-        Each member computes the rows of its fold alone, a fifth of what `embed` would take.
+        Member k computes the rows of fold k alone, so this takes 1 / K of the time of `embed`.
         """
         rows_of_fold = [np.flatnonzero(folds == k) for k in range(self.folds)]
         longest = max(map(len, rows_of_fold))
@@ -454,8 +454,8 @@ class TorchReducer(Reducer):
     def untrained_module(self, X: Floats) -> Encoder | None:
         """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
 
-        After a training it is the present one; before, that of a clone with initial weights. None
-        if TorchScript cannot compile the network.
+        After a training it is the present `encoder_` itself; before, that of a clone with initial
+        weights. None, with a warning in the log, if TorchScript cannot compile the network.
         """
         if "encoder_" in vars(self):
             return self.module()
@@ -472,8 +472,9 @@ class TorchReducer(Reducer):
     def report(self) -> FitReport:
         """Return the report of the last training: its steps, steps that are missing, and a note.
 
-        The note names loss and steps so far, "" if no step was taken and none is missing. Raises
-        NotFittedError before a fit.
+        The note gives the loss and the number of steps so far, if the last training took a step,
+        and the number of missing steps, if there are any; else it is "". Raises NotFittedError
+        before a fit.
         """
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
@@ -563,7 +564,8 @@ def draw_batches(
     folds : array of int, shape (n,)
         Member k gets no row of fold k.
     n_folds, batch_size, steps : int
-        K, B and the number of batches. B is smaller where a member has fewer rows.
+        K, B and the number of batches. B is reduced, for all members, to the number of rows of the
+        member that has the fewest.
     rng : numpy.random.Generator
 
     Yields

@@ -255,8 +255,8 @@ class UmapReducer(Reducer):
         """Return the number of epochs that the next training takes on `n_traces` traces.
 
         That is `n_epochs` if it was given. Otherwise it is those that are missing to the first 200,
-        or, if none are, 240,000 / n_traces but at least 60; and in any case no more than 200 or
-        400,000 / n_traces.
+        or, if none are, 240,000 / n_traces but at least 60; in both cases at most 200 and at most
+        400,000 / n_traces, but at least 1.
         """
         if self.n_epochs is not None:
             return self.n_epochs
@@ -387,7 +387,8 @@ class UmapReducer(Reducer):
     def untrained_module(self, X: Floats) -> UmapEncoder:
         """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
 
-        After a training it is the present encoder; before, a new one whose references are all 0.
+        After a training it is the present `encoder_` itself; before, a new one whose references are
+        all 0.
         """
         if self._is_fitted:
             return self.encoder_

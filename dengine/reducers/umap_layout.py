@@ -90,8 +90,9 @@ def leading_eigenvectors(
 ) -> NDArray[np.float64] | None:
     """Compute n eigenvectors of D^(-1/2) A D^(-1/2), where A is the graph and D its degrees.
 
-    The first, whose eigenvalue is largest, is left out. Returns float64 (n_traces, n), the next
-    ones by increasing eigenvalue, or None if the solver does not converge. `rng` draws its start.
+    They belong to the n largest eigenvalues after the very largest. Returns them as columns,
+    float64 (n_traces, n), in the order of increasing eigenvalues, or None if the solver does not
+    converge. `rng` draws its start.
     """
     root = np.sqrt(np.asarray(graph.sum(1), dtype=np.float64)).ravel()
     coordinates = graph.tocoo()
