@@ -73,7 +73,10 @@ def check_out(revision: str, folder: Path) -> None:
 
 
 def measure(root: Path, decisions: int, reports: int) -> dict[str, float]:
-    """Measure the dengine in a folder in a new process; return the seconds of each quantity."""
+    """Measure the dengine in a folder, in a new process; return the seconds of each quantity.
+
+    Raises SystemExit if that process fails.
+    """
     code = MEASUREMENT.replace("DECISIONS", str(decisions)).replace("REPORTS", str(reports))
     environment = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
     process = subprocess.run(

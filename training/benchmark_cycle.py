@@ -120,7 +120,10 @@ def busy_cores() -> Iterator[None]:
 
 
 def filled_engine(data: Dataset, recipe: Recipe, executor: Executor | None = None) -> DataEngine:
-    """Return an engine that has learned the whole set: every trace is one of its references."""
+    """Return an engine that has decided on the whole set, learned the labels, and retrained.
+
+    A part that it rejected is not among its references, since nobody tells it the label.
+    """
     engine = DataEngine(recipe=recipe, executor=executor)
     for trace, label in zip(data.X, data.y, strict=True):
         decision = engine.decide(trace)
@@ -136,9 +139,9 @@ class ConcurrentTimes(NamedTuple):
     Attributes
     ----------
     decisions : list of float
-        By the version that the engine had.
+        Of those that left the engine's version as it was.
     swaps : list of float
-        Those that also swapped a new version in.
+        Of those that also swapped a new version in.
     """
 
     decisions: list[float]

@@ -228,7 +228,10 @@ def run_cell(plan: Plan, data: Dataset, cell: int) -> dict[str, Any]:
 
 
 def flush_within(engine: DataEngine, seconds: float) -> None:
-    """Flush the engine; while its store is unavailable, try again for so long."""
+    """Flush the engine; try again while its store is unavailable, at most for these seconds.
+
+    Returns also if the store is still unavailable at the end.
+    """
     deadline = time.monotonic() + seconds
     engine.flush()
     while core_of(engine).store_fault and time.monotonic() < deadline:
@@ -294,13 +297,13 @@ def run_cells(plan: Plan, data: Dataset) -> list[CellRun]:
 
 
 def check_rows(plan: Plan, run: CellRun) -> dict[str, Any]:
-    """Compare a cell's rows in the store with what it was told.
+    """Compare a cell's rows in the store with what the cell remembers.
 
     Returns
     -------
     row : dict
-        cell, version, certain, and counts: labels sent, stored, lost and wrong, and mixed, the
-        traces that belong to another cell or product.
+        cell, version, certain, and counts: labels sent, stored, lost (not in the store) and wrong,
+        and mixed, the traces that belong to another cell or product.
     """
     lost = 0
     wrong = 0
@@ -330,7 +333,10 @@ def check_rows(plan: Plan, run: CellRun) -> dict[str, Any]:
 
 
 def show_results(plan: Plan, runs: list[CellRun], out: Path) -> bool:
-    """Print tables and write them as CSV; return whether nothing was lost, wrong or mixed."""
+    """Print tables, write them as CSV, over earlier files, and return whether all is well.
+
+    That is so if the store has as many labels as were sent, and none is lost, wrong or mixed.
+    """
     seconds = Times(list)
     for run in runs:
         for name, durations in run.seconds.items():

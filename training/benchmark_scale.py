@@ -27,7 +27,10 @@ N_DECISIONS = 300  # timed
 
 
 def fill_store(engine: DataEngine, data: Dataset, n: int) -> None:
-    """Write n labelled traces into the engine's store, in chunks."""
+    """Write n labelled traces into the engine's store, in chunks.
+
+    The engine first decides on one more trace, which sets the shape of all.
+    """
     rng = np.random.default_rng(0)
     engine.decide(noisy(data, 1, rng)[0][0])  # the first trace sets the form of all
     for start in track(range(0, n, CHUNK), description=f"{n:,} traces"):

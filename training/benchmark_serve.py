@@ -134,7 +134,7 @@ class XmlRpc:
         return self._decide(xmlrpc.client.Binary(trace.astype("<f4").tobytes()), request_id)
 
     def _decide(self, trace: Any, request_id: str) -> dict[str, Any]:
-        """Call the server; return the answer in the form of HTTP."""
+        """Call the server; return id, action and model_version, named as the HTTP API does."""
         answer: Any = self._proxy.decide(trace, request_id)
         return {
             "id": answer["id"],
@@ -163,7 +163,9 @@ class ServedTimes(NamedTuple):
 def time_requests(
     data: Dataset, n: int, kinds: dict[str, Decide], report: Report, prefix: str, pace: float
 ) -> ServedTimes:
-    """Ask for n decisions by each kind of request, in turn, and report the outcomes.
+    """Time n decisions by each kind of request, in turn, and the reports of the outcomes.
+
+    A rejected part is not reported.
 
     Parameters
     ----------
@@ -216,7 +218,9 @@ def wait_for_version(connection: Connection) -> None:
 def measure(
     data: Dataset, n: int, recipe: Path, folder: Path, pace: float, only: str
 ) -> dict[str, list[float]]:
-    """Start a server and time decisions over HTTP and XML-RPC, and reports.
+    """Start a server, time decisions over HTTP and XML-RPC, and reports, and end the server.
+
+    It prints the number of new versions on standard error.
 
     Parameters
     ----------
@@ -230,7 +234,12 @@ def measure(
     pace : float
         Seconds between two parts.
     only : str
-        Kinds of requests whose names begin with it.
+        Kinds of requests whose names begin with it; "" for all.
+
+    Returns
+    -------
+    times : dict of str to list of float
+        Wall times in seconds by kind of request, and those of "HTTP, report".
     """
     server = Server(folder, "--recipe", str(recipe))
     try:
@@ -255,7 +264,7 @@ def measure(
 
 
 def time_syncs(folder: Path) -> list[float]:
-    """Return the times that the disk takes to make 4 kB durable.
+    """Return the times, in seconds, that the disk takes to make 4 kB durable.
 
     A decision under a caller's own id waits for one of these.
     """

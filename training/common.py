@@ -22,7 +22,10 @@ POLICY = {"alpha": 0.1, "lower_bound": 0.9}
 
 
 def parse_seeds(text: str) -> range:
-    """Parse '100:130' as the seeds 100 to 129; argparse prints an error for other text."""
+    """Parse '100:130' as the seeds 100 to 129.
+
+    Raises ValueError or ArgumentTypeError for other text; argparse turns both into a message.
+    """
     first, last = map(int, text.split(":"))
     if not 0 <= first < last:
         expected = "first:last with 0 <= first < last, as 100:130"
@@ -47,7 +50,7 @@ OPTIONS: dict[str, tuple[Any, str]] = {
 
 
 def options(description: str | None, **defaults: Any) -> argparse.ArgumentParser:
-    """Return a parser with some of the `OPTIONS`: those that `defaults` gives a default value."""
+    """Return a parser with the `OPTIONS` that `defaults` names, each with the default given."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -73,9 +76,9 @@ def quantiles(seconds: Sequence[float] | np.ndarray) -> dict[str, Any]:
 def print_table(
     rows: Sequence[Mapping[str, Any]], title: str, path: Path | None = None, width: int = 124
 ) -> None:
-    """Print rows as a table, and write them as CSV where a path is given.
+    """Print rows, one at least, as a table; write them as CSV where a path is given.
 
-    The end of a column's name is its unit: _s, _bytes, _share.
+    A file that is there is replaced. The end of a column's name is its unit: _s, _bytes, _share.
     """
     if path is not None:
         write_csv(pd.DataFrame(rows), path, force=True)

@@ -136,7 +136,10 @@ class Difference(NamedTuple):
 
 
 def mean_difference(values: pd.Series) -> Difference:
-    """Return the mean of paired differences with Student's 95 % interval."""
+    """Return the mean of paired differences with Student's 95 % interval.
+
+    All are NaN without pairs, and the interval is NaN for a single pair.
+    """
     n_pairs = len(values)
     if n_pairs == 0:
         return Difference(math.nan, math.nan, math.nan)
@@ -336,7 +339,10 @@ def known_methods(differences: pd.DataFrame) -> list[str]:
 
 
 def verdict_lines(rows: pd.DataFrame) -> list[str]:
-    """Return a table that counts the sets on which conv is ahead of each method, or behind."""
+    """Return the lines of a table that counts the sets on which conv is ahead of each method.
+
+    It counts those where conv is behind as well. A sentence says it if nothing can be compared.
+    """
     table = []
     for method in known_methods(rows):
         compared = rows[(rows["recipe"] == method) & rows["certain_low"].notna()]
@@ -353,7 +359,7 @@ def verdict_lines(rows: pd.DataFrame) -> list[str]:
 
 
 def count_verdicts(rows: pd.DataFrame, measure: str) -> str:
-    """Return on how many sets conv has more, on how many nothing is sure, and has less."""
+    """Return as text on how many sets conv has more, on how many nothing is sure, and has less."""
     n_ahead = int((rows[f"{measure}_high"] < 0).sum())
     n_behind = int((rows[f"{measure}_low"] > 0).sum())
     return f"{n_ahead} / {len(rows) - n_ahead - n_behind} / {n_behind}"
@@ -377,7 +383,7 @@ def measure_lines(rows: pd.DataFrame) -> list[str]:
 
 
 def measure_cell(row: pd.Series, measure: str) -> str:
-    """Return the mean of a method and, below it, the difference from conv."""
+    """Return the mean of a method and, below it, the difference from conv, if there is one."""
     mean = f"{row[measure]:.{MEASURES[measure].decimals}f}"
     if row["recipe"] == REFERENCE or math.isnan(row[f"{measure}_more"]):
         return mean
@@ -385,7 +391,10 @@ def measure_cell(row: pd.Series, measure: str) -> str:
 
 
 def difference_cell(row: pd.Series, measure: str) -> str:
-    """Return the difference from conv with its interval, bold if that does not contain zero."""
+    """Return the difference from conv with its interval, bold if that does not contain zero.
+
+    It is "-" where there is no difference, and stands alone where there is no interval.
+    """
     digits = f".{MEASURES[measure].decimals}f"
     difference = Difference(*(row[f"{measure}_{end}"] for end in ("more", "low", "high")))
     if math.isnan(difference.mean):
@@ -399,7 +408,10 @@ def difference_cell(row: pd.Series, measure: str) -> str:
 
 
 def rank_row(rows: pd.DataFrame, measure: str, methods: Sequence[str]) -> list[list[str]]:
-    """Return the row of mean ranks over the sets that all methods have played; none without."""
+    """Return a list of one row: the mean ranks over the sets that all methods have played.
+
+    The list is empty if there is no such set, or fewer than two methods.
+    """
     rows = rows[rows["recipe"].isin(methods)]
     is_complete = rows.groupby("set")["recipe"].transform("nunique") == len(methods)
     complete = rows[is_complete]
@@ -434,7 +446,11 @@ def figure_lines() -> list[str]:
 
 
 def loss_lines(rows: pd.DataFrame) -> list[str]:
-    """Return the table of the sets and methods that conv loses to."""
+    """Return the lines of a table: where a method beats conv beyond chance, and by how much.
+
+    It beats conv by certain decisions or by net seconds. A sentence says it if none does, or if
+    nothing can be compared.
+    """
     rows = rows[rows["recipe"].isin(METHODS)]
     losses = rows[(rows["certain_low"] > 0) | (rows["net_s_low"] > 0)]
     if not (rows["recipe"] != REFERENCE).any() or rows["certain_low"].isna().all():

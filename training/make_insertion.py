@@ -73,7 +73,7 @@ def select_first(
 
 
 def draw_causes(data: Dataset, path: Path) -> None:
-    """Draw `N_DRAWN` traces of each cause, in panels of one scale."""
+    """Draw `N_DRAWN` traces of each cause, in panels of one scale, and save the picture."""
     figure = Figure(figsize=(13, 5.5), layout="constrained")
     panels = figure.subplots(2, 4, sharex=True, sharey=True).flat
     time_s = np.arange(data.X.shape[1]) / data.spec.rate_hz
@@ -87,7 +87,7 @@ def draw_causes(data: Dataset, path: Path) -> None:
 
 
 def draw_heights(data: Dataset, heights_mm: NDArray[np.float32], wrong: Bools, path: Path) -> None:
-    """Draw histograms of final heights near the tolerance.
+    """Draw histograms of final heights near the tolerance, and save the picture.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def draw_heights(data: Dataset, heights_mm: NDArray[np.float32], wrong: Bools, p
 
 
 def draw_scenarios(path: Path, n: int = 160, seed: int = 1, n_jobs: int = -1) -> None:
-    """Simulate each scenario and draw what it changes in the force."""
+    """Simulate n insertions of each scenario, draw how the force changes, and save the picture."""
     figure = Figure(figsize=(15, 3.6), layout="constrained")
     panels = figure.subplots(1, len(SCENARIOS), sharex=True, sharey=True)
     for axes, scenario in zip(panels, SCENARIOS, strict=True):
@@ -168,7 +168,7 @@ def cause_table(data: Dataset) -> str:
 
 
 def parameter_table() -> str:
-    """Return all settings of the nominal cell."""
+    """Return all settings of the nominal cell as a Markdown table."""
     rows = []
     for field in fields(CellParameters):
         value = getattr(CellParameters(), field.name)
@@ -190,7 +190,7 @@ def cross_predict(X: NDArray[Any], y: Labels, model: Any, seed: int = 0) -> NDAr
 
 
 def hardness_table(data: Dataset, repeats: int = 3) -> str:
-    """Return the accuracy of 1-NN and of a random forest on the raw traces.
+    """Return a Markdown table: the accuracy of 1-NN and of a random forest on the raw traces.
 
     It is the mean ± the standard deviation over `repeats` shuffles of the folds.
     """
@@ -205,7 +205,10 @@ def hardness_table(data: Dataset, repeats: int = 3) -> str:
 
 
 def ambiguity_table(heights_mm: NDArray[np.float32], wrong: Bools) -> str:
-    """Return the share of a forest's errors by the distance of the part from its seat."""
+    """Return a Markdown table of the parts by their distance from the seat.
+
+    It has the number of parts at each distance, and on which share of them a forest errs.
+    """
     distance = np.abs(heights_mm)
     tolerance = CellParameters().height_tolerance_mm
     zones = {
@@ -244,7 +247,7 @@ def repeated_samples(before: NDArray[np.float32]) -> Floats:
 
 
 def shortcut_table(data: Dataset) -> str:
-    """Return the accuracy of a forest that sees only one feature of the traces.
+    """Return a Markdown table: the accuracy of a forest that sees only one feature of the traces.
 
     The five features before contact must not give the label away; the last two may.
     """
@@ -287,7 +290,10 @@ def compare_time_steps(n: int, seed: int, n_jobs: int) -> str:
 
 
 def replace_table(card: str, table: str) -> str:
-    """Return the card with a table in place of the one that has the same head."""
+    """Return the card with a table in place of the one that has the same head.
+
+    Raises SystemExit unless exactly one table of the card has it.
+    """
     head = re.escape(table.split("\n", 1)[0])
     pattern = rf"^{head}\n(\|.*\n)+"
     card, n_replaced = re.subn(pattern, lambda _: f"{table}\n", card, flags=re.MULTILINE)
@@ -298,6 +304,8 @@ def replace_table(card: str, table: str) -> str:
 
 def write_card(out: Path, n_steps: int, n_jobs: int) -> str:
     """Write the pictures and the card of the data set in a folder; return the card's text.
+
+    It takes the text of `CARD`, and replaces its tables and measured numbers.
 
     Parameters
     ----------

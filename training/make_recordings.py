@@ -63,7 +63,10 @@ def to_csv(values: Floats, start_s: float, rate_hz: float) -> str:
 
 
 def break_text(text: str, index: int) -> str:
-    """Return the text of a broken file: in turn empty, cut in the last line, with another name."""
+    """Return a file's text broken in one of three ways, which follow each other by `index`.
+
+    It is empty, or cut off in its last line, or its force has another name.
+    """
     if index % 3 == 0:
         return ""
     if index % 3 == 1:
@@ -74,7 +77,10 @@ def break_text(text: str, index: int) -> str:
 def write_recordings(
     folder: Path, n: int = 200, n_broken: int = 3, seed: int = 0, rate_hz: float = 500.0
 ) -> list[str]:
-    """Write n files, some of them broken; return the names of the broken ones."""
+    """Write n recordings as CSV files, some of them broken; return the names of the broken ones.
+
+    Raises SystemExit unless 0 <= n_broken <= n, and n is at most the number of bundled traces.
+    """
     rng = np.random.default_rng(seed)
     data = load_dataset("insertion")
     if not 0 <= n_broken <= n <= len(data):

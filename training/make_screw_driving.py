@@ -27,7 +27,7 @@ def read_run(path: Path, n_samples: int) -> tuple[np.ndarray, dict[str, Any]]:
     Returns
     -------
     torque : array of float32, shape (n_samples,)
-        On the grid.
+        Interpolated at the multiples of `STEP_S`, from 0.
     run : dict
         Everything in the file.
     """
@@ -42,7 +42,10 @@ def read_run(path: Path, n_samples: int) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def convert(folder: Path, n_samples: int = N_SAMPLES) -> dict[str, np.ndarray]:
-    """Return the arrays of the data set; those of the runs have a row for each run."""
+    """Return the arrays of the data set; those of the runs have a row for each run.
+
+    Raises SystemExit if the folder has no recordings.
+    """
     paths = sorted(folder.glob("Ch_*.json"))
     if not paths:
         raise SystemExit(

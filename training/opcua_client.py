@@ -122,6 +122,8 @@ class Controller:
 async def play(url: str, n_parts: int, empty: str | None) -> list[str]:
     """Play recorded parts; return lines with the counts of actions and the `VARIABLES`.
 
+    The outcomes that a cell would learn are reported: those of verified parts, and line stops.
+
     Parameters
     ----------
     url : str

@@ -57,8 +57,9 @@ class Stretch:
 
 
 def resident_memory(process: int) -> dict[str, int]:
-    """Return the resident memory of a process and of its descendants, in bytes.
+    """Return the resident memory in bytes: of a process, and of all its descendants together.
 
+    The keys are `server_bytes` and `trainer_bytes`.
     Memory that processes share is counted once in each of them.
     """
     parents: dict[int, int] = {}
@@ -122,7 +123,10 @@ class Soak:
             print(row, file=sys.stderr, flush=True)
 
     def _play_cycle(self, part: str, trace: np.ndarray, good: bool, stretch: Stretch) -> None:
-        """Ask for a decision, and report the label where the cell would learn it."""
+        """Ask for a decision, and report the label where the cell would learn it.
+
+        Adds times and counts to `stretch`, and a reported label to `acknowledged`.
+        """
         seconds, decision = wall_time(self.web.decide, trace, part)
         stretch.decide.append(seconds)
         stretch.actions[decision["action"]] += 1
@@ -141,7 +145,7 @@ class Soak:
 
 
 def compare_with_store(path: Path, acknowledged: dict[str, bool]) -> dict[str, Any]:
-    """Open the store again; count lost and wrong labels, and time the retrains.
+    """Open the store again; return counts of lost and wrong labels, and the times of retrains.
 
     Parameters
     ----------

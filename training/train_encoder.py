@@ -127,7 +127,9 @@ def check_classes(labels: NDArray[np.int8]) -> None:
 def train(
     members: Members, training: TensorDataset, held_out: TensorDataset, epochs: int, seed: int
 ) -> tuple[Members, list[Epoch]]:
-    """Train a single member; returns the weights of the best epoch, and a row per epoch.
+    """Train a single member; return the weights of the best epoch, and a row per epoch.
+
+    Each epoch prints a line.
 
     Parameters
     ----------
@@ -190,7 +192,10 @@ def train(
 
 @torch.inference_mode()
 def evaluate(network: nn.Module, batches: Batches) -> dict[str, float]:
-    """Predict batches in evaluation mode; returns log loss, AUROC and calibration error."""
+    """Predict batches; return log loss, AUROC and calibration error by name.
+
+    The network is in evaluation mode afterwards.
+    """
     log_loss = MeanMetric()
     auroc = BinaryAUROC()
     calibration_error = BinaryCalibrationError()
