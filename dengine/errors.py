@@ -1,4 +1,5 @@
-"""The exceptions of dengine, and functions that raise them and build their messages.
+"""The exceptions of dengine, and functions that raise them and build their messages. All modules
+use them; a user catches `DengineError` or a subclass.
 
 `expect` and `instead` raise messages of one form: what was expected, what came, what to do.
 `shortened`, `excerpt` and `listed` keep a message to one line, `without_password` masks passwords,

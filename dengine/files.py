@@ -1,4 +1,5 @@
-"""Files: outputs, written as a whole or not at all, and NumPy archives, read safely.
+"""Files: outputs, written as a whole or not at all, and NumPy archives, read safely. Data
+sets, exports, backups, tables and figures are read and written by them.
 
 `output_file` and `write_output` never replace a file unasked, and never a database. `read_archive`
 unpacks no Python objects, and no more bytes than the machine can hold. `write_manifest` lists the

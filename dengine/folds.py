@@ -1,4 +1,5 @@
-"""Permanent hashes of traces and parts: they assign folds, draw audits and recognise parts.
+"""Permanent hashes of traces and parts: they assign folds, draw audits and recognise parts. The
+reducers, the decider, the store and the imports compute with them.
 
 A label may be counted for a query only in an embedding that never saw that label, so every trace
 has a fold for life. The fold must not depend on ids, order or time: it comes from the number of the

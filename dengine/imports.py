@@ -1,4 +1,6 @@
-"""Importing a class of the user, a reducer or a decision rule, by its name `module:Class`."""
+"""Importing a class of the user, a reducer or a decision rule, by its name `module:Class`.
+`Policy` and `make_reducer` call `import_class`.
+"""
 
 from importlib import import_module
 

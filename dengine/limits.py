@@ -1,4 +1,5 @@
 """An operator's limits of the force: the class `ForceLimits` and its text form, START:END:LOW:HIGH.
+A `Policy` holds them, and a part whose trace leaves them is verified or rejected.
 
 `Policy(windows=...)` takes them as objects or as texts, `--window` as text, and a store keeps the
 text. `traces.ForceLimitsGate` checks a trace against them, in the engine and in exported files.

@@ -1,4 +1,5 @@
 """`Recipe`, every setting of an engine, read from and written to TOML, and the named `RECIPES`.
+Engines, replays and the command line take one, and a store keeps it as TOML.
 
     >>> Recipe.load("conv")  # a name in `RECIPES`, a TOML file, or a Recipe
     >>> Recipe.load("my_cell.toml").to_toml()

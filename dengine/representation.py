@@ -1,4 +1,5 @@
-"""How records are shown: as HTML in a notebook, and as values that `json` takes.
+"""How records are shown: as HTML in a notebook, and as values that `json` takes. Records and
+replays, the command line and the HTTP service use these functions.
 
 `to_html` is the `_repr_html_` of every record that prints itself. `to_jsonable` makes what
 `--json` of the command line and the HTTP service answer.

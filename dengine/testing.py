@@ -1,4 +1,5 @@
-"""The contract of a reducer, as checks that its author can run.
+"""The contract of a reducer, as checks that its author can run. The project's own tests run them on
+the built-in reducers.
 
     from dengine.testing import check_reducer
     check_reducer(MyReducer())  # an AssertionError names the clause that is broken

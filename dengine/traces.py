@@ -1,4 +1,5 @@
-"""Traces as they come in: shapes and types are converted, and faults are found.
+"""Traces as they come in: shapes and types are converted, and faults are found. The engine, the
+readers of data sets and exported models check traces by this module.
 
 `as_trace` and `as_traces` convert what a caller gives to float32 arrays by a `TraceSpec`. A wrong
 shape is the caller's bug and raises TraceError. `TraceGate` finds what is wrong with a trace of the

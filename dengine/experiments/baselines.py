@@ -1,5 +1,6 @@
 """Methods that dengine is compared with, in the same loop; each decides by its own rule: nearest
-neighbours, kernel densities, a Gaussian process, MiniRocket, always verify, never verify.
+neighbours, kernel densities, a Gaussian process, MiniRocket, always verify, never verify. `replay`
+and `run_grid` make them by name, and an engine takes one as `model`.
 
 >>> DataEngine(model=make_baseline("knn", Policy(alpha=0.1, lower_bound=0.9), seed=0))
 

@@ -1,4 +1,5 @@
 """Which alpha and LB pay: what a part costs under each, in replays of the user's own recordings.
+The verb `costs` prints it.
 
     curve = cost_curve("insertion", check=5, escape=600, false_reject=30, recipe="pca", n_jobs=2)
     print(curve.sentence)

@@ -1,4 +1,5 @@
 """The paper's experiment: its grid, its two tables with its numbers beside ours, and its findings.
+The verb `compare` and `training/evidence_page.py` write them.
 
     frame = run_grid("insertion", ["conv"], **GRID, repeats=30)
     print(paper_table(frame, "conv", "wilson"))

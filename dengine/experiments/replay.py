@@ -1,4 +1,5 @@
 """One stream of parts through one engine: `replay` plays recordings, `watch` drives any cell.
+`grid` plays by `replay`, the verb `run` by `observe_cycles` and `to_replay`.
 
 Both return a `Replay`, the record of each cycle. `replay` uses a fresh engine, as the paper's
 prototype online environment does. A `Contender` says who plays: a recipe or a baseline.

@@ -1,9 +1,9 @@
-"""A survey of a data set before anything is learned from it: counts, faults, repeats and drift.
+"""A survey of a data set before anything is learned from it: counts, faults, repeats and drift. The
+verb `data` prints it.
 
     survey_dataset(load_dataset("cell_3/", channel="FZ_Base"))
 
-It counts traces, labels, faults and repeats, and looks for drift in the recorded order. `dengine
-data` prints it.
+It counts traces, labels, faults and repeats, and looks for drift in the recorded order.
 """
 
 from dataclasses import dataclass
