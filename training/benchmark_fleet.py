@@ -242,6 +242,8 @@ def flush_within(engine: DataEngine, seconds: float) -> None:
 def break_server(url: str, seconds: float) -> None:
     """Freeze a PostgreSQL server for a while, continue it, then kill it and start it again.
 
+    Prints each step, and returns when the server is started.
+
     Parameters
     ----------
     url : str
@@ -361,7 +363,7 @@ def show_results(plan: Plan, runs: list[CellRun], out: Path) -> bool:
 
 
 def main() -> None:
-    """Run the cells, check their rows, print and write the tables."""
+    """Run the cells, check their rows, print and write the tables; exit with 1 at a fault."""
     parser = options(__doc__, data="insertion", samples=None, recipe="pca", out=Path("out"))
     parser.add_argument("--cells", type=int, default=16, help="processes with an engine each")
     parser.add_argument(

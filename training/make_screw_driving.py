@@ -76,7 +76,7 @@ def convert(folder: Path, n_samples: int = N_SAMPLES) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Convert the recordings and write the data set."""
+    """Convert the recordings, write the data set, and print its size."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

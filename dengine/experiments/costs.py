@@ -202,10 +202,11 @@ def cost_curve(
     n_jobs: int = 1,
     keep: Folder | None = None,
 ) -> CostCurve:
-    """Compute what a part costs under every alpha and LB, and under the guarantee of costs.
+    """Compute what a part costs under every alpha and LB, and under ``guarantee="cost"``.
 
-    The data set is replayed `repeats` times under each of these policies. The guarantee of costs is
-    left out for a baseline, and where it refuses these costs or the policy's feedback.
+    The data set is replayed `repeats` times under each of these policies. ``guarantee="cost"`` is
+    left out for a baseline, and where `Policy` refuses it with these costs, `stops` and
+    `audit_rate`.
 
     Parameters
     ----------
@@ -255,9 +256,9 @@ def priced_tasks(
 ) -> list[Task]:
     """Return the replays of a cost curve as tasks.
 
-    There is one for every alpha, lower bound and seed, and one for every seed under the guarantee
-    of costs, unless the contender is a baseline or that guarantee refuses these costs or the
-    policy's feedback. Raises SettingError for an alpha or a lower bound out of range.
+    There is one for every alpha, lower bound and seed, and one for every seed under
+    ``guarantee="cost"``, unless the contender is a baseline, or `Policy` refuses that with these
+    costs, `stops` and `audit_rate`. Raises SettingError for an alpha or a lower bound out of range.
     """
     contender = Contender.load(recipe)
     tasks = grid_tasks([contender], alphas, lower_bounds, seeds=seeds, cycles=cycles)

@@ -318,8 +318,9 @@ def curves(
     """Draw the paper's curve, with a colour for each recipe.
 
     Above: the share of certain decisions, those without a check, the precision of the accepted ones
-    and LB. Below: the errors, as shares of what was decided alike, and the tolerance 100 - LB, a
-    share of the accepted parts. Shares of fewer than `FEWEST` parts are not drawn.
+    and LB. Below: the errors, bad parts as a share of the accepted ones and good parts as a share
+    of the rejected ones, and the tolerance 100 - LB. Shares of fewer than `FEWEST` parts are not
+    drawn.
 
     Parameters
     ----------
@@ -365,7 +366,8 @@ def _draw_replays(
     """Draw the curves of replays: the share of certain decisions and precision above, errors below.
 
     A band shows the spread of the certain share over the replays. The legend has the counts of the
-    errors: where too few parts were decided alike for a curve, they still say what went wrong.
+    errors: where too few parts were accepted or rejected for a curve, they still say what went
+    wrong.
     """
     lines = window_curves(replays, window, FEWEST)
     counts = [replay.stretch() for replay in replays]

@@ -211,7 +211,8 @@ def load_contenders(recipes: Sequence[Any]) -> list[Contender]:
     Raises
     ------
     SettingError
-        Two have the same name and policy, so that no table could tell them apart.
+        One is no recipe, or two have the same name and policy, so that no table could tell them
+        apart.
     """
     recipes = [recipes] if isinstance(recipes, str) else recipes
     contenders = [Contender.load(recipe) for recipe in recipes]
@@ -327,7 +328,7 @@ def run_grid(
 ) -> "pd.DataFrame":
     """Replay a data set over recipes x intervals x alphas x lower bounds x seeds.
 
-    Of accepted parts only the stops are known, as in the paper.
+    Of accepted parts only those that stop the line are known, as in the paper.
 
     Parameters
     ----------

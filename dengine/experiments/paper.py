@@ -97,7 +97,7 @@ def findings(frame: "pd.DataFrame") -> list[str]:
     Parameters
     ----------
     frame : DataFrame
-        As `run_grid` gives it, of one feedback and one guarantee.
+        As `run_grid` gives it, of one guarantee and one value of `stops` and `confirm`.
 
     Returns
     -------
@@ -164,8 +164,8 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
 def grid_lines(frame: "pd.DataFrame") -> list[str]:
     """Return the lines of a Markdown page with the tables and findings of a grid.
 
-    It has a heading for each guarantee and feedback, below it a table for each recipe and interval,
-    and a list of the findings.
+    It has a heading for each combination of guarantee, `stops` and `confirm`, below it a table for
+    each recipe and interval, and a list of the findings.
     """
     caption = (
         "false positives / certain, mean ± standard deviation over the shuffles [the paper's, on "

@@ -117,7 +117,8 @@ class Contender:
     def engine(self, seed: int) -> DataEngine:
         """Return a new engine in memory, with the baseline as its model if there is one.
 
-        It counts steps and not seconds in a retrain, so that the same seed repeats exactly.
+        It counts steps and not seconds in a retrain, so that the same seed repeats exactly. Raises
+        SettingError if the baseline's library is not installed.
         """
         model = None
         if self.baseline is not None:
@@ -280,7 +281,7 @@ class Replay:
         return [self.stretch(slice(begin, end)) for begin, end in pairwise(edges)]
 
     def stretch(self, cycles: slice = slice(None)) -> dict[str, Any]:
-        """Count decisions, errors and stops over some of the cycles.
+        """Count decisions, errors and line stops over some of the cycles.
 
         Parameters
         ----------
@@ -515,8 +516,8 @@ def replay(
     shuffle : bool, default True
         False plays the stream in its recorded order, drift included.
     confirm : bool, default False
-        Whether the cell confirms accepted good parts. By default only stops are known. With
-        `Policy(stops="all")` the engine takes the absence of a stop as a confirmation anyway.
+        Whether the cell confirms accepted good parts. By default only line stops are known. With
+        `Policy(stops="all")` the engine takes the absence of a line stop as a confirmation anyway.
     on_cycle : callable or None, default None
         Called with the number of finished cycles, for a progress bar.
 

@@ -64,9 +64,9 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
 
 
 def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, Any]]:
-    """Pool the replays that have the same recipe, interval, alpha, LB, guarantee and feedback.
+    """Pool the replays of equal settings: the columns `CONDITION`, from the recipe to `confirm`.
 
-    Returns a row for each combination of these columns (`CONDITION`), in the frame's order.
+    Returns a row for each combination of their values, in the frame's order.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def _share_right(n_wrong: int, n_decided: int) -> float:
 
 
 def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence for each pooled row: whether the accepted parts kept to LB.
+    """Return a sentence for each pooled row: whether at least LB of the accepted parts were good.
 
     It ends in "kept", "broken", or that there are too few accepted parts to say; or it says that no
     part was accepted. It names the recipe, the guarantee, and interval, alpha and confirmation only
@@ -159,8 +159,9 @@ def pooled_table(
 ) -> Table:
     """Return the rows of `pool` as a rich Table for the screen.
 
-    There must be at least one row. The first column has recipe, guarantee and feedback, and the
-    interval if the rows differ in it.
+    There must be at least one row. The first column has the recipe, the guarantee, how outcomes of
+    accepted parts come ("confirmed", or the policy's `stops`), and the interval if the rows differ
+    in it.
     """
     several_intervals = len({row["interval"] for row in rows}) > 1
     shown = []

@@ -567,7 +567,7 @@ class CrossFitted(_Wrapping):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Fit clone k on the traces outside fold k, for every k; this replaces `clones_`.
+        """Fit clone k on the traces outside fold k, for every k, and replace `clones_` and `dim_`.
 
         Parameters
         ----------

@@ -347,11 +347,11 @@ class RocketReducer(Reducer):
     ) -> Floats:
         """Fit the heads from their present weights; the kernels stay those of the first training.
 
-        X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. By `numbers`
-        (n,), those of the labels, features are found in the cache of the last call. `stop` may end
-        the Newton steps. Of more than 4000 traces the heads read 4000. Returns the points of all
-        traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20
-        traces, and if the traces outside a fold have a single class.
+        X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,)
+        identify the traces from call to call, so that the features of traces in the last call come
+        from a cache. `stop` may end the Newton steps. Of more than 4000 traces the heads read 4000.
+        Returns the points of all traces, float32 (n, d), row i in space ``folds[i]``. Raises
+        SettingError for fewer than 20 traces, and if the traces outside a fold have a single class.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
@@ -393,10 +393,10 @@ class RocketReducer(Reducer):
         return self.check_traces(X)
 
     def _start(self, traces: Floats) -> None:
-        """Build the module `net_`, and set channel scales and kernels from traces (n, C, T).
+        """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
 
-        No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its
-        range or fewer than 2 samples.
+        It also sets `average_`. No label is read. Earlier fits are forgotten. Raises SettingError
+        for a parameter out of its range or fewer than 2 samples.
         """
         x = torch.from_numpy(traces)
         self.average_ = averaging(x)

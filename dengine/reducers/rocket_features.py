@@ -213,11 +213,12 @@ class RocketEncoder(nn.Module):
         return by_dilation.reshape(n, channels * taps, columns)
 
     def ramp_features(self, windows: Tensor, batch: int) -> Tensor:
-        """Compute tower 1 from windows (D, C * 9, P * B) of `batch` = B traces: (B, D * F * R).
+        """Compute the features of tower 1: (B, D * F * R).
 
-        A kernel's answer at a place goes through a ramp from 0 to 1 around its threshold. A feature
-        is the mean of that over a region, plus twice the mean over the whole trace. Dilations are
-        the slowest axis, regions the fastest.
+        `windows` (D, C * 9, P * B) are those of `batch` = B traces. A kernel's answer at a place
+        goes through a ramp from 0 to 1 around its threshold. A feature is the mean of that over a
+        region, plus twice the mean over the whole trace. Dilations are the slowest axis, regions
+        the fastest.
         """
         h = torch.baddbmm(self.threshold, self.kernel, windows).clamp_(0.0, 1.0)  # (D, F, P * B)
         if batch == 1:  # one product whose columns are the regions takes four times as long
@@ -229,11 +230,12 @@ class RocketEncoder(nn.Module):
         return h.reshape(self.n_dilations * self.n_kernels * self.n_regions, batch).t()
 
     def competition_features(self, windows: Tensor, batch: int) -> Tensor:
-        """Compute tower 2 from windows (2D, C * 9, Q * B) of `batch` = B traces: (B, 4D * G * 8).
+        """Compute the features of tower 2: (B, 4D * G * 8).
 
-        A feature is the root of the share of places where a kernel answers most of its group; the
-        second half of them is of those where it answers least. `learn_filters` has divided the
-        kernels by `COMPETITION_WIDTH`, so that a kernel counts in part within a distance of 1.
+        `windows` (2D, C * 9, Q * B) are those of `batch` = B traces. A feature of the first half is
+        the root of the share of places at which a kernel's answer is the largest of its group, one
+        of the second half that of the places at which it is the smallest. An answer that is less
+        than 1 away from the largest or smallest one counts in part.
         """
         n_groups = 2 * self.n_dilations * self.n_groups
         size = self.group_size

@@ -199,9 +199,9 @@ class TorchReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, labels or folds do not fit the traces, the
-            checkpoint cannot be used, a trace has one sample, or fewer than two traces lie outside
-            a fold.
+            If a parameter is out of its range, labels or folds do not fit the traces, the network
+            does not give (B, features), the checkpoint cannot be used, a trace has one sample, or
+            fewer than two traces lie outside a fold.
         TraceError, ValueError
             For an X of another shape, and for values that are not finite.
         """
@@ -223,7 +223,7 @@ class TorchReducer(Reducer):
         """Train on traces (n, C, T), labels y (n,) 1 or 0, and folds (n,); replace `encoder_`.
 
         It takes `n_steps_due` steps, or fewer if `stop` ends them, from the present weights, or
-        from initial ones the first time. `numbers` is not read. Returns the traces as references,
+        from initial ones the first time. `numbers` is not read. Returns the points of the traces,
         float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20 traces in
         the first training, and for fewer than two outside a fold.
         """

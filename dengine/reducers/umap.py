@@ -239,10 +239,11 @@ class UmapReducer(Reducer):
     ) -> Floats:
         """Lay traces out, from the last layout if it can, and make them the encoder's references.
 
-        X are traces (n, C, T), `numbers` (n,) increasing numbers of their labels; labels and folds
-        are not read. `stop` may end the epochs. The layout starts anew without `numbers`, or if
-        fewer than half of the traces were in the last training. Returns the layout, float32 (n,
-        n_components). Raises SettingError for a parameter out of its range, or too few traces.
+        X are traces (n, C, T); `numbers` (n,), increasing, identify them from training to training;
+        labels and folds are not read. `stop` may end the epochs. The layout starts anew without
+        `numbers`, or if fewer than half of the traces were in the last training. Returns the points
+        of the traces, float32 (n, n_components), not a copy of `embedding_`. Raises SettingError
+        for a parameter out of its range, or too few traces.
         """
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
