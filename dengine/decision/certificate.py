@@ -413,12 +413,12 @@ def certify(
     -----
     Under "all", or if every accepted part was confirmed or stopped the line, all outcomes are
     known, and the bound is about the accepted parts. Otherwise it comes from audits and is about
-    all parts that the model would have accepted, let go or audited; it is never below the share
-    known to be bad. Without audits it is 1. Where both ways are possible they share alpha, one
-    tenth for known outcomes and nine for audits, so that whoever sees now the one and now the other
-    is wrong with probability alpha at most. Rejected parts are known by audits, and without these
-    their bound is 1; the share that was found good without being asked for is a floor of that
-    bound. A forgotten or overdue label counts as a wrong decision.
+    all parts that the model would have accepted, those that were audited included; it is never
+    below the share known to be bad. Without audits it is 1. Where both ways are possible they share
+    alpha, a tenth for known outcomes and nine tenths for audits, so that whoever sees now the one
+    bound and now the other is wrong with probability alpha at most. The bound on rejected parts
+    comes from audits, and without these it is 1; it is never below the share known to be good. A
+    forgotten or overdue label counts as a wrong decision.
     """
     expect(stops in ("all", "some"), "stops among all, some", stops)
     expect(0.0 < tolerance < 1.0, "0 < tolerance < 1", tolerance, "0.05 tolerates 5 % of errors")

@@ -212,8 +212,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
     def _add(self, Z: Any, y: Any) -> Self:
         """Add embeddings with labels to the index; returns self.
 
-        The last of `classes_` is stored as success. A lone class 0, False or -1 is stored as
-        failure.
+        A label equal to the last of `classes_` is stored as success, any other as failure, which is
+        not checked. A lone class 0, False or -1 is stored as failure.
         """
         success = np.asarray(y) == self.classes_[-1]
         if len(self.classes_) == 1 and self.classes_[0] in (0, False, -1):

@@ -231,12 +231,12 @@ class MemberEvidence(nn.Module):
         """Count a part's outcome on both sides, choose the thresholds, and end a safe mode if due.
 
         `lower` and `upper` are the bound that the part was decided by, `success` is its label, and
-        `predicted` (position in `Action`) what the model alone would have done.
-        `inclusion_probability`, with which the outcome would be asked for, says how the part
-        counts: 1 as checked, above 0 as audited. At 0 only the drift detectors see it, unless all
-        outcomes are known. A wrong outcome may raise an alarm, which starts the safe mode. This
-        ends when the side that raised the alarm has an open level again; after too many novel
-        traces, when novel ones are few again and either side has one.
+        `predicted` (position in `Action`) what the model alone would have done. Where all outcomes
+        are known, every part counts as checked. Elsewhere `inclusion_probability`, with which the
+        outcome would be asked for, says how it counts: 1 as checked, above 0 as audited, and at 0
+        only the drift detectors see it. A wrong outcome may raise an alarm, which starts the safe
+        mode. This ends when the side that raised the alarm has an open level again; after too many
+        novel traces, when novel ones are few again and either side has an open level.
         """
         self.count_outcome(0, lower, not success, predicted, inclusion_probability)
         self.count_outcome(1, 1.0 - upper, success, predicted, inclusion_probability)

@@ -235,7 +235,7 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
     """Return what is added to each roughness before its logarithm, float32, shape (C, 2*S + 3).
 
     It is a twentieth of the roughness that the median of the traces x (n, C, T) has over as long a
-    stretch, and 1e-12 for a channel that never moved: any sound is then far away.
+    stretch, and 1e-12 for a channel that never moved: any movement there is then far away.
     """
     n_samples = x.size(2)
     steps = torch.zeros(x.size(1))

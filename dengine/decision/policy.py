@@ -209,8 +209,8 @@ class Policy:
         """Make a decision rule that has learned nothing yet.
 
         It is the class that `RULES` names for `guarantee` and `stops`, or the user's
-        `module:Class`, made with alpha, lower_bound and interval; the pooled and the priced rule
-        also get `inclusion_probability`, the priced one `tolerances`.
+        `module:Class`, made with alpha, lower_bound and interval. `PooledRule`, `PricedRule` and
+        their subclasses also get `inclusion_probability`, priced ones `tolerances` as well.
 
         Returns
         -------

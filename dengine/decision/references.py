@@ -390,7 +390,7 @@ class RadiusIndex(nn.Module):
             Hash of its part.
         label : int or None
             1 is success, 0 is failure. None removes the point; the others keep their order of age
-            and move to the first slots.
+            and move to the first slots, and `total` becomes their number.
 
         Returns
         -------

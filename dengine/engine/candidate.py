@@ -1,9 +1,9 @@
 """`Candidate`: a newly trained version of the model, from the end of its training until it answers.
+`learner.Learner` makes one after each training, and takes it through the steps in between.
 
-Until then the previous version goes on answering. The candidate takes in the labels that came since
-its training began, is stored, and then replaces the previous version; or it is dropped.
-`learner.Learner` takes it through these steps, either all at once or one short step between two
-cycles.
+Meanwhile the previous version goes on answering. The candidate takes in the labels that came since
+its training began, is stored, and then replaces the previous version; or it is dropped. This
+happens either all at once or in short steps between cycles.
 """
 
 from __future__ import annotations

@@ -203,10 +203,11 @@ class EngineCore:
         or of the store, is the reason.
 
         Before it decides, the call takes a short step with a version that the executor has trained
-        (where cells share a product, all steps), and counts earlier accepted parts without a report
-        as confirmed or unobserved. Afterwards it announces a safe mode that began or ended. Raises
-        TraceError for a wrong trace or part's number, ReportError for what is no id, and StoreError
-        for an engine that is closed, only reads, or is in use by another thread.
+        (where cells share a product, all steps), rebuilds the rule where that is due, and counts
+        earlier accepted parts without a report as confirmed or unobserved. Afterwards it announces
+        a safe mode that began or ended. Raises TraceError for a wrong trace or part's number,
+        SettingError for a first trace that the force limits do not fit, ReportError for what is no
+        id, and StoreError for an engine that is closed, only reads, or is in use by another thread.
         """
         self.outbox.check_usable()
         with self.exclusive:
@@ -234,9 +235,10 @@ class EngineCore:
         When it returns None, nothing has changed. That is so where the outbox is locked, before the
         first trace, while settings are unsaved or the rule must be rebuilt, and where the model is
         a baseline, uses classes of the user's, or is not compiled. The decision is recorded in
-        memory and goes to the disk later. Any thread may call it while no other uses the engine;
-        else it raises StoreError. It leaves swapping versions and announcing safe mode to
-        `process_retrains`. Raises TraceError for a wrong trace or part's number.
+        memory and goes to the disk later. Any thread may call it while no other uses the engine; it
+        is limited to one torch thread. Swapping versions and announcing safe mode are left to
+        `process_retrains`. Raises TraceError for a wrong trace or part's number, and StoreError for
+        an engine that is closed, only reads, or is in use by another thread.
         """
         self.outbox.check_usable()
         with self.outbox.try_lock() as is_free, self.exclusive:
@@ -300,7 +302,7 @@ class EngineCore:
         confirmed or unobserved. The decision is VERIFY where `timed_out` (`Reason.LATE`), and where
         the store is damaged or its journal cannot be written (`Reason.NO_STORE`); a fault of the
         trace is the reason instead. Returns the record with its number, 0 where it could not be
-        recorded. Raises TraceError for a wrong shape.
+        recorded. Raises what `_check_trace` raises.
         """
         x = self._check_trace(trace)
         self.learner.catch_up()
@@ -379,8 +381,8 @@ class EngineCore:
         Where none is set, the first trace without a fault sets it, or a contract that peers have
         set is taken. The first finite trace also has an untrained model compute in advance.
         Settings that could not be saved before are saved. Raises TraceError for a wrong shape, or
-        too few samples of a first trace; a trace with NaN, or another fault, is returned like any
-        other.
+        too few samples of a first trace, and SettingError where the force limits do not fit the
+        contract that it sets; a trace with NaN, or another fault, is returned like any other.
         """
         settings = self.settings.now
         has_learned = self.live.version + self.learner.labels.new_labels > 0
@@ -405,9 +407,10 @@ class EngineCore:
         """Learn the outcome of a decision; return the report of a retrain done here for it, or
         None.
 
-        `trace` and `part` are used only where the decision is unknown and `success` is False. It
-        returns when the label is on disk, and raises NotTakenError where that is not certain. Then
-        a retrain that is due is done in this thread, or begun in the executor. The label of a trace
+        `trace` and `part` are used only where the decision is unknown and `success` is False. A
+        version that the executor has trained first comes a step further. The label is on disk when
+        this returns; NotTakenError is raised where that is not certain. Before it returns, a
+        retrain that is due is done in this thread, or begun in the executor. The label of a trace
         with a fault is stored, and sets off no retrain. Raises ReportError, TraceError and
         StoreError as `DataEngine.report`.
         """
@@ -430,8 +433,8 @@ class EngineCore:
         """Record an ACCEPT under this id for a line stop whose decision was lost; return the
         record.
 
-        Raises UnknownDecisionError without the trace and for a success, and TraceError for a wrong
-        trace or part's number; then nothing is recorded.
+        Raises UnknownDecisionError if `trace` is None or `success` is True, and TraceError for a
+        wrong trace or part's number; then nothing is recorded.
         """
         if trace is None or success:
             raise UnknownDecisionError(

@@ -1,12 +1,11 @@
 """`Corrections`: with it people correct a label, forget labels, go back to an earlier version, or
-set another policy.
+set another policy. The methods of `DataEngine` that do this call it.
 
     engine.correct(decision.id, success=False, author="kim")
     engine.rollback(3)
 
-`DataEngine` passes these verbs on to `Corrections`. Each one is an event that is kept for ever.
-Nothing is overwritten: a correction is a later row, an earlier version answers again as a new one,
-and a decision stays as it was decided.
+Each change is an event that is kept for ever. Nothing is overwritten: a correction is a later row,
+an earlier version answers again as a new one, and a decision stays as it was decided.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,9 +1,8 @@
 """`DecisionMaker` turns a trace into a `StoredDecision`: the model's decision, an id, a version and
-a time.
+a time. `EngineCore` owns one and hands its results to the outbox.
 
-`EngineCore` owns one `DecisionMaker` and hands its results to the outbox. The functions below it
-check what a caller passes, a part's number and an id that was decided before, and make a VERIFY
-without a trace.
+The functions below it check what a caller passes, a part's number and an id that was decided
+before, and make a VERIFY without a trace.
 """
 
 import logging

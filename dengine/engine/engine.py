@@ -412,6 +412,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         TraceError
             For a wrong shape, a first trace of less than 10 samples, an id that belongs to another
             trace, and a part's number that is none.
+        SettingError
+            For a first trace that the policy's force limits do not fit.
         ReportError
             For an id that is no id.
         StoreError

@@ -1,5 +1,6 @@
 """`Feedback` collects the outcomes of decided parts: it updates the decision rule and the
-references with them, and turns them into stored labels.
+references with them, and turns them into stored labels. `core.EngineCore` calls it for each
+decision, `learner.Learner` for each report.
 
 With `Policy(stops="all")` a bad part stops the system before the next decision, so the next
 decision confirms an accepted part: the rule is updated, the trace becomes a reference, and its
@@ -127,7 +128,8 @@ class Feedback:
 
         A VERIFY of a trace with a fault, or that was not recorded, is not pending. The rule is
         updated with checks that have become overdue. When nearly all recent decisions are
-        `Reason.NOVEL`, an event is recorded, once until their share has fallen to one half.
+        `Reason.NOVEL`, an event is recorded; the next one only after their share has fallen to one
+        half.
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
@@ -188,10 +190,9 @@ class Feedback:
 
         A confirmation by silence is taken back first. If its label went to the outbox before, the
         new label goes there too, but is not learned yet: `remedy` is set to CORRECT. Otherwise its
-        reference is removed, and `remedy` is set to REBUILD_RULE, as for a check that was counted
-        as overdue.
-        Returns whether there was such a confirmation, whatever the label is now. Raises ReportError
-        for any other second label.
+        reference is removed, and `remedy` is set to REBUILD_RULE. The latter is also set for a
+        check that the rule counted as overdue. Returns whether there was such a confirmation,
+        whatever the label is now. Raises ReportError for any other second label.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -285,8 +286,9 @@ class Feedback:
     def _count_overdue(self) -> None:
         """Make the rule count as wrong each decision whose check is overdue.
 
-        It is if nothing was reported of it while `label_within` later decisions were recorded. Each
-        is counted once; one without evidence, or from before the present rule began, is not.
+        A check is overdue if it was not reported while `label_within` later decisions were
+        recorded. Each decision is counted once; one with the bound (0, 1), which says nothing, or
+        from before the present rule began, is not counted.
         """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within

@@ -1,9 +1,9 @@
 """`Peers`: reads from the store what the other cells of a product have learned, labels and the
 newest version of the model, and takes it over: labels become references, a newer version answers.
+`learner.Learner` calls it between two cycles, never within `decide`.
 
-The cells of a product share one store. News is asked for between two cycles, never by `decide`. A
-cell whose connection is lost goes on with what it has. `learner.Learner` asks for news in the order
-that `Learner._take_in_news` shows.
+The cells of a product share one store. A cell whose connection is lost goes on with what it has.
+`Learner._take_in_news` shows the order of the steps.
 """
 
 from __future__ import annotations

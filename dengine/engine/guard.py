@@ -1,8 +1,7 @@
 """`GuardedModel`: calls of the engine's model in which an exception is logged and never reaches the
-cell.
+cell. Every object of the engine that prepares a model, or teaches it, calls it in this way.
 
-`live_model.LiveModel`, `resume` and the training make these calls. A prediction that fails is
-guarded where decisions are made, because its reason is recorded with the decision.
+Predictions and trainings are guarded where their failure is recorded, in `decide` and `trainer`.
 """
 
 import logging

@@ -1,9 +1,9 @@
 """`CellLabels` and `ProductLabels`: each adds labels to the training window, and counts those since
-the last retrain began.
+the last retrain began. `feedback.Feedback` adds labels; `learner.Learner` asks whether a retrain is
+due.
 
 `CellLabels` is for a cell that learns alone. `ProductLabels` is for a cell that shares a product
-with others, whose labels have one sequence in the store. `feedback.Feedback` adds labels;
-`learner.Learner` asks whether a retrain is due.
+with others, whose labels have one sequence in the store.
 """
 
 from __future__ import annotations
@@ -166,9 +166,10 @@ class ProductLabels:
             self.admit(trace, label, hash_, seq)
 
     def admit(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
-        """Add the product's next label to the window, and count it as new unless a retrain had it.
+        """Add the product's next label to the window.
 
-        A peer's label also becomes a reference of the answering model, unless that has it already.
+        It counts as new unless the newest retrain was trained on it. A peer's label also becomes a
+        reference of the answering model, unless that has it already.
         """
         is_own = self._waiting.pop(seq, None) is not None
         self._window.add(trace, label, hash_, seq)

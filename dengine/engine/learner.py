@@ -1,10 +1,10 @@
 """`Learner` calls, in the right order, all that an engine learns with: store labels, update the
-rule, train, swap, take in peers' news.
+rule, train, swap, take in peers' news. `core.EngineCore` calls it once per decision, report and
+cycle.
 
 It is the only object that calls the others in this order. `Feedback` turns outcomes into labels,
 `LiveModel` learns them, `Retrainer` trains a candidate, and `Peers` reads what other cells of the
-product made; none of them knows the learner. `core.EngineCore` calls it once per decision, report
-and cycle.
+product made; none of them knows the learner.
 """
 
 from __future__ import annotations
@@ -355,8 +355,8 @@ class Learner:
         """Store the candidate, set the number that the store gave it, and return True.
 
         Returns False if another step is needed: labels are missing, or the commit is under way.
-        With `to_the_end` it blocks instead, and without it for labels that `PATIENCE` steps did not
-        bring. Raises StoreError where it cannot be stored.
+        With `to_the_end` it blocks for both instead; without, it blocks only for labels that
+        `PATIENCE` steps did not bring. Raises StoreError where it cannot be stored.
         """
         if candidate.storing is None:
             if not candidate.catch_up(self._window, np.inf if to_the_end else STEP):
@@ -546,8 +546,9 @@ class Learner:
         `event`.
 
         Later labels, up to the window's capacity, become its references, and the present rule goes
-        on. New labels count from zero. Raises StoreError for a version that is not kept, where a
-        trace is damaged that the model must be fitted on again, and where it cannot be stored.
+        on. Afterwards news of peers is taken in, and new labels count from zero. Raises StoreError
+        for a version that is not kept, where a trace is damaged that the model must be fitted on
+        again, and where it cannot be stored.
         """
         self._outbox.check_integrity()
         begin = self._clock()

@@ -1,7 +1,5 @@
 """`LiveModel`: the model that answers, and how its references and its rule learn from outcomes.
-
-`LiveModel` knows the store and the training window below it. Which version answers, and when, is up
-to `learner.Learner`; outcomes come from `feedback.Feedback`.
+Outcomes come from `feedback.Feedback`; `learner.Learner` says which version answers, and when.
 """
 
 from __future__ import annotations
@@ -221,8 +219,8 @@ class LiveModel:
     def count_overdue(self, decision: Decision) -> None:
         """Update the rule as if a decision was wrong, because its check was not reported in time.
 
-        The decision's id is kept in `overdue`. A decision without evidence, or from before the
-        present rule began, changes nothing.
+        The decision's id is kept in `overdue`. A decision with the bound (0, 1), which says
+        nothing, or from before the present rule began, changes nothing.
         """
         if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
@@ -245,10 +243,10 @@ class LiveModel:
         return True
 
     def rebuild_rule(self) -> None:
-        """Reset the rule of the answering model, or of the template before the first retrain, and
-        update it with `SqlStore.outcomes_since` it began.
+        """Reset the rule, and update it with all stored outcomes of decisions since it began.
 
-        Overdue checks are among these. Labels that are not in the store yet are not, so the rule
+        It is the rule of the answering model, or of the template before the first retrain. Overdue
+        checks are among the outcomes. Labels that are not in the store yet are not, so the rule
         forgets them: store them before. The ledger is not checked here. Raises StoreError, and
         changes nothing, where the store is away.
         """

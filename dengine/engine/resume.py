@@ -1,5 +1,4 @@
 """Functions that restore a stored version bit for bit: its model, later labels and corrections.
-
 `live_model.LiveModel` uses these functions when a store is opened, `learner.Learner` for a
 rollback, and `fleet.Peers` when another cell's version is taken over.
 """
@@ -87,9 +86,10 @@ def add_labels_since(
     """Add to a version's model, as references, the labels that came after it was stored.
 
     They are at most as many as `window` holds, and end with the window's newest label. Corrections
-    that came meanwhile are applied in the same order as then, so that the model is the same bit for
-    bit. A baseline, which cannot be corrected, gets the labels as they count now. Returns the
-    number of the newest correction in the store.
+    that came meanwhile are applied between the labels, where they came, so that the model is the
+    same bit for bit. A baseline, which cannot be corrected, gets the labels as they count now. A
+    label that the model cannot take is logged and skipped. Returns the number of the newest
+    correction in the store.
     """
     corrected_to = newest_correction(version)
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another

@@ -1,6 +1,5 @@
 """`EngineSettings`, what an engine was made with and its store keeps; `SettingsInForce`, the
 present ones while it runs; and functions that check and complete the settings a program gives.
-
 `DataEngine` makes or reads `EngineSettings` before it opens a cell. What the engine has learned is
 not among them.
 """

@@ -1,9 +1,9 @@
 """`TrainingWindow` holds the newest labelled traces in memory; `Retrainer` trains a new version on
-them within a time budget, in the calling thread or in an executor.
+them within a time budget, in the calling thread or in an executor. `learner.Learner` decides when
+to train, and what becomes of the result.
 
-It trains a successor of the present model, on a snapshot of the window. No failure of a training or
-of the executor stops the cell. `learner.Learner` decides when to train, and what becomes of the
-result.
+The retrainer trains a successor of the present model, on a snapshot of the window. No failure of a
+training or of the executor stops the cell.
 """
 
 import logging
@@ -298,8 +298,8 @@ class Retrainer:
     def _give_up(self, future: Future[Trained], error: Exception) -> str:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
-        An executor that died or did not finish in time is used no more: later retrains run in the
-        calling thread.
+        An executor that died or did not finish in time is used no more: its training is cancelled
+        if it has not begun, and later retrains run in the calling thread.
         """
         training_raised = future.done() and not isinstance(error, BrokenExecutor)
         log.error("a retrain in the executor failed: %s", error, exc_info=training_raised)

@@ -97,9 +97,9 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> CellJournal:
     """Read and check the journal of a cell program.
 
     Rejected parts, and verified ones without a label, are left out. An accepted part whose label
-    came late is there twice. From a line whose checksum does not fit on, everything is set aside,
-    which is no error; `set_aside` says so, or that lines are missing that FILE.head knows of. A
-    warning is logged if FILE.head is missing.
+    came late is there twice. The first line whose checksum does not fit, and all lines after it,
+    are set aside without an error; `set_aside` says so, or that the journal lacks lines that
+    FILE.head knows of. A warning is logged if FILE.head is missing.
 
     Parameters
     ----------
@@ -207,7 +207,8 @@ def _parse_label(words: list[str], parts: Mapping[str, JournalLine], where: str)
     """Return the earlier part that a label's line names, as a new `JournalLine` with the label.
 
     `words` are id and label, 1 or 0; `parts` has the parts so far by id. Raises DataError, naming
-    `where`, if there is no such part, it was rejected, or it has a label.
+    `where`, for other words, an id that is not in `parts`, and a part that was rejected or has a
+    label.
     """
     is_valid = len(words) == 2 and words[0] in parts and words[1] in LABELS
     expect_data(is_valid, f"an earlier part's id and a label of 1 or 0 in {where}", ",".join(words))

@@ -284,6 +284,7 @@ class DecisionModule(nn.Module):
         """Learn the outcome of the pending decision; then none is pending.
 
         The rule is updated, and the trace becomes a reference: of a success if `success` is True.
+        That a decision is pending is not checked.
         """
         self.learn_outcome(
             self.pending_lower,

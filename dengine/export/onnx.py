@@ -91,11 +91,12 @@ def export_onnx(
     Raises
     ------
     ExportError
-        If the engine audits, has force limits or a rule that learns, or a part came again; if
-        nothing was trained yet; for a baseline; if the reducer or the interval has no module; for
-        code that was changed after it was compiled; if the rule is stale, because an update of it
-        failed; if the store was changed from outside; if the key cannot be read, or a package is
-        missing; and if onnxruntime does not decide as the model does.
+        If the engine audits, has force limits or a rule other than the paper's, or a part is among
+        the references more than once; if nothing was trained yet; for a baseline; if the reducer or
+        the interval has no module; for code that was changed after it was compiled; if the rule is
+        stale, because an update of it failed; if the store was changed from outside; if the key
+        cannot be read, or a package is missing; and if onnxruntime does not decide as the model
+        does.
     OutputError
         If `path` cannot be written.
     """
@@ -146,8 +147,8 @@ def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> "O
 def _refuse_unsupported(source: Exportable) -> None:
     """Raise ExportError if the decision needs something that ONNX cannot carry.
 
-    That is an audit rate above 0, a rule other than the paper's, parts that came more than once,
-    and force limits.
+    That is an audit rate above 0, a rule other than the paper's, a part that is among the
+    references more than once, and force limits.
     """
     rule = type(source.model.rule)
     n_repeats = int(source.model.index.repeats)
@@ -326,11 +327,11 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
 
 
 def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None:
-    """Compare an ONNX model with the model that answers, on 64 random traces of every size.
+    """Compare an ONNX model with the model that answers, on 64 traces of noise.
 
-    Raises ExportError if embeddings differ by more than another order of additions explains, counts
-    by more than two references, which may lie at the radius, or, where counts are equal, actions or
-    bounds.
+    Its amplitudes are from 0.01 to 100. Raises ExportError if embeddings differ by more than
+    `TOLERANCE`, if counts differ by more than two references, which may lie at the radius, or if
+    counts are equal and action or bound differ.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)

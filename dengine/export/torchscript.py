@@ -325,7 +325,7 @@ def load_exported(path: str | os.PathLike[str], *, key: KeyFile | None = None) -
 
 
 def _check_golden(model: ExportedModel, path: Path) -> None:
-    """Warm a model up on its golden trace; raise ExportError if the embedding is another.
+    """Warm a model up on the golden trace in its file; raise ExportError for another embedding.
 
     The model decides on the trace and learns it several times, so pass a copy.
     """

@@ -356,7 +356,8 @@ class ModelPrediction(EngineModel):
         """Train the reducer from scratch, and make the traces the references.
 
         Of more traces than the classifier's capacity the last become references. Scales and novelty
-        gate are computed anew as well. The rule stays as it is.
+        gate are computed anew as well. The rule stays as it is. If the training raises, the reducer
+        is left untrained: fit again.
 
         Parameters
         ----------
@@ -430,9 +431,9 @@ class ModelPrediction(EngineModel):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
-        Before the first training, if reducer and rule can be compiled, a template of the decider is
-        compiled meanwhile: the first retrain has no time for that. The call returns when both are
-        done, and raises what one of them raised.
+        `numbers` are the labels' sequence numbers. Before the first training, if reducer and rule
+        can be compiled, a template of the decider is compiled meanwhile: the first retrain has no
+        time for that. The call returns when both are done, and raises what one of them raised.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -463,8 +464,9 @@ class ModelPrediction(EngineModel):
         """Share the rule of the previous model, stale or not, and build the decider.
 
         It is built for the conditions under which the previous model decided, or if it never did,
-        for this one's. A decider that was built with that rule for these is kept. Nothing happens
-        if the previous model is no `ModelPrediction`.
+        for this one's. If this model has a decider with that rule for those conditions, it is kept.
+        Nothing happens if the previous model is no `ModelPrediction`. Raises ValueError if nothing
+        was fitted.
         """
         if not isinstance(previous, ModelPrediction):
             return
@@ -490,9 +492,9 @@ class ModelPrediction(EngineModel):
         Returns
         -------
         Decider
-            Compiled if encoder and rule can be compiled; otherwise Python asks the parts, of which
-            those that can be are compiled. A warning is logged if the code of a part was changed
-            after it was compiled.
+            Compiled if encoder and rule can be compiled. Otherwise it runs in Python, and those of
+            its parts that can be compiled are. A warning is logged if the code of a part was
+            changed after it was compiled.
 
         Raises
         ------
@@ -533,9 +535,8 @@ class ModelPrediction(EngineModel):
     def decider(self, conditions: DecisionConditions | None) -> Decider:
         """Return the decider for these conditions, and keep it.
 
-        It is built anew if there is none, or if the conditions differ from those of the last call.
-        None stands for no force limits, no sensor limit and no audits. Raises ValueError if nothing
-        was fitted.
+        It is built anew if none is kept, or if the kept one is for other conditions. None stands
+        for no force limits, no sensor limit and no audits. Raises ValueError if nothing was fitted.
         """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
