@@ -56,7 +56,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         self.capacity = capacity
 
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
-        """Forget all references and take these in their place.
+        """Make these embeddings the references, in place of all earlier ones.
 
         It sets `classes_`, the sorted classes, of which the last is the success. A lone class 0,
         False or -1 counts as failure, any other lone class as success.

@@ -329,11 +329,12 @@ class MemberEvidence(nn.Module):
     def choose_threshold(self, side: int) -> None:
         """Set target level and threshold of one side, 0 accept or 1 reject, from the counts.
 
-        The target is the lowest level whose parts since the last alarm, and whose newest parts, are
-        good enough; if there is none, it is the strictest level. The threshold is the target's
-        score if there is one and the members, of all time and since the last alarm, are good
-        enough, else `CLOSED`. The watched rule has no target: its threshold stays, and after an
-        alarm is the first level again once the parts since then show that the tolerance is kept.
+        The target is the lowest level whose parts since the last alarm pass the bet (or, under the
+        priced rule, the account) and whose newest parts have few errors; if there is none, it is
+        the strictest level. The threshold is the target's score if such a level was found, the
+        members of all time pass, and those since an alarm pass the bet; else it is `CLOSED`. The
+        watched rule has no target: its threshold stays, and after an alarm is the first level again
+        once the parts since then pass the bet.
         """
         levels: list[list[int]] = self.level_counts_since_alarm[side].flatten(1).tolist()
         if self.is_watched:  # only an alarm closes it

@@ -333,10 +333,11 @@ def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tens
     """Return (usual squared distance between nearest points, reach of each point (n,)).
 
     `points` is (n, P); `same` (n, n) bool marks pairs whose distance does not count. The usual
-    distance is the QUANTILE of the distances to the nearest other point, capped at six times what
-    nine in ten stay below, so that a few outliers are not the measure of the others; it is 0.001 at
-    least. The reach, squared as well, is the usual distance; of more than three outliers, one's is
-    the distance to its third nearest outlier, if that is larger and all points that are no outliers
+    distance is the `QUANTILE` of the squared distances to the nearest other point, capped at six
+    times their 0.9 quantile, so that a few outliers are not the measure of the others; it is 0.001
+    at least. Outliers are the points whose nearest is farther than that, or than three times the
+    0.9 quantile. The reach, squared as well, is the usual distance. Where more than three points
+    are outliers, one reaches to its third nearest outlier, if that is farther and all other points
     are more than twice as far: such a cluster is a kind of its own.
     """
     norms = points.square().sum(1)

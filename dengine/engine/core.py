@@ -232,11 +232,11 @@ class EngineCore:
         """Decide as `decide` without an id, but only where nothing has to be waited for; else
         return None.
 
-        When it returns None, nothing has changed. That is so where the outbox is locked, before the
-        first trace, while settings are unsaved or the rule must be rebuilt, and where the model is
-        a baseline, uses classes of the user's, or is not compiled. The decision is recorded in
-        memory and goes to the disk later. Any thread may call it while no other uses the engine; it
-        is limited to one torch thread. Swapping versions and announcing safe mode are left to
+        It returns None, and changes nothing, where the outbox is locked, before the first trace,
+        while settings are unsaved or the rule must be rebuilt, and where the model is a baseline,
+        uses classes of the user's, or is not compiled. The decision is recorded in memory and goes
+        to the disk later. Any thread may call it while no other uses the engine, and has one torch
+        thread from then on. Swapping versions and announcing safe mode are left to
         `process_retrains`. Raises TraceError for a wrong trace or part's number, and StoreError for
         an engine that is closed, only reads, or is in use by another thread.
         """

@@ -225,7 +225,7 @@ class Feedback:
         A trace with a fault teaches neither; any other outcome counts as a new label. A rejected
         part that was inspected does not update the rule: which of them are inspected is somebody's
         choice, and no sample. An outcome that updates the rule sets the count of unobserved parts
-        back to zero, and its label keeps that count, without the part itself.
+        back to zero; its label holds the count from before, less one if the part itself was in it.
         """
         decision = stored.decision
         version = self._live.version

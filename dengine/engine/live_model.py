@@ -275,9 +275,9 @@ class LiveModel:
         """Apply the store's newest corrections to the references of the answering model.
 
         Returns False where the model must be trained again: always for a baseline, and where it
-        cannot change a reference. The latter is said once for each correction, so the caller must
-        retrain then. Returns True before the first retrain. The rule is left to `rebuild_rule`.
-        Raises StoreError where the store is away.
+        cannot change a reference. The caller must retrain then, because each correction is read
+        only once. Returns True before the first retrain. The rule is left to `rebuild_rule`. Raises
+        StoreError where the store is away.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None

@@ -254,8 +254,8 @@ class Retrainer:
         """Begin to train a successor of the current model in the executor, on the window as it is
         now.
 
-        `collect` returns the outcome; none may be under way. Returns False, and begins nothing,
-        without an executor and where it takes no more work; such an executor is given up.
+        `collect` returns the outcome; no other training may be under way. Returns False, and begins
+        nothing, without an executor and where it takes no more work; such an executor is given up.
         """
         if self.executor is None:
             return False

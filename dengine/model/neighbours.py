@@ -823,10 +823,10 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     """Count those of the newest `NEWEST` traces that nearly repeat one of another part among them.
 
     Labels are counted as independent trials, so a part that is inserted again must be known as such
-    (`part=`). This notices the plain cases where it is not; it changes no decision. A trace counts
-    if the nearest one of another part is nearer than `NEAR` times the distance of the next behind
-    the `NEIGHBOURS` nearest, so one with more near repeats is not noticed, one with 1 to
-    `NEIGHBOURS` traces of other parts always counts, and one with none never.
+    (`part=`). This notices the plain cases where it is not; it changes no decision. Only traces of
+    other parts are compared with a trace. It counts if the nearest of them is nearer than `NEAR`
+    times the distance of the one that comes after the `NEIGHBOURS` nearest; so more near repeats
+    than that hide one another. If there are only 1 to `NEIGHBOURS` of them, the trace counts.
 
     Parameters
     ----------
