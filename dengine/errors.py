@@ -43,8 +43,9 @@ def without_password(text: str) -> str:
 def shortened(value: Any) -> str:
     """Return the `repr` of a value for a message, its middle cut out beyond some 60 characters.
 
-    A container shows only its first items. An integer of more digits than Python prints is
-    described by its number of bits.
+    A container shows only its first items. Where `repr` raises ValueError, an integer, which then
+    has more digits than Python prints, is described by its number of bits, another value by its
+    type.
     """
     try:
         return _REPR.repr(value)

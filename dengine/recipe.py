@@ -342,7 +342,7 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
 
 
 def describe_estimator(estimator: Any) -> str:
-    """Return an estimator as text: its class and all parameters, nested ones included, by name.
+    """Return an estimator as text: its class and all parameters, also nested ones, sorted by name.
 
     The text is the same in every process, because a value that is not plain is named by its class
     alone.

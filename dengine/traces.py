@@ -164,13 +164,13 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
         If `can_fit_length` is False, the trace is cut or padded with NaN, and at least its last
         sample is NaN, so that `TraceGate` finds it.
     """
-    have = x.size(-1)
-    last = have - 1
-    can_fit = can_fit_length(have, samples, fit)
+    length = x.size(-1)
+    last = length - 1
+    can_fit = can_fit_length(length, samples, fit)
     if fit != 3 or not can_fit:
         result = x.index_select(-1, torch.arange(samples).clamp(max=last))
         if not can_fit:
-            result[..., min(have, samples - 1) :].fill_(float("nan"))
+            result[..., min(length, samples - 1) :].fill_(float("nan"))
         return result
     position = torch.arange(samples, dtype=torch.float64) * (last / max(samples - 1, 1))
     left = position.floor().to(torch.int64).clamp(max=last)
@@ -179,17 +179,17 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     return (low + (high - low) * (position - left)).to(torch.float32)
 
 
-def can_fit_length(have: int, samples: int, fit: int) -> bool:
-    """Return whether a trace of `have` samples can be fitted to `samples` without making up data.
+def can_fit_length(length: int, samples: int, fit: int) -> bool:
+    """Return whether a trace of `length` samples can be fitted to `samples` without making up data.
 
     `fit` is a position in `FITS`. "strict" takes the same length alone, "cut" that or a longer one,
     "pad" and "resample" from half to twice the length.
     """
     if fit == 0:
-        return have == samples
+        return length == samples
     if fit == 1:
-        return have >= samples
-    return 2 * have >= samples and have <= 2 * samples
+        return length >= samples
+    return 2 * length >= samples and length <= 2 * samples
 
 
 def is_time_column(name: str) -> bool:

@@ -130,7 +130,7 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
     The first and the third are left out for baselines, and where too few settings or no certain
     predictions are there to compare.
     """
-    who = f"{recipe}, {interval}"
+    condition = f"{recipe}, {interval}"
     is_ours = recipe.split(" ")[0] not in BASELINES
     cells = rows.groupby(["alpha", "lower_bound"], sort=False)
     means = cells[["certain", "false_positive"]].mean()
@@ -141,11 +141,11 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
         claim = "Wilson answers" if interval == "wilson" else "Binomial does not answer"
         measured = f"certain from {certain.min():.1f} to {certain.max():.1f} over the cells"
         holds = answers == (interval == "wilson")
-        yield _finding(holds, f"{claim} to alpha and LB; {who}", measured)
+        yield _finding(holds, f"{claim} to alpha and LB; {condition}", measured)
     shares = (means["false_positive"] / certain).fillna(0.0)
     n_kept = int((shares < 1.0 - means.index.get_level_values("lower_bound")).sum())
     worst = f"in {n_kept} of {n_cells} cells, at most {100 * shares.max():.1f} % of the certain"
-    claim = f"the mean share of false positives stays below 1 - LB; {who}"
+    claim = f"the mean share of false positives stays below 1 - LB; {condition}"
     yield _finding(n_kept == n_cells, claim, worst)
     if not is_ours or interval != "wilson":
         return
@@ -158,7 +158,7 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
                 f"cycle {cycle:.0f} at {alpha:g}" for alpha, cycle in first.items()
             )
             claim = "lower alpha delays the first certain prediction"
-            yield _finding(is_later, f"{claim}; {who}, LB {100 * bound:g} %", measured)
+            yield _finding(is_later, f"{claim}; {condition}, LB {100 * bound:g} %", measured)
 
 
 def grid_lines(frame: "pd.DataFrame") -> list[str]:

@@ -318,7 +318,7 @@ class Replay:
     def summary(self, check_seconds: float = VERIFY_SECONDS) -> dict[str, Any]:
         """Return one row of a table: settings, counts, shares and times over the whole run.
 
-        A share or time of nothing is NaN.
+        Shares, times and `first_certain` are NaN where there is nothing to compute them from.
 
         Parameters
         ----------

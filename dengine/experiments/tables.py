@@ -140,9 +140,9 @@ def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             "confirm": "good ones confirmed" if row["confirm"] else "stops alone",
         }
         settings = ", ".join([row["guarantee"], *(words[name] for name in varying)])
-        who = f"{row['recipe']} ({settings})"
+        subject = f"{row['recipe']} ({settings})"
         if not row["total_accepted"]:
-            lines.append(f"{who}: no part was accepted.")
+            lines.append(f"{subject}: no part was accepted.")
             continue
         too_few = f"fewer than {ENOUGH} accepted parts, too few to say"
         verdict = {True: "kept", False: "broken", None: too_few}[row["promise_kept"]]
@@ -150,7 +150,7 @@ def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         if not math.isnan(row["error_lower"]):
             lower = f"{100 * row['error_lower']:.1f}"
             good += f"; bad: {lower} to {percent(row['error_upper'])} at 95 %"
-        lines.append(f"{who}: {good}, LB {100 * row['lower_bound']:g} %: {verdict}.")
+        lines.append(f"{subject}: {good}, LB {100 * row['lower_bound']:g} %: {verdict}.")
     return lines
 
 

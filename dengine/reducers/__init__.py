@@ -68,8 +68,8 @@ def reducer_class(name: str) -> type:
     cls: type = __getattr__(_NAMED[name][1]) if name in _NAMED else import_class(name)
     missing = [method for method in TRANSFORMER_METHODS if not callable(getattr(cls, method, None))]
     if missing:
-        got = f"{name} has no {' and no '.join(missing)}"
-        raise SettingError(f"Expected a scikit-learn transformer as reducer, {got}.")
+        actual = f"{name} has no {' and no '.join(missing)}"
+        raise SettingError(f"Expected a scikit-learn transformer as reducer, {actual}.")
     return cls
 
 

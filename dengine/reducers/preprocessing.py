@@ -49,7 +49,8 @@ class Preprocessor(nn.Module):
         """Set mean and scale of each channel, and the scale of its differences, in place.
 
         They are read from the first 256 of the traces (n, C, T), after averaging. A scale is one
-        over the standard deviation: a channel becomes (x - mean) * scale.
+        over the standard deviation, to which a small floor is added, for a channel that never
+        moved: a channel becomes (x - mean) * scale.
         """
         averaged = self.average_samples(traces[:STATISTICS_TRACES]).double()
         self.mean.copy_(averaged.mean((0, 2))[:, None])

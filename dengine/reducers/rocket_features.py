@@ -97,8 +97,8 @@ class RocketEncoder(nn.Module):
     ) -> None:
         super().__init__()
         if samples < 2:
-            got = f"{samples} (n_features = {channels * samples})"
-            raise SettingError(f"Expected at least 2 samples, got {got}.")
+            actual = f"{samples} (n_features = {channels * samples})"
+            raise SettingError(f"Expected at least 2 samples, got {actual}.")
         frames = samples // average
         places = max(1, min(frames, MAX_PLACES[0]) // regions) * regions
         sparse_places = min(frames, MAX_PLACES[1])

@@ -269,8 +269,8 @@ class TorchReducer(Reducer):
         """
         self.check()
         if samples < 2:
-            got = f"{samples} (n_features = {channels * samples})"
-            raise SettingError(f"Expected at least 2 samples, got {got}.")
+            actual = f"{samples} (n_features = {channels * samples})"
+            raise SettingError(f"Expected at least 2 samples, got {actual}.")
         self.preprocessor_ = Preprocessor(channels, samples, average)
         self.seed_ = draw_seed(self.random_state)
         shape = self.preprocessor_.channels, self.preprocessor_.samples
@@ -581,9 +581,9 @@ def draw_batches(
     pools = [np.flatnonzero(folds != k) for k in range(n_folds)]
     smallest = min(map(len, pools))
     if smallest < 2:
-        got = f"{smallest} (n_samples = {len(folds)}); all traces may be the same"
+        actual = f"{smallest} (n_samples = {len(folds)}); all traces may be the same"
         raise SettingError(
-            f"Expected at least 2 traces outside each fold, got {got}. "
+            f"Expected at least 2 traces outside each fold, got {actual}. "
             "Check the sensor and the unit."
         )
     size = min(batch_size, smallest)

@@ -483,5 +483,5 @@ class UmapReducer(Reducer):
         expect(epochs is None or is_whole(epochs, 1, 10**6), "n_epochs of 1 or more", epochs)
         smallest = max(self.n_neighbors, self.n_components)
         if n_traces <= smallest:
-            got = f"n_samples = {n_traces}"
-            raise SettingError(f"UMAP needs more than {smallest} traces, got {got}.")
+            actual = f"n_samples = {n_traces}"
+            raise SettingError(f"UMAP needs more than {smallest} traces, got {actual}.")
