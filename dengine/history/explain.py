@@ -224,8 +224,8 @@ def _restore_thresholds(
 def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     """Return the decision rule as it is now: the stored rule, updated with all outcomes since.
 
-    If outcomes were corrected or a check is overdue, it is rebuilt from all outcomes. The stored
-    rule does not change.
+    Where the stored rule cannot be continued (`RuleProgress.last_seq` is 0, for example after a
+    correction or by an overdue check), it is rebuilt from all outcomes. The store does not change.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
 
 
 def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
-    """Update a rule, in place, with the outcome of one part and the silent parts before it."""
+    """Update a rule, in place, with one part's outcome and the unreported accepts before it."""
     rule.observe(outcome.silent, outcome.novel)
     rule.update(
         outcome.lower,
@@ -346,7 +346,7 @@ def envelope_of(
     Returns
     -------
     Envelope or None
-        None for fewer than 20 successes, or another shape.
+        None for fewer than 20 successes, or if their shape is not the trace's.
     """
     if len(successes) < MIN_SUCCESSES or successes.shape[1:] != trace.shape:
         return None
@@ -921,6 +921,9 @@ def find_decision_id(store: SqlStore, part: str) -> str:
 def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanation:
     """Explain one decision from what its store keeps; nothing is trained or embedded.
 
+    If a label or a trace of a success is damaged, it is left out, and an event is written to the
+    store.
+
     Parameters
     ----------
     store : SqlStore
@@ -938,7 +941,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     ReportError
         For a decision that the store does not hold, and for a part with several decisions.
     StoreError
-        For a store that no engine has used, and for a damaged trace.
+        For a store that no engine has used, and for a damaged trace of the decision or of a
+        neighbour.
     """
     settings = store.settings()
     if "recipe" not in settings:

@@ -12,6 +12,7 @@ import numpy as np
 from ..recipe import Recipe
 from ..records import Action
 from ..reducers import has_own_unit
+from ..store.records import StoredDecision
 from ..store.views import HistoryFilter
 from .explain import load_past_version
 
@@ -88,25 +89,24 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
         those that this version made and embedded. A part that is both is drawn once, as a newest
         one.
     """
-    recent = [item.decision for item in store.decisions(HistoryFilter(), N_NAMED)]
-    ids = [decision.id for decision in recent[-N_NEWEST:] if decision.model_version == version]
-    newest = list(_newest_marks(store, ids))
+    recent = store.decisions(HistoryFilter(), N_NAMED)
+    newest = list(_newest_marks(recent[-N_NEWEST:], version))
     newest_ids = {mark.id for mark in newest}
-    parts = {decision.id: decision.part for decision in recent}
+    parts = {item.decision.id: item.decision.part for item in recent}
     labelled = _known_marks(store, recipe, version, parts) if version else []
     labelled = [mark for mark in labelled if mark.id not in newest_ids]
     radius = recipe.radius if newest else None
     return PartMap(version, (*labelled, *newest), radius, has_own_unit(recipe.reducer))
 
 
-def _newest_marks(store: "SqlStore", ids: list[str]) -> Iterator[Mark]:
-    """Yield the marks of these decisions, in the ids' order, each at its mean over the spaces.
+def _newest_marks(items: list[StoredDecision], version: int) -> Iterator[Mark]:
+    """Yield the marks of decisions, in their order, each at its mean over the spaces.
 
-    Decisions without an embedding are left out.
+    Decisions of another version, and those without an embedding, are left out.
     """
-    for item in filter(None, map(store.get_decision, ids)):
+    for item in items:
         decision = item.decision
-        if decision.embedding is not None:
+        if decision.model_version == version and decision.embedding is not None:
             x, y = _first_two(np.mean(decision.embedding, axis=0))
             yield Mark(decision.id, decision.part, x, y, item.success, decision.action)
 

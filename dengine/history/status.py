@@ -316,6 +316,8 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
 def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:
     """Read the status of an engine from its store.
 
+    If a new label is damaged, it is left out, and an event is written to the store.
+
     Parameters
     ----------
     store : SqlStore
@@ -466,10 +468,11 @@ def _verdict(lower: float, upper: float, tolerance: float) -> str:
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     """Estimate how many of the accepted parts were bad, audited ones included.
 
-    If every outcome of the unaudited is known it is by these alone, else by audits, whose coin
-    knows no outcome, so that they speak for all. Under `stops="all"` a part whose outcome is still
-    open is left out. Line stops count besides the audits: the lower end is at least the one that
-    follows if all other parts were good, and the upper end at least their share.
+    The estimate rests on the reported outcomes of the unaudited parts if all of them are known;
+    under `stops="all"` if any is, and a part whose outcome is still open is left out. Otherwise it
+    rests on the audits, whose coin knows no outcome, so that they speak for all parts. Line stops
+    count besides the audits: the lower end is at least the one that follows if all other parts were
+    good, and the upper end at least the share of line stops.
 
     Parameters
     ----------
@@ -505,7 +508,7 @@ def read_watch(store: SqlStore, recipe: Recipe) -> Watch | None:
     """Return how close the detectors of drift are to an alarm, by the rule as it is now.
 
     Each value is from 0 to 1, which is the alarm. The rule is the stored one, updated with all
-    outcomes since. None if it has no detectors, as "local" with stops="some", or cannot be
+    outcomes since. None if the rule has no detectors, as "local" with stops="some", or cannot be
     restored. In a safe mode that novel traces began, each is 0.
     """
     from ..decision.member_rules import MemberRule  # torch

@@ -36,8 +36,8 @@ class BackupReport:
     decisions, labels : int
         Numbers in the copy, of all cells.
     from_journals : int
-        Number of records (decisions, labels, events) that were added from journals, since the store
-        had not taken them yet.
+        Number of records (decisions, labels, events) in the journals that the store had not taken
+        when they were read.
     without_journal : tuple of str
         Cells that have no journal beside the store, sorted.
     """
@@ -68,8 +68,9 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
     Raises
     ------
     StoreError
-        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), and if a journal
-        cannot be read.
+        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), if a journal cannot
+        be read, and if one holds records while the cell's ledger has another key than the
+        environment names.
     OutputError
         If `out` exists, or cannot be written.
     """

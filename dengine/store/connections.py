@@ -72,7 +72,7 @@ def make_engine(url: str | None) -> sa.Engine:
     """Return a new SQLAlchemy engine for a store's database; it does not connect yet.
 
     In SQLite a commit is synced to the disk, and a store's file is in WAL mode. PostgreSQL
-    connections use psycopg.
+    connections use psycopg, unless the URL names another driver.
 
     Parameters
     ----------
@@ -156,8 +156,8 @@ def _connect_sqlite(
 
     SQLAlchemy calls it with the dialect and the driver's arguments. A file that cannot be written
     and has no `-wal` beside it is opened as immutable. If it has a `-wal` without a `-shm`, which
-    SQLite must create to read it, both files are copied to a temporary folder, and the copy is
-    opened.
+    SQLite must create to read it, both files are copied to a temporary folder, which is deleted
+    with the connection, and the copy is opened for reading.
     """
     name = str(arguments[0])
     file = Path(name)
@@ -180,7 +180,9 @@ def _connect_sqlite(
     folder = TemporaryDirectory(prefix="dengine-", ignore_cleanup_errors=True)
     for source in (file, log_file):
         shutil.copyfile(source, Path(folder.name) / source.name)
-    copy = dialect.connect(str(Path(folder.name) / file.name), factory=CopyConnection, **options)
+    # For reading: what was written to a copy would be lost.
+    copied = f"{(Path(folder.name) / file.name).as_uri()}?mode=ro"
+    copy = dialect.connect(copied, uri=True, factory=CopyConnection, **options)
     weakref.finalize(copy, folder.cleanup)
     return copy
 
@@ -259,8 +261,8 @@ def _store_errors(verb: str, name: str) -> Iterator[None]:
 def reading(url: str) -> Iterator[sa.Connection]:
     """Context manager that opens a store for reading; the block sees one snapshot of the database.
 
-    Nothing is created or written, and the connection is closed after the block. In SQLite, text
-    with damaged bytes is read with escapes instead of an error.
+    No store is created and no row is changed, and the connection is closed after the block. In
+    SQLite, text with damaged bytes is read with escapes instead of an error.
 
     Parameters
     ----------
@@ -384,8 +386,8 @@ class Database:
         """Create the tables or check them, enter the cell if it is new, and set `newest_entry`.
 
         A new cell gets its product, and the key of its ledger. Return the cell with its product.
-        Raise StoreError, and disconnect, if the database is no store of this schema, or if the cell
-        has another ledger key or another product.
+        Raise StoreError, and disconnect, if the database cannot be opened or is no store of this
+        schema, and if the cell has another ledger key or another product.
         """
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
@@ -421,8 +423,8 @@ class Database:
         committed; then `newest_entry` is set and `on_entry` called. Without such rows, or changed
         settings, there is no entry. On an error everything is rolled back; dengine's own errors
         pass, those of the database, a file or a value become StoreError, any other passes.
-        StoreError is raised, too, if the file was replaced, or if `commit_if` no longer wants the
-        commit.
+        StoreError is raised, too, if `commit_if` no longer wants the commit, and if the SQLite file
+        was replaced; if that is noticed only after the commit, the lost file has the rows.
         """
         with _store_errors("write to", self.name), self._writer.connect() as connection:
             connection.execution_options(dengine_write=True)
@@ -638,8 +640,8 @@ class Database:
         connection : sqlalchemy.Connection
             In a write transaction.
         column : sqlalchemy.Column
-            The table's column that takes the numbers. They continue those of the cell; or those of
-            its product, if it has one and the table is shared.
+            The table's column that takes the numbers. Decisions and events continue the numbers of
+            the cell; labels, versions and corrections those of its product, if it has one.
         rows : sequence of mapping
             Without `cell_id` and the number. They are not changed.
 
@@ -700,9 +702,10 @@ class Database:
         """Commit records of a journal; return (decision id, label number) of their labels.
 
         All are committed in one transaction. A record that is stored already changes nothing, and
-        its label is returned, too; one that contradicts what is stored becomes an event of kind
-        "dead letter". If the database refuses a value, the records are halved until the refused one
-        is alone, and that one becomes such an event. Any other failure raises StoreError.
+        its label is returned, too. One that contradicts the store becomes an event of kind "dead
+        letter", but a line stop corrects a label "confirmed" by silence. If the database refuses a
+        value, the records are halved, each half in a transaction of its own, until the refused
+        record is alone; that becomes a dead letter, too. Any other failure raises StoreError.
         """
         try:
             return self.write(lambda connection: self._insert_records(connection, records))
@@ -722,10 +725,11 @@ class Database:
     ) -> list[tuple[str, int]]:
         """Insert the decisions, labels and events that are not stored yet; this does not commit.
 
-        Return (decision id, number) of each label, new or stored before with the same value. A
-        record that contradicts a stored one becomes an event of kind "dead letter". A line stop of
-        a part whose label was "confirmed" by silence corrects that label to failure, and its number
-        is returned, too; if it was forgotten, the line stop is a dead letter.
+        Return (decision id, number) of each label, new or stored before with the same success and
+        source. A record that contradicts a stored one, or a label without its decision, becomes an
+        event of kind "dead letter". A line stop of a part whose label was "confirmed" by silence
+        corrects that label to failure, and the label's number is returned, too; if that label was
+        forgotten, the line stop is a dead letter.
         """
         events = self._new_events(
             connection, [record for record in records if isinstance(record, Event)]

@@ -237,7 +237,7 @@ class Journal:
         """Remove all records, drained or not; the caller has made sure that the store holds them.
 
         The file is cut off behind its header, which frees the reserved space: call `reserve`
-        afterwards.
+        afterwards. Raise StoreError if the file cannot be written.
         """
         with _os_errors(self.path):
             self._file.truncate(HEADER)
@@ -373,7 +373,8 @@ def _os_errors(path: Path, owning: bool = True) -> AbstractContextManager[None]:
 def _open_file(path: Path, owning: bool = True) -> OwnedFile:
     """Open a journal's file, and lock it if `owning`; it is then created if need be.
 
-    Raise StoreError if the system refuses, or if another engine has locked it; that is then named.
+    Raise StoreError if the system refuses, or if another engine has locked it; the message then
+    names that engine's process.
     """
     with _os_errors(path, owning):
         try:
@@ -447,7 +448,8 @@ def read_undrained(path: Path) -> list[Record]:
     """Return the records of a journal that its store has not taken, oldest first, whoever owns it.
 
     If several decisions share an id, only the last is returned. Damaged records are left out.
-    Nothing is locked or changed. Raise StoreError if the file cannot be read or is no journal.
+    Nothing is locked or changed. Raise StoreError if the file cannot be read or is no journal, and
+    for a record that another release of dengine wrote.
     """
     journal = Journal(path, owning=False)
     try:

@@ -135,14 +135,14 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
     key : bytes
         b"" for a ledger without a key.
     begin : bool, default False
-        If the cell has no ledger entry yet, store a setting by which the key is recognized later (a
-        keyed digest, not the key).
+        If the cell has no ledger entry and no key yet, store a setting by which this key is
+        recognized later (a keyed digest, not the key); nothing for b"".
 
     Raises
     ------
     StoreError
         If the ledger was begun with another key, or with a key and b"" is given, or the reverse.
-        Without `begin` a cell that has no entry yet counts as begun without a key.
+        Without `begin` a cell that has neither an entry nor a key counts as begun without a key.
     """
     tag = hmac.new(key, b"dengine ledger", "sha256").hexdigest() if key else None
     is_tag = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == LEDGER_KEY)

@@ -36,7 +36,8 @@ def open_store(
         None: a store in memory. A file or URL: a database; a `CellAddress` (see `address`) also
         names the cell and its product, otherwise the cell is "cell". A store is returned as it is.
     must_exist : bool, default False
-        Raise a StoreError for a file or cell that does not exist, instead of creating it.
+        Raise a StoreError for a file or cell that does not exist, instead of creating it. Without
+        effect on None and on an open store.
     wait : float or None
         Seconds that an engine on this store waits for the disk or database at most, as `SqlStore`
         takes it; pass `LONG_WAIT` where no cell waits for it. Not used for a store in memory or an
@@ -77,7 +78,7 @@ def opening(
 ) -> Iterator[SqlStore]:
     """Context manager that opens a store as `open_store` does, and gives it.
 
-    The store stays open after the block. Only if the block raises is a store that was opened here
+    The store stays open after the block. If the block raises, a store that was opened here is
     closed; one that was passed open is never closed.
     """
     opened = open_store(store, must_exist=must_exist, wait=wait)

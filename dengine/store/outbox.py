@@ -187,8 +187,8 @@ class Outbox:
 
         Damage in the journal is stored as an event. The journal is emptied, and space reserved in
         it. From now on every use of the store drains the journal first. The check by SQLite is
-        waited for only CHECK_SECONDS and goes on in a thread. On an error the journal is closed,
-        and the error raised.
+        waited for only CHECK_SECONDS and goes on in a thread. What a check finds is not raised: it
+        becomes `integrity_error`. On any other error the journal is closed, and the error raised.
         """
         try:
             self._compare_with_ledger(journal)  # before anything is drained
@@ -354,7 +354,7 @@ class Outbox:
         return os.getpid() == self._pid and not self._closed
 
     def check_usable(self) -> None:
-        """Raise a StoreError if the outbox is closed, was opened for reading, or was forked."""
+        """Raise a StoreError if the outbox is closed, for reading only, or of a parent process."""
         if os.getpid() != self._pid:
             raise forked_error(self._pid, "the engine")
         if self._closed:
@@ -474,7 +474,7 @@ class Outbox:
         """Add records in memory, in their order, and wake the thread that writes the journal.
 
         The caller holds the lock. Without a journal the store takes the records here, before this
-        returns.
+        returns; if it raises StoreError, nothing is added.
         """
         numbers = self.store.apply_records(records) if self._journal is None else []
         for record in records:
@@ -623,8 +623,9 @@ class Outbox:
     def load_ids(self) -> None:
         """Read the ids of all decisions from the store into a Bloom filter in memory.
 
-        Afterwards a new id is recognized without the store. A second call does nothing. It takes
-        about a second for a million ids. Raise StoreError if the store cannot be read.
+        Afterwards a new id is recognized without the store, and another call does nothing. It takes
+        about a second for a million ids. Raise StoreError if the store cannot be read; another call
+        then tries again.
         """
         with self._changed:
             if self._known_ids is None:
@@ -741,7 +742,8 @@ class Outbox:
         ------
         StoreError
             If it takes longer than `limit`. The call is then cancelled, so that it commits nothing.
-            A call that is committing is waited for COMMIT_SECONDS more; then it may still succeed.
+            A call that is already committing is waited for COMMIT_SECONDS more; if StoreError is
+            raised after these, it may still have committed, or do so later.
         """
         if not wait([future], self.limit).done and not future.cancel():
             wait([future], COMMIT_SECONDS)
@@ -788,10 +790,10 @@ class Outbox:
                 self.drain()
 
     def close(self) -> None:
-        """Drain, stop the threads, close store and journal; it takes seconds at most.
+        """Drain, stop the threads, close store and journal, within seconds unless `patient`.
 
-        What the store does not take stays in the journal, and the next engine drains it. The
-        journal, too, is closed. A second call does nothing, nor does one in a forked process.
+        What the store does not take stays in the journal, and the next engine drains it. A second
+        call does nothing, nor does one in a forked process.
 
         Raises
         ------
@@ -827,8 +829,8 @@ class Outbox:
     def _write_loop(self, journal: Journal) -> None:
         """Write and sync new records in batches until closed: the journal's thread runs it.
 
-        After an error it wakes those who wait in `sync`, and tries the same records again a second
-        later.
+        After an error, which is kept for `fault`, it wakes those who wait in `sync`, and tries the
+        same records again a second later.
         """
         while True:
             with self._changed:
@@ -855,7 +857,8 @@ class Outbox:
         """Append records to the journal, sync it, and mark them as synced.
 
         A journal above 8 MB is cleared first if the store takes its records within BATCH_SECONDS. A
-        journal whose file was lost is created again, and an event is recorded.
+        journal whose file was lost is created again, and an event is recorded. Raise StoreError if
+        the disk fails; the records then stay unwritten.
         """
         if journal.end > 8 << 20:
             with self._changed:  # a cell that never pauses would fill the disk
@@ -962,7 +965,8 @@ class Outbox:
     def _run_call(self, future: Future[Any], call: Callable[[], Any]) -> None:
         """Run a submitted call; set the future's result or exception. Nothing is raised here.
 
-        A call that was cancelled is not run, or if it runs, its transactions are rolled back.
+        A call that was cancelled before is not run. One that is cancelled while it runs is rolled
+        back; once it has begun to commit it cannot be cancelled.
         """
 
         def is_wanted() -> bool:

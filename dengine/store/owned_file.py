@@ -175,8 +175,8 @@ class OwnedFile:
         """Reserve disk space for `size` bytes in total, and sync the file.
 
         It becomes at least `size` bytes long, with zeros at its end. If the system cannot reserve
-        it, on a full disk for one, the file keeps its size and nothing is raised; OSError only if
-        the sync or the cut back to that size fails.
+        them, for example on a full disk, the file keeps its size and nothing is raised; OSError
+        only if the sync or the cut back to that size fails.
         """
         before = self.size
         try:

@@ -75,8 +75,8 @@ class Scope:
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
         """Return the number of the next row of a table; it stays free until the transaction ends.
 
-        `column` is the table's column of numbers. Decisions and events are numbered by cell,
-        everything else by product, if there is one: that is then locked until the transaction ends.
+        `column` is the table's column of numbers. Decisions and events are numbered by cell, which
+        the caller has locked; everything else by product, if there is one, which is locked here.
         """
         if self.product is None or column.table in (DECISION, EVENT):
             return Scope(self.cell_id).newest(connection, column) + 1

@@ -10,6 +10,7 @@ keeps what it synced. The decisions and labels of a running engine do not come i
 they go into the journal first, and from there, by `apply_records`, into the database.
 """
 
+import logging
 import math
 import os
 import time
@@ -89,6 +90,7 @@ from .schema import (
 )
 from .views import LABELS, DecisionGroup, HistoryFilter, PastLabel, Stretch, Tally
 
+log = logging.getLogger("dengine")
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 # Of the environment: seconds for all stores that are given none.
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"
@@ -334,7 +336,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         with self.database.reading() as connection:
             rows = self._read_newest(connection, query, limit, last)[::-1]
             labelled, damaged = self._with_traces(connection, rows, scope)
-        self._put_damage_event(damaged, "trace")
+        self._record_left_out(damaged, "trace")
         return labelled
 
     def _read_newest(
@@ -389,7 +391,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             )
             version = self._scope.newest_version(connection)
             correction = self._scope.newest(connection, CORRECTION.c.number)
-        self._put_damage_event(damaged, "trace")
+        self._record_left_out(damaged, "trace")
         return ProductNews(labelled, version, correction)
 
     def _with_traces(
@@ -441,17 +443,15 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         )
         return labelled, [rows[i].decision_id for i in np.flatnonzero(~is_kept)]
 
-    def _put_damage_event(self, damaged: Sequence[str], part: str) -> None:
-        """Commit an event that names decisions whose damaged trace or label was left out.
+    def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
+        """Record as damage that the trace or label of some decisions was left out.
 
-        `part` is "trace" or "label". Nothing happens without decisions, or if there is such an
-        event.
+        `damaged` has the decisions' ids, and `part` is "trace" or "label". Nothing happens without
+        decisions.
         """
         if damaged:
             names = f"decision {listed(damaged)}; see dengine verify"
-            self._put_event_once(
-                "damaged", f"left out, since the {part} is not as it was stored: {names}"
-            )
+            self._record_damage(f"left out, since the {part} is not as it was stored: {names}")
 
     # Outcomes
 
@@ -665,7 +665,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         ----------
         report : RetrainReport
         last_seq : int
-            Number of the newest label that it knew of.
+            Number of the newest label that the retrain knew of.
         state : mapping of str to array, or None
             The version's arrays, which are copied; None for a dropped candidate.
 
@@ -781,7 +781,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             try:
                 return self._load_retrain(row.retrain)
             except VersionError as error:
-                self._put_event_once("damaged", f"{error} The accepted version before it answers.")
+                self._record_damage(f"{error} The accepted version before it answers.")
         return None
 
     def load_version(self, version: int) -> ModelVersion:
@@ -818,8 +818,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def _load_retrain(self, retrain: int) -> ModelVersion:
         """Return the version of a retrain with its arrays.
 
-        A peer's version is returned without the state of its rule. Raise VersionError if the state
-        is missing or damaged.
+        A peer's version is returned without the state of its rule, and with a `rule_last_seq` of 0.
+        Raise VersionError if the state is missing or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
@@ -886,12 +886,18 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """
         self.apply_change(Change(kind, text, data, author))
 
-    def _put_event_once(self, kind: str, text: str) -> None:
-        """Commit an event, unless the cell has one with the same kind and text."""
+    def _record_damage(self, text: str) -> None:
+        """Commit an event of kind "damaged", unless the cell has one with this text.
+
+        If the store cannot be written, the text is logged instead, and nothing raised.
+        """
         query = sa.select(EVENT.c.number).where(EVENT.c.cell_id == self.cell_id)
-        query = query.where(EVENT.c.kind == as_text(kind), EVENT.c.text == as_text(text))
+        query = query.where(EVENT.c.kind == "damaged", EVENT.c.text == as_text(text))
         if not self._read(query.limit(1)):
-            self.put_event(kind, text)
+            try:
+                self.put_event("damaged", text)
+            except StoreError as error:  # a store that can only be read is read all the same
+                log.warning("%s (%s)", text, error)
 
     def events(self, limit: int | None = None) -> list[Event]:
         """Return the newest events of the cell, oldest first.
@@ -948,7 +954,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         SettingError
             If a peer's settings contradict the new ones.
         StoreError
-            If a peer of the product stored a version meanwhile, and if the database fails.
+            For data that JSON does not have, for a setting that is the store's own, for a version
+            without arrays, if a peer of the product stored a version meanwhile, and if the database
+            fails.
         """
         now = float(self.clock())
         author = as_text(change.author)
@@ -1105,7 +1113,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             for row in rows
             if not is_intact(LABEL.name, dict(zip(names, row, strict=False)))
         }
-        self._put_damage_event(sorted(damaged), "label")
+        self._record_left_out(sorted(damaged), "label")
         rows = [row for row in rows if row.decision_id not in damaged]
         return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
 

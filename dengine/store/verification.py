@@ -82,7 +82,7 @@ class CellHistory:
     entries : int
         Number of entries of its ledger.
     rows : int
-        Number of rows that they chain.
+        Number of its rows in the tables that the ledger chains.
     digest : str
         Of the newest entry, hexadecimal; "" without one.
     waiting : int or None
@@ -386,7 +386,7 @@ class CellCheck:
             yield self._fault(LEDGER.name, f"entry {number}", "is missing")
 
     def _check_settings(self) -> Iterator[HistoryFault]:
-        """Yield a fault for each setting that was changed, or is missing here or in the ledger.
+        """Yield a fault for each setting that was changed, or is only in the table or the ledger.
 
         If the setting with the schema's version is missing (no engine has opened the cell), that is
         a fault, too.

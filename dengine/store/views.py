@@ -131,7 +131,7 @@ class DecisionGroup:
         """The corrected label in a word: good, bad, forgotten, overdue or none.
 
         "overdue": a check was asked for, has brought no label, and so many decisions followed that
-        it is too late. "none": no label, for another reason.
+        it is too late. "none": no label, for another reason, or of a quarantined trace.
         """
         if self.source is not None:
             if self.success is None:

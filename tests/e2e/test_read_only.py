@@ -3,9 +3,11 @@
 import json
 import os
 import shutil
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +29,23 @@ LOCKED = {"a folder": (0o555, 0o644), "a file": (0o755, 0o444), "both": (0o555, 
 CASES = [(left, locked) for left in LEFT for locked in LOCKED]
 
 
-def dengine(*commands: Sequence[object]) -> list[dict[str, Any]]:
-    """Verbs, typed by somebody whom permission bits bind; the result of each."""
+# Writes an event to a store, prints why that is refused, or how many such events there are then.
+WRITE = """
+import sys
+from dengine.errors import StoreError
+from dengine.store import open_store
+try:
+    with open_store(sys.argv[1]) as store:
+        store.put_event("note", "kept")
+    with open_store(sys.argv[1]) as store:
+        print([event.kind for event in store.events()].count("note"))
+except StoreError as error:
+    print(error)
+"""
+
+
+def python(*words: str) -> str:
+    """What a new Python prints that permission bits bind."""
     bound: list[str] = []
     if os.geteuid() == 0:
         bound = AS_A_USER
@@ -38,11 +55,16 @@ def dengine(*commands: Sequence[object]) -> list[dict[str, Any]]:
         ):
             pytest.skip("permission bits do not bind root, and setpriv cannot take its rights away")
     environment = os.environ | {"PYTHONPATH": str(REPO), "PYTHONDONTWRITEBYTECODE": "1"}
-    words = json.dumps([[str(word) for word in command] for command in commands])
-    command = [*bound, sys.executable, "-m", "tests.support.verbs", words]
+    command = [*bound, sys.executable, *words]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
-    results: list[dict[str, Any]] = json.loads(done.stdout)
+    return done.stdout
+
+
+def dengine(*commands: Sequence[object]) -> list[dict[str, Any]]:
+    """Verbs, typed by somebody whom permission bits bind; the result of each."""
+    words = json.dumps([[str(word) for word in command] for command in commands])
+    results: list[dict[str, Any]] = json.loads(python("-m", "tests.support.verbs", words))
     return results
 
 
@@ -128,3 +150,22 @@ def test_what_only_reads_reads_it_and_leaves_it_as_it_is(store: Path, tmp_path: 
     assert refused["exit_code"] == 1
     assert "writable" in refused["output"]
     assert not refused["unforeseen"]
+
+
+def test_a_write_to_it_is_refused_or_kept_and_never_lost(store: Path) -> None:
+    answer = python("-c", WRITE, str(store))
+    assert answer == "1\n" or "writable" in answer
+
+
+def test_a_damaged_label_in_it_is_left_out_as_it_is_read(
+    stores: dict[str, Path], tmp_path: Path
+) -> None:
+    folder = tmp_path / "archive"
+    shutil.copytree(stores["closed"], folder)
+    with closing(sqlite3.connect(folder / "engine.db")) as connection, connection:
+        connection.execute("UPDATE label SET silent = 5 WHERE seq = 20")
+    (folder / "engine.db").chmod(0o444)
+    folder.chmod(0o555)
+    (explained,) = dengine(("explain", folder / "engine.db", "last", "--json"))
+    folder.chmod(0o755)
+    assert explained["exit_code"] == 0, explained
