@@ -148,9 +148,9 @@ def _was_known(label: PastLabel, item: StoredDecision, stops_all: bool) -> bool:
 
 
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
-    """Return the index of a stored version's references and of the labels that came later.
+    """Return the index of a stored version's references, with the labels `added` later.
 
-    A label without a point is left out. In a full index each replaces the oldest reference.
+    A label without a point is left out; any other replaces the oldest reference of a full index.
     """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])
@@ -1079,7 +1079,7 @@ def _note_sentences(
 ) -> Iterator[str]:
     """Yield sentences on what was computed again, and where it differs from what was recorded.
 
-    Also why no neighbours are shown.
+    If no neighbours are shown, a sentence says why.
     """
     decision = item.decision
     policy = circumstances.recipe.policy

@@ -3,7 +3,7 @@
 block of reading. `Database` has the transactions, each of which ends with a ledger entry, the lock
 by which one engine owns a cell on a PostgreSQL server, and the insertion of journal records. It
 also notices a deleted file and a forked process, and leaves out rows that the database refuses.
-`SqlStore` is built on it.
+`SqlStore` is built on `Database`; backup, verification and the list of cells use `reading`.
 """
 
 import hashlib
@@ -152,7 +152,7 @@ class CopyConnection(sqlite3.Connection):
 def _connect_sqlite(
     dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]
 ) -> Any:
-    """Return a new SQLite connection, for a file that cannot be written one that only reads.
+    """Return a new SQLite connection; it only reads if the file cannot be written.
 
     SQLAlchemy calls it with the dialect and the driver's arguments. A file that cannot be written
     and has no `-wal` beside it is opened as immutable. If it has a `-wal` without a `-shm`, which
@@ -477,7 +477,7 @@ class Database:
         ] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:
-        """Compare what an engine reads of this cell, and its product's others, with their ledgers.
+        """Compare what an engine reads of this cell and of its product's others with their ledgers.
 
         These are settings, corrections, labels and model versions. Of the labels only the newest
         are checked, everything else in full but for the versions' arrays.
@@ -672,11 +672,11 @@ class Database:
         )
 
     def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
-        """Return, by id, a row for each of these decisions of the cell that is stored.
+        """Return, by id, a row for each of the given decisions that the cell has stored.
 
-        It has content_hash, quarantined and time of the decision, and of its label success, source,
-        seq and `corrected`: the label after corrections, 0, 1 or FORGOTTEN. These four are None
-        without a label. Ids that are not stored are left out.
+        A row has content_hash, quarantined and time of the decision, and of its label success,
+        source, seq and `corrected`: the label after corrections, 0, 1 or FORGOTTEN. These four are
+        None without a label. Ids that are not stored are left out.
         """
         label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
         query = sa.select(
