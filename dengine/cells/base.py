@@ -41,8 +41,8 @@ class Cell(Protocol):
 def check_cell(cell: Any) -> None:
     """Raise SettingError for an object that lacks a method of `Cell`; no method is called.
 
-    The message names the missing methods. An attribute that is found statically counts as a method
-    and is not read, so that a cell that reacts to this does nothing; any other must be callable.
+    The message names the missing methods. An attribute that `inspect.getattr_static` finds counts
+    as a method, so that no code of the cell runs; any other is read and must be callable.
     """
     # Static look-up first: a cell may react to the reading of its attributes.
     missing = [

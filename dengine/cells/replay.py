@@ -1,5 +1,6 @@
 """`ReplayCell`, a recorded data set that an engine drives like a cell: it plays the labelled traces
-one after another, and answers a verification with the recorded label.
+one after another, and answers a verification with the recorded label. Replays, `dengine run` and
+the demonstration of `dengine serve` use it.
 """
 
 from typing import Any

@@ -56,11 +56,12 @@ class Verbs(click.Group):
         return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a verb and return its result; raise its expected errors as click's.
+        """Run a verb and return its result; raise its expected errors as `click.ClickException`.
 
-        These are DengineError, OSError (but BrokenPipeError) and UnicodeError. Passwords in their
-        messages are masked. The current folder is added to the end of `sys.path`, so that
-        `module:Class` is found there. Ctrl-C ends the process with exit code 130.
+        Expected are DengineError, OSError (but BrokenPipeError) and UnicodeError. Passwords in the
+        messages are masked, also in click's own. The current folder is added to the end of
+        `sys.path`, so that `module:Class` is found there. Ctrl-C ends the process with exit code
+        130.
         """
         folder = str(Path.cwd())
         if folder not in sys.path:

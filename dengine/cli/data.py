@@ -81,9 +81,10 @@ def data(source: DataChoice, out: Out | None) -> None:
 
 
 def _drift_row(drift: "Drift") -> tuple[str, str, str]:
-    """Return three cells of a table: the quantity, its means over tenths, and whether it drifts.
+    """Return three cells of a table: the quantity, its means over tenths, and a verdict on drift.
 
-    It rises or falls if the p-value is below 0.01; rho is NaN for one that never changes.
+    The verdict is "rises" or "falls" if the p-value is below 0.01, else that no drift is seen, and
+    has Spearman's rho and the p-value. It is "never changes" where rho is NaN.
     """
     means = " ".join(f"{mean:.2g}" for mean in drift.tenths)
     if math.isnan(drift.rho):
@@ -155,9 +156,9 @@ def train(
 
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant)
     is stored, but never trained on. A store that has been used has its own recipe and seed: leave
-    them out, others are refused. If nothing is new and a version answers, nothing is trained. If
-    the new version is not used, the exit code is 1. Ctrl-C keeps what was imported; the same
-    command continues there.
+    them out, others are refused. Files are brought to the length of its traces. If nothing is new
+    and a version answers, nothing is trained. If the new version is not used, the exit code is 1.
+    Ctrl-C keeps what was imported; the same command continues there.
     """
     from ..datasets.importing import import_labelled, stored_form
     from ..engine.engine import DataEngine, core_of

@@ -176,7 +176,10 @@ def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> s
 
 
 def _event_line(item: StoredVersion | Event) -> str:
-    """Return the line of an event or a retrain: its time in UTC, what happened, and why."""
+    """Return the line of an event or a retrain: its time in UTC, what happened, and why.
+
+    That of a retrain also has the number of traces and the duration.
+    """
     from ..store.records import Event
 
     time_text = format_time(item.time, SHORT_TIME)
@@ -249,7 +252,8 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     """Yield (title, text) rows of an explanation.
 
     They say when and by which version it was decided, the part, why, what was found when it was
-    computed again, and how much of the trace leaves the envelope of successes.
+    computed again, and how much of the trace leaves the envelope of successes, or that there are
+    too few successes for one.
     """
     decision = explanation.decision.decision
     version = decision.model_version
@@ -277,8 +281,8 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
 def _excess_rows(explanation: Explanation) -> Iterator[tuple[str, ...]]:
     """Yield table rows of where the trace leaves the envelope, at most 5, the farthest first.
 
-    Each has the channel's name, begin and end in seconds, and how far, in widths of the band. There
-    are none without an envelope.
+    Each has the channel's name, begin and end in seconds, and how far above or below, in widths of
+    the band. There are none without an envelope.
     """
     spec = explanation.spec
     names = spec.columns or [f"channel {i + 1}" for i in range(spec.channels)]

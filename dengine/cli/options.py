@@ -156,7 +156,7 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
     make : callable
         Takes the options' values by their names, and returns that argument.
     options : mapping of str to option
-        By the names of their values.
+        The decorator that adds each option, by the name of the option's value.
     """
 
     def decorate(command: Command) -> Command:
@@ -220,7 +220,7 @@ def store_option(text: str, *names: str, required: bool = False) -> Option:
     """Return a decorator that adds `--store`, `--cell-id` and `--product`.
 
     They are handed on as one address; the store need not exist. The address, the verb's argument
-    `store`, is None without `--store`.
+    `store`, is None without `--store`; a cell or product without it is a usage error.
 
     Parameters
     ----------
@@ -265,8 +265,8 @@ class RecipeChoice:
         Raises
         ------
         SettingError
-            The recipe or its reducer is not found. This is checked here, before a store is created;
-            a reducer of the user's own is imported for that.
+            The recipe or its reducer is not found, or a setting is out of range. This is checked
+            here, before a store is created; a reducer of the user's own is imported for that.
         """
         from ..recipe import Recipe
         from ..reducers import REDUCERS, reducer_class
@@ -286,6 +286,7 @@ class RecipeChoice:
         """Return the contender of a replay: dengine with this recipe, or the baseline of this name.
 
         Both get the settings that were given. Without a name it is dengine with the recipe conv.
+        Raises SettingError as `load` does.
         """
         from ..experiments.replay import Contender
 
@@ -551,6 +552,11 @@ def trace_spec_from(options: Mapping[str, Any]) -> TraceSpec | None:
     """Return the contract of live traces, by those options of `TRACE` that were given.
 
     `--channels` with one number gives how many there are; with names, their columns.
+
+    Parameters
+    ----------
+    options : mapping
+        Values by the names in `TRACE`, without those that were not given. Others are ignored.
 
     Returns
     -------

@@ -132,10 +132,10 @@ def print_result(
     Parameters
     ----------
     record : mapping
-        The JSON document, which `--json` prints alone. The verb's name and the paths of the files
-        are added to it.
+        The JSON document, which `--json` prints alone, with the verb's name and the paths of the
+        files besides. The mapping itself is not changed.
     *parts : str or rich.Table
-        What people see instead.
+        What people see instead, with a line for each file that was written.
     out : Out or None
         Where the files go. None writes none.
     make_files : callable or None

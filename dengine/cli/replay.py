@@ -97,9 +97,9 @@ class PlayedTasks(NamedTuple):
 
 
 def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> PlayedTasks:
-    """Play the tasks with a progress bar; return the finished replays with what they cost.
+    """Play the tasks with a progress bar; return the finished replays and the time they took.
 
-    Ctrl-C ends the work, and those that were finished until then are returned.
+    Ctrl-C ends the work and raises nothing: those that were finished until then are returned.
     """
     from ..experiments.grid import iterate_replays
 
@@ -141,7 +141,8 @@ _SHUFFLES = "Number of shuffled replays of each recipe."
 def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
     """Return a decorator that adds the options of how streams are played.
 
-    They are handed on as one `Stream`, the verb's argument `stream`.
+    They are handed on as one `Stream`, the verb's argument `stream`. `--repeats` beside
+    `--in-order` is a usage error.
 
     Parameters
     ----------
@@ -351,7 +352,9 @@ def _replay_and_print(
 
 
 def _duration_line(n_replays: int, costs: Mapping[str, float]) -> str:
-    """Return a sentence that says how many replays were played, in what time."""
+    """Return a sentence: how many replays were played, in what time, and how many were kept from
+    an earlier run.
+    """
     seconds = format_value("seconds", costs["seconds"])
     core_seconds = format_value("core_seconds", costs["core_seconds"])
     kept = f"; {costs['kept']} of them were kept from before" if costs["kept"] else ""

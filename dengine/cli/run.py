@@ -223,7 +223,8 @@ def _make_simulated_cell(
     """Return the simulated cell, its name, and the traces' contract, if options gave one.
 
     Its seed, which grows with the decisions in the store and differs between the cells of a
-    product, gives parts that the store has not seen. A verification takes `check_seconds`.
+    product, gives parts that the store has not seen. A verification takes `check_seconds` of
+    simulated time.
     """
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters
@@ -242,9 +243,11 @@ def _make_simulated_cell(
 def _make_replay_cell(
     store: SqlStore, source: DataChoice, cycles: int, **others: Any
 ) -> CellToDrive:
-    """Return a cell that plays a recording, from the part after the last one that the store knows.
+    """Return a cell that plays a recording from the part after the last one that was played before.
 
-    It knows a part whose trace has a label, and the newest accepted one without a report.
+    Played before are parts whose trace has a label of this cell in the store, and its newest
+    accepted part without a report. The cell's name and the contract of the recording are returned
+    beside it.
 
     Raises
     ------
@@ -273,12 +276,12 @@ def _make_replay_cell(
 
 
 def _make_robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
-    """Connect to a Universal Robots controller; return its cell, with its traces' contract.
+    """Connect to a Universal Robots controller; return its cell, name and contract of traces.
 
     Raises
     ------
     SettingError
-        No host, or a port that is no number.
+        No host, a port that is no number, or an option that the recorder does not take.
     CellError
         The controller cannot be reached, or its program is not ready in time.
     """

@@ -111,10 +111,11 @@ def serve(
     Continues with its store, or starts a new one, and retrains in a separate process. It runs until
     SIGTERM or Ctrl-C, which end it in order: requests in line are answered, and everything known is
     written. --demo plays recorded parts as a robot would, in a new --store, or without one in a
-    store that is forgotten. Without --token-file, programs on the same machine need no token. Other
-    machines reach it only with --host, which needs --token-file, and should have --cert and --key.
-    --samples, --rate-hz, --unit, --channels and --fit are the contract of traces; without them a
-    new store takes the form of its first trace.
+    store that is forgotten, with a deadline of 5 s or more. Without --token-file, programs on the
+    same machine need no token. Other machines reach it only with --host, which needs --token-file,
+    and should have --cert and --key. --samples, --rate-hz, --unit, --channels and --fit are the
+    contract of traces; without them a new store takes the form of its first trace, or with --robot
+    1000 samples.
     """
     options.require_modules("the server", "serve", *MODULES)
     if settings["opcua"]:

@@ -1,5 +1,6 @@
 """Access control of the HTTP server: `Guard` refuses a request by its token, host name, origin,
-size, time or rate, and `read_tokens` reads the tokens.
+size, time or rate, and `read_tokens` reads the tokens. `create_app` puts the `Guard` before the
+application.
 
 A server that only this machine can reach needs no token. But a browser on this machine may also
 send requests for web pages of other sites. `Guard` recognises these by the host name that they use
@@ -278,7 +279,7 @@ class Guard:
                 response.headers.append("WWW-Authenticate", 'Bearer realm="dengine"')
             await response(scope, receive, _with_headers(send))
         else:
-            await self.app(scope, _limited(receive, self.access), _with_headers(send))
+            await self.app(scope, _limit_body(receive, self.access), _with_headers(send))
 
     def _check(self, scope: Scope) -> None:
         """Raise Refusal for a request that is not allowed; else note its token for the handlers.
@@ -341,7 +342,7 @@ class Guard:
             )
 
 
-def _limited(receive: Receive, access: Access) -> Receive:
+def _limit_body(receive: Receive, access: Access) -> Receive:
     """Return a `receive` that limits the body of a request in size and time.
 
     It raises Refusal 413 beyond `access.largest` bytes, and 408 if the body is not complete after

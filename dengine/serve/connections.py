@@ -1,5 +1,5 @@
 """`ConnectionPool` and its `Connection`s limit what uvicorn does not: the number of connections,
-and the time of a request's head.
+and the time of a request's head. uvicorn makes a `Connection` for each client (`uvicorn_options`).
 
 If all places are taken, a new connection replaces the oldest one that is idle and was never
 authorized, so that clients without a token cannot keep out one that has it. A connection is closed
@@ -46,11 +46,10 @@ class ConnectionPool:
         self.open: list[Connection] = []  # oldest first
 
     def add(self, connection: "Connection") -> bool:
-        """Add a connection; return False if there is no place for it, in all or for its IP address.
+        """Add a connection; return False, and do not add it, if no place can be made for it.
 
-        If all places are taken, the oldest connection that is idle and was never authorized is sent
-        503 and closed to make room; if those of its address are taken, the oldest such of that
-        address.
+        If all places of its IP address are taken, or else all of the pool, the oldest connection
+        among these that is idle and was never authorized is sent 503 and closed to make room.
         """
         same_address = [other for other in self.open if other.address == connection.address]
         is_address_full = len(same_address) >= self.per_address
@@ -111,9 +110,9 @@ class Connection(AutoHTTPProtocol):
     def connection_made(  # type: ignore[override]  # as of uvicorn's
         self, transport: asyncio.Transport
     ) -> None:
-        """Take a place in the pool and start the time of the first head; or respond 503, close.
+        """Take a place in the pool and start the time of the first head; or respond 503 and close.
 
-        A full pool may first close an idle connection that was never authorized (`add`).
+        A full pool may close another connection for it (`ConnectionPool.add`).
         """
         self.transport = transport
         self.address = str((transport.get_extra_info("peername") or ("",))[0])

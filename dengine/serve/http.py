@@ -508,9 +508,9 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     """Return the explanation of a decision, given by its id or its part's number, as a response.
 
     It has the decision's trace, the band of good parts (None where there is none), up to `N_BADS`
-    newest bad traces among the newest `N_LABELS` labels (none if their shape differs), both rounded
-    for a picture, and the corrections of its label. Raises UnknownDecisionError without a decision,
-    ReportConflictError if the part has several.
+    newest bad traces among the newest `N_LABELS` labels (none if their shape differs), and the
+    corrections of its label. Band and bad traces are rounded for a picture. Raises
+    UnknownDecisionError without a decision, ReportConflictError if the part has several.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
@@ -536,7 +536,8 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
 def _zip_export(source: Exportable) -> bytes:
     """Export a model to TorchScript, and return it with its checksum as a zip archive in bytes.
 
-    The export is recorded as an event. Raises ExportError for a model that cannot be exported.
+    The engine records the export as an event. Raises ExportError for a model that cannot be
+    exported.
     """
     from ..export import export_torchscript
 

@@ -78,8 +78,7 @@ class Metrics:
     def observe(self, response: ServiceResponse | ReportResponse | RetrainReport) -> None:
         """Add the duration of a response or a retrain to the histogram of its type.
 
-        The histogram is divided by the fields that `HISTOGRAMS` names, an action and its reason for
-        one.
+        Its labels are the fields that `HISTOGRAMS` names, of a decision its action and reason.
         """
         kind = type(response)
         record = response.decision if isinstance(response, ServiceResponse) else response

@@ -1,5 +1,5 @@
 """`opcua_server` serves a cell over OPC UA: methods for a PLC to call, and variables for a SCADA
-system to read.
+system to read. `dengine serve --opcua` starts it.
 
     async with opcua_server(service, port=4840):
         ...
@@ -186,6 +186,8 @@ async def opcua_server(
 ) -> AsyncIterator[Server]:
     """Serve a cell over OPC UA in this event loop, as long as the context lasts.
 
+    The logger of asyncua is set to CRITICAL, and stays so.
+
     Parameters
     ----------
     service : CellService
@@ -273,7 +275,7 @@ class AddressSpace:
 
     async def build(self) -> None:
         """Create the object Cell, its `VARIABLES`, the methods Decide and Report, and the generator
-        of alarm events.
+        of alarm events; call it once, before the server starts.
         """
         self._index = await self._server.register_namespace(NAMESPACE)
         objects = self._server.nodes.objects
@@ -378,11 +380,10 @@ class AddressSpace:
         arguments: list[Argument],
         results: list[Argument],
     ) -> Callable[..., Awaitable[Any]]:
-        """Return a call as asyncua needs a method, which raises nothing.
+        """Return a method for asyncua that checks its arguments and calls `call` with their values.
 
-        The method checks its arguments and returns the call's results as variants; for wrong
-        arguments and for an error it returns a status code, and writes a line that says why to
-        LastRefused.
+        The method raises nothing. It returns the results as variants; for wrong arguments and for
+        an error of `call` it returns a status code, and writes a line that says why to LastRefused.
         """
         listed = ", ".join(
             f"{argument.name} ({argument.type.name}{' array' if argument.is_array else ''})"

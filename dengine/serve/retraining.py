@@ -1,4 +1,5 @@
-"""`RetrainingProcess`, an executor with one process, in which a served engine retrains.
+"""`RetrainingProcess`, an executor with one process, in which the engine of `dengine serve`
+retrains.
 
 In a process of its own a retrain never holds the lock of the interpreter that answers decisions.
 Calls and results are pickled in the executor's thread, and their arrays are passed through a file
@@ -46,7 +47,7 @@ class RetrainingProcess(ProcessPoolExecutor):
     """
 
     def __init__(self) -> None:
-        super().__init__(1, multiprocessing.get_context("spawn"), _end_with_parent)
+        super().__init__(1, multiprocessing.get_context("spawn"), _prepare_process)
         other_processes = set(multiprocessing.active_children())
         with _signals_blocked():
             self.submit(_warm_up).add_done_callback(partial(_log_start, time.monotonic()))
@@ -78,7 +79,7 @@ def _signals_blocked() -> Iterator[None]:
     Ctrl-C signals all processes of a terminal. The retraining process must outlive the signal,
     since the server ends it in order. On Windows it does nothing.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # on Windows `_end_with_parent` ignores them
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows `_prepare_process` ignores them
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
@@ -134,12 +135,12 @@ def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _
     return _NEWEST_RESULT[0]
 
 
-def _end_with_parent() -> None:
-    """Prepare the retraining process, in which it runs first: let it end with its parent.
+def _prepare_process() -> None:
+    """Prepare the retraining process, in which this runs first: it ends with its parent.
 
-    It ends even during a call into C++, and at once if the parent has ended already. Where that can
-    be set, it also leaves one of several cores to decisions and has a lower priority. On Windows it
-    ignores the ending signals.
+    The process ends even during a call into C++, and at once if the parent has ended already. Where
+    that can be set, it leaves one of several cores to decisions and has a lower priority. On
+    Windows it ignores the ending signals.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned

@@ -206,8 +206,8 @@ class RobotCalls:
     async def decide_added(self, request: Any, part: Any = "") -> Struct:
         """Decide on the pieces of a part's trace; return action, id, reason, bounds and version.
 
-        A part that has a decision gets it again. A decision with an id drops the pieces; after a
-        VERIFY with an empty id they stay, so that the call can be repeated. Raises TraceError
+        A part that has a decision gets it again. A new decision with an id drops the pieces; after
+        a VERIFY with an empty id they stay, so that the call can be repeated. Raises TraceError
         without pieces or for a trace, and ReportError for an id, that the engine does not take.
         """
         if (stored := await self._find(request)) is not None:
@@ -339,8 +339,7 @@ class RobotCalls:
         struct
             decisions, accepted, rejected, bad (false accepts): so far. verified_share: of the
             newest 500 decisions, 1 without any. version: of the model. safe_mode, alarm: why, or
-            "".
-            shadow: whether the shadow mode is on. waiting: requests in the queue. late, busy:
+            "". shadow: whether the shadow mode is on. waiting: requests in the queue. late, busy:
             decisions past the deadline, and requests refused.
 
         Raises

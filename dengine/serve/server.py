@@ -130,7 +130,7 @@ def serve(
         For a port in use, files that cannot be used, and an address that other machines can reach
         without a token.
     DengineError
-        What `make` raises.
+        What `make` or `recorder` raises.
     """
     if token_file is None and not is_loopback(host):
         raise SettingError(
@@ -180,10 +180,10 @@ def serve(
 
 
 def uvicorn_options(connections: int = CONNECTIONS) -> dict[str, Any]:
-    """Return the options of `uvicorn.Config` by name: limits of connections, and no logs of its
-    own.
+    """Return the options of `uvicorn.Config` by name, without those of TLS.
 
-    `connections` is the most connections that may be open at once.
+    At most `connections` may be open at once. uvicorn writes no log of its own, trusts no proxy's
+    headers and serves no web sockets.
     """
     return {
         "http": ConnectionPool(connections).new_connection,

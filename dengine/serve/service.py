@@ -204,9 +204,9 @@ class CellService:
         Returns
         -------
         ServiceResponse
-            If the engine has not begun by the deadline, VERIFY with `Reason.LATE`, or with the
-            fault of the trace or the store, which is counted in `late`. One that it has begun is
-            waited for. If the store cannot be written, or the id not be looked up, VERIFY with
+            If the engine has not begun by the deadline, VERIFY, counted in `late`; its reason is
+            `Reason.LATE`, or the fault of the trace or the store. One that it has begun is waited
+            for. If the store cannot be written, or the id not be looked up, VERIFY with
             `Reason.NO_STORE`, which may not be recorded.
 
         Raises

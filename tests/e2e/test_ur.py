@@ -3,6 +3,7 @@
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -210,6 +211,20 @@ def test_a_recorder_cuts_several_channels_by_any_trigger_with_samples_from_befor
         3,
         tuple(channels),
     )
+
+
+def test_who_waits_for_an_insertion_is_woken_when_the_recorder_is_closed() -> None:
+    with (
+        FakeController(None) as fake,
+        RtdeRecorder(fake.host, port=fake.port) as recorder,
+    ):
+        closing = threading.Timer(0.2, recorder.close)
+        closing.start()
+        begin = time.monotonic()
+        with pytest.raises(CellError, match="Expected an insertion"):
+            recorder.record(timeout=WAIT)
+        assert time.monotonic() - begin < WAIT / 2
+        closing.join()
 
 
 def decisions(cell: Cell, n: int) -> list[dict]:

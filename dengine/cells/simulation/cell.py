@@ -271,9 +271,8 @@ class SimulatedCell:
         waits.
         """
         success = self._take_waiting("proceed").success
-        chance = float(
-            _make_generators(self.seed, self._done - 1)[2].random()
-        )  # depends on the part alone
+        # It depends on the part alone.
+        chance = float(_make_generators(self.seed, self._done - 1)[2].random())
         if success:
             return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN
         if chance < self.parameters.silent_share:

@@ -29,7 +29,7 @@ def simulate(
 ) -> list[SimulatedInsertion]:
     """Simulate the first n cycles of a cell in parallel processes.
 
-    In the nominal scenario insertion i depends on (seed, i) alone; in the others also on i / n.
+    In the nominal scenario insertion i depends on (seed, i) alone; in the others also on n.
 
     Parameters
     ----------

@@ -153,8 +153,8 @@ class UrCell(AbstractContextManager["UrCell"]):
         """Have a part inserted, wait for it, and return its trace, (T,) or (C, T).
 
         Lost samples are NaN; all are if no insertion was seen, as when its start was lost or the
-        trigger is wrong. Set `last`, and count an incomplete trace. Raise CellError if the robot
-        does not answer in time, fails, or its program stops.
+        trigger is wrong. Set `last`, and count a trace with missing samples in `incomplete`. Raise
+        CellError if the robot does not answer in time, fails, or its program stops.
         """
         self._execute_order(Verb.INSERT)
         if self.last is None:  # the start was lost, or the trigger is wrong

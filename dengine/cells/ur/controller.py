@@ -146,9 +146,9 @@ class RobotProgram:
         """Play the next trace into the outputs, a yield per control cycle; return DONE (`yield
         from`).
 
-        Before it come `approach` cycles, after it two at rest. While it plays, the output PHASE has
-        the order's number, and `place` is set. Returns FAILED at once, without a cycle, if all
-        traces were played.
+        The part is added to `played`. Before the trace come `approach` cycles, after it two at
+        rest. While it plays, the output PHASE has the order's number, and `place` is set. Returns
+        FAILED at once, without a cycle, if all traces were played.
         """
         if len(self.played) == len(self.data):
             return ResultCode.FAILED  # the bin is empty
@@ -379,7 +379,8 @@ class FakeController(AbstractContextManager["FakeController"]):
             self._clients.remove(client)
 
     def _respond(self, client: Client, type_: PackageType, payload: bytes) -> None:
-        """Carry out one request of a client, and send the response if the protocol has one.
+        """Carry out one request of a client, and send the response if the protocol has one; the
+        caller holds the lock.
 
         Text is ignored, and data sets `inputs`; neither has a response. The others are: declare
         outputs or inputs, start (packages are sent until the next of these requests), pause, and
@@ -457,7 +458,7 @@ class FakeController(AbstractContextManager["FakeController"]):
         """Run one control cycle: the program, troubles, and a package to each client that is due.
 
         Return whether a client was to receive one. Part and sample of an insertion's package that
-        no client was sent are added to the set `lost`.
+        no client was sent are added to the set `lost`. The caller holds the lock.
         """
         values = {
             **STATE,
@@ -487,7 +488,8 @@ class FakeController(AbstractContextManager["FakeController"]):
     def _send(self, client: Client, values: Values, trouble: str) -> bool:
         """Send a client the package of this cycle, or what `trouble` makes of it.
 
-        Return whether the package will arrive, now or later.
+        Return whether the package will arrive, now or later. After "half" and "garbage" the client
+        is disconnected.
         """
         if self._cycle < self._until["drop"] or client.output is None:
             return False

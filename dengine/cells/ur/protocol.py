@@ -77,7 +77,8 @@ class PackageReader:
     def feed(self, piece: bytes) -> Iterator[Package]:
         """Add bytes, and yield every package that is complete; an incomplete rest is kept.
 
-        Raise CellError for bytes that are no RTDE package.
+        Nothing is added before the iteration begins. Raise CellError for bytes that are no RTDE
+        package.
         """
         self._bytes += piece
         while len(self._bytes) >= HEADER.size:
@@ -122,7 +123,7 @@ class RtdeRecipe:
         """Return a data package, with its header, of these values by column.
 
         Columns that are left out are 0, and names that are no columns are ignored. Numbers for an
-        integer field are cut to integers.
+        integer field are cut to integers. Raise struct.error for one that its field cannot hold.
         """
         numbers = [
             values.get(name, 0) if letter == "d" else int(values.get(name, 0))

@@ -166,11 +166,16 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         )
 
     def rows(self, seconds: float) -> Iterator[Row]:
-        """Yield packages as they arrive, for this many seconds; each is taken from the stream."""
+        """Yield packages as they arrive, for this many seconds; each is taken from the stream.
+
+        The time runs from the first package that is asked for. A closed stream ends it early.
+        """
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
-            if (row := self.stream.take(left)) is not None:
-                yield row
+            row = self.stream.take(left)
+            if row is None:  # the time is over, or the stream closed
+                return
+            yield row
 
     @property
     def begun(self) -> bool:
@@ -184,9 +189,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         was received, and everything before is discarded.
         """
         record = None
-        if (
-            self._rows and row.timestamp < self._rows[-1].timestamp - self._step / 2
-        ):  # it was restarted
+        # An earlier time: the controller was restarted.
+        if self._rows and row.timestamp < self._rows[-1].timestamp - self._step / 2:
             if self.begun:
                 record = self.cut()
             self._reset()
@@ -196,9 +200,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
                 {name: np.array([row.values[c]]) for name, c in self._signals.items()}
             )
             self._start = self._finder.feed(row.timestamp, bool(active[0]))
-            del self._rows[
-                : -self._before - 2
-            ]  # keeps two more: the edge, and the connection before it
+            # Two more are kept: the edge, and the connection before it.
+            del self._rows[: -self._before - 2]
         last = self._first_time() + (self.spec.samples - 1.5) * self._step
         return self.cut() if row.timestamp > last else record
 

@@ -79,7 +79,7 @@ class RtdeClient:
         ):
             self._socket = socket.create_connection((host, port), timeout)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._incoming = self._received()
+        self._incoming = self._receive_packages()
         try:
             if self._request(PackageType.VERSION, struct.pack(">H", VERSION))[:1] != b"\1":
                 raise CellError(
@@ -133,7 +133,7 @@ class RtdeClient:
         """Send a request, wait for its response, and return the payload of the response.
 
         Other packages that arrive before are dropped. For START the first data package counts as a
-        yes, and is kept for `rows`. Raise CellError if the connection is lost.
+        yes, and is kept for `rows`. Raise CellError as `_receive_packages` does.
         """
         self._send(Package(type_, payload).to_bytes())
         while (package := next(self._incoming)).type is not type_:
@@ -152,10 +152,11 @@ class RtdeClient:
         ):
             self._socket.sendall(data)
 
-    def _received(self) -> Iterator[Package]:
-        """Yield packages as they arrive, without an end; texts are kept for errors instead.
+    def _receive_packages(self) -> Iterator[Package]:
+        """Yield packages as they arrive, without an end, but texts, of which the newest is kept.
 
-        Raise CellError if the connection is lost, silent for `timeout` seconds, or sends no RTDE.
+        Raise CellError if the connection is lost, silent for `timeout` seconds, or sends no RTDE;
+        its message quotes the newest text.
         """
         packages = PackageReader()
         while True:
