@@ -106,7 +106,7 @@ class Span:
         Of the parts that the model accepted, and would have accepted but for an audit, at the
         policy's alpha; of no part if none was accepted, as in shadow mode.
     unlabelled : int
-        Verified parts whose result was not reported.
+        Verified parts without a label, a forgotten one included.
     retrains : int
     dropped : dict of str to int
         Reasons of dropped retrains, and how often each.
@@ -177,7 +177,8 @@ class Status:
     newest, ever : Span
         The newest decisions, and all decisions.
     unreported : int
-        Accepted parts whose outcome was never reported; see `ever.unlabelled` for verified ones.
+        Accepted parts without a label, a forgotten one included; see `ever.unlabelled` for
+        verified ones.
     actions, reasons, sources : dict of str to int
         Decisions by action and by reason, labels by source.
     labels, corrected, forgotten : int

@@ -397,7 +397,7 @@ class Correction:
     Attributes
     ----------
     number : int
-        1, 2, ... in each cell.
+        1, 2, ... in each cell, or product.
     time : float
         In seconds since 1970.
     decision_id : str
@@ -409,7 +409,7 @@ class Correction:
     event : int
         Number of the event that records it.
     newest_seq : int
-        Number of the cell's newest label at that moment.
+        Number of the newest label of the cell, or product, at that moment.
     seq : int
         Number of the label that is corrected.
     """

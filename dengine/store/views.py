@@ -29,6 +29,7 @@ class HistoryFilter:
     action : Action or str, optional
     reason : Reason or str, optional
     label : {"good", "bad", "none"}, optional
+        After corrections; "none" also if it was forgotten.
     since, until : float, optional
         Seconds since 1970; `since` is included, `until` is not.
     predicted : Action or str, optional
