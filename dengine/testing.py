@@ -6,8 +6,8 @@ the built-in reducers.
 
 `REDUCER_CHECKS` holds the clauses one by one, for pytest's parametrize. Each takes a reducer, works
 on clones of it, returns None and raises AssertionError if its clause is broken. Any transformer of
-sklearn may be checked. It is used as in an engine: in one space if it uses no labels, else
-cross-fitted in two folds. Honest counting rests on the clause
+sklearn may be checked. It is used as in an engine: in one space if it uses no labels; if it does,
+in its own spaces, or cross-fitted in two folds where it has but one. Honest counting rests on the clause
 `labels_of_a_fold_move_nothing_in_its_space`. `toy_traces` makes the traces of these checks, and of
 examples.
 """
@@ -82,10 +82,10 @@ QUERIES = toy_traces(20, seed=5)[0]
 def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     """Assert that `embed`, `transform` and `embed_references` of a trained clone fit together.
 
-    `embed` must return finite float32 of shape (n, K, d), the same from two trained clones, with K
-    of 2 or more if labels are used; `transform` must return (n, d); `embed_references` must return
-    of each row of `embed` the space of its fold. The caller's traces must not be written to.
-    `reducer` may be unfitted and stays unchanged.
+    `reducer` must be a scikit-learn estimator. `embed` must return finite float32 of shape
+    (n, K, d), the same from two trained clones, with K of 2 or more if labels are used; `transform`
+    must return (n, d); `embed_references` must return of each row of `embed` the space of its fold.
+    The caller's traces must not be written to. `reducer` may be unfitted and stays unchanged.
     """
     is_estimator = isinstance(reducer, BaseEstimator)
     assert is_estimator, f"{type(reducer).__name__} is no scikit-learn estimator"
@@ -130,7 +130,8 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
 def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
     """Assert that a reducer whose `fit` needs labels has `uses_labels = True`.
 
-    Otherwise it gets none, and every retrain would fail. A clone is trained on test traces: an
+    That of a transformer which is no `Reducer` is its tag `target_tags.required`. If it is False, an
+    engine passes no labels, and every retrain would fail. A clone is trained on test traces: an
     error of its `fit` that is not due to missing labels is raised as it is, and `reducer` stays
     unchanged.
     """
@@ -298,9 +299,9 @@ def check_reducer(reducer: Any) -> None:
 def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reducer:
     """Return a clone of a reducer, trained `times` times in a row on the toy traces.
 
-    It is trained as in an engine, in 2 folds by content, for at most 8 optimiser steps each time.
-
-    labels : replace the labels of the toy traces; None keeps them.
+    It is trained as in an engine, with folds by content, as many as it has spaces: 2 if it is
+    cross-fitted from outside. Each training takes at most 8 optimiser steps. `labels` (100,)
+    replace those of the toy traces; None keeps them.
     """
     X, y = toy_traces()
     trained = as_reducer(clone(reducer), FOLDS)

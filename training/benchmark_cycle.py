@@ -34,6 +34,8 @@ def measure(
 ) -> list[dict[str, Any]]:
     """Measure every quantity; return a row of the table for each.
 
+    It also prints what `time_replays` found.
+
     Parameters
     ----------
     data : Dataset

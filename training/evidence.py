@@ -255,7 +255,10 @@ def last_commit() -> str:
 
 
 def print_cost(plan: Plan, keep: Path, n_jobs: int) -> None:
-    """Print how many replays are not kept yet, and how long they take."""
+    """Print how many replays are not in `keep` yet, and how long they take.
+
+    It makes the folder `keep` if that is missing.
+    """
     remaining = list[str]()
     for shuffle in plan.iterate_shuffles():
         kept = KeptReplays(keep, shuffle.data)

@@ -366,7 +366,11 @@ def count_verdicts(rows: pd.DataFrame, measure: str) -> str:
 
 
 def measure_lines(rows: pd.DataFrame) -> list[str]:
-    """Return a table for each of the `MEASURES`: a row for each set, a column for each method."""
+    """Return the lines of a section for each of the `MEASURES`: its title, its text and a table.
+
+    The table has a row for each set and a column for each method, and for some measures a last row
+    with mean ranks.
+    """
     methods = known_methods(rows)
     lines = []
     for name, measure in MEASURES.items():

@@ -261,8 +261,8 @@ def iterate_replays(
     n_jobs : int, default 1
         Replays at a time, as joblib counts them. Timings are right with 1 alone.
     keep : path or None, default None
-        Folder of finished replays: those in it are not played again, and others are added as they
-        end.
+        Folder of finished replays, made if it is missing: those in it are not played again, and
+        others are added as they end.
     on_cycle : callable or None, default None
         Called with the number of finished cycles of a replay, only where `n_jobs` is 1: a callback
         cannot travel to other processes.
