@@ -7,9 +7,9 @@ the built-in reducers.
 `REDUCER_CHECKS` holds the clauses one by one, for pytest's parametrize. Each takes a reducer, works
 on clones of it, returns None and raises AssertionError if its clause is broken. Any transformer of
 sklearn may be checked. It is used as in an engine: in one space if it uses no labels; if it does,
-in its own spaces, or cross-fitted in two folds where it has but one. Honest counting rests on the clause
-`labels_of_a_fold_move_nothing_in_its_space`. `toy_traces` makes the traces of these checks, and of
-examples.
+in its own spaces, or cross-fitted in two folds where it has but one. Honest counting rests on the
+clause `labels_of_a_fold_move_nothing_in_its_space`. `toy_traces` makes the traces of these checks,
+and of examples.
 """
 
 from collections.abc import Callable
@@ -130,8 +130,8 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
 def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
     """Assert that a reducer whose `fit` needs labels has `uses_labels = True`.
 
-    That of a transformer which is no `Reducer` is its tag `target_tags.required`. If it is False, an
-    engine passes no labels, and every retrain would fail. A clone is trained on test traces: an
+    For a transformer that is no `Reducer`, its tag `target_tags.required` must be True. Otherwise
+    an engine passes no labels, and every retrain would fail. A clone is trained on test traces: an
     error of its `fit` that is not due to missing labels is raised as it is, and `reducer` stays
     unchanged.
     """
