@@ -178,8 +178,9 @@ def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
 
 
 def any_length_and_several_channels_work(reducer: Any) -> None:
-    """Assert that traces of other lengths, and of three channels, are embedded to finite points.
+    """Assert that traces of other lengths, and of three channels, can be trained on and embedded.
 
+    `train` must return a point for each trace, and all points must be finite.
     For each shape a clone is trained on test traces, so `reducer` may be unfitted and stays
     unchanged.
     """

@@ -283,10 +283,10 @@ def window_curves(
     Returns
     -------
     curves : dict of str to array, shape (n,)
-        In percent. certain : decisions without a check, of all cycles in the window, the mean over
-        the replays. certain_low, certain_high : its 10th and 90th percentile over the replays.
-        precision, false_positive : good and bad ones of the accepted parts in the windows of all
-        replays together. false_negative : good ones of the rejected parts.
+        In percent. certain : parts that the model accepted or rejected, of all cycles in the
+        window, the mean over the replays. certain_low, certain_high : its 10th and 90th percentile
+        over the replays. precision, false_positive : good and bad ones of the accepted parts in the
+        windows of all replays together. false_negative : good ones of the rejected parts.
     """
     certain = sliding_mean(np.stack([r.accepted | r.rejected for r in replays]), window)
 
@@ -517,7 +517,7 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     """Draw a cost curve, with a ring around the chosen policy.
 
     Above: the cost per part with its interval, and the cost of verifying everything. Below: the
-    share of parts that were decided without a check.
+    share of parts that the model accepted or rejected.
 
     Parameters
     ----------

@@ -125,10 +125,10 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
     """Yield the lines of the findings about one recipe and interval, from the rows of its grid.
 
     The findings: whether the number of certain predictions varies with alpha and LB, as the paper
-    says of Wilson and denies of the binomial interval, whether the mean share of false positives
-    stays below 1 - LB, and, for Wilson, whether a lower alpha delays the first certain prediction.
-    The first and the third are left out for baselines, and where too few settings or no certain
-    predictions are there to compare.
+    says of Wilson and denies of the binomial interval; whether the mean share of false positives
+    among the certain predictions stays below 1 - LB; and, for Wilson, whether a lower alpha delays
+    the first certain prediction. The first and the third are left out for baselines, and where too
+    few settings or no certain predictions are there to compare.
     """
     condition = f"{recipe}, {interval}"
     is_ours = recipe.split(" ")[0] not in BASELINES

@@ -328,10 +328,11 @@ class Replay:
         Returns
         -------
         row : dict
-            Among others certain, the number of decisions without a check; first_certain, the cycle
-            of the first of them, counted from 1; dropped, the reason of the last retrain that was
-            dropped, or ""; saved_s, the seconds of the checks that were left out, and net_s, less
-            what the errors cost, in seconds by the defaults of `Costs`.
+            Among others certain, the number of parts that the model accepted or rejected;
+            first_certain, the cycle of the first of them, counted from 1; dropped, the reason of
+            the last retrain that was dropped, or ""; saved_s, the seconds of the checks that these
+            parts did without, and net_s, less what the errors cost, in seconds by the defaults of
+            `Costs`.
         """
         nan = float("nan")
         policy = self.recipe.policy
@@ -505,7 +506,7 @@ def replay(
         Anything `load_dataset` takes.
     recipe : object
         Anything `Recipe.load` takes, the name of a baseline (`experiments.baselines.BASELINES`), a
-        `Contender`, or a fresh engine, for a model of your own.
+        `Contender`, or a fresh engine, for a model of your own, which then holds what it learned.
     seed : int, default 0
         Of the shuffle, and of the engine unless one is given; the same seed gives the same
         decisions.

@@ -404,7 +404,7 @@ class RocketReducer(Reducer):
         self.net_.encoder.learn(x, np.random.default_rng(seed_of(self.random_state)))
 
     def _build(self, channels: int, samples: int) -> None:
-        """Set an empty module, `net_`, and an empty state for traces of this shape.
+        """Set a module `net_` whose kernels and heads are 0, and an empty state, for this shape.
 
         The number of samples that are averaged, `average_`, must be set. Raises SettingError for a
         parameter out of its range or fewer than 2 samples.

@@ -202,7 +202,7 @@ class UmapReducer(Reducer):
     random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Start anew and complete the layout.
+        """Start anew and take `n_epochs` epochs, by default the 200 of a first layout.
 
         Parameters
         ----------
