@@ -232,10 +232,9 @@ class Recipe:
     ) -> Recipe:
         """Parse ``settings["recipe"]`` of a store's settings, and return the recipe.
 
-        No class that it names is imported.
-        Raises StoreError if `radius` or `retrain_every` is missing and a user's class would have to
-        be imported for its default: the store is damaged. Raises SettingError for a text
-        that is no recipe.
+        No class that it names is imported. Raises StoreError if `radius` or `retrain_every` is
+        missing and a user's class would have to be imported for its default: the store is damaged.
+        Raises SettingError for a text that is no recipe.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]

@@ -628,7 +628,7 @@ class RocketSelective(Baseline):
         self._classifier: Any = make_pipeline(features, StandardScaler(), regression)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
-        """Train on some labels and choose both thresholds on the others; return whether it trained.
+        """Train on some labels and set `thresholds` by the others; return whether it trained.
 
         It needs both classes among the labels that train, and one label at least to choose on. A
         side without a guaranteed threshold gets an infinite one and is never decided.

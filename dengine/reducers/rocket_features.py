@@ -337,8 +337,8 @@ def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
     """Compute the raw features of traces (n, C, T): float32 (n, P).
 
     A trace has the same features to the bit whatever other traces are with it, since every chunk is
-    full; the last one is filled up with zeros. From `PARALLEL_TRACES` on the encoder is compiled
-    and two threads compute; the call returns when all is done.
+    full; the last one is filled up with zeros. From `PARALLEL_TRACES` traces on the encoder is
+    compiled and two threads compute; the call returns when all is done.
     """
     x = torch.from_numpy(traces)
     n = len(traces)

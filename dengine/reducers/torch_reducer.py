@@ -251,7 +251,8 @@ class TorchReducer(Reducer):
 
         The channels' scales are read from the traces, the weights from the checkpoint, if any.
         Earlier trainings are forgotten. Raises SettingError for a parameter out of its range, fewer
-        than 2 samples, or a checkpoint that cannot be used.
+        than 2 samples, a network that does not give (B, features), or a checkpoint that cannot be
+        used.
         """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
@@ -263,9 +264,10 @@ class TorchReducer(Reducer):
     def _build(self, channels: int, samples: int, average: int) -> None:
         """Set initial weights and an empty state for traces of this shape; no trace is read.
 
-        `average` is the number of samples that are averaged to one. The seed is drawn here; torch's
-        global generator keeps its state. Raises SettingError for a parameter out of its range or
-        fewer than 2 samples.
+        An `encoder_` of the initial weights is set as well. `average` is the number of samples that
+        are averaged to one. The seed is drawn here; torch's global generator keeps its state.
+        Raises SettingError for a parameter out of its range, fewer than 2 samples, or a network
+        that does not give (B, features).
         """
         self.check()
         if samples < 2:
@@ -362,6 +364,7 @@ class TorchReducer(Reducer):
     def make_optimizer(self) -> torch.optim.Optimizer:
         """Return a new AdamW for the members, with the moments that the last training left.
 
+        The moments are not copied: a step of the optimiser changes `optimizer_state_`.
         Weights decay; biases and the parameters of batch normalisation do not.
         """
         decayed: list[nn.Parameter] = []
