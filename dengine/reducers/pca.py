@@ -1,5 +1,5 @@
-"""PCA, the simplest reducer without labels: `PcaReducer`, which is fitted in closed form at every
-training, and `PcaEncoder`, the module that it exports.
+"""PCA, the simplest reducer without labels: `PcaReducer`, the reducer "pca", which is fitted in
+closed form at every training, and `PcaEncoder`, the module that it exports.
 """
 
 from collections.abc import Mapping

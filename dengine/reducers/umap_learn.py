@@ -1,5 +1,5 @@
-"""UMAP by the library umap-learn, `UmapLearnReducer`, to compare with `dengine.reducers.umap`. It
-fits anew at every training and cannot be exported.
+"""UMAP by the library umap-learn: `UmapLearnReducer`, the reducer "umap-learn", to compare with
+`dengine.reducers.umap`. It fits anew at every training and cannot be exported.
 """
 
 import warnings
