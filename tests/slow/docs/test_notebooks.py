@@ -19,6 +19,8 @@ SMALLER = {  # by notebook: what makes its long cells quick; never in an exact o
         "replay(data, recipe, seed=0)": "replay(data, recipe, seed=0, cycles=400)",
         "[1, 60, 400, 800, 1500]": "[1, 60, 400]",
         "seeds=[0, 1], cycles=600": "seeds=[0, 1], cycles=120",
+        "range(100, 1501, 100)": "(100, 400, 1500)",
+        "(200, 800, 1500)": "(100, 400)",
         "cycles=300": "cycles=100",
     },
     "corrections": {"range(200)": "range(20)"},
@@ -29,7 +31,7 @@ SMALLER = {  # by notebook: what makes its long cells quick; never in an exact o
         '"repeats": 6': '"repeats": 2',
     },
     "the_guarantee_seen": {
-        "parts = 0.80, 0.2, 400": "parts = 0.80, 0.2, 160",
+        "n_parts = 400": "n_parts = 160",
         "for seed in range(4)": "for seed in range(1)",
         "cycles=500": "cycles=150",
         "cycles=900": "cycles=300",
