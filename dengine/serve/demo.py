@@ -29,10 +29,9 @@ POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 async def playing(
     service: CellService, data: Any = "insertion", speed: float = 1.0, seed: int = 0
 ) -> AsyncIterator[None]:
-    """Play recordings through the service in a random order, in a task that lasts as long as the
-    context.
+    """Play recordings through the service in a random order, in a task beside the context's block.
 
-    When the context ends, the task is cancelled.
+    The task plays each recording once, and is cancelled when the context ends.
 
     Parameters
     ----------
@@ -47,9 +46,11 @@ async def playing(
     cell = ReplayCell(data)
     cell.order = np.random.default_rng(seed).permutation(len(cell.data))
     task = asyncio.create_task(drive(service, cell, speed))
-    yield
-    task.cancel()
-    await asyncio.wait([task])
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
 
 
 async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:

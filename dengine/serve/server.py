@@ -255,8 +255,8 @@ class CellServer(uvicorn.Server):
 def quick_switches() -> Iterator[None]:
     """Shorten, within the block, the time that a decision can wait for another thread.
 
-    It shortens the interval after which Python switches threads, and excludes the objects that
-    exist now from garbage collection.
+    For the whole process it shortens the interval after which Python switches threads, and excludes
+    the objects that exist now from garbage collection.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)

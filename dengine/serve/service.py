@@ -134,7 +134,8 @@ class CellService:
     make : callable
         Opens the engine, in the thread that will own it. What it raises is raised here.
     store : str or path, optional
-        Name of the same store, for `read`. None: the engine has a store in memory.
+        Name of the same store, for `read`. None: the engine has a store in memory. If it cannot be
+        opened, the engine is closed and the error raised.
     deadline : float, default 0.5
         Seconds that a decision may wait in the queue. Then the response is VERIFY with
         `Reason.LATE`, and is recorded as such.
@@ -184,7 +185,13 @@ class CellService:
         self._thread.start()
         self.engine = opened.result()
         self.core = core_of(self.engine)
-        self.read_store = self.engine.store if store is None else open_store(store)
+        self.read_store = self.engine.store
+        if store is not None:
+            try:
+                self.read_store = open_store(store)
+            except BaseException:
+                self.close()  # or its thread would keep the process alive
+                raise
 
     async def decide(
         self, trace: ArrayLike, request: str | None = None, part: str | int | None = None
@@ -204,10 +211,11 @@ class CellService:
         Returns
         -------
         ServiceResponse
-            If the engine has not begun by the deadline, VERIFY, counted in `late`; its reason is
-            `Reason.LATE`, or the fault of the trace or the store. One that it has begun is waited
-            for. If the store cannot be written, or the id not be looked up, VERIFY with
-            `Reason.NO_STORE`, which may not be recorded.
+            If the engine has not begun by the deadline, the decision that the id has already, else
+            VERIFY with `Reason.LATE` or the fault of the trace or the store; it is counted in
+            `late`. A decision that the engine has begun is waited for. If the store cannot be
+            written, or the id not be looked up, VERIFY with `Reason.NO_STORE`, which may not be
+            recorded.
 
         Raises
         ------
@@ -465,8 +473,9 @@ class CellService:
     def _next_job(self, engine: DataEngine) -> Job | None:
         """Wait for the next job in the queue and return it; None means that the service ends.
 
-        While the queue is empty, retrains are processed: a new version is swapped in by steps, and
-        a finished one is passed to observers and listeners. Errors of that are logged.
+        While the queue is empty, the engine's other work is done: a retrain that is due begins, a
+        new version is swapped in by steps, and safe mode is announced. A finished retrain is passed
+        to the observers, and the listeners are notified. Errors of that are logged.
         """
         core = core_of(engine)
         # The time right after a response is best for other work: the next part is farthest away.

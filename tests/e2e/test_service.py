@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dengine import DataEngine, Dataset, Reason, ReplayCell
-from dengine.errors import BusyError, TraceError
+from dengine.errors import BusyError, StoreError, TraceError
 from dengine.serve.demo import drive
 from dengine.serve.service import CellService
 from tests.support.driving import Counting, evidence
@@ -117,6 +117,15 @@ def test_a_decision_without_an_id_is_what_the_thread_would_say_and_verify_where_
 
     with a_service() as service:
         asyncio.run(cell(service))
+
+
+def test_a_service_whose_second_connection_fails_closes_its_engine_and_ends_its_thread(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(StoreError, match="Could not open"):
+        CellService(lambda: DataEngine.open_or_create(tmp_path / "a.db"), tmp_path / "no" / "b.db")
+    assert "dengine-engine" not in [thread.name for thread in threading.enumerate()]
+    DataEngine.open(tmp_path / "a.db").close()
 
 
 def test_a_demonstration_goes_on_after_a_report_that_found_the_queue_full(
