@@ -61,10 +61,16 @@ class Stream:
 
     Parameters
     ----------
-    seeds, cycles, shuffle
-        As in `grid_tasks`.
-    n_jobs, keep
-        As in `iterate_replays`.
+    seeds : range
+        Each gives a replay of every contender and policy.
+    cycles : int or None
+        Parts of a replay; None: all.
+    shuffle : bool, default True
+        Whether the parts are shuffled, by the seed; False: in recorded order.
+    n_jobs : int, default 1
+        Replays at a time, as joblib counts them.
+    keep : Path or None
+        Folder of finished replays, which are read from there and not played again.
     check_seconds : float, default 5.0
         How long a verification takes.
     """

@@ -94,9 +94,9 @@ def _change_and_print(
 def report(store: str, part: str, label: str, author: str, allow_import: bool) -> None:
     """Report whether a part was good or bad.
 
-    The part is named by its number, if one decision was made on it, or by that decision's id. An
-    accepted part that was bad is a line stop; a rejected one that was examined afterwards is an
-    inspection, and the engine trains on its label. An event records it. The same label again
+    The part is named by its number, if it has one decision beside rejects, or by that decision's
+    id. An accepted part that was bad is a line stop; a rejected one that was examined afterwards is
+    an inspection, and the engine trains on its label. An event records it. The same label again
     changes nothing. A wrong label is put right by `dengine correct`.
     """
     from ..engine.corrections import Changed

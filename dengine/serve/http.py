@@ -67,7 +67,9 @@ Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
 Id = Annotated[str, Meta(description="Of the decision.")]
 PartNumber = Annotated[
     str,
-    Meta(description="The part's number, in place of the id, if there is one decision on it."),
+    Meta(
+        description="The part's number, in place of the id, if it has one decision beside rejects."
+    ),
 ]
 Author = Annotated[
     str,
@@ -211,8 +213,8 @@ class HttpApi:
     async def _find_id(self, id_: str, part: str) -> str:
         """Return the id of a decision, given by its id or by its part's number.
 
-        Raises Refusal 422 for both or neither, and as `find_decision_id` for a part without a
-        decision or with several. An id is not looked up.
+        Raises Refusal 422 for both or neither, UnknownDecisionError for a part without a decision,
+        and ReportConflictError for a part with several. An id is not looked up.
         """
         if bool(id_) == bool(part):
             raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")

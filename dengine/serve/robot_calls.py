@@ -199,7 +199,7 @@ class RobotCalls:
         Raises
         ------
         TraceError, ReportError
-            As `DataEngine.decide`.
+            For a trace, or an id, that the engine does not take.
         """
         return await self.decide_array(as_samples(trace), request, part)
 

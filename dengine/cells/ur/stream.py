@@ -133,7 +133,8 @@ class RtdeClient:
         """Send a request, wait for its response, and return the payload of the response.
 
         Other packages that arrive before are dropped. For START the first data package counts as a
-        yes, and is kept for `rows`. Raise CellError as `_receive_packages` does.
+        yes, and is kept for `rows`. Raise CellError if the connection is lost or silent for
+        `timeout` seconds, or for bytes that are no RTDE.
         """
         self._send(Package(type_, payload).to_bytes())
         while (package := next(self._incoming)).type is not type_:
