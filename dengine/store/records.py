@@ -499,8 +499,15 @@ def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
             for option in (get_args(hint) if is_union else (hint,))
             if option is not type(None)
         ]
-        fields[name] = (get_origin(types[0]) or types[0], is_union)
+        fields[name] = (_plain_type(types[0]), is_union)
     return fields
+
+
+def _plain_type(hint: Any) -> type:
+    """Return the class of a type hint that is no union: `dict` for `dict[str, int]`."""
+    plain = get_origin(hint) or hint
+    # A `type` statement names its type here; NumPy's NDArray is one on Python 3.12 and later.
+    return _plain_type(plain.__value__) if hasattr(plain, "__value__") else plain
 
 
 def to_row(record: Any, *names: str) -> dict[str, Any]:
