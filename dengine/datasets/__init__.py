@@ -1,4 +1,4 @@
-"""Labelled traces as people have them: folders of CSV files, tables, arrays, archives, bags.
+"""Read labelled traces from folders of CSV files, tables, arrays, archives and bags.
 
 >>> load_dataset("insertion")  # 1503 simulated insertions, shipped with the package
 >>> load_dataset("recorded.npz", samples=400)  # X (n, T) or (n, C, T), y (n,)

@@ -1,4 +1,4 @@
-"""`DataEngine`, and the objects that it decides, learns and retrains with.
+"""`DataEngine`, and the objects that decide, learn and retrain for it.
 
 This file holds no code; import `DataEngine` from `dengine`.
 """
