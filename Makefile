@@ -84,8 +84,10 @@ proof: $(VENV)/.dev
 	cp $(OUT)/proof/proof.csv docs/explanation/
 
 # Hours: it says how many before it begins, and goes on where it was killed. SCREW names the screw-driving set, an .npz file.
+RESULTS = index.md replays.csv differences.csv curves.png net_seconds.png
 evidence: $(VENV)/.dev
-	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(VENV)/bin/python training/evidence.py $(if $(SCREW),--screw $(SCREW))
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(VENV)/bin/python training/evidence.py --out $(OUT) $(if $(SCREW),--screw $(SCREW))
+	cp $(addprefix $(OUT)/evidence/,$(RESULTS)) docs/results/
 
 # pip-audit may skip every package and still end well, so what it audited is counted. It gets names and plain versions: one
 # that is installed in editable form, or a build like 2.9.0+cpu, is not on PyPI, and --strict fails at what is not there.

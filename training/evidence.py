@@ -361,7 +361,7 @@ def main() -> None:
         if replays.empty:
             raise SystemExit(f"Expected replays in {folder / 'replays.csv'}, got none; play them.")
         write_results(replays, folder)
-        print(f"Wrote {folder / 'tables.md'} from {len(replays)} replays.")
+        print(f"Wrote {folder / 'index.md'} from {len(replays)} replays.")
         return
     if "screw driving" in arguments.sets and arguments.screw is None:
         arguments.sets.remove("screw driving")

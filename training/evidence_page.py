@@ -5,7 +5,7 @@
     differences.csv    means per set, policy and method, and paired differences from conv
     curves.png         how the certain share grows with the labels
     net_seconds.png    the seconds saved beside conv
-    tables.md          the page: three tables per policy, both figures, where conv loses
+    index.md           the page: three tables per policy, both figures, where conv loses
 
 Nothing is played here, so the page can be written again from a table of an earlier run:
 `python training/evidence.py --tables-only --out OUT`.
@@ -110,7 +110,7 @@ MEASURES = {
 
 
 def write_results(replays: pd.DataFrame, folder: Path) -> None:
-    """Write `differences.csv`, both figures and the page `tables.md` into a folder.
+    """Write `differences.csv`, both figures and the page `index.md` into a folder.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def write_results(replays: pd.DataFrame, folder: Path) -> None:
     save(draw_learning_curves(replays), folder / "curves.png", dpi=80, force=True)
     save(draw_net_seconds(differences), folder / "net_seconds.png", dpi=80, force=True)
     page = "\n".join(page_lines(replays, differences)) + "\n"
-    write_output(folder / "tables.md", page.encode(), force=True)
+    write_output(folder / "index.md", page.encode(), force=True)
 
 
 class Difference(NamedTuple):

@@ -56,13 +56,13 @@ def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run: Run, tmp_pa
     row = differences.query("alpha == 0.1 and recipe == 'knn'").iloc[0]
     assert row["certain_more"] == pytest.approx(mean_difference, abs=1e-3)
     assert row["certain_low"] < row["certain_more"] < row["certain_high"]
-    page = (folder / "tables.md").read_text(encoding="utf-8")
+    page = (folder / "index.md").read_text(encoding="utf-8")
     assert "| opposite | 150 | " in page
 
-    for name in ("tables.md", "curves.png", "net_seconds.png", "differences.csv"):
+    for name in ("index.md", "curves.png", "net_seconds.png", "differences.csv"):
         (folder / name).unlink()
     run("evidence", "--tables-only", "--out", tmp_path)
-    assert (folder / "tables.md").read_text(encoding="utf-8") == page
+    assert (folder / "index.md").read_text(encoding="utf-8") == page
     assert (folder / "net_seconds.png").stat().st_size > 0
 
 
