@@ -302,7 +302,8 @@ class EngineCore:
         confirmed or unobserved. The decision is VERIFY where `timed_out` (`Reason.LATE`), and where
         the store is damaged or its journal cannot be written (`Reason.NO_STORE`); a fault of the
         trace is the reason instead. Returns the record with its number, 0 where it could not be
-        recorded. Raises what `_check_trace` raises.
+        recorded. Raises TraceError for a wrong shape, and SettingError for a first trace that the
+        force limits do not fit.
         """
         x = self._check_trace(trace)
         self.learner.catch_up()
@@ -411,8 +412,9 @@ class EngineCore:
         version that the executor has trained first comes a step further. The label is on disk when
         this returns; NotTakenError is raised where that is not certain. Before it returns, a
         retrain that is due is done in this thread, or begun in the executor. The label of a trace
-        with a fault is stored, and sets off no retrain. Raises ReportError, TraceError and
-        StoreError as `DataEngine.report`.
+        with a fault is stored, and sets off no retrain. Raises ReportError for an unknown id, a
+        second report or what is no label, TraceError for a wrong `trace` or `part`, and StoreError
+        for an engine that is closed, only reads, or is in use by another thread.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)

@@ -237,9 +237,9 @@ class Corrections:
         Raises
         ------
         SettingError
-            For what is no policy, for force limits that the traces cannot hold, and, of a model
-            that was handed in, for anything but audit_rate, stops, label_within, windows and
-            shadow.
+            For what is no policy, for force limits that the traces cannot hold, for a guarantee
+            whose class cannot be imported or made, and, of a model that was handed in, for anything
+            but audit_rate, stops, label_within, windows and shadow.
         StoreError
             Where the store does not answer.
         """
@@ -295,7 +295,8 @@ class Corrections:
         """Finish what is under way, then return the decisions of these ids, in their order.
 
         A decision whose label was forgotten has `success` None. Raises ReportError for an unknown
-        id, and for a decision that never had a label.
+        id, and for a decision that never had a label, and StoreError where the store does not
+        answer.
         """
         self._bring_up_to_date()
         decisions = []
@@ -312,7 +313,8 @@ class Corrections:
         """Store a change of labels, and apply it to references, training window and rule.
 
         A model that cannot change its references is retrained. A safe mode that began or ended is
-        announced. Returns what was done, with the number of the change's event.
+        announced. Returns what was done, with the number of the change's event. Raises StoreError
+        where the store does not answer.
         """
         self._store.apply_change(change)
         for id_ in change.decisions:

@@ -106,7 +106,7 @@ class Feedback:
 
         The live model must be restored before. With `stops="all"` the accepted parts are kept, so
         that the next trace confirms them. With "some" they are only counted, as unobserved since
-        the last label.
+        the last label. Raises StoreError where the store cannot be read.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store

@@ -95,7 +95,8 @@ class Learner:
 
         A check is overdue after `label_within` later decisions; `policy_since` is the first version
         under the policy in force. With a version, or with at least `IMPORTED` labels, it also
-        begins in a thread to compute what the next retrain starts with.
+        begins in a thread to compute what the next retrain starts with. Raises StoreError where the
+        store cannot be read.
         """
         version = self._store.last_version()  # before the labels: a peer may store both meanwhile
         labelled = self._store.labelled(self._window.capacity)
@@ -579,7 +580,8 @@ class Learner:
 
         With `policy` the rule starts anew and counts the decisions of `evidence`. With None only
         settings outside the model have changed, and its rule goes on. Before the first retrain only
-        the event is stored. Raises StoreError where it cannot be stored: then nothing changes.
+        the event is stored. Raises SettingError for a rule that cannot be made, and StoreError
+        where the event cannot be stored: then nothing changes.
         """
         live = self.live
         template = live.template

@@ -293,7 +293,7 @@ class LiveModel:
         """Return copies of template and answering model under another policy, with a new rule.
 
         The second is None before the first retrain; it shares the references of the answering
-        model. Neither is in force yet.
+        model. Neither is in force yet. Raises SettingError for a rule that cannot be made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)

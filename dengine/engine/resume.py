@@ -29,7 +29,8 @@ def restore_model(
 
     A model that is stored by its traces is trained on them again. Returns None where one of these
     traces is damaged or missing. The two models share one rule, so the template has the stored
-    rule, too. Raises StoreError for a state that this dengine cannot restore, and as `refit`.
+    rule, too. Raises StoreError for a state that this dengine cannot restore, for a damaged label,
+    and where the store cannot be read.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -89,7 +90,7 @@ def add_labels_since(
     that came meanwhile are applied between the labels, where they came, so that the model is the
     same bit for bit. A baseline, which cannot be corrected, gets the labels as they count now. A
     label that the model cannot take is logged and skipped. Returns the number of the newest
-    correction in the store.
+    correction in the store. Raises StoreError where the store cannot be read.
     """
     corrected_to = newest_correction(version)
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another
@@ -127,7 +128,7 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     Returns False, and changes nothing, where the model has references and cannot change that one:
     it must be trained again. Otherwise True, also where nothing is changed: for a reference that
     is not there, for a quarantined part, for a damaged trace that would have to be added again, and
-    for a baseline, which has no references.
+    for a baseline, which has no references. Raises StoreError where the store cannot be read.
     """
     if not model.keeps_references:
         return True

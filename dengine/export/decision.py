@@ -105,7 +105,7 @@ class DecisionModule(nn.Module):
         Parameters
         ----------
         trace : Tensor of any real dtype, shape (T,) or (C, T)
-            As `as_trace` takes it.
+            Another T is fitted as the contract's `fit` says.
         part : int, default 0
             Hash of its part's number (`folds.part_hash`); 0 for an unknown part.
 
@@ -176,7 +176,7 @@ class DecisionModule(nn.Module):
         Parameters
         ----------
         trace : Tensor of any real dtype, shape (T,) or (C, T)
-            As `as_trace` takes it.
+            Another T is fitted as the contract's `fit` says.
         success : bool
             The label.
         part : int, default 0

@@ -294,7 +294,8 @@ class ModelPrediction(EngineModel):
         """Return the untrained model that a recipe describes; `seed` is the reducer's.
 
         Reducer, radius, folds, novelty, policy and decision rule are the recipe's; its window is
-        the largest number of references.
+        the largest number of references. Raises SettingError for a reducer or a rule that cannot be
+        made.
         """
         policy = recipe.policy
         classifier = WilsonRadiusClassifier(
@@ -501,13 +502,11 @@ class ModelPrediction(EngineModel):
         ValueError
             If nothing was fitted.
         """
-        if "index" not in vars(self):
-            raise ValueError("Expected a fitted model; call fit(X, y) first.")
+        unlimited = DecisionConditions(self.trace_spec)
+        conditions = conditions or unlimited
         encoder = self.spaces.module()
         neighbours: Any = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
         scale = torch.from_numpy(self.scale)
-        channels, samples = self.trace_shape
-        conditions = conditions or DecisionConditions(TraceSpec(samples, channels=channels))
         shape = (self.n_spaces, self.index.dim)
         rule_compiles = self.rule.scriptable and _is_code_unchanged(self.rule)
         if encoder is not None and not _is_code_unchanged(encoder):
@@ -522,6 +521,14 @@ class ModelPrediction(EngineModel):
         neighbours = script(neighbours) if rule_compiles else neighbours
         predictor = Predictor(encoder, scale, script(self.gate), neighbours)
         return Decider(predictor, conditions, shape).eval()
+
+    @property
+    def trace_spec(self) -> TraceSpec:
+        """Shape of the traces that it was trained on; ValueError if nothing was fitted."""
+        if "index" not in vars(self):
+            raise ValueError("Expected a fitted model; call fit(X, y) first.")
+        channels, samples = self.trace_shape
+        return TraceSpec(samples, channels=channels)
 
     @property
     def is_compiled(self) -> bool:  # type: ignore[override]  # asked when there is a predictor
@@ -549,10 +556,10 @@ class ModelPrediction(EngineModel):
 
         `y` is 1 for success, 0 for failure. The content of the trace gives its fold and stands for
         its part. The reducer is not trained, and a full index drops its oldest reference. Returns
-        self; raises ValueError if nothing was fitted, and for another label, RuntimeError for a
-        trace of another shape. Samples are not checked: a NaN makes a reference of NaN.
+        self; raises ValueError if nothing was fitted, TraceError for a trace of another shape, and
+        ReportError for another label. Samples are not checked: a NaN makes a reference of NaN.
         """
-        X = as_traces(np.asarray(x)[None])
+        X = as_traces(np.asarray(x)[None], self.trace_spec)
         hash_ = int(content_hash(X)[0])
         self.add_reference(X[0], int(as_success(np.asarray(y))), hash_)
         return self
@@ -648,7 +655,7 @@ class ModelPrediction(EngineModel):
         """Return a model under another policy, to be compiled anew around the same references.
 
         Its rule has learned nothing and is not stale. This model does not change, but both share
-        the references and the reducer.
+        the references and the reducer. Raises SettingError for a rule that cannot be made.
         """
         settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         model = copy.copy(self)
@@ -665,8 +672,9 @@ class ModelPrediction(EngineModel):
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """Predict one trace (channels, samples) without force limits, fault checks and audits.
 
-        References of the part with this hash have no vote; 0 excludes none. Raises RuntimeError
-        where the rule is stale or the trace has another shape, ValueError where nothing was fitted.
+        References of the part with this hash have no vote; 0 excludes none. The trace's shape is
+        not checked. Raises RuntimeError where the rule is stale, ValueError where nothing was
+        fitted.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -699,16 +707,19 @@ class ModelPrediction(EngineModel):
             raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
 
     def predict_many(self, X: ArrayLike) -> list[Prediction]:
-        """Predict each trace of X, shape (n, samples) or (n, channels, samples)."""
-        return [self.predict_one(x) for x in as_traces(X)]
+        """Predict each trace of X, shape (n, samples) or (n, channels, samples).
+
+        Raises TraceError for traces of another shape than those it was trained on.
+        """
+        return [self.predict_one(x) for x in as_traces(X, self.trace_spec)]
 
     def count(self, X: ArrayLike) -> Counts:
         """Count the labels in the neighbourhood of each trace of X, summed over the K spaces.
 
         X has the shape (n, samples) or (n, channels, samples). Returns (n_success, n_failure), each
         an array of int64, shape (n,); 0 for a novel trace. No part is excluded, so a reference
-        counts itself. Raises RuntimeError where the rule is stale, ValueError where nothing was
-        fitted.
+        counts itself. Raises TraceError for another shape, RuntimeError where the rule is stale,
+        and ValueError where nothing was fitted.
         """
         predictions = self.predict_many(X)
         n_success = np.array([prediction.n_success for prediction in predictions], dtype=np.int64)
@@ -719,7 +730,8 @@ class ModelPrediction(EngineModel):
         """Return (lower, upper), each float64 (n,): the bounds of each trace's success probability.
 
         X has the shape (n, samples) or (n, channels, samples). The bound is (0, 1) for a novel
-        trace. Raises RuntimeError where the rule is stale, ValueError where nothing was fitted.
+        trace. Raises TraceError for another shape, RuntimeError where the rule is stale, and
+        ValueError where nothing was fitted.
         """
         predictions = self.predict_many(X)
         lower = np.array([prediction.lower for prediction in predictions])
@@ -804,8 +816,7 @@ class ModelPrediction(EngineModel):
             raise ExportError(
                 "Nothing was trained yet; report labels until the first retrain, then export."
             )
-        channels, samples = self.trace_shape
-        return Exportable(self, trace or TraceSpec(samples, channels=channels))
+        return Exportable(self, trace or self.trace_spec)
 
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.

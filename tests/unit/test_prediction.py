@@ -7,7 +7,14 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.neighbors import NeighborhoodComponentsAnalysis
 
-from dengine import DataEngine, Dataset, ModelPrediction, TraceSpec, WilsonRadiusClassifier
+from dengine import (
+    DataEngine,
+    Dataset,
+    ModelPrediction,
+    TraceError,
+    TraceSpec,
+    WilsonRadiusClassifier,
+)
 from dengine.decision.decider import DecisionConditions, trace_gate
 from dengine.folds import content_fold, content_hash
 from dengine.model import neighbours
@@ -111,6 +118,18 @@ def test_a_label_added_later_is_counted_in_its_own_folds_space(data: Dataset) ->
         / model.scale[fold[150:], None]
     )
     np.testing.assert_allclose(ring.points[:, 150:200].numpy().T, custom, atol=1e-5)
+
+
+def test_a_trace_of_another_shape_is_refused_even_where_the_encoder_would_take_it(
+    data: Dataset,
+) -> None:
+    model = ModelPrediction("rocket", novelty=0).fit(data.X, data.y)
+    longer = np.pad(data.X, ((0, 0), (0, 100)), mode="edge")
+    with pytest.raises(TraceError, match="samples"):
+        model.add(longer[0], 1)
+    with pytest.raises(TraceError, match="samples"):
+        model.count(longer)
+    assert len(model.index) == len(data.X)
 
 
 class _Nosy(TransformerMixin, BaseEstimator):
