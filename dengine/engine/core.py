@@ -472,7 +472,7 @@ class EngineCore:
         milliseconds. A retrain that is due begins in the executor, or without one runs here.
         Returns the newest report, of a retrain that was accepted or dropped, a rollback or a new
         policy; None if this method has returned it before. `report` and `retrain` may have returned
-        it, too.
+        it, too. Raises StoreError while another thread uses the engine.
         """
         with self.exclusive:
             self.learner.collect(to_the_end=not brief)
@@ -507,7 +507,7 @@ class EngineCore:
         store.
 
         A second call does nothing. Raises NotTakenError, and closes nothing, where the journal
-        cannot be written.
+        cannot be written, and StoreError while another thread uses the engine.
         """
         with self.exclusive:
             if self.outbox.is_usable:
