@@ -23,7 +23,6 @@ COPIED = {  # page or picture of the site -> file of the repository
     "explanation/insertion_heights.png": "dengine/data/insertion_heights.png",
     "explanation/insertion_scenarios.png": "dengine/data/insertion_scenarios.png",
 }
-NOTEBOOKS = "<!-- every notebook -->"
 CARDS = "<!-- every card -->"
 MOST_OUTPUT = 4000  # characters of one output
 
@@ -43,11 +42,10 @@ def on_files(files: Files, config: MkDocsConfig, **others: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **others: Any) -> str:
-    """Return a page with lists in the place of its marks, and with links into docs/ corrected."""
-    notebook_links = [f"- [{title(path)}]({path.stem}.md)" for path in notebooks()]
+    """Return a page with the list of cards, and with links to docs/ and notebooks corrected."""
     card_links = [f"- [{path.parent.name}]({path.parent.name}/card.md)" for path in cards()]
     markdown = re.sub(r"\]\(((?:\.\./)*)docs/", r"](\1", markdown)
-    markdown = markdown.replace(NOTEBOOKS, "\n".join(notebook_links))
+    markdown = re.sub(r"\]\((\w+)\.ipynb\)", r"](\1.md)", markdown)
     return markdown.replace(CARDS, "\n".join(card_links))
 
 
@@ -59,13 +57,6 @@ def notebooks() -> list[Path]:
 def cards() -> list[Path]:
     """Return the paths of the trained models' cards."""
     return sorted((REPO / "models").glob("*/card.md"))
-
-
-def title(notebook: Path) -> str:
-    """Return a notebook's first heading, or its file's name."""
-    page = notebook_files(notebook)[f"{notebook.stem}.md"]
-    heading = re.search(r"^# (.+)$", page, flags=re.MULTILINE)
-    return heading[1] if heading else notebook.stem
 
 
 def notebook_files(notebook: Path) -> dict[str, Any]:

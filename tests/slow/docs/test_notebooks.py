@@ -1,8 +1,8 @@
-"""The walkthroughs are committed as they ran, with pictures and without errors, and run again from their code alone.
+"""The notebooks are stored as they ran, without errors, and their code still runs.
 
-Cells that take long run again with fewer replays and parts; those that are exact run as they are.
-
-After a change: `jupyter execute --inplace notebooks/NAME.ipynb`, and look at every picture.
+Cells that take long run with fewer replays and parts. Cells with the tag "exact" run unchanged,
+and must print what is stored. After a change: `jupyter execute --inplace notebooks/NAME.ipynb`,
+and look at every picture.
 """
 
 import copy
@@ -12,9 +12,11 @@ from typing import Any
 import pytest
 
 FOLDER = Path(__file__).parents[3] / "notebooks"
+INDEX = FOLDER.parent / "docs" / "notebooks" / "index.md"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-BIGGEST = 600_000  # bytes, pictures included
-SMALLER = {  # by notebook: what makes its long cells quick; never in an exact one
+MAX_BYTES = 600_000  # of a notebook with its pictures
+# Notebook -> text of its code, and the text that replaces it to make long cells quick.
+SMALLER = {
     "comparing_reducers": {
         "replay(data, recipe, seed=0)": "replay(data, recipe, seed=0, cycles=400)",
         "[1, 60, 400, 800, 1500]": "[1, 60, 400]",
@@ -23,9 +25,7 @@ SMALLER = {  # by notebook: what makes its long cells quick; never in an exact o
         "(200, 800, 1500)": "(100, 400)",
         "cycles=300": "cycles=100",
     },
-    "corrections": {"range(200)": "range(20)"},
-    "recordings_to_deployment": {"--repeats 2": "--repeats 1 --cycles 80"},
-    "training_an_encoder": {"range(1, 13)": "range(1, 4)", "cycles=400": "cycles=120"},
+    "recordings_to_deployment": {"repeats=2": "repeats=1, cycles=80"},
     "shadow_and_costs": {
         '"alphas": (0.5, 0.1, 0.05)': '"alphas": (0.5, 0.1)',
         '"repeats": 6': '"repeats": 2',
@@ -36,70 +36,78 @@ SMALLER = {  # by notebook: what makes its long cells quick; never in an exact o
         "cycles=500": "cycles=150",
         "cycles=900": "cycles=300",
     },
+    "training_an_encoder": {"range(1, 13)": "range(1, 4)", "cycles=400": "cycles=120"},
 }
+
+every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
 def read(path: Path) -> Any:
     return pytest.importorskip("nbformat").read(path, as_version=4)
 
 
-def outputs(notebook: Any) -> list[Any]:
-    return [out for cell in notebook.cells for out in cell.get("outputs", [])]
+def code_cells(notebook: Any) -> list[Any]:
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-def text(cell: Any) -> str:
-    """What a cell printed, and what it shows as text, in one piece: a kernel may send it in several."""
-    return "".join(
-        out.get("text", out.get("data", {}).get("text/plain", "")) for out in cell.outputs
-    )
-
-
-def exact(notebook: Any) -> list[Any]:
-    """The cells whose output depends on no machine: seeded counts, files that are read, and no model."""
+def exact_cells(notebook: Any) -> list[Any]:
     return [cell for cell in notebook.cells if "exact" in cell.metadata.get("tags", [])]
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
-def test_a_notebook_is_committed_as_it_ran_small_and_shows_no_folder_of_its_author(
-    path: Path,
-) -> None:
+def has_picture(notebook: Any) -> bool:
+    outputs = [output for cell in code_cells(notebook) for output in cell.outputs]
+    return any("image/png" in output.get("data", {}) for output in outputs)
+
+
+def printed(cell: Any) -> str:
+    """Join what a cell printed and shows as text; a kernel may send it in several outputs."""
+    return "".join(
+        output.get("text", output.get("data", {}).get("text/plain", "")) for output in cell.outputs
+    )
+
+
+def test_the_index_names_every_notebook() -> None:
+    text = INDEX.read_text(encoding="utf-8")
+    assert [path.stem for path in NOTEBOOKS if f"({path.stem}.md)" not in text] == []
+
+
+@every_notebook
+def test_a_notebook_is_stored_as_it_ran_without_errors_and_paths(path: Path) -> None:
     notebook = read(path)
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
-    assert not [
-        out
-        for out in outputs(notebook)
-        if out.output_type == "error" or out.get("name") == "stderr"
-    ]
-    assert any("image/png" in out.get("data", {}) for out in outputs(notebook))
-    assert any(text(cell) for cell in exact(notebook))
-    assert path.stat().st_size < BIGGEST
-    shown = "".join(map(text, code))
-    assert not [
-        folder
-        for folder in ("/home/", "/root/", "/tmp/", "/Users/", str(FOLDER.parent))
-        if folder in shown
-    ]
+    cells = code_cells(notebook)
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    for output in (output for cell in cells for output in cell.outputs):
+        assert output.output_type != "error"
+        assert output.get("name") != "stderr"
+    assert has_picture(notebook)
+    assert any(printed(cell) for cell in exact_cells(notebook))
+    assert path.stat().st_size < MAX_BYTES
+    text = "".join(printed(cell) for cell in cells)
+    for folder in ("/home/", "/root/", "/tmp/", "/Users/", str(FOLDER.parent)):
+        assert folder not in text
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
-def test_a_notebook_runs_anew_and_its_exact_cells_say_what_they_said(path: Path) -> None:
+@every_notebook
+def test_a_notebook_runs_and_its_exact_cells_print_what_is_stored(path: Path) -> None:
     nbclient = pytest.importorskip("nbclient")
-    committed = read(path)
-    notebook = copy.deepcopy(committed)
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    for cell in code:
+    stored = read(path)
+    notebook = copy.deepcopy(stored)
+    for cell in code_cells(notebook):
         cell.outputs = []
-    left = [cell for cell in code if cell not in exact(notebook)]
+    exact = exact_cells(notebook)
+    others = [cell for cell in code_cells(notebook) if cell not in exact]
     for long, short in SMALLER[path.stem].items():
-        assert any(long in cell.source for cell in left), (
-            f"{long} is in no cell that may be shorter"
-        )
-        for cell in left:
+        assert any(long in cell.source for cell in others), f"{long} is in no cell"
+        for cell in others:
             cell.source = cell.source.replace(long, short)
-    there = {"metadata": {"path": str(FOLDER)}}
-    done = nbclient.NotebookClient(
-        notebook, timeout=240, kernel_name="python3", resources=there
-    ).execute()  # raises
-    assert any("image/png" in out.get("data", {}) for out in outputs(done))
-    assert [text(cell) for cell in exact(done)] == [text(cell) for cell in exact(committed)]
+    client = nbclient.NotebookClient(
+        notebook,
+        timeout=240,  # of each cell
+        kernel_name="python3",
+        resources={"metadata": {"path": str(FOLDER)}},
+    )
+    executed = client.execute()
+    assert has_picture(executed)
+    assert [printed(cell) for cell in exact_cells(executed)] == [
+        printed(cell) for cell in exact_cells(stored)
+    ]
