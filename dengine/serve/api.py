@@ -252,7 +252,7 @@ def _look_like_float64(words: NDArray[np.float32]) -> bool:
     if not low.view(np.uint32).any():  # whole numbers, or halves of them
         return bool(high.view(np.uint32).any())
     low = low[np.isfinite(low)]
-    largest = float(np.abs(high[np.isfinite(high)]).max(initial=1.0))
+    largest = np.float64(np.abs(high[np.isfinite(high)]).max(initial=1.0))
     n_large = int((np.abs(low) > LARGE_FACTOR * largest).sum())
     return n_large >= LARGE_SHARE * len(words)
 
