@@ -358,7 +358,7 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
 
     It replaces the handlers of these signals until the block ends. The first signal makes the next
     call of `count` raise StepInterruptedError. A second one acts at once, as it would have without
-    this block.
+    this block. It must be used in the main thread, as Python asks of signal handlers.
 
     Parameters
     ----------

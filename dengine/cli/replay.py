@@ -1,6 +1,6 @@
 """The verbs `dengine replay`, `compare` and `costs`: recorded streams through fresh engines.
 
-All three play replays with the same options (`stream_options`). Ctrl-C keeps and shows the replays
+All three take the options of `stream_options` for how streams are played. Ctrl-C keeps and shows the replays
 that were finished.
 """
 
@@ -71,8 +71,6 @@ class Stream:
         Replays at a time, as joblib counts them.
     keep : Path or None
         Folder of finished replays, which are read from there and not played again.
-    check_seconds : float, default 5.0
-        How long a verification takes.
     """
 
     seeds: range
@@ -80,7 +78,6 @@ class Stream:
     shuffle: bool = True
     n_jobs: int = 1
     keep: Path | None = None
-    check_seconds: float = 5.0
 
 
 class PlayedTasks(NamedTuple):
@@ -155,12 +152,12 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
     repeats, n_jobs : int
         Defaults of `--repeats` and `--n-jobs`.
     least : int
-        Smallest number of repeats.
+        Smallest number of repeats; above 1 there is no `--in-order`, which plays one.
     text : str
         Help of `--repeats`.
     """
 
-    def make_stream(repeats: int, in_order: bool, seed: int, **settings: Any) -> Stream:
+    def make_stream(repeats: int, seed: int, in_order: bool = False, **settings: Any) -> Stream:
         """Return the stream; a usage error if `--repeats` is given beside `--in-order`."""
         if in_order:
             source = click.get_current_context().get_parameter_source("repeats")
@@ -169,25 +166,23 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
             repeats = 1
         return Stream(range(seed, seed + repeats), shuffle=not in_order, **settings)
 
-    return options.bundle_options(
-        "stream",
-        make_stream,
-        {
-            "repeats": click.option(
-                "--repeats",
-                type=click.IntRange(least),
-                default=repeats,
-                show_default=True,
-                help=text,
-            ),
-            "seed": options.seed_option,
-            "cycles": click.option("--cycles", type=COUNT, help=_CYCLES),
-            "in_order": click.option("--in-order", is_flag=True, help=_IN_ORDER),
-            "n_jobs": options.n_jobs_option(n_jobs, _N_JOBS),
-            "keep": click.option("--keep", type=options.FOLDER, metavar="FOLDER", help=_KEEP),
-            "check_seconds": options.check_option,
-        },
-    )
+    flags: dict[str, options.Option] = {
+        "repeats": click.option(
+            "--repeats",
+            type=click.IntRange(least),
+            default=repeats,
+            show_default=True,
+            help=text,
+        ),
+        "seed": options.seed_option,
+        "cycles": click.option("--cycles", type=COUNT, help=_CYCLES),
+        "in_order": click.option("--in-order", is_flag=True, help=_IN_ORDER),
+        "n_jobs": options.n_jobs_option(n_jobs, _N_JOBS),
+        "keep": click.option("--keep", type=options.FOLDER, metavar="FOLDER", help=_KEEP),
+    }
+    if least > 1:
+        del flags["in_order"]
+    return options.bundle_options("stream", make_stream, flags)
 
 
 GRID_LISTS = {
@@ -214,6 +209,7 @@ POLICY_LISTS = GRID_LISTS | {
 @options.recipe_options
 @click.option("--confirm", is_flag=True, help="Accepted good parts are confirmed afterwards.")
 @stream_options(30, 1, 1, _SHUFFLES)
+@options.check_option
 @explain_option
 @options.out_option
 def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
@@ -256,6 +252,7 @@ _FEEDBACK = (
     help=_FEEDBACK,
 )
 @stream_options(30, 1, 1, _SHUFFLES)
+@options.check_option
 @explain_option
 @options.out_option
 def compare(
@@ -309,6 +306,7 @@ def _replay_and_print(
     grid: Mapping[str, Any],
     source: DataChoice,
     stream: Stream,
+    check_seconds: float,
     out: Out | None,
 ) -> None:
     """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
@@ -327,7 +325,7 @@ def _replay_and_print(
     replays, interrupted, costs = _play_tasks(dataset, tasks, stream)
     if not replays:
         exit_interrupted(f"{interrupted}; there is nothing to show.")
-    frame = tables.frame_of(replays, stream.check_seconds)
+    frame = tables.frame_of(replays, check_seconds)
     rows = tables.pool(frame, replays)
     by_name = _group_replays(replays, lambda replay: replay.name)
     title = _title(dataset.name, by_name, not stream.shuffle)

@@ -285,7 +285,8 @@ class Guard:
         """Raise Refusal for a request that is not allowed; else note its token for the handlers.
 
         In this order it checks the host name (421), rate and token (`_check_token`), the site that
-        a change comes from (403), and the announced length of the body (400, 413).
+        a change comes from (403), and the announced length of the body (400, 413). A token in the
+        path is removed from the scope.
         """
         headers = Headers(scope=scope)
         host = headers.get("host")

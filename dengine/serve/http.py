@@ -564,6 +564,8 @@ def create_app(
 ) -> Starlette:
     """Create the application. The caller closes the service after it has ended.
 
+    The service gets an observer, which counts its responses for `GET /metrics`.
+
     Parameters
     ----------
     service : CellService

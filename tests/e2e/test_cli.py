@@ -220,6 +220,13 @@ def test_in_order_plays_the_stream_once_and_json_has_null_where_nothing_was_acce
     assert dengine(*words, "--repeats", 3).exit_code == 2
 
 
+@pytest.mark.parametrize("option", ["--in-order", "--check-seconds=8"])
+def test_costs_refuses_what_it_could_not_follow(data: Path, option: str) -> None:
+    prices = ("--escape", 120, "--false-reject", 30)
+    result = dengine("costs", "--data", data, *prices, option)
+    assert (result.exit_code, "No such option" in result.output) == (2, True)
+
+
 def compare(data: Path, words: str) -> list[object]:
     return ["compare", "--data", data, "--cycles", 60, *words.split()]
 
