@@ -1,7 +1,7 @@
 """The verbs `dengine replay`, `compare` and `costs`: recorded streams through fresh engines.
 
-All three take the options of `stream_options` for how streams are played. Ctrl-C keeps and shows the replays
-that were finished.
+All three take the options of `stream_options` for how streams are played. Ctrl-C keeps and shows
+the replays that were finished.
 """
 
 from __future__ import annotations
