@@ -332,7 +332,8 @@ class RobotCalls:
         return True
 
     async def status(self) -> Struct:
-        """Return how the cell is doing, in plain numbers and texts. No decision waits for it.
+        """Return how the cell is doing, in plain numbers and texts. No decision waits for the
+        reading of the store.
 
         Returns
         -------

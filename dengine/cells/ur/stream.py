@@ -296,7 +296,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def take(self, timeout: float) -> Row | None:
         """Remove and return the oldest buffered package.
 
-        None if none comes in `timeout` s, or the stream is closed.
+        None if none comes in `timeout` seconds, or before the stream is closed.
         """
         with self._news:
             self._news.wait_for(lambda: self._rows or self._closing.is_set(), timeout)
