@@ -36,7 +36,8 @@ SIGNIFICANT = 0.01  # p-values below it are called drift
 def data(source: DataChoice, out: Out | None) -> None:
     """Describe a data set, and list what is wrong with it.
 
-    A table counts traces, labels, faults and repeats, and shows drift; --out draws the traces too.
+    A table counts traces, labels, faults and repeats, one says how the data were read, and one
+    shows drift; --out draws the traces too.
 
     DATA is one of: a folder of CSV files, one for each insertion, with the label in its name or in
     a column; a wide .csv or .parquet file, with a row for each insertion; a long one, with a row
@@ -58,6 +59,7 @@ def data(source: DataChoice, out: Out | None) -> None:
     if survey.not_finite_in:
         files = listed(survey.not_finite_in)
         parts.append(f"Not finite, because cells are empty or hold no number: {files}.")
+    parts.append(table_of_rows("How it was read", dataset.reading.items()))
     if dataset.ordered:
         drifts = map(_drift_row, survey.drift)
         parts.append(table_of_rows("By tenths of the recorded order", drifts, ("", "means", "")))
@@ -72,7 +74,7 @@ def data(source: DataChoice, out: Out | None) -> None:
             "(--part)."
         )
     print_result(
-        {"data": source.data, "survey": survey, "notes": dataset.notes},
+        {"data": source.data, "survey": survey, "notes": dataset.notes, "reading": dataset.reading},
         *parts,
         *fault_lines(dataset, MOST_FAULTS),
         out=out,
@@ -185,6 +187,7 @@ def train(
             "store": store,
             "faults": dataset.faults,
             "notes": dataset.notes,
+            "reading": dataset.reading,
             "import": imported,
         }
         if not (imported.imported or core_of(engine).new_labels) and engine.version:

@@ -398,18 +398,21 @@ class DataChoice:
     def load(self) -> Dataset:
         """Load the data set and return it.
 
-        Its notes and the first recordings that were left out are printed to stderr, but not with
-        `--json`.
+        How it was read, its notes and the first recordings that were left out are printed to
+        stderr, but not with `--json`.
 
         Raises
         ------
         DataError
             It cannot be read.
         """
-        from ..datasets import load_dataset
+        from ..datasets import BUNDLED, load_dataset
 
         data = load_dataset(self.data, **self.options)
         if not as_json():
+            about = "; ".join(f"{name}: {text}" for name, text in data.reading.items())
+            if self.data not in BUNDLED:
+                click.echo(f"How it was read: {about}.", err=True)
             for line in (*map(as_options, data.notes), *fault_lines(data, 3)):
                 click.echo(line, err=True)
         return data

@@ -19,9 +19,17 @@ from ..errors import DataError, listed
 from ..files import read_archive
 from ..traces import is_time_column
 from . import labels
-from .dataset import Dataset, LoadOptions, RecordingCollector, UnreadableError, as_dataset
+from .dataset import (
+    Dataset,
+    LoadOptions,
+    Reading,
+    Recording,
+    RecordingCollector,
+    UnreadableError,
+    as_dataset,
+)
 from .tables import choose_channels
-from .text import TimedTrace, rows_to_trace
+from .text import rows_to_trace
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,7 +81,7 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
         channels = choose_channels(available, options)
     collector = RecordingCollector(name, channels)
 
-    def read(path: Path) -> TimedTrace:
+    def read(path: Path) -> Recording:
         """Return the trace of an archive, with the rate that it states or its times tell."""
         arrays, _ = read_archive(path)
         rows = _to_frame(arrays, options)
@@ -84,8 +92,11 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
         timed = rows_to_trace(rows, places, options, collector.notes)
         unit = (str(arrays["unit"]),) * len(channels) if "unit" in arrays else ()
         rate = float(arrays["rate_hz"]) if "rate_hz" in arrays else timed.rate_hz
-        return TimedTrace(timed.trace, None if options.rate_hz else rate, unit)
+        if "rate_hz" in arrays and not options.rate_hz:
+            timed = timed._replace(reading=Reading(clock="none, the array rate_hz"))
+        return timed._replace(rate_hz=None if options.rate_hz else rate, units=unit)
 
+    collector.order = "by name, numbers by size"
     labels.collect_recordings(named, read, _label_source(named, options), collector)
     return as_dataset(collector, options)
 

@@ -20,13 +20,14 @@ from . import labels
 from .dataset import (
     Dataset,
     LoadOptions,
+    Reading,
+    Recording,
     RecordingCollector,
     UnreadableError,
     as_dataset,
     expect_data,
 )
 from .tables import natural_key
-from .text import TimedTrace
 from .triggers import Active, StartFinder, Trigger, as_trigger, place
 
 if TYPE_CHECKING:
@@ -55,12 +56,15 @@ class Messages(NamedTuple):
     wrench : array of float64, shape (n, 6)
     others : dict
         For each other topic its messages, as (nanoseconds of the log, value).
+    clock : str
+        Which times they are, in words.
     """
 
     times: Times
     logged: NDArray[np.int64]
     wrench: NDArray[np.float64]
     others: dict[str, list[tuple[int, Any]]]
+    clock: str
 
     def signal(self, name: str) -> NDArray[np.float64]:
         """Return an axis of the wrench, or the value of a topic at each wrench, shape (n,).
@@ -158,8 +162,9 @@ def _read_messages(files: Sequence[Path], wrench: str, topics: Sequence[str]) ->
                     others[topic].append((record.log_time, message.data))
     expect_data(len(logged) >= 2, f"messages of {wrench} in {files[0]}", len(logged))
     exact = np.array(logged if 0 in stamped else stamped, dtype=np.int64)
+    clock = "times of the log" if 0 in stamped else "stamps of the headers"
     times = (exact - exact[0]) / NANOSECONDS
-    return Messages(times, np.array(logged), np.array(forces), others)
+    return Messages(times, np.array(logged), np.array(forces), others, clock)
 
 
 def _nanoseconds_of(stamp: Any) -> int:
@@ -268,12 +273,13 @@ def _cut_dataset(
     else:
         source = _labels_in_topic(options, messages, cuts, names)
 
-    def read(insertion: "RecordedInsertion") -> TimedTrace:
+    def read(insertion: "RecordedInsertion") -> Recording:
         if insertion.fault:
             raise UnreadableError(insertion.fault)
-        return TimedTrace(insertion.trace, None if options.rate_hz else rate)
+        return Recording(insertion.trace, None if options.rate_hz else rate, reading=reading)
 
-    collector = RecordingCollector(name, channels)
+    reading = Reading(clock="" if options.rate_hz else messages.clock)
+    collector = RecordingCollector(name, channels, order="as in the bag")
     labels.collect_recordings(insertions, read, source, collector)
     return as_dataset(collector, options)
 

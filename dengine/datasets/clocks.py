@@ -67,11 +67,14 @@ class Clock(NamedTuple):
         Since the first row; NaN where a cell states no time.
     note : str
         What was assumed and users should know; "" where name and unit say it all.
+    form : str
+        Its unit or form in words, as "ms" or "dates".
     """
 
     name: str
     seconds: NDArray[np.float64]
     note: str
+    form: str
 
 
 def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
@@ -231,8 +234,10 @@ def clock_of(
     seconds = _join_seconds(frame, name)
     wrong = list[int]()
     note = ""
+    form = "seconds and nanoseconds"
     if seconds is None:
-        seconds, wrong, note = seconds_of(column, name, units_row[place] if units_row else "")
+        unit = units_row[place] if units_row else ""
+        seconds, wrong, note, form = seconds_of(column, name, unit)
     if wrong:
         wanted = f"a time in column {name}, in seconds or as 2026-03-01T12:00:00.002"
         actual = excerpt(str(column[wrong[0]]))
@@ -241,9 +246,8 @@ def clock_of(
             do = "leave such rows out of the file if they are no samples"
         raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", wrong[0])
     if time is None and not is_time_column(name):
-        assumed = f"Column {name or place + 1} is taken as the clock by its values"
-        note = f"{assumed}; {note}" if note else assumed
-    return Clock(name, seconds, note)
+        form = f"{form}, column {place + 1} by its values"
+    return Clock(name, seconds, note, form)
 
 
 def _join_seconds(frame: pd.DataFrame, name: str) -> NDArray[np.float64] | None:
@@ -275,7 +279,7 @@ def _join_seconds(frame: pd.DataFrame, name: str) -> NDArray[np.float64] | None:
 
 def seconds_of(
     column: pd.Series, name: str, unit: str = ""
-) -> tuple[NDArray[np.float64], list[int], str]:
+) -> tuple[NDArray[np.float64], list[int], str, str]:
     """Convert a column of times to seconds.
 
     Parameters
@@ -294,6 +298,8 @@ def seconds_of(
         Index of each cell that states no time, but not of empty ones among numbers.
     note : str
         What was assumed of the unit, for the user; "" for nothing.
+    form : str
+        As in `Clock`.
 
     Raises
     ------
@@ -306,9 +312,11 @@ def seconds_of(
         times, wrong = floats(column)
         if 2 * len(wrong) < max(len(times), 1):
             scale, note = _seconds_per_count(times, name, unit)
-            return _elapsed(column, times) * scale, wrong, note
+            unit = next((u for u, s in units.SECONDS.items() if s == scale), f"{scale:g} s")
+            return _elapsed(column, times) * scale, wrong, note, unit
     seconds, missing = _parse_timestamps(column)
-    return seconds, column.index[missing].tolist(), ""
+    form = "dates" if holds_dates(column) else "times of day"
+    return seconds, column.index[missing].tolist(), "", form
 
 
 def holds_dates(column: pd.Series) -> bool:

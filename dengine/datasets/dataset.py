@@ -36,6 +36,8 @@ UNKNOWN_RATE = (
     " rate_hz=..."
 )
 LABEL_FORMS = "as True/False, OK/NOK, pass/fail or 1/0"
+MEANINGS = ("bad", "good")  # of the labels 0 and 1
+MAX_COUNTED = 6  # different texts of a kind that are shown of how recordings were read
 MAX_LABEL_WORDS = 12  # more different words are no labels
 expect_data = partial(expect, error=DataError)
 
@@ -134,6 +136,9 @@ class Dataset:
     ordered : bool, default True
         Whether the order of the traces is that of the recording. False for files that are ordered
         by their label, as in folders `good/` and `bad/`.
+    reading : mapping of str to str
+        How the recordings were read, in words: their labels, clock, rows, numbers, order, and the
+        first of them. What does not apply is left out.
     """
 
     X: NDArray[np.float32]
@@ -152,6 +157,7 @@ class Dataset:
     notes: tuple[str, ...] = ()
     unlabelled: int = 0
     ordered: bool = True
+    reading: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.y)
@@ -322,40 +328,115 @@ class LoadOptions:
             codecs.lookup(self.encoding or "utf-8")
 
 
+def no_clock(options: LoadOptions) -> str:
+    """Return in words where the rate of recordings without a clock is from."""
+    return "none" if options.rate_hz is None else "none, the rate is stated"
+
+
 def split_names(names: str | Sequence[str] | None) -> tuple[str, ...]:
     """Return names one by one, of "FZ_Base,FX_Base" or of a list of them, without blanks."""
     items = names.split(",") if isinstance(names, str) else names or ()
     return tuple(name.strip() for name in items if name.strip())
 
 
+class Reading(NamedTuple):
+    """How one recording was read, in words; "" where that is not known.
+
+    place, word : str
+        Where its label stands, and what is there.
+    clock : str
+        Which column its times are from, and in which unit or form.
+    rows : str
+        Lines that were left out of it.
+    numbers : str
+        The marks in its numbers, what stands between cells, and the encoding if it is not UTF-8.
+    """
+
+    place: str = ""
+    word: str = ""
+    clock: str = ""
+    rows: str = ""
+    numbers: str = ""
+
+
+def describe_reading(
+    readings: Sequence[Reading],
+    labels: Sequence[int],
+    order: str,
+    first: str = "",
+    *,
+    no_clock: str = "none",
+) -> dict[str, str]:
+    """Return how recordings were read, as `Dataset.reading` has it.
+
+    readings, labels : one for each recording.
+    order, first : by what they are ordered, and `describe_ends` of the first.
+    no_clock : what stands for the clock of a recording without one.
+    """
+    words = dict[str, Counter[str]]()
+    for reading, label in zip(readings, labels, strict=True):
+        counts = words.setdefault(reading.place, Counter())
+        counts[f"{reading.word} -> {MEANINGS[label]}"] += 1
+    about = {"labels": "; ".join(f"{place}: {_with_counts(n)}" for place, n in words.items())}
+    for name, default in (("clock", no_clock), ("rows", "all"), ("numbers", "")):
+        counts = Counter(getattr(reading, name) or default for reading in readings)
+        about[name] = _with_counts(counts) if len(counts) > 1 else next(iter(counts))
+    about |= {"order": order, "first": first}
+    return {name: text for name, text in about.items() if text not in ("", "all")}
+
+
+def _with_counts(counts: Counter[str]) -> str:
+    """Return the most frequent texts, each with its count, and how many more there are."""
+    texts = ", ".join(f"{text} {n}" for text, n in counts.most_common(MAX_COUNTED))
+    n_more = len(counts) - MAX_COUNTED
+    return f"{texts} and {n_more} more" if n_more > 0 else texts
+
+
+def describe_ends(
+    source: str, trace: NDArray[np.float32], channels: Sequence[str], all_units: Sequence[str]
+) -> str:
+    """Return the first and last value of each channel of a trace (C, T) in words, with its unit.
+
+    all_units : one for each channel.
+    """
+    texts = []
+    for i, (row, unit) in enumerate(zip(trace, all_units, strict=True)):
+        name = channels[i] if i < len(channels) else f"channel {i + 1}"
+        texts.append(f"{name} {row[0]:.6g} to {row[-1]:.6g} {unit}".strip())
+    return f"{source}: {listed(texts)} in {trace.shape[1]} samples"
+
+
 class Recording(NamedTuple):
-    """One recording.
+    """One recording; a reader of traces leaves out its label, source and part.
 
     trace : array of float32, shape (C, T)
+    rate_hz : float or None
+        Sampling rate by its own timestamps.
+    units : tuple of str
+        Unit of each channel, "" where unknown.
+    start : float or None
+        Its first time in seconds since 1970, if its clock holds dates.
+    reading : Reading
+        How it was read.
     label : int
         1 for success, 0 for failure.
     source : str
         Its file or row.
     part : str or None
         Number of its part.
-    rate_hz : float or None
-        Sampling rate by its own timestamps.
-    units : tuple of str
-        Unit of each channel, "" where unknown.
     length : int
         Samples as recorded, if the trace has others by now; else 0.
-    start : float or None
-        Its first time in seconds since 1970, if its clock holds dates.
     """
 
     trace: NDArray[np.float32]
-    label: int
-    source: str
-    part: str | None = None
     rate_hz: float | None = None
     units: tuple[str, ...] = ()
-    length: int = 0
     start: float | None = None
+    reading: Reading = Reading()
+    label: int = 0
+    source: str = ""
+    part: str | None = None
+    length: int = 0
 
 
 @dataclass
@@ -378,6 +459,8 @@ class RecordingCollector:
         Words of the recordings whose parts were not checked yet; "" for an empty label.
     ordered : bool
         As in `Dataset`.
+    order : str
+        By what the recordings are ordered, in words.
     """
 
     name: str
@@ -390,6 +473,7 @@ class RecordingCollector:
     label_file: str = ""
     unlabelled_words: Counter[str] = field(default_factory=Counter)
     ordered: bool = True
+    order: str = "as the rows"
 
     @property
     def unlabelled(self) -> int:
@@ -427,16 +511,14 @@ class RecordingCollector:
     def order_by_start(self) -> None:
         """Put the recordings in the order of their first times, if all are known and differ.
 
-        Then `ordered` is True, and a note says so if their order changes.
+        Then `ordered` is True.
         """
         starts = [r.start for r in self.recordings if r.start is not None]
         if len(set(starts)) < len(self.recordings):
             return
         self.ordered = True
-        in_order = sorted(self.recordings, key=lambda recording: recording.start or 0.0)
-        if [r.source for r in in_order] != [r.source for r in self.recordings]:
-            self.notes["Recordings are in the order of their times, not of their names"] = 1
-            self.recordings = in_order
+        self.order = "by the dates of their clocks"
+        self.recordings.sort(key=lambda recording: recording.start or 0.0)
 
     def check_label_words(self) -> None:
         """Raise DataError if too many labels are words whose meaning is unknown.
@@ -502,6 +584,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         `fit="strict"`.
     """
     collector.check_label_words()
+    as_read = {recording.source: recording for recording in collector.recordings}
     unit = _convert_to_one_unit(collector, options)
     options, rate = _bring_to_one_rate(collector, options)
     lengths = np.array([r.trace.shape[1] for r in collector.recordings], dtype=np.int64)
@@ -531,6 +614,11 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     n_good = sum(recording.label for recording in recordings)
     if n_good in (0, len(recordings)) and len(recordings) >= MANY:
         notes.append(f"No recording is {'bad' if n_good else 'good'}: check how labels are read.")
+    first = as_read[recordings[0].source]
+    channel_units = split_unit(unit, len(first.trace))
+    channel_units = [
+        a or b for a, b in zip(first.units or channel_units, channel_units, strict=True)
+    ]
     # A recording without a number is a part of its own.
     parts = [recording.part or recording.source for recording in recordings]
     has_parts = any(recording.part is not None for recording in recordings)
@@ -548,6 +636,13 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         notes=tuple(notes),
         unlabelled=collector.unlabelled,
         ordered=collector.ordered,
+        reading=describe_reading(
+            [recording.reading for recording in recordings],
+            [recording.label for recording in recordings],
+            collector.order,
+            describe_ends(first.source, first.trace, collector.channels, channel_units),
+            no_clock=no_clock(options),
+        ),
         source=np.array([recording.source for recording in recordings]),
         lengths=np.array(lengths_read, dtype=np.int64),
         rates=rates if np.isfinite(rates).any() else None,

@@ -27,7 +27,6 @@ OTHERS = {
     "euc_jp": ("euc_jp", "[\u3041-\u30ff\u4e00-\u9fff]"),
     "cp1251": ("cp1251", "[А-яЁё]"),
 }
-LEVEL_ONE = {"shift_jis": b"\x98\x72", "gb2312": b"\xd7\xf9", "big5": b"\xc6\x7e"}  # the last
 FEW = 3  # encodings that an error proposes
 SHOWN = 24  # characters of a text
 
@@ -99,8 +98,9 @@ def _advice(content: bytes) -> str:
         with suppress(UnicodeDecodeError):
             text = content.decode(encoding)
             high = "".join(HIGH.findall(text))
-            n_usual = sum(_is_usual(char, usual) for char in re.findall(letters, high))
-            scores[encoding] = n_usual / max(len(high), 1)
+            # Characters that are rare in the script are left out.
+            usual_text = high.encode(usual, "ignore").decode(usual)
+            scores[encoding] = len(re.findall(letters, usual_text)) / max(len(high), 1)
             first = HIGH.search(text)
             start = text.rfind("\n", 0, first.start() if first else 0) + 1
             texts[encoding] = text[start:].partition("\n")[0].strip()[:SHOWN]
@@ -109,11 +109,3 @@ def _advice(content: bytes) -> str:
         f"encoding={encoding!r} if {shortened(texts[encoding])} is right" for encoding in best
     ]
     return f"; state it, {', or '.join(proposals)}" if proposals else ""
-
-
-def _is_usual(char: str, encoding: str) -> bool:
-    """Return whether a character of a script is among its usual ones."""
-    with suppress(UnicodeEncodeError):
-        code = char.encode(encoding)
-        return char < "\u4e00" or char > "\u9fff" or code <= LEVEL_ONE.get(encoding, b"\xff\xff")
-    return False

@@ -26,8 +26,10 @@ from ..errors import DataError, instead, listed
 from .clocks import EMPTY_CELLS
 from .dataset import (
     MAX_LABEL_WORDS,
+    MEANINGS,
     Fault,
     LoadOptions,
+    Reading,
     Recording,
     RecordingCollector,
     UnknownWordError,
@@ -35,7 +37,7 @@ from .dataset import (
     UnreadableError,
     expect_data,
 )
-from .text import SUFFIXES, TimedTrace, column_place, read_table
+from .text import SUFFIXES, column_place, read_table
 
 GOOD = (
     "true",
@@ -147,7 +149,6 @@ FEW_NAMES = 5  # in fewer names each word may be a label
 
 LabelMap = Mapping[str, bool]
 NO_WORDS: LabelMap = {}
-MEANINGS = ("bad", "good")  # of the labels 0 and 1
 
 
 class SeveralLabelsError(UnreadableError):
@@ -171,20 +172,33 @@ class SourcedLabel(NamedTuple):
 
     label : int
         1 for success, 0 for failure.
-    text : str
-        What says so, for an error: "its name says good (OK)".
+    place : str
+        What the place is called: "its name", "column verdict".
+    word : str
+        What says so there.
     part : str or None
         Number of the part, if it stands there too.
+    column : str
+        The column, if `place` does not name it.
     """
 
     label: int
-    text: str
+    place: str
+    word: str
     part: str | None = None
+    column: str = ""
 
+    @property
+    def text(self) -> str:
+        """What says so, for an error: "its name says good (OK)"."""
+        return f"{self.place} says {MEANINGS[self.label]} ({self.word})"
 
-def _sourced(label: int, place: str, word: str, part: str | None = None) -> SourcedLabel:
-    """Return a label with the text that a place says it by a word."""
-    return SourcedLabel(label, f"{place} says {MEANINGS[label]} ({word})", part)
+    @property
+    def reading(self) -> Reading:
+        """The place, without the line in it, and the word."""
+        place = self.place.partition(", line")[0].removeprefix("its ")
+        column = f", column {self.column}" if self.column else ""
+        return Reading("file name" if place == "name" else f"{place}{column}", self.word)
 
 
 @dataclass(frozen=True)
@@ -320,7 +334,7 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
         if match is None or match[1] is None:
             wanted = f"a label where the pattern {pattern} finds it"
             raise UnreadableError(f"Expected {wanted}, found none")
-        return _sourced(label_of(match[1], words), "its path", match[1])
+        return SourcedLabel(label_of(match[1], words), "its path", match[1])
 
     def without_label(name: str) -> str:
         """Return a path without what the pattern finds in it."""
@@ -442,11 +456,11 @@ class LabelColumn:
         stated = [text for text in texts if text.lower() not in self.unchecked]
         if len(stated) < 2:
             word = next(filter(None, stated or texts), "")
-            return _sourced(self.label_of(word), place, word)
+            return SourcedLabel(self.label_of(word), place, word)
         with suppress(UnknownWordError):
             labels = {self.label_of(text) for text in stated}
             if len(labels) == 1:
-                return _sourced(labels.pop(), place, listed(stated))
+                return SourcedLabel(labels.pop(), place, listed(stated))
         raise SeveralLabelsError(f"Expected one label in {place}, got {listed(stated)}")
 
 
@@ -641,12 +655,10 @@ def _find_label(name: str, words: LabelMap) -> SourcedLabel:
             do = "say which it is by a pattern with a group for it (label)"
             raise UnreadableError(f"Expected one label, {actual}; {do}")
     place = "its folder" if first.start <= name.rfind("/") else "its name"
-    return _sourced(first.label, place, first.text)
+    return SourcedLabel(first.label, place, first.text)
 
 
-def suggest_label_sources(
-    names: Sequence[str], words: LabelMap = NO_WORDS
-) -> Iterator[tuple[str, str, LabelSource]]:
+def suggest_label_sources(words: LabelMap = NO_WORDS) -> Iterator[tuple[str, str, LabelSource]]:
     """Yield ways to find labels in names that do not state them in the usual way.
 
     Each is the condition under which it is right, the option to give, and the source, by which the
@@ -656,16 +668,9 @@ def suggest_label_sources(
     pairs = (f"{word}={'good' if good else 'bad'}" for word, good in with_digits.items())
     source = labels_in_names(None, with_digits)
     yield "if 1 and 0 at its end are labels", f"label_map={','.join(pairs)!r}", source
-    patterns = {"if 1 and 0 are the folders of its labels": "(?:^|/)([01])/"}
-    in_files = (label for name in names for label in _labels_in_file(*_components(name)[0], words))
-    endings = {label.text for label in in_files if label.decides}
-    if endings:
-        longest_first = sorted(endings, key=len, reverse=True)
-        choice = "|".join(re.sub(r"\W", "[^A-Za-z]", word) for word in longest_first)
-        condition = "if the end of the file's name says it"
-        patterns[condition] = f"({choice})[^A-Za-z]*[.][^./]*$"
-    for condition, pattern in patterns.items():
-        yield condition, f"label='{pattern}'", labels_in_names(pattern, words)
+    pattern = "(?:^|/)([01])/"
+    condition = "if 1 and 0 are the folders of its labels"
+    yield condition, f"label='{pattern}'", labels_in_names(pattern, words)
 
 
 def _remove_label(name: str, words: LabelMap) -> str:
@@ -833,7 +838,6 @@ def labels_in_file(
     notes = Counter[str]()
     if any(len(row.lines) > 1 for row in rows):
         notes[f"{source} names recordings more than once: their labels must be equal"] = 1
-    notes[f"The labels are those in column {column} of {source}"] = 1
     label_column = LabelColumn(column, options.words, notes)
     rows_by_file = defaultdict[str, list[_LabelRow]](list)
     for row in rows:
@@ -887,7 +891,7 @@ def _label_of_row(row: _LabelRow, column: LabelColumn, where: str) -> SourcedLab
     except UnknownWordError as error:
         error.args = (f"{error} in {where}",)
         raise
-    return column.find(row.labels, where)._replace(part=row.part)
+    return column.find(row.labels, where)._replace(part=row.part, column=column.name)
 
 
 def listing_to_trust(file: str, column: str) -> str:
@@ -1019,7 +1023,7 @@ def _label_file_columns(
 
 def collect_recordings(
     places: Mapping[str, Any],
-    read: Callable[[Any], TimedTrace],
+    read: Callable[[Any], Recording],
     source: LabelSource,
     collector: RecordingCollector,
 ) -> RecordingCollector:
@@ -1056,9 +1060,9 @@ def collect_recordings(
             unlabelled[name] = getattr(error, "words", ())
             n_contradictions += isinstance(error, SeveralLabelsError)
             raise
-        timed = read(place)
-        about = (name, label.part, timed.rate_hz, timed.units)
-        return Recording(timed.trace, label.label, *about, start=timed.start)
+        recording = read(place)
+        reading = recording.reading._replace(place=label.reading.place, word=label.word)
+        return recording._replace(label=label.label, source=name, part=label.part, reading=reading)
 
     for name, place in places.items():
         collector.add(name, partial(read_labelled, name, place))

@@ -31,16 +31,21 @@ from .dataset import (
     UNKNOWN_RATE,
     Dataset,
     LoadOptions,
+    Reading,
     Recording,
     RecordingCollector,
     UnknownWordError,
     UnlabelledError,
     UnreadableError,
     as_dataset,
+    describe_ends,
+    describe_reading,
     expect_data,
     make_dataset,
+    no_clock,
     refit,
     split_names,
+    split_unit,
 )
 from .labels import (
     LabelColumn,
@@ -49,7 +54,15 @@ from .labels import (
     parse_label_map,
     read_ordered_labels,
 )
-from .tables import FORCE, are_tables, find_recordings, from_frame, read_folder, read_tables
+from .tables import (
+    FORCE,
+    are_tables,
+    find_recordings,
+    from_frame,
+    read_folder,
+    read_heads,
+    read_tables,
+)
 from .text import SUFFIXES as TEXTS
 from .triggers import Trigger
 
@@ -186,20 +199,14 @@ def load_dataset(
     stated = [name for name in optional if getattr(options, name) not in (None, ())]
     unused = [name for name in stated if name not in accepted]
     if unused:
-        why = _why_unused(unused)
-        raise DataError(f"Expected no {' or '.join(unused)} for {title}: {why}; leave it out.")
-    return read()
-
-
-def _why_unused(options: Sequence[str]) -> str:
-    """Return the reason, for an error, why a source does not take the first of these options."""
-    if {"trigger", "topic"} & set(options):
-        return "only one long recording is cut"
-    if "time" in options:
-        return "only a table has columns"
-    if set(TEXT_FORMAT) & set(options):
-        return "only text files are written so"
-    return "it has its labels"
+        options_text = " or ".join(unused)
+        raise DataError(f"Expected no {options_text} for {title}, which has none; leave it out.")
+    data = read()
+    if "first" in data.reading or isinstance(source, Dataset):
+        return data
+    trace = as_traces(data.X)[0]
+    first = describe_ends("trace 1", trace, data.channels, split_unit(data.unit, len(trace)))
+    return replace(data, reading={**data.reading, "first": first})
 
 
 def _find_reader(
@@ -242,8 +249,9 @@ def _find_file_reader(
     named = {path.name: path}
     if path.is_dir():
         named = find_recordings(path, options)
-        if not are_tables(named, options):
-            read = partial(read_folder, path, named, name, options)
+        heads = read_heads(named, options)
+        if not are_tables(named, heads, options):
+            read = partial(read_folder, path, named, heads, name, options)
             return ("label", "labels", "time", *TEXT_FORMAT), read
     if len(named) == 1:
         path = next(iter(named.values()))
@@ -386,8 +394,9 @@ def _read_archives(
     except DataError as error:
         if "Object arrays" not in str(error):
             raise
-        advice = _object_arrays_advice(next(iter(named.values())), options)
-        raise DataError(f"{str(error).partition(':')[0]}: {advice}") from error
+        why = "Python objects, which can run code when they are read"
+        do = "If you trust it, np.load(..., allow_pickle=True) and load_dataset((X, y))"
+        raise DataError(f"{str(error).partition(':')[0]}: {why}. {do}.") from error
     first = next(iter(named))
     arrays = dict[str, NDArray[Any]]()
     all_names = list[str]()
@@ -407,24 +416,6 @@ def _read_archives(
                 actual = f"{old.shape or old} and {other.shape or other}"
                 raise DataError(f"Expected {key} alike in {first} and {source}, got {actual}.")
     return arrays, all_names
-
-
-def _object_arrays_advice(path: Path, options: LoadOptions) -> str:
-    """Return advice how to make a table of an archive of Python objects, which is not read.
-
-    Reading such objects, as traces of several lengths are stored, can run code.
-    """
-    _, names = read_archive(path, ())
-    X = next((name for name in (*options.channels, "X") if name in names), names[0])
-    y = next((name for name in (options.label, "y") if name in names), names[-1])
-    steps = (
-        "import numpy as np, pandas as pd",
-        f"d = np.load({str(path)!r}, allow_pickle=True)",
-        f"frame = pd.DataFrame([*d[{X!r}]]).assign(y=d[{y!r}].astype(str))",
-        f"frame.to_csv({str(path.with_suffix('.csv'))!r}, index=False)",
-    )
-    why = "Python objects, which can run code when they are read"
-    return f'{why}. If you trust it, make a table of it: python -c "{"; ".join(steps)}".'
 
 
 def _parts_first(x: NDArray[Any], labels: NDArray[Any] | None) -> NDArray[Any]:
@@ -537,28 +528,31 @@ def _from_arrays(
             collector.label_forms = error.forms
             return 0
 
+    words = np.asarray(y)
     wanted = "a label for each trace, 1 (success) or 0 (failure)"
     with instead(DataError, f"Expected {wanted}", ValueError, TypeError):
-        labels = np.asarray(y)
-        is_usual = not (label_column.is_inverted or label_column.is_ambiguous)
-        if labels.dtype.kind in "OUS" or options.words or not is_usual:
-            labels = np.array([to_label(word) for word in labels.tolist()])
+        labels = np.array([to_label(word) for word in words.tolist()])
+        X = np.asarray(X)
     collector.check_label_words()
     about["notes"] = tuple(f"{note}." for note in collector.notes)
-    has_empty = labels.dtype.kind == "f" and labels.shape == np.shape(X)[:1]
-    is_empty = np.isnan(labels) if has_empty else np.zeros(1, dtype=bool)
-    if not is_empty.any():
-        return make_dataset(X, labels, name=name, **about)
-    n = int(is_empty.sum())
-    collector.unlabelled_words[""] += n - collector.unlabelled
-    actual = f"{n} that have no label yet"
-    expect_data(not is_empty.all(), f"labelled traces in {name}", actual)
-    for key in ("part", "cause"):
-        if about.get(key) is not None:
-            about[key] = np.asarray(about[key])[~is_empty]
-    note = f"{collector.unlabelled_text(len(labels), 'traces')}: they are left out."
-    about |= {"notes": (*about["notes"], note), "unlabelled": n}
-    return make_dataset(np.asarray(X)[~is_empty], labels[~is_empty], name=name, **about)
+    if collector.unlabelled and len(labels) == len(X):
+        is_labelled = ~np.isnan(labels)
+        actual = f"{collector.unlabelled} that have no label yet"
+        expect_data(bool(is_labelled.any()), f"labelled traces in {name}", actual)
+        note = f"{collector.unlabelled_text(len(labels), 'traces')}: they are left out."
+        about |= {"notes": (*about["notes"], note), "unlabelled": collector.unlabelled}
+        for key in ("part", "cause"):
+            if about.get(key) is not None:
+                about[key] = np.asarray(about[key])[is_labelled]
+        X = X[is_labelled]
+        labels = labels[is_labelled]
+        words = words[is_labelled]
+    data = make_dataset(X, labels, name=name, **about)
+    clock = "none, the array rate_hz" if data.rate_hz and not options.rate_hz else ""
+    readings = [Reading(label, str(word), clock) for word in words.tolist()]
+    clock = no_clock(options)
+    reading = describe_reading(readings, data.y.tolist(), "as the rows", no_clock=clock)
+    return replace(data, reading=reading)
 
 
 def _index_as_column(frame: Any) -> Any:
@@ -593,12 +587,15 @@ def _from_list(traces: list[Any], labels: list[Any], options: LoadOptions) -> Da
             n = len(collector.recordings[0].trace)
             raise UnreadableError(f"Expected {n} channel(s), as the first has, got {len(x)}")
         collector.channels = collector.channels or spec_of(x, selected).columns
-        rate = None
+        clock = rate = None
         if hasattr(trace, "iloc") and trace.ndim == 2 and not options.rate_hz:
             clock = clock_of(_index_as_column(trace), options.time)
             rate = None if clock is None else rate_of(clock, trace.index)
         channel_units = tuple(units.split(name)[1] for name in collector.channels)
-        return Recording(x, label, f"trace {number}", rate_hz=rate, units=channel_units)
+        text = "" if clock is None else f"column {clock.name} ({clock.form})"
+        reading = Reading("y", str(word), text)
+        source = f"trace {number}"
+        return Recording(x, rate, channel_units, reading=reading, label=label, source=source)
 
     for row in zip(count(1), traces, labels, strict=False):
         collector.add("data", partial(read, *row), row[0])

@@ -160,7 +160,7 @@ def decimal_of(columns: Sequence[tuple[str, str]], delimiter: str) -> str | None
 
 def write_as_python(
     frame: pd.DataFrame, delimiter: str, decimal: str | None, thousands: str | None
-) -> tuple[str, dict[int, str]]:
+) -> tuple[str, str, dict[int, str]]:
     """Rewrite the numbers of a table of texts as Python writes them, in place.
 
     Parameters
@@ -176,6 +176,8 @@ def write_as_python(
     -------
     mark : str
         The decimal mark; "" if the values do not depend on it.
+    group : str
+        The mark before thousands; "" if there is none.
     wrong : dict of int to str
         What is wrong in a line: a number in another format than the file's, which stays as it is.
 
@@ -200,6 +202,7 @@ def write_as_python(
     tail = rf"(?P<tail>{re.escape(decimal)}\d*)?(?P<power>{EXPONENT})"
     number = re.compile(rf"(?P<sign>{SIGN})(?P<whole>{whole}){tail}")
     wrong = dict[int, str]()
+    groups = set[str]()
     for i, cells in columns.items():
         if decimal == "." and not UNUSUAL.search(texts[i]):
             continue
@@ -207,6 +210,7 @@ def write_as_python(
         for k, cell in enumerate(cells):
             match = number.fullmatch(cell)
             if match is not None:
+                groups.update(match["mark"] or "")
                 digits = re.sub(r"\D", "", match["whole"])
                 decimals = (match["tail"] or "").replace(decimal, ".")
                 python = match["sign"] + digits + decimals + match["power"]
@@ -215,4 +219,4 @@ def write_as_python(
                 message = f"Expected {wanted}, as the file has, got {cell!r}"
                 wrong.setdefault(int(frame.index[k]), message)
         frame.isetitem(i, cells)
-    return mark, wrong
+    return mark, next(iter(groups), ""), wrong

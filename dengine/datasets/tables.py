@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,6 @@ from .numerals import UndecidedError
 from .text import SUFFIXES as TEXTS
 from .text import (
     TextTable,
-    TimedTrace,
     parse_numbers,
     read_recording,
     read_table,
@@ -106,20 +105,66 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     return {name: named[name] for name in sorted(others or texts, key=natural_key)}
 
 
-def are_tables(named: Mapping[str, Path], options: LoadOptions) -> bool:
+class FolderHeads(NamedTuple):
+    """What the heads of a folder's text files tell, each of which is read once.
+
+    header : list of str
+        Columns of the first file.
+    channel_choices : Counter
+        The columns of a file that are no clock, with the number of files that have these.
+    verdicts : dict
+        The labels in all heads for each column whose head is one verdict in each file.
+    """
+
+    header: list[str]
+    channel_choices: Counter[tuple[str, ...]]
+    verdicts: dict[str, set[int]]
+
+
+def read_heads(named: Mapping[str, Path], options: LoadOptions) -> FolderHeads:
+    """Read the first rows of each text file; of Parquet and .npz files nothing is read.
+
+    Raises DataError if the files cannot be decoded by `options.encoding`.
+    """
+    paths = [path for path in named.values() if path.suffix.lower() in TEXTS]
+    if not paths:
+        return FolderHeads([], Counter(), {})
+    _check_encoding(paths, options)
+    header, *rows = _first_rows(paths[0], options)
+    usual = _usual_label_columns(header)
+    verdicts: dict[str, set[int]] = {
+        name: set()
+        for i, name in enumerate(header)
+        if name not in usual and labels.is_verdict(name, _column_cells(rows, i), options.words)
+    }
+    heads = FolderHeads(header, Counter(), verdicts)
+    for path in paths:
+        header, *rows = _first_rows(path, options)
+        heads.channel_choices[_columns_without_clock(header, rows, options)] += 1
+        for name in [name for name in verdicts if name in header]:
+            column = labels.LabelColumn(name, options.words, Counter())
+            try:
+                label = column.find(_column_cells(rows, header.index(name)))
+                verdicts[name].add(label.label)
+            except UnlabelledError:
+                continue
+            except UnreadableError:
+                del verdicts[name]
+    return heads
+
+
+def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptions) -> bool:
     """Return whether a folder's files are to be read as tables of many insertions, not as one
     recording each.
 
     The first file's type and columns tell, with the names of all and the user's options. True for
     Parquet and .npz files, unread: whether an archive holds one insertion, `hold_one_each` tells
-    later. Raises DataError if text files cannot be decoded by `options.encoding`, or the first one
-    cannot be read.
+    later. Raises DataError if the first file cannot be read.
     """
     path = next(iter(named.values()))
     if path.suffix.lower() not in TEXTS:
         return True
-    _check_encoding(list(named.values()), options)
-    header = _first_rows(path, options)[0]
+    header = heads.header
     if options.time is not None and options.part in header:
         return True
     numbered = [names for names in _numbered_columns(header).values() if len(names) >= MIN_NUMBERED]
@@ -132,7 +177,7 @@ def are_tables(named: Mapping[str, Path], options: LoadOptions) -> bool:
         for name in named:
             source.find(name)
         return False
-    if len(named) > 1 and options.part not in header and _has_label_column(named, options):
+    if len(named) > 1 and options.part not in header and _has_label_column(named, heads, options):
         return False
     has_label = labels.column_among(header, labels.LABEL_COLUMNS) is not None
     if len(named) == 1 or options.time is not None:
@@ -156,7 +201,11 @@ def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
 
 
 def read_folder(
-    folder: Path, named: Mapping[str, Path], name: str, options: LoadOptions
+    folder: Path,
+    named: Mapping[str, Path],
+    heads: FolderHeads,
+    name: str,
+    options: LoadOptions,
 ) -> Dataset:
     """Read a folder with a file for each insertion.
 
@@ -165,6 +214,8 @@ def read_folder(
     folder : Path
     named : mapping of str to Path
         The files, from `find_recordings`.
+    heads : FolderHeads
+        Of the files.
     name : str
         Name of the data set.
     options : LoadOptions
@@ -182,15 +233,18 @@ def read_folder(
     if options.labels is None and options.part != "part":
         wanted = f"a file of labels with a column {options.part}"
         raise DataError(f"Expected {wanted}: a folder's names tell no parts' numbers.")
-    source, label_columns = _label_source(named, options)
-    channels = options.channels or _usual_channels(named.values(), options, label_columns)
+    source, label_columns = _label_source(named, heads, options)
+    channels = options.channels or _usual_channels(heads, options, label_columns)
     collector = RecordingCollector(name, channels)
     in_order = sorted(named, key=lambda name: natural_key(source.without_label(name)))
     collector.ordered = sorted(named, key=natural_key) == in_order
+    collector.order = "by name, numbers by size"
+    if not collector.ordered:
+        collector.order = f"{collector.order}, without the labels in them"
     collector.notes.update(_unread_files_note(folder, named, options))
     common_mark = cache(partial(_common_decimal_mark, list(named.values()), options))
 
-    def read(path: Path) -> TimedTrace:
+    def read(path: Path) -> Recording:
         """Read a recording; if its decimal mark is undecided, by that of the other files."""
         notes = Counter[str]()
         try:
@@ -211,7 +265,7 @@ def read_folder(
         if not (options.label or options.labels):
             advice = _label_file_advice(folder, named, options)
             if advice is None and not collector.unknown_words:
-                advice = _label_advice(named, options)
+                advice = _label_advice(named, heads.header, options)
         if advice is None:
             raise
         raise DataError(f"{str(error).rpartition(';')[0]}; {advice}.") from error
@@ -220,7 +274,7 @@ def read_folder(
 
 
 def _label_source(
-    named: Mapping[str, Path], options: LoadOptions
+    named: Mapping[str, Path], heads: FolderHeads, options: LoadOptions
 ) -> tuple[labels.LabelSource, list[str]]:
     """Return the source of a folder's labels, and the columns of its files that tell labels.
 
@@ -231,7 +285,7 @@ def _label_source(
     in_names = labels.labels_in_names(None, options.words)
     if options.labels is not None:
         listing = labels.labels_in_file(options.labels, list(named), options)
-        columns = _verdict_columns(named, options)
+        columns = _verdict_columns(named, heads, options)
         if options.label is not None:
             return listing, columns
         sources = [labels.labels_in_column(named, column, options) for column in columns]
@@ -239,19 +293,16 @@ def _label_source(
         words = {word: good for word, good in options.words.items() if not word.isdecimal()}
         sources.append(labels.labels_in_names(None, words))
         return labels.labels_that_agree(listing, sources, listing.trust), columns
-    if options.label in _first_rows(next(iter(named.values())), options)[0]:
-        source = labels.labels_in_column(named, options.label, options)
-        source.notes[f"The labels are those in column {options.label} of each file"] = 1
-        return source, [options.label]
+    if options.label in heads.header:
+        return labels.labels_in_column(named, options.label, options), [options.label]
     if options.label is not None:
         return labels.labels_in_names(options.label, options.words), []
-    columns = _verdict_columns(named, options)
+    columns = _verdict_columns(named, heads, options)
     if set(_count_labels(named, in_names)) <= {None, ""}:
-        columns = columns or _usual_label_columns(named, options)[:1]
+        columns = columns or _usual_label_columns(heads.header)[:1]
         sources = [labels.labels_in_column(named, column, options) for column in columns]
         if not sources:
             return in_names, []
-        sources[0].notes[f"The labels are those in column {columns[0]} of each file"] = 1
         do = f"name the one to trust: label={columns[0]!r}"
         return labels.labels_that_agree(sources[0], sources[1:], do), columns
     if not columns:
@@ -261,15 +312,16 @@ def _label_source(
     return labels.labels_that_agree(in_names, sources, do, fills_in=True), columns
 
 
-def _usual_label_columns(named: Mapping[str, Path], options: LoadOptions) -> list[str]:
-    """Return the columns of the first file that have the name of a label and are no signal's."""
-    header = _first_rows(next(iter(named.values())), options)[0]
+def _usual_label_columns(header: Sequence[str]) -> list[str]:
+    """Return the columns of a file that have the name of a label and are no signal's."""
     usual = [name for name in labels.LABEL_COLUMNS if name not in labels.SIGNAL_COLUMNS]
     places = (labels.column_among(header, [name]) for name in usual)
     return [header[place] for place in places if place is not None]
 
 
-def _verdict_columns(named: Mapping[str, Path], options: LoadOptions) -> list[str]:
+def _verdict_columns(
+    named: Mapping[str, Path], heads: FolderHeads, options: LoadOptions
+) -> list[str]:
     """Return the columns of a folder's files that tell labels.
 
     They have the name of a label and labels in them, or any name and one verdict in the first rows
@@ -277,29 +329,11 @@ def _verdict_columns(named: Mapping[str, Path], options: LoadOptions) -> list[st
     name means the bad outcome, or is `ok`.
     """
     sample = list(named)[:: max(len(named) // TRIED, 1)]
-    usual = _usual_label_columns(named, options)
-    counts = {
-        name: _count_labels(sample, labels.labels_in_column(named, name, options)) for name in usual
-    }
-    columns = [name for name in usual if counts[name][0] + counts[name][1]]
-    header, *rows = _first_rows(next(iter(named.values())), options)
-    by_column: dict[str, set[int]] = {
-        name: set()
-        for i, name in enumerate(header)
-        if name not in usual and labels.is_verdict(name, _column_cells(rows, i), options.words)
-    }
-    for path in named.values() if by_column else ():
-        header, *rows = _first_rows(path, options)
-        for name in [name for name in by_column if name in header]:
-            column = labels.LabelColumn(name, options.words, Counter())
-            try:
-                label = column.find(_column_cells(rows, header.index(name)))
-                by_column[name].add(label.label)
-            except UnlabelledError:
-                continue
-            except UnreadableError:
-                del by_column[name]
-    return columns + [name for name, values in by_column.items() if values == {0, 1}]
+    columns = []
+    for name in _usual_label_columns(heads.header):
+        counts = _count_labels(sample, labels.labels_in_column(named, name, options))
+        columns += [name] if counts[0] + counts[1] else []
+    return columns + [name for name, values in heads.verdicts.items() if values == {0, 1}]
 
 
 def _column_cells(rows: Iterable[Sequence[str]], i: int) -> list[str]:
@@ -307,13 +341,13 @@ def _column_cells(rows: Iterable[Sequence[str]], i: int) -> list[str]:
     return [row[i] for row in rows if i < len(row)]
 
 
-def _has_label_column(named: Mapping[str, Path], options: LoadOptions) -> bool:
+def _has_label_column(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptions) -> bool:
     """Return whether the files have a column of labels that can be read in the first file.
 
     Its cells there may be empty, or a word of unknown meaning.
     """
     with suppress(DataError):
-        _, columns = _label_source(named, options)
+        _, columns = _label_source(named, heads, options)
         if columns:
             source = labels.labels_in_column(named, columns[0], options)
             return _count_labels([next(iter(named))], source)[None] == 0
@@ -366,21 +400,24 @@ def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOpt
     return None
 
 
-def _label_advice(named: Mapping[str, Path], options: LoadOptions) -> str | None:
+def _label_advice(
+    named: Mapping[str, Path], header: Sequence[str], options: LoadOptions
+) -> str | None:
     """Return advice, for an error, how the user can say where the labels of recordings are.
 
     Other ways to read names are tried on all recordings, then each column on a sample of them. None
     if no way finds labels for most.
+
+    header : columns of the first file.
     """
     suggestions = [
         (_count_labels(named, source), f"{condition}, say so: {do}")
-        for condition, do, source in labels.suggest_label_sources(list(named), options.words)
+        for condition, do, source in labels.suggest_label_sources(options.words)
     ]
     counts, advice = max(suggestions, key=lambda suggestion: -suggestion[0][None])
     if _look_like_labels(counts) and counts[0] and counts[1]:
         return advice
     sample = dict(list(named.items())[:: max(len(named) // TRIED, 1)])
-    header = _first_rows(next(iter(named.values())), options)[0]
     counts_by_column = {
         column: _count_labels(sample, labels.labels_in_column(sample, column, options))
         for column in header
@@ -440,7 +477,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def _usual_channels(
-    paths: Iterable[Path], options: LoadOptions, label_columns: Sequence[str]
+    heads: FolderHeads, options: LoadOptions, label_columns: Sequence[str]
 ) -> tuple[str, ...]:
     """Return `FZ_Base` if a file has it or none has channels, else the only channel of most files.
 
@@ -448,33 +485,32 @@ def _usual_channels(
 
     label_columns : the columns that tell labels, which are no channels.
     """
-    headers = []
-    for path in paths:
-        channels = _columns_without_clock(_first_rows(path, options), options)
-        headers.append(tuple(name for name in channels if name not in label_columns))
-    names = {name.lower() for header in headers for name in header}
-    if not names or FORCE.lower() in names:
+    choices = Counter[tuple[str, ...]]()
+    for names, n in heads.channel_choices.items():
+        choices[tuple(name for name in names if name not in label_columns)] += n
+    lower = {name.lower() for channels in choices for name in channels}
+    if not lower or FORCE.lower() in lower:
         return (FORCE,)
-    most_frequent = Counter(headers).most_common(1)[0][0]
-    return choose_channels(most_frequent, options)
+    return choose_channels(choices.most_common(1)[0][0], options)
 
 
-def _columns_without_clock(first_rows: list[list[str]], options: LoadOptions) -> list[str]:
+def _columns_without_clock(
+    header: list[str], rows: list[list[str]], options: LoadOptions
+) -> tuple[str, ...]:
     """Return the names of a file's columns that are no clock, given its header and some rows.
 
     Columns of labels are still among them; those without a name are not.
     """
     import pandas as pd
 
-    header, *rows = first_rows
     complete = [row for row in rows if len(row) == len(header)]
     clock = None
     with suppress(UnreadableError):
         frame = pd.DataFrame(complete, columns=header, dtype=object)
         clock = place_of_clock(frame, options.time)
-    return [
+    return tuple(
         name for i, name in enumerate(header) if name and i != clock and not is_time_column(name)
-    ]
+    )
 
 
 def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> Dataset:
@@ -483,29 +519,27 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
     Raises DataError if one cannot be read or has no rows, or their columns or units differ.
     """
     collector = RecordingCollector(name, ())
-    tables: dict[str, pd.DataFrame] = {}
-    units_by_source = dict[str, list[str]]()
+    tables: dict[str, TextTable] = {}
     for source, path in named.items():
         try:
             is_text = path.suffix.lower() in TEXTS
-            table = read_table(path, options, collector.notes) if is_text else _read_parquet(path)
+            table = read_table(path, options) if is_text else _read_parquet(path)
         except UnreadableError as error:
             fault = Fault(path.name, error.line, str(error))
             raise DataError(f"Cannot read {path}: {fault}.") from error
         if table.frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
         collector.faults += [replace(fault, source=source) for fault in table.faults]
-        tables[source] = table.frame
-        units_by_source[source] = table.units
+        tables[source] = table
         others = (str(other) for other in path.parent.glob("*.csv") if other not in named.values())
         collector.label_file = next(others, collector.label_file)
-    first, *sources = units_by_source
-    for source in sources:
-        if units_by_source[source] != units_by_source[first]:
-            actual = [", ".join(units_by_source[s]) or "none" for s in (first, source)]
+    first = next(iter(tables))
+    for source, table in tables.items():
+        if table.units != tables[first].units:
+            actual = [", ".join(tables[s].units) or "none" for s in (first, source)]
             wanted = f"the same units in {first} and in {source}"
             raise DataError(f"Expected {wanted}, got {' and '.join(actual)}; convert one.")
-    return _from_tables(tables, options, collector, units_by_source[first])
+    return _from_tables(tables, options, collector)
 
 
 def _read_parquet(path: Path) -> TextTable:
@@ -530,14 +564,12 @@ def from_frame(frame: pd.DataFrame, options: LoadOptions) -> Dataset:
     Raises DataError if a column holds lists or occurs twice, or columns that are needed are missing
     or not named.
     """
-    return _from_tables({"row": _number_rows(frame)}, options, RecordingCollector("data", ()))
+    table = TextTable(_number_rows(frame), [], 0, [], "")
+    return _from_tables({"row": table}, options, RecordingCollector("data", ()))
 
 
 def _from_tables(
-    tables: Mapping[str, pd.DataFrame],
-    options: LoadOptions,
-    collector: RecordingCollector,
-    units_row: Sequence[str] = (),
+    tables: Mapping[str, TextTable], options: LoadOptions, collector: RecordingCollector
 ) -> Dataset:
     """Make a data set of tables of one form, wide or long.
 
@@ -545,24 +577,23 @@ def _from_tables(
     DataError if their columns differ or hold lists, and for a long table without these options.
 
     tables : by the names of their files, or "row" for a DataFrame; the index is the line.
-    units_row : unit of each column.
     """
-    first = next(iter(tables))
-    for source, frame in tables.items():
+    frames = {source: table.frame for source, table in tables.items()}
+    first = next(iter(frames))
+    for source, frame in frames.items():
         _check_columns(frame, source)
-        if differing := listed(sorted(_column_forms(frame) ^ _column_forms(tables[first]))):
+        if differing := listed(sorted(_column_forms(frame) ^ _column_forms(frames[first]))):
             wanted = f"the same columns in {first} and in {source}"
             raise DataError(f"Expected {wanted}, only one of them has {differing}.")
     if options.time is not None or options.labels is not None:
-        column_units = dict(zip(tables[first].columns, units_row, strict=False))
-        frame = _concatenate_long(_without_repeated_parts(tables, options, collector), options)
-        return _from_long(frame, options, collector, first, column_units)
-    if advice := _long_table_advice(tables[first], options, collector.label_file):
-        columns = listed(tables[first].columns)
+        frame = _concatenate_long(_without_repeated_parts(frames, options, collector), options)
+        return _from_long(frame, options, collector, first, tables[first])
+    if advice := _long_table_advice(frames[first], options, collector.label_file):
+        columns = listed(frames[first].columns)
         actual = f"a row a sample: {columns}"
         raise DataError(f"Expected a row an insertion, got {actual}; a long table needs {advice}.")
-    for source, frame in tables.items():
-        _add_wide_rows(frame, options, collector, source)
+    for source, table in tables.items():
+        _add_wide_rows(table, options, collector, source)
     return as_dataset(collector, options)
 
 
@@ -595,7 +626,7 @@ def _column_forms(frame: pd.DataFrame) -> set[str]:
 
 
 def _add_wide_rows(
-    frame: pd.DataFrame, options: LoadOptions, collector: RecordingCollector, source: str
+    table: TextTable, options: LoadOptions, collector: RecordingCollector, source: str
 ) -> None:
     """Add each row of a wide table to a collector as a recording, and set its channels.
 
@@ -604,6 +635,7 @@ def _add_wide_rows(
     without a label yet is only counted. Raises DataError if the columns of labels, parts or samples
     are not found.
     """
+    frame = table.frame
     label_column = _label_column(frame, options)
     label_columns = [label_column, *_compared_columns(frame, label_column, options)]
     if options.part != "part" and options.part not in frame:
@@ -635,8 +667,15 @@ def _add_wide_rows(
             f"column {column.name}": partial(column.find, [word])
             for column, word in zip(label_cells, words, strict=True)
         }
-        label = labels.agreed_label(finders, do, collector.notes).label
-        return Recording(_without_trailing_nan(trace), label, f"{source}, line {line}", number)
+        label = labels.agreed_label(finders, do, collector.notes)
+        reading = label.reading._replace(numbers=table.numbers)
+        return Recording(
+            _without_trailing_nan(trace),
+            reading=reading,
+            label=label.label,
+            source=f"{source}, line {line}",
+            part=number,
+        )
 
     words = zip(*(frame[name].tolist() for name in label_columns), strict=True)
     for row in zip(frame.index, traces, words, parts, strict=True):
@@ -729,15 +768,16 @@ def _from_long(
     options: LoadOptions,
     collector: RecordingCollector,
     source: str,
-    column_units: Mapping[str, str],
+    first: TextTable,
 ) -> Dataset:
     """Make a data set of a long table: the rows of a part, by their times, are one insertion.
 
     Its label is in a column, or in a file of parts. Raises DataError if the column of parts or of
     times is not found.
 
-    column_units : unit of each column, from a row of units.
+    first : the first of the tables that `frame` is of, for the units of columns.
     """
+    column_units = dict(zip(first.frame.columns, first.units, strict=False))
     time = _time_column(frame, options)
     for name in (options.part, time):
         if name not in frame:
@@ -759,12 +799,11 @@ def _from_long(
     rows_of_part = {str(part): rows for part, rows in groups}
     no_stations = {options.part, time, *label_columns, *collector.channels}
     _check_single_station(rows_of_part, [name for name in others if name not in no_stations])
-    rows_of_part, order_note = _order_by_time(rows_of_part, holds_dates(frame[time]))
-    collector.notes.update(order_note)
+    rows_of_part = _order_by_time(rows_of_part, holds_dates(frame[time]), collector)
     places = [frame.columns.get_loc(name) for name in collector.channels]
     read_options = replace(options, time=time)
 
-    def read(rows: pd.DataFrame) -> TimedTrace:
+    def read(rows: pd.DataFrame) -> Recording:
         """Return the rows of a part as a trace, in the order of their times."""
         rows = rows.sort_values(SECONDS_COLUMN, kind="stable")
         rows = rows.drop(columns=[SECONDS_COLUMN, RUN_COLUMN])
@@ -772,7 +811,8 @@ def _from_long(
         timed = rows_to_trace(rows, places, read_options, collector.notes, units_row)
         channels = collector.channels
         channel_units = (column_units.get(name) or units.split(name)[1] for name in channels)
-        return timed._replace(units=tuple(channel_units))
+        reading = timed.reading._replace(numbers=first.numbers)
+        return timed._replace(units=tuple(channel_units), reading=reading)
 
     label_source = _label_source_of_parts(rows_of_part, label_columns, options)
     labels.collect_recordings(rows_of_part, read, label_source, collector)
@@ -889,28 +929,22 @@ def _are_stations(rows: pd.DataFrame, name: str) -> bool:
 
 
 def _order_by_time(
-    rows_of_part: dict[str, pd.DataFrame], has_dates: bool
-) -> tuple[dict[str, pd.DataFrame], list[str]]:
+    rows_of_part: dict[str, pd.DataFrame], has_dates: bool, collector: RecordingCollector
+) -> dict[str, pd.DataFrame]:
     """Return the parts in the order of their first times, if these are dates and no parts overlap;
-    else in that of the rows.
-
-    If the two orders differ, a note says which it is, unless the times are no dates and overlap, or
-    one is not known.
+    else in that of the rows. The collector's `order` says which it is.
     """
     starts = {part: rows[SECONDS_COLUMN].min() for part, rows in rows_of_part.items()}
     ends = {part: rows[SECONDS_COLUMN].max() for part, rows in rows_of_part.items()}
     by_time = sorted(starts, key=starts.__getitem__)
-    if by_time == list(starts) or not np.isfinite([*starts.values(), *ends.values()]).all():
-        return rows_of_part, []
-    overlap = any(starts[b] <= ends[a] for a, b in itertools.pairwise(by_time))
-    if has_dates and not overlap:
-        note = "Parts are in the order of their times, which is not that of the rows"
-        return {part: rows_of_part[part] for part in by_time}, [note]
-    if has_dates or not overlap:
-        return rows_of_part, [
-            "Parts are in the order of the rows, which is not that of their times"
-        ]
-    return rows_of_part, []
+    is_known = np.isfinite([*starts.values(), *ends.values()]).all()
+    is_apart = all(ends[a] < starts[b] for a, b in itertools.pairwise(by_time))
+    if has_dates and is_known and is_apart:
+        collector.order = "by the dates of their clocks"
+        return {part: rows_of_part[part] for part in by_time}
+    if by_time != list(starts):
+        collector.order = "as the rows, not by their times"
+    return rows_of_part
 
 
 def _time_column(frame: pd.DataFrame, options: LoadOptions) -> str:
@@ -1009,7 +1043,7 @@ def _long_table_advice(frame: pd.DataFrame, options: LoadOptions, label_file: st
 def _rises_within_parts(frame: pd.DataFrame, part: str, name: str) -> bool:
     """Return whether the numbers or times of a column rise from row to row of each part."""
     with suppress(ValueError, TypeError):
-        values, wrong, _ = seconds_of(frame[name], name)
+        values, wrong, *_ = seconds_of(frame[name], name)
         is_same_part = (frame[part] == frame[part].shift()).to_numpy()
         steps = np.diff(values)[is_same_part[1:]]
         return not wrong and bool(is_same_part.any()) and bool((steps > 0).all())

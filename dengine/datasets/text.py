@@ -37,7 +37,7 @@ from .clocks import (
     rising_columns,
     start_of,
 )
-from .dataset import Fault, LoadOptions, UnreadableError
+from .dataset import Fault, LoadOptions, Reading, Recording, UnreadableError
 from .encodings import decode
 from .numerals import is_numeral, write_as_python
 
@@ -60,24 +60,6 @@ DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")
 # How a row of units states times of day: hh:mm:ss, HH:MM:SS.fff or mm:ss,0.
 TIME_FORMAT = re.compile(r"(h{1,2}:)?m{1,2}:s{1,2}([.,:](f+|s+|m+|z+|x+|0+))?", re.IGNORECASE)
-
-
-class TimedTrace(NamedTuple):
-    """The samples of one recording.
-
-    trace : array of float32, shape (C, T)
-    rate_hz : float or None
-        Sampling rate by its timestamps.
-    units : tuple of str
-        Unit of each channel, "" where unknown.
-    start : float or None
-        Its first time in seconds since 1970, if its clock holds dates.
-    """
-
-    trace: NDArray[np.float32]
-    rate_hz: float | None = None
-    units: tuple[str, ...] = ()
-    start: float | None = None
 
 
 class TextCells(NamedTuple):
@@ -114,6 +96,8 @@ class TextTable(NamedTuple):
         Unit of each column, "" where unknown.
     decimal : str
         The decimal mark that its cells prove, "" where they prove none.
+    numbers : str
+        As in `Reading`.
     """
 
     frame: pd.DataFrame
@@ -121,6 +105,7 @@ class TextTable(NamedTuple):
     line: int
     units: list[str]
     decimal: str
+    numbers: str = ""
 
 
 def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
@@ -317,7 +302,6 @@ def _columns_advice(rows: list[list[str]]) -> str:
 def read_table(
     path: Path,
     options: LoadOptions,
-    notes: Counter[str] | None = None,
     decimal: str | None = None,
     *,
     as_text: bool = False,
@@ -329,8 +313,6 @@ def read_table(
     path : Path
     options : LoadOptions
         How its text, numbers and columns are written, where the user stated it.
-    notes : Counter, optional
-        Counts what users should know; it is added to.
     decimal : str, optional
         Decimal mark, as of the other files of a folder, that is taken if the user stated none.
         None: as the cells prove.
@@ -358,8 +340,6 @@ def read_table(
         raise UnreadableError(f"Expected {wanted}, got {size // 2**20} MB; {do}")
     text, encoding = decode(path.read_bytes(), options.encoding)
     cells = split_cells(text, options.columns)
-    if notes is not None and encoding not in ("utf-8-sig", options.encoding):
-        notes[f"Text is read as {encoding}, not UTF-8; encoding=... states another"] += 1
     if not cells.header:
         raise UnreadableError("Expected a header and rows, it is empty")
     header = _without_trailing_empty(cells.header)  # a delimiter at its end
@@ -375,11 +355,16 @@ def read_table(
     frame = pd.DataFrame(
         list(complete.values()), index=list(complete), columns=header, dtype=object
     )
-    mark = ""
+    mark = numbers = ""
     if not as_text:
         decimal = options.decimal or decimal
-        mark, odd_cells = write_as_python(frame, cells.delimiter, decimal, options.thousands)
+        mark, group, odd_cells = write_as_python(frame, cells.delimiter, decimal, options.thousands)
         wrong |= odd_cells
+        between = f"{cells.delimiter!r} between cells" if cells.delimiter else ""
+        other = "" if encoding == "utf-8-sig" else encoding
+        thousands = f"thousands mark {group!r}" if group else ""
+        marks = (f"decimal mark {mark!r}" if mark else "whole numbers", thousands, between, other)
+        numbers = ", ".join(filter(None, marks))
     faults = [Fault(path.name, i, message) for i, message in sorted(wrong.items())]
     frame = frame.drop(index=[i for i in wrong if i in complete])
     column_units = cells.units[:n]
@@ -392,7 +377,7 @@ def read_table(
     stated = units.stated_in_preamble(preamble, header, without)
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
-    return TextTable(frame, faults, cells.line, column_units, mark)
+    return TextTable(frame, faults, cells.line, column_units, mark, numbers)
 
 
 def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
@@ -421,14 +406,14 @@ def read_recording(
     options: LoadOptions,
     notes: Counter[str],
     decimal: str | None = None,
-) -> TimedTrace:
+) -> Recording:
     """Read the channels of a file that holds one recording, in the order of `channels`.
 
     `notes` is added to; `decimal` is the mark that is taken if the user stated none. Raises
     UnreadableError, with the line if it is known, for a cell, a row, a clock or a text that cannot
     be read, a channel that is not there, and no samples.
     """
-    table = read_table(path, options, notes, decimal)
+    table = read_table(path, options, decimal)
     header = list(table.frame.columns)
     places = [column_place(name, header, table.line) for name in channels]
     if table.faults:
@@ -442,11 +427,18 @@ def read_recording(
     rows = _without_summary(frame, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
     timed = rows_to_trace(rows, places, options, notes, table.units)
+    n_below = len(frame) - len(rows)
+    left_out = (
+        f"header in line {table.line}" if table.line > 1 else "",
+        f"{n_below} left out below" if n_below else "",
+        timed.reading.rows,
+    )
+    reading = timed.reading._replace(rows=", ".join(filter(None, left_out)), numbers=table.numbers)
     start = None
     with suppress(UnreadableError):
         place = place_of_clock(rows, options.time)
         start = None if place is None else start_of(rows.iloc[:, place])
-    return timed._replace(units=channel_units, start=start)
+    return timed._replace(units=channel_units, start=start, reading=reading)
 
 
 def _beside_their_clock(
@@ -506,7 +498,7 @@ def rows_to_trace(
     options: LoadOptions,
     notes: Counter[str],
     units_row: Sequence[str] = (),
-) -> TimedTrace:
+) -> Recording:
     """Convert the rows of a table, one for each sample, to a trace with its rate.
 
     Parameters
@@ -524,7 +516,7 @@ def rows_to_trace(
 
     Returns
     -------
-    TimedTrace
+    Recording
         In the order of the times, where these can be trusted; see `clocks.in_order_of_time`. An
         empty cell is NaN, which the engine finds. The rate is None if one is stated, or no clock is
         known; there are no units.
@@ -544,28 +536,50 @@ def rows_to_trace(
     except UnreadableError as error:
         if options.rate_hz is None or error.line:
             raise
-        return TimedTrace(trace)  # a stated rate needs no clock
-    if clock is not None:
-        order, clock = in_order_of_time(rows, clock, options.time)
-        if (order != np.arange(len(rows))).any():
-            notes["Rows are put in the order of their times"] += 1
-            trace = np.ascontiguousarray(trace[:, order])
-            rows = rows.iloc[order]
-        check_rows(clock, rows.index)
-        _check_repeated(rows, clock)
-    if options.rate_hz is not None:
-        return TimedTrace(trace)
+        return Recording(trace)  # a stated rate needs no clock
     if clock is None:
-        _offer_clock(rows, places, notes)
-        return TimedTrace(trace)
-    rate = rate_of(clock, rows.index)
+        if options.rate_hz is None:
+            _offer_clock(rows, places, notes)
+        return Recording(trace)
+    order, clock = in_order_of_time(rows, clock, options.time)
+    if (order != np.arange(len(rows))).any():
+        notes["Rows are put in the order of their times"] += 1
+        trace = np.ascontiguousarray(trace[:, order])
+        rows = rows.iloc[order]
+    check_rows(clock, rows.index)
+    _check_repeated(rows, clock)
+    return _trace_at_rate(trace, clock, rows.index, options, notes)
+
+
+def _trace_at_rate(
+    trace: NDArray[np.float32],
+    clock: Clock,
+    lines: pd.Index,
+    options: LoadOptions,
+    notes: Counter[str],
+) -> Recording:
+    """Return a trace (C, T) with the rate by its clock, or without one if the rate is stated.
+
+    With `fit="resample"` it is interpolated at even times; else a note says that rows are missing.
+
+    lines : line in the file of each sample.
+    """
+    if options.rate_hz is not None:
+        clock_text = f"none, the rate is stated; column {clock.name} shows lost rows"
+        return Recording(trace, reading=Reading(clock=clock_text))
+    reading = Reading(clock=f"column {clock.name} ({clock.form})")
+    rate = rate_of(clock, lines)
     if clock.note:
         notes[clock.note] += 1
     if options.fit == "resample":
         trace = resample_evenly(trace, clock, rate)
     else:
-        _note_missing(check_even(clock, rate), clock.name, notes)
-    return TimedTrace(trace, rate)
+        n_missing = check_even(clock, rate)
+        if n_missing > 1:
+            text = f"Rows are missing by column {clock.name}: later samples stand too early"
+            notes[f"{text}; fit='resample' puts all at even times"] += 1
+            reading = reading._replace(rows="rows are missing")
+    return Recording(trace, rate, reading=reading)
 
 
 def _check_repeated(rows: pd.DataFrame, clock: Clock) -> None:
@@ -575,13 +589,6 @@ def _check_repeated(rows: pd.DataFrame, clock: Clock) -> None:
     if n_repeated and len(np.unique(clock.seconds)) == len(rows) - n_repeated:
         line = int(rows.index[int(is_repeated.argmax())])
         raise UnreadableError("Expected each row once, this one came before", line)
-
-
-def _note_missing(n_missing: int, clock: str, notes: Counter[str]) -> None:
-    """Note that rows are missing if it is more than one; `clock` is the column that tells it."""
-    if n_missing > 1:
-        text = f"Rows are missing by column {clock}: later samples stand too early"
-        notes[f"{text}; fit='resample' puts all at even times"] += 1
 
 
 def _offer_clock(rows: pd.DataFrame, places: Sequence[int], notes: Counter[str]) -> None:

@@ -141,7 +141,7 @@ def test_a_file_that_does_not_tell_its_decimal_mark_is_refused_until_somebody_st
     with pytest.raises(DataError, match=r"decimal mark, '.' or ','"):
         load_dataset(tmp_path / "a", decimal=";")
     with pytest.raises(
-        DataError, match=r"Expected no decimal for .*: only text files are written so"
+        DataError, match=r"Expected no decimal for .*, which has none; leave it out"
     ):
         load_dataset((np.zeros((2, 3)), [0, 1]), decimal=",")
 
@@ -230,7 +230,7 @@ def test_a_clock_without_a_name_is_known_by_its_values(tmp_path: Path) -> None:
         frame.to_csv(folder / "a_OK.csv", index=name != "since 1970")
         data = load_dataset(folder)
         assert (data.channels, data.rate_hz) == (("FZ",), 250.0), name
-        assert "is taken as the clock by its values" in data.notes[0]
+        assert "by its values" in data.reading["clock"]
     both = [frames["stamps"], frames["seconds"]]
     assert load_dataset((both, [1, 0])).rates.tolist() == [250.0, 250.0]
 
@@ -363,9 +363,9 @@ def test_a_clock_that_names_no_unit_is_read_by_its_size_and_that_is_said(tmp_pat
 def test_counts_that_float64_would_round_are_subtracted_exactly() -> None:
     counts = [639079416000000001 + 7 * i for i in range(N)]
     for column in (pd.Series(counts), pd.Series(list(map(str, counts)))):
-        seconds, wrong, note = seconds_of(column, "Ticks")
+        seconds, wrong, note, form = seconds_of(column, "Ticks")
         np.testing.assert_allclose(seconds, 7e-7 * np.arange(N), rtol=1e-12)
-        assert (wrong, note) == ([], "")
+        assert (wrong, note, form) == ([], "", "1e-07 s")
 
 
 def test_a_count_that_no_epoch_makes_a_date_of_is_refused(tmp_path: Path) -> None:

@@ -908,15 +908,14 @@ def test_parts_with_dates_are_in_the_order_of_their_times(small: Dataset) -> Non
     newest_first = load_dataset(table[::-1], time="time")
     np.testing.assert_array_equal(newest_first.X, expected.X)
     np.testing.assert_array_equal(newest_first.y, expected.y)
-    assert not any("order of their times" in note for note in expected.notes)
-    assert any("in the order of their times" in note for note in newest_first.notes)
+    assert newest_first.reading["order"] == "by the dates of their clocks"
     # Parts that overlap, and times that are no dates, leave the order of the file.
     overlapping = long_table(small, lambda i: stamp + i * 10 * step, step)[::-1]
     no_dates = long_table(small, lambda i: 60.0 * i)[::-1]
     for other in (overlapping, no_dates):
         data = load_dataset(other, time="time")
         np.testing.assert_array_equal(data.X, expected.X[::-1])
-        assert any("order of the rows, which is not that" in note for note in data.notes)
+        assert data.reading["order"] == "as the rows, not by their times"
 
 
 def test_a_word_of_an_undecided_part_is_unlabelled_and_never_proposed_as_a_label(
@@ -1183,8 +1182,7 @@ def test_western_texts_are_read_as_windows_1252(text: str, few: Path, small: Dat
         path.write_bytes(f"{text}\n\n".encode("cp1252") + path.read_bytes())
     data = load_dataset(few)
     np.testing.assert_array_equal(data.X, small.X[:4])
-    note = "Text is read as Windows-1252, not UTF-8; encoding=... states another (4 times)."
-    assert note in data.notes
+    assert data.reading["numbers"].endswith("Windows-1252")
 
 
 def test_words_of_the_user_are_found_in_capitals_and_in_marks_that_are_characters() -> None:
@@ -1394,8 +1392,7 @@ def test_recordings_with_dates_are_in_the_order_of_their_times(
         frame.to_csv(folder / f"{i}_{'OK' if y else 'NOK'}.csv", index=False)
     data = load_dataset(tmp_path)
     np.testing.assert_array_equal(data.X, small.X[:6])
-    note = "Recordings are in the order of their times, not of their names."
-    assert (data.ordered, note in data.notes) == (True, True)
+    assert (data.ordered, data.reading["order"]) == (True, "by the dates of their clocks")
 
 
 def test_clocks_of_two_epochs_are_in_one_order(small: Dataset, tmp_path: Path) -> None:
