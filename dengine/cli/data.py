@@ -187,7 +187,6 @@ def train(
             "store": store,
             "faults": dataset.faults,
             "notes": dataset.notes,
-            "reading": dataset.reading,
             "import": imported,
         }
         if not (imported.imported or core_of(engine).new_labels) and engine.version:

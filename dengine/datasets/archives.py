@@ -127,10 +127,11 @@ def _label_source(named: Mapping[str, Path], options: LoadOptions) -> labels.Lab
 
     Unless the user states the array, the names must not contradict the file or the array.
     """
-    in_names = labels.labels_in_names(None, options.words)
+    others = []
+    if options.label is None:
+        others = [labels.labels_in_names(None, options.words)]
     if options.labels is not None:
         listing = labels.labels_in_file(options.labels, list(named), options)
-        others = [in_names] if options.label is None else []
         return labels.labels_that_agree(listing, others, listing.trust)
     array = options.label or LABEL
     if array not in read_archive(next(iter(named.values())), ())[1]:
@@ -148,5 +149,4 @@ def _label_source(named: Mapping[str, Path], options: LoadOptions) -> labels.Lab
         return column.find(np.atleast_1d(cells).tolist(), place)
 
     source = labels.LabelSource(find, "name the array of labels (label)", place, notes=notes)
-    do = f"name the one to trust: label={array!r}"
-    return labels.labels_that_agree(source, [in_names] if options.label is None else [], do)
+    return labels.labels_that_agree(source, others, f"name the one to trust: label={array!r}")

@@ -310,7 +310,7 @@ def _labels_in_topic(
         if name not in words:
             wanted = f"a message of {topic} before the next insertion begins"
             raise UnreadableError(f"Expected {wanted}, found none")
-        return label_messages.find([words[name]])
+        return label_messages.find([words[name]], f"topic {topic}")
 
     advice = f"give the topic that tells them, {topic} does not, or a file of labels"
     return labels.LabelSource(find, advice, f"topic {topic}", notes=notes)

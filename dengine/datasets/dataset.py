@@ -37,7 +37,6 @@ UNKNOWN_RATE = (
 )
 LABEL_FORMS = "as True/False, OK/NOK, pass/fail or 1/0"
 MEANINGS = ("bad", "good")  # of the labels 0 and 1
-MAX_COUNTED = 6  # different texts of a kind that are shown of how recordings were read
 MAX_LABEL_WORDS = 12  # more different words are no labels
 expect_data = partial(expect, error=DataError)
 
@@ -328,11 +327,6 @@ class LoadOptions:
             codecs.lookup(self.encoding or "utf-8")
 
 
-def no_clock(options: LoadOptions) -> str:
-    """Return in words where the rate of recordings without a clock is from."""
-    return "none" if options.rate_hz is None else "none, the rate is stated"
-
-
 def split_names(names: str | Sequence[str] | None) -> tuple[str, ...]:
     """Return names one by one, of "FZ_Base,FX_Base" or of a list of them, without blanks."""
     items = names.split(",") if isinstance(names, str) else names or ()
@@ -365,19 +359,20 @@ def describe_reading(
     order: str,
     first: str = "",
     *,
-    no_clock: str = "none",
+    rate_hz: float | None = None,
 ) -> dict[str, str]:
     """Return how recordings were read, as `Dataset.reading` has it.
 
     readings, labels : one for each recording.
     order, first : by what they are ordered, and `describe_ends` of the first.
-    no_clock : what stands for the clock of a recording without one.
+    rate_hz : that the user stated.
     """
     words = dict[str, Counter[str]]()
     for reading, label in zip(readings, labels, strict=True):
         counts = words.setdefault(reading.place, Counter())
         counts[f"{reading.word} -> {MEANINGS[label]}"] += 1
     about = {"labels": "; ".join(f"{place}: {_with_counts(n)}" for place, n in words.items())}
+    no_clock = "none, the rate is stated" if rate_hz else "none"
     for name, default in (("clock", no_clock), ("rows", "all"), ("numbers", "")):
         counts = Counter(getattr(reading, name) or default for reading in readings)
         about[name] = _with_counts(counts) if len(counts) > 1 else next(iter(counts))
@@ -386,10 +381,8 @@ def describe_reading(
 
 
 def _with_counts(counts: Counter[str]) -> str:
-    """Return the most frequent texts, each with its count, and how many more there are."""
-    texts = ", ".join(f"{text} {n}" for text, n in counts.most_common(MAX_COUNTED))
-    n_more = len(counts) - MAX_COUNTED
-    return f"{texts} and {n_more} more" if n_more > 0 else texts
+    """Return texts with their counts, the most frequent first: `a 30, b 8`."""
+    return listed(f"{text} {n}" for text, n in counts.most_common())
 
 
 def describe_ends(
@@ -399,10 +392,8 @@ def describe_ends(
 
     all_units : one for each channel.
     """
-    texts = []
-    for i, (row, unit) in enumerate(zip(trace, all_units, strict=True)):
-        name = channels[i] if i < len(channels) else f"channel {i + 1}"
-        texts.append(f"{name} {row[0]:.6g} to {row[-1]:.6g} {unit}".strip())
+    rows = zip(channels or [""] * len(trace), trace, all_units, strict=True)
+    texts = (f"{name} {row[0]:.6g} to {row[-1]:.6g} {unit}".strip() for name, row, unit in rows)
     return f"{source}: {listed(texts)} in {trace.shape[1]} samples"
 
 
@@ -641,7 +632,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
             [recording.label for recording in recordings],
             collector.order,
             describe_ends(first.source, first.trace, collector.channels, channel_units),
-            no_clock=no_clock(options),
+            rate_hz=options.rate_hz,
         ),
         source=np.array([recording.source for recording in recordings]),
         lengths=np.array(lengths_read, dtype=np.int64),

@@ -13,12 +13,14 @@ An empty label, and a word as pending or unknown, is that of a part that was not
 
 import os
 import re
+import tomllib
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -39,49 +41,15 @@ from .dataset import (
 )
 from .text import SUFFIXES, column_place, read_table
 
-GOOD = (
-    "true",
-    "wahr",
-    "vrai",
-    "verdadero",
-    "vero",
-    "okay",
-    "ok",
-    "passed",
-    "pass",
-    "good",
-    "successful",
-    "success",
-    "gut",
-)
-BAD = (
-    *(
-        "false",
-        "falsch",
-        "faux",
-        "falso",
-        "nok",
-        "ng",
-        "failed",
-        "failure",
-        "fail",
-        "bad",
-        "unsuccessful",
-        "schlecht",
-    ),
-    "nio",
-)
+# The words of labels, and the names of their columns.
+LISTS = tomllib.loads((files("dengine") / "data" / "label_words.toml").read_text("utf-8"))
+GOOD = LISTS["good"]
+BAD = LISTS["bad"]
 MEANING = {
     **dict.fromkeys((*GOOD, "yes", "io", "1"), True),
     **dict.fromkeys((*BAD, "no", "0"), False),
 }
-# Labels of parts that nobody has decided on yet: in a cell each, in a name the words.
-UNCHECKED = (
-    *(*EMPTY_CELLS, "-", "--", "?"),
-    *("unknown", "unbekannt", "unlabelled", "unlabeled", "unchecked", "not checked", "undecided"),
-    *("untested", "ungeprüft", "nicht geprüft", "pending", "pendiente", "en attente", "in arbeit"),
-    *("in progress", "offen", "open", "todo", "tbd"),
-)
+UNCHECKED = (*EMPTY_CELLS, *LISTS["unchecked"])
 # What a file manager adds to the name of a copy.
 COPY_SUFFIX = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)
 LAST_WORD = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # without a number
@@ -113,38 +81,12 @@ UNCHECKED_WORDS = "|".join(
     word.replace(" ", r"[\W_]*") for word in UNCHECKED if re.search(LETTER, word)
 )
 UNCHECKED_AT_END = re.compile(rf"{WORD_START}(?i:{UNCHECKED_WORDS})$")
-LABEL_COLUMNS = (
-    *("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome"),
-    *("ergebnis", "bewertung", "urteil"),
-)
-# A column whose name ends in such a word says by true, yes or 1 that it is good.
-GOOD_COLUMNS = (
-    *(*LABEL_COLUMNS, *GOOD, "succeeded", "accepted", "accept", "approved", "valid", "correct"),
-    *("io", "bestanden", "konform", "conform", "conforme", "height_check"),
-)
-# A column of this name, or whose name ends in such a word, says by true, yes or 1 that it is bad.
-BAD_COLUMNS = (
-    *("fail", "fails", "failed", "failure", "bad", "nok", "ng", "nio", "notok", "fault", "faulty"),
-    *("defect", "defects", "defective", "reject", "rejects", "rejected", "scrap", "scrapped"),
-    *("error", "errors", "anomaly", "anomalous", "ausschuss", "ausschuß", "fehler", "fehlerhaft"),
-    *("defekt", "schlecht", "rebut", "défaut", "defaut", "échec", "echec", "scarto", "rechazo"),
-)
-FLAG_ENDINGS = ("flag", "bit", "detected", "found")  # failed_flag, defect_detected
-NEGATIONS = ("not", "no", "non", "nicht", "kein", "keine", "without", "ohne", "free", "frei")
-FLAGS = {  # in any column, whether what its name says is so
-    **dict.fromkeys(("true", "yes", "1", "y", "ja", "j", "oui"), True),
-    **dict.fromkeys(("false", "no", "0", "n", "nein", "non"), False),
-    # What Excel writes in other languages.
-    **dict.fromkeys(("wahr", "vrai", "verdadero", "vero"), True),
-    **dict.fromkeys(("falsch", "faux", "falso"), False),
-}
+LABEL_COLUMNS = LISTS["label_columns"]
+BAD_COLUMNS = LISTS["bad_columns"]
+GOOD_COLUMNS = (*LABEL_COLUMNS, *GOOD, *LISTS["good_columns"])
+FLAGS = {**dict.fromkeys(LISTS["yes"], True), **dict.fromkeys(LISTS["no"], False)}
 # In the columns of a recording these may be something else: a position, a robot's state.
 SIGNAL_COLUMNS = ("y", "class", "status", "ok")
-FILE_COLUMNS = (
-    *("file", "filename", "file_name", "name", "path", "recording", "source", "insertion"),
-    *("datei", "dateiname"),
-)
-
 FEW_NAMES = 5  # in fewer names each word may be a label
 
 LabelMap = Mapping[str, bool]
@@ -354,7 +296,7 @@ def means_bad(column: str) -> bool:
     words = _name_words(column)
     if "".join(words) in BAD_COLUMNS:
         return True
-    others = {*NEGATIONS, *GOOD}  # pass_fail says it of both
+    others = {*LISTS["negations"], *GOOD}  # pass_fail says it of both
     return bool(words) and words[-1] in BAD_COLUMNS and others.isdisjoint(words)
 
 
@@ -367,16 +309,16 @@ def means_good(column: str) -> bool:
     if means_bad(column):
         return False
     words = _name_words(column)
-    is_negated = not set(NEGATIONS).isdisjoint(words)
+    is_negated = not set(LISTS["negations"]).isdisjoint(words)
     names = {*words[-1:], "".join(words), column.lower()}
     others = BAD_COLUMNS if is_negated else GOOD_COLUMNS
     return not names.isdisjoint(others) or (is_negated and not set(words).isdisjoint(BAD_COLUMNS))
 
 
 def _name_words(column: str) -> list[str]:
-    """Return the words of a column's name in lower case, without `FLAG_ENDINGS` at its end."""
+    """Return the words of a column's name in lower case, without such as `flag` at its end."""
     words = re.findall(rf"{LETTER}+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", column).lower())
-    while len(words) > 1 and words[-1] in FLAG_ENDINGS:
+    while len(words) > 1 and words[-1] in LISTS["flag_endings"]:
         words.pop()
     return words
 
@@ -658,7 +600,9 @@ def _find_label(name: str, words: LabelMap) -> SourcedLabel:
     return SourcedLabel(first.label, place, first.text)
 
 
-def suggest_label_sources(words: LabelMap = NO_WORDS) -> Iterator[tuple[str, str, LabelSource]]:
+def suggest_label_sources(
+    names: Sequence[str], words: LabelMap = NO_WORDS
+) -> Iterator[tuple[str, str, LabelSource]]:
     """Yield ways to find labels in names that do not state them in the usual way.
 
     Each is the condition under which it is right, the option to give, and the source, by which the
@@ -668,9 +612,16 @@ def suggest_label_sources(words: LabelMap = NO_WORDS) -> Iterator[tuple[str, str
     pairs = (f"{word}={'good' if good else 'bad'}" for word, good in with_digits.items())
     source = labels_in_names(None, with_digits)
     yield "if 1 and 0 at its end are labels", f"label_map={','.join(pairs)!r}", source
-    pattern = "(?:^|/)([01])/"
-    condition = "if 1 and 0 are the folders of its labels"
-    yield condition, f"label='{pattern}'", labels_in_names(pattern, words)
+    patterns = {"if 1 and 0 are the folders of its labels": "(?:^|/)([01])/"}
+    in_files = (label for name in names for label in _labels_in_file(*_components(name)[0], words))
+    endings = {label.text for label in in_files if label.decides}
+    if endings:
+        longest_first = sorted(endings, key=len, reverse=True)
+        choice = "|".join(re.sub(r"\W", "[^A-Za-z]", word) for word in longest_first)
+        condition = "if the end of the file's name says it"
+        patterns[condition] = f"({choice})[^A-Za-z]*[.][^./]*$"
+    for condition, pattern in patterns.items():
+        yield condition, f"label='{pattern}'", labels_in_names(pattern, words)
 
 
 def _remove_label(name: str, words: LabelMap) -> str:
@@ -1000,7 +951,7 @@ def _label_file_columns(
     one is not found. with_names : the columns in which recordings are named. column : the one of
     labels, if the user stated it.
     """
-    of_file = column_among(header, FILE_COLUMNS)
+    of_file = column_among(header, LISTS["file_columns"])
     of_label = column_among(header, LABEL_COLUMNS if column is None else (column.lower(),))
     if column is not None and of_label is None:
         wanted = f"a column {column} of labels in {path}"
@@ -1015,7 +966,7 @@ def _label_file_columns(
     if of_label is None and len(bad_columns) == 1:
         of_label = bad_columns[0]
     if of_file is None or of_label is None:
-        wanted = FILE_COLUMNS[0] if of_file is None else "label"
+        wanted = "file" if of_file is None else "label"
         actual = ", ".join(header)
         raise DataError(f"Expected a column {wanted} in {path}, got {actual}; call it so.")
     return of_file, of_label

@@ -42,7 +42,6 @@ from .dataset import (
     describe_reading,
     expect_data,
     make_dataset,
-    no_clock,
     refit,
     split_names,
     split_unit,
@@ -394,9 +393,8 @@ def _read_archives(
     except DataError as error:
         if "Object arrays" not in str(error):
             raise
-        why = "Python objects, which can run code when they are read"
-        do = "If you trust it, np.load(..., allow_pickle=True) and load_dataset((X, y))"
-        raise DataError(f"{str(error).partition(':')[0]}: {why}. {do}.") from error
+        advice = _object_arrays_advice(next(iter(named.values())), options)
+        raise DataError(f"{str(error).partition(':')[0]}: {advice}") from error
     first = next(iter(named))
     arrays = dict[str, NDArray[Any]]()
     all_names = list[str]()
@@ -416,6 +414,24 @@ def _read_archives(
                 actual = f"{old.shape or old} and {other.shape or other}"
                 raise DataError(f"Expected {key} alike in {first} and {source}, got {actual}.")
     return arrays, all_names
+
+
+def _object_arrays_advice(path: Path, options: LoadOptions) -> str:
+    """Return advice how to make a table of an archive of Python objects, which is not read.
+
+    Reading such objects, as traces of several lengths are stored, can run code.
+    """
+    _, names = read_archive(path, ())
+    X = next((name for name in (*options.channels, "X") if name in names), names[0])
+    y = next((name for name in (options.label, "y") if name in names), names[-1])
+    steps = (
+        "import numpy as np, pandas as pd",
+        f"d = np.load({str(path)!r}, allow_pickle=True)",
+        f"frame = pd.DataFrame([*d[{X!r}]]).assign(y=d[{y!r}].astype(str))",
+        f"frame.to_csv({str(path.with_suffix('.csv'))!r}, index=False)",
+    )
+    why = "Python objects, which can run code when they are read"
+    return f'{why}. If you trust it, make a table of it: python -c "{"; ".join(steps)}".'
 
 
 def _parts_first(x: NDArray[Any], labels: NDArray[Any] | None) -> NDArray[Any]:
@@ -550,8 +566,8 @@ def _from_arrays(
     data = make_dataset(X, labels, name=name, **about)
     clock = "none, the array rate_hz" if data.rate_hz and not options.rate_hz else ""
     readings = [Reading(label, str(word), clock) for word in words.tolist()]
-    clock = no_clock(options)
-    reading = describe_reading(readings, data.y.tolist(), "as the rows", no_clock=clock)
+    stated = options.rate_hz
+    reading = describe_reading(readings, data.y.tolist(), "as the rows", rate_hz=stated)
     return replace(data, reading=reading)
 
 

@@ -144,8 +144,8 @@ def read_heads(named: Mapping[str, Path], options: LoadOptions) -> FolderHeads:
         for name in [name for name in verdicts if name in header]:
             column = labels.LabelColumn(name, options.words, Counter())
             try:
-                label = column.find(_column_cells(rows, header.index(name)))
-                verdicts[name].add(label.label)
+                cells = _column_cells(rows, header.index(name))
+                verdicts[name].add(column.find(cells).label)
             except UnlabelledError:
                 continue
             except UnreadableError:
@@ -239,8 +239,6 @@ def read_folder(
     in_order = sorted(named, key=lambda name: natural_key(source.without_label(name)))
     collector.ordered = sorted(named, key=natural_key) == in_order
     collector.order = "by name, numbers by size"
-    if not collector.ordered:
-        collector.order = f"{collector.order}, without the labels in them"
     collector.notes.update(_unread_files_note(folder, named, options))
     common_mark = cache(partial(_common_decimal_mark, list(named.values()), options))
 
@@ -412,7 +410,7 @@ def _label_advice(
     """
     suggestions = [
         (_count_labels(named, source), f"{condition}, say so: {do}")
-        for condition, do, source in labels.suggest_label_sources(options.words)
+        for condition, do, source in labels.suggest_label_sources(list(named), options.words)
     ]
     counts, advice = max(suggestions, key=lambda suggestion: -suggestion[0][None])
     if _look_like_labels(counts) and counts[0] and counts[1]:
@@ -859,12 +857,7 @@ def _compared_columns(frame: pd.DataFrame, label: str | None, options: LoadOptio
     if options.label is not None:
         return []
     columns = []
-    for name in frame.columns:
-        is_usual = (
-            name.lower() in labels.LABEL_COLUMNS and name.lower() not in labels.SIGNAL_COLUMNS
-        )
-        if name == label or not is_usual:
-            continue
+    for name in sorted({*_usual_label_columns(list(frame.columns))} - {label}):
         column = labels.LabelColumn(name, options.words, Counter())
         has_labels = False
         with suppress(UnknownWordError):

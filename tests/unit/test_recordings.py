@@ -14,6 +14,7 @@ from dengine import DataEngine, Dataset, TraceSpec, load_dataset
 from dengine.datasets.importing import import_labelled
 from dengine.datasets.labels import labels_in_names, means_bad, parse_label_map
 from dengine.errors import DataError, TraceError, as_options
+from tests.support.command_line import document, line_of
 from tests.support.recording_forms import LABEL_FORMS, NOT_CHECKED_NAMES
 
 
@@ -1407,3 +1408,64 @@ def test_clocks_of_two_epochs_are_in_one_order(small: Dataset, tmp_path: Path) -
     data = load_dataset(tmp_path)
     np.testing.assert_array_equal(data.X, small.X[:6])
     assert (data.ordered, data.rate_hz) == (True, 250.0)
+
+
+def test_data_says_how_a_folder_was_read(small: Dataset, tmp_path: Path) -> None:
+    for i, x in enumerate(small.X[:5]):
+        rows = [f"{4 * k};{1000 + value:.2f}".replace(".", ",") for k, value in enumerate(x)]
+        text = "\n".join(["Presse 3", "Zeit [ms];Kraft [N]", *rows, "Max;12,5"])
+        (tmp_path / f"Teil_{i}_{'NOK' if i in (1, 3) else 'OK'}.csv").write_text(text + "\n")
+    expected = {
+        "labels": "file name: OK -> good 3, NOK -> bad 2",
+        "clock": "column Zeit [ms] (ms)",
+        "rows": "header in line 2, 1 left out below",
+        "numbers": "decimal mark ',', ';' between cells",
+        "order": "by name, numbers by size",
+        "first": f"Teil_0_OK.csv: Kraft [N] {round(1000 + float(small.X[0, 0]), 2):.6g} to "
+        f"{round(1000 + float(small.X[0, -1]), 2):.6g} N in 50 samples",
+    }
+    assert load_dataset(tmp_path).reading == expected
+    assert document("data", tmp_path)["reading"] == expected
+    text = line_of("data", tmp_path)
+    assert "How it was read" in text
+    assert expected["labels"] in text
+
+
+def test_data_says_how_each_form_was_read(small: Dataset, tmp_path: Path) -> None:
+    verdicts = np.where(small.y == 1, "OK", "NOK")
+    n_good = int(small.y.sum())
+    counted = f"OK -> good {n_good}, NOK -> bad {len(small) - n_good}"
+    step = pd.Timedelta(milliseconds=4)
+    start = pd.Timestamp("2026-03-01")
+    long = long_table(small, lambda i: start + i * pd.Timedelta(hours=1), step)
+    wide = small.to_frame().assign(verdict=verdicts).drop(columns=["label"])
+    wide.to_parquet(tmp_path / "wide.parquet")
+    np.savez(tmp_path / "a.npz", X=small.X, y=verdicts, rate_hz=250.0)
+    folder = tmp_path / "archives"
+    folder.mkdir()
+    for i, x in enumerate(small.X[:4]):
+        np.savez(folder / f"{i}_{verdicts[i]}.npz", force=x, time=0.004 * np.arange(len(x)))
+    readings = {
+        "wide": load_dataset(tmp_path / "wide.parquet").reading,
+        "array": load_dataset(tmp_path / "a.npz").reading,
+        "archives": load_dataset(folder).reading,
+        "pair": load_dataset((small.X, verdicts)).reading,
+        "list": load_dataset((list(small.X), verdicts.tolist()), rate_hz=250.0).reading,
+    }
+    by_name = "by name, numbers by size"
+    for name, labels, clock, order in (
+        ("wide", f"column verdict: {counted}", "none", "as the rows"),
+        ("array", f"y: {counted}", "none, the array rate_hz", "as the rows"),
+        ("archives", "file name: ", "column time (s)", by_name),
+        ("pair", f"y: {counted}", "none", "as the rows"),
+        ("list", f"y: {counted}", "none, the rate is stated", "as the rows"),
+    ):
+        reading = readings[name]
+        assert reading["labels"].startswith(labels), name
+        assert (reading["clock"], reading["order"]) == (clock, order), name
+        assert f"{float(small.X[0, 0]):.6g} to {float(small.X[0, -1]):.6g}" in reading["first"]
+    dates = load_dataset(long, time="time").reading
+    assert (dates["clock"], dates["order"]) == (
+        "column time (dates)",
+        "by the dates of their clocks",
+    )
