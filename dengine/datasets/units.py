@@ -7,82 +7,16 @@ units; `seconds_in` reads the units of clocks; `find_columns` finds a column as 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Sequence
+from importlib.resources import files
 
-PREFIXES = {
-    "G": 1e9,
-    "M": 1e6,
-    "k": 1e3,
-    "da": 1e1,
-    "d": 1e-1,
-    "c": 1e-2,
-    "m": 1e-3,
-    "u": 1e-6,
-    "µ": 1e-6,
-    "μ": 1e-6,
-    "n": 1e-9,
-    "": 1.0,
-}
+TABLES = tomllib.loads((files("dengine") / "data" / "units.toml").read_text("utf-8"))
+PREFIXES: dict[str, float] = TABLES["prefixes"]
+BASES: dict[str, tuple[str, float]] = TABLES["bases"]  # with their dimension and factor
+SECONDS: dict[str, float] = TABLES["seconds"]
+ALONE: list[str] = TABLES["alone"]
 USUAL_PREFIXES = ("", "k", "m", "M")  # by which a unit is known that is spelled in another case
-# Units that may have a prefix, with their dimension and factor.
-BASES = {
-    **dict.fromkeys(("N", "Newton", "newton", "Newtons"), ("N", 1.0)),
-    **dict.fromkeys(("Nm", "N·m", "N*m", "N.m", "N m"), ("Nm", 1.0)),
-    "Nmm": ("Nm", 1e-3),
-    "N·mm": ("Nm", 1e-3),
-    "Ncm": ("Nm", 1e-2),
-    "m": ("m", 1.0),
-    "s": ("s", 1.0),
-    "V": ("V", 1.0),
-    "A": ("A", 1.0),
-    "g": ("g", 1.0),
-    "Pa": ("Pa", 1.0),
-    "bar": ("Pa", 1e5),
-    "Hz": ("Hz", 1.0),
-    "rad": ("rad", 1.0),
-    **dict.fromkeys(("sec", "second", "seconds", "Sek.", "Sekunden"), ("s", 1.0)),
-    "W": ("W", 1.0),
-    "K": ("K", 1.0),
-}
-# Seconds in one unit of a clock, by its name in lower case. "min", "h" and "d" are units of a clock
-# alone: `F_min` is a minimum.
-SECONDS = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), 1.0),
-    **{
-        f"{p}{base}": PREFIXES[p]
-        for p in ("m", "u", "µ", "μ", "n")
-        for base in ("s", "sec", "secs")
-    },
-    **{
-        f"{name}{base}": PREFIXES[prefix]
-        for name, prefix in (("milli", "m"), ("micro", "u"), ("nano", "n"))
-        for base in ("s", "sec", "seconds")
-    },
-    "min": 60.0,
-    "h": 3600.0,
-    "d": 86400.0,
-    "days": 86400.0,
-}
-# Units that have no prefix, and that nothing is converted to.
-ALONE = (
-    "°",
-    "deg",
-    "°C",
-    "%",
-    "lbf",
-    "lb",
-    "kgf",
-    "kp",
-    "counts",
-    "digits",
-    "a.u.",
-    "in",
-    "inch",
-    "ft",
-    "psi",
-    "mV/V",
-    "V/V",
-)
 BRACKETED = re.compile(
     r"(?P<name>.*?)\s*[\[({<]\s*(?P<unit>[^\[\](){}<>]*?)\s*[\])}>]\s*"
 )  # FZ [kN]
