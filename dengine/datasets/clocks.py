@@ -419,7 +419,7 @@ def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tupl
     step = float(np.median(np.abs(np.diff(times))))
     low, high = EXCEL_DAYS
     if low < times[0] < high and 0 < step * DAY < 1.0:
-        return DAY, ""
+        return DAY, f"The clock {name} is read as days, as Excel counts them"
     scale = next((scale for scale in (1.0, 1e-3, 1e-6) if step * scale < SLOWEST_STEP), 1e-9)
     if scale == 1.0 and 0 < step < SLOWEST_STEP / 10:
         return scale, ""
