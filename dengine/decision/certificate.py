@@ -287,9 +287,10 @@ class Certificate:
     def saved(self) -> float | None:
         """Lower bound on what was saved by not checking accepted parts, in the unit of the prices.
 
-        It is n_unchecked check - escape min(n_unchecked, n upper), an expectation as the bound is:
-        an audited part saves no check, and it cannot escape. It may be negative: then not checking
-        may have cost money. None without prices.
+        With the prices of a check and of an escape it is check * n_unchecked - escape *
+        min(n_unchecked, n * upper), an expectation as the bound is: an audited part saves no check,
+        and it cannot escape. It may be negative: then not checking may have cost money. None
+        without prices.
         """
         if self.prices is None:
             return None

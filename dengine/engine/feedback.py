@@ -222,7 +222,7 @@ class Feedback:
     def _learn(self, stored: StoredDecision, success: bool, source: Source) -> NewLabel:
         """Update rule and references with the outcome of a part; return its label for the store.
 
-        A trace with a fault teaches neither; any other outcome counts as a new label. A rejected
+        A trace with a fault updates neither; any other outcome counts as a new label. A rejected
         part that was inspected does not update the rule: which of them are inspected is somebody's
         choice, and no sample. An outcome that updates the rule sets the count of unobserved parts
         back to zero; its label holds the count from before, less one if the part itself was in it.
@@ -259,8 +259,8 @@ class Feedback:
     def store_pending(self) -> bool:
         """Hand the labels of silently confirmed parts to the outbox, without waiting.
 
-        Returns False if there were none. Labels that the store has numbered by now enter the
-        window.
+        Returns False, and does nothing, if there are none; else True, and labels that the store has
+        numbered by now enter the training window.
         """
         if not self._pending:
             return False

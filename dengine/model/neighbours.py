@@ -590,7 +590,8 @@ class ModelPrediction(EngineModel):
     def _reference_point(self, x: Floats, hash_: int, embedding: Embedding | None) -> Floats:
         """Return the scaled point of a trace (C, T) in the space of its fold, float32 (d,).
 
-        It is taken from `embedding` (K, d), or computed where that is None.
+        It is taken from `embedding` (K, d), which is scaled already, or computed where that is
+        None.
         """
         if embedding is not None:
             return np.array(embedding[self._fold(hash_)], dtype=np.float32)
