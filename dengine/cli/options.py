@@ -404,7 +404,9 @@ class DataChoice:
         Raises
         ------
         DataError
-            It cannot be read.
+            It cannot be read, or an option does not apply to it.
+        SettingError
+            The text of `--trigger` names no trigger.
         """
         from ..datasets import BUNDLED, load_dataset
 

@@ -478,8 +478,8 @@ class HttpApi:
 def _checked_author(author: str) -> str:
     """Return the author for the event log: the token's name if it has one, else the given name.
 
-    Runs of spaces become one. Raises Refusal 422 without a name or for one that is too long, and
-    for another name than the token's.
+    Runs of spaces become one. Raises Refusal 422 without a name, for one that is too long or not
+    printable, and for another name than the token's.
     """
     owner = CURRENT_TOKEN.get().name
     name = " ".join(author.split())

@@ -76,6 +76,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     ------
     CellError
         If the controller cannot be reached.
+    SettingError
+        For a trigger that is none, a channel that the controller does not have, and `before` or
+        `samples` out of range.
     """
 
     def __init__(

@@ -233,9 +233,10 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     """Receives packages in a thread and buffers them for `take`.
 
     The parameters are those of `RtdeClient`, and `clock`, which returns seconds. The first
-    connection raises CellError if it fails. A connection that is lost later is made again, with as
-    many attempts as that takes, and the newest inputs are written again, unless they are old or the
-    controller was restarted. The buffer holds 60 s of packages; older ones are dropped.
+    connection raises CellError if it fails, SettingError for an unknown column. A connection that
+    is lost later is made again, with as many attempts as that takes, and the newest inputs are
+    written again, unless they are old or the controller was restarted. The buffer holds 60 s of
+    packages; older ones are dropped.
 
     Attributes
     ----------
