@@ -97,7 +97,8 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
     The part is named by its number, if it has one decision beside rejects, or by that decision's
     id. An accepted part that was bad is a line stop; a rejected one that was examined afterwards is
     an inspection, and the engine trains on its label. An event records it. The same label again
-    changes nothing. A wrong label is put right by `dengine correct`.
+    changes nothing. A wrong label is put right by `dengine correct`. A store that names a reducer
+    or rule of your own, module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id

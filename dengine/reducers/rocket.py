@@ -395,8 +395,9 @@ class RocketReducer(Reducer):
     def _start(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
 
-        It also sets `average_`. No label is read. Earlier fits are forgotten. Raises SettingError
-        for a parameter out of its range or fewer than 2 samples.
+        It also sets `average_`, the number of samples that are averaged to one. No label is read.
+        Earlier fits are forgotten. Raises SettingError for a parameter out of its range or fewer
+        than 2 samples.
         """
         x = torch.from_numpy(traces)
         self.average_ = averaging(x)
