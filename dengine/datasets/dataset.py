@@ -729,10 +729,12 @@ def _bring_to_one_rate(
 ) -> tuple[LoadOptions, float | None]:
     """Bring the recordings to one rate; return the options to fit them by, and the rate.
 
-    Recordings at another rate than most become faults. With `fit="resample"` all are interpolated
-    at one rate instead: if they last equally long, they are stretched to one length, else padded,
-    so that equal sample numbers mean equal times. A recording without a clock is taken to have the
-    rate of the others. If none has one, the rate is the stated one or None.
+    Recordings at another rate than most become faults. With `fit="resample"`, where rates differ,
+    only those at more than twice or less than half the median rate become faults, and the others
+    are interpolated at one rate. If these last equally long, the returned options stretch them to
+    one length, else they pad, so that equal sample numbers mean equal times. A recording without a
+    clock is taken to have the rate of the others. If none has one, the rate is the stated one or
+    None.
     """
     rates = np.array([recording.rate_hz or np.nan for recording in collector.recordings])
     clocked = rates[~np.isnan(rates)]

@@ -1,6 +1,7 @@
 """Confidence intervals of a success probability, from counts of successes and failures: Wilson,
 Wald (the paper's "binomial"), Clopper-Pearson and Jeffreys. `INTERVALS` lists them by name for the
-policy, the rules and the exports; `normal_quantile` turns an error level into z.
+policy and the rules; an export can have the first two alone. `normal_quantile` turns an error level
+into z.
 
     >>> from dengine import wilson_interval
     >>> wilson_interval(96, 4, alpha=0.05)  # the paper's "Wilson Formula results" (b), first row

@@ -260,9 +260,10 @@ class MemberEvidence(nn.Module):
         bound. `wrong` says whether the side's action would have been wrong. If the score reaches
         the threshold, the drift detector of the side takes a step first, which may start the safe
         mode. Then all levels that the score reaches count the part, and the members do if it
-        reaches the target level or `predicted` is the side's action. A part whose outcome was not
-        asked for (`inclusion_probability` 0) is only counted if all outcomes are known. No
-        threshold is chosen if the part is counted nowhere.
+        reaches the target level or `predicted` is the side's action. It counts as one part, without
+        a weight. If all outcomes are known, it counts as checked; else `inclusion_probability` says
+        how: 1 as checked, above 0 as audited, and 0 not at all. No threshold is chosen if the part
+        is counted nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)

@@ -392,9 +392,10 @@ def fill_from_peers(
 def check_model_settings(reducer: Any, given: Mapping[str, Any]) -> None:
     """Raise SettingError for settings that have no effect beside a model that is handed in.
 
-    `given` holds settings by name. Without effect are radius, folds, reducer, and a policy that
-    differs from the default in more than `BASELINE_SETTINGS`: audit_rate, stops, label_within,
-    windows and shadow.
+    The caller has such a model. `reducer` is the setting of that name, and `given` holds the other
+    settings by name; None is a setting that was not given. Without effect are reducer, radius,
+    folds, and a policy that differs from the default in more than `BASELINE_SETTINGS`: audit_rate,
+    stops, label_within, windows and shadow.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:
