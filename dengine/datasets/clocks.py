@@ -256,21 +256,18 @@ def _join_seconds(frame: pd.DataFrame, name: str) -> NDArray[np.float64] | None:
     Such are `stamp.secs` and `stamp.nsecs`. None if the column `name` is not one of two such
     columns, or a cell of them is no number.
     """
-    match = re.fullmatch(r"(.*?)(n?(?:ano)?)(secs?)", name)
+    import pandas as pd
+
+    match = re.fullmatch(r"(.*?)(n?(?:ano)?)secs?", name)
     if match is None:
         return None
-    places = {str(column): i for i, column in enumerate(frame.columns)}
-
-    def find(endings: Sequence[str]) -> int | None:
-        names = (f"{match[1]}{ending}" for ending in endings)
-        return next((places[column] for column in names if column in places), None)
-
-    whole = find(("secs", "sec"))
-    part = find(("nsecs", "nsec", "nanosec", "nanosecs"))
-    if whole is None or part is None:
+    columns = {str(name).removesuffix("s"): frame[name] for name in frame.columns}
+    whole = columns.get(f"{match[1]}sec")
+    part = columns.get(f"{match[1]}nsec", columns.get(f"{match[1]}nanosec"))
+    if not (isinstance(whole, pd.Series) and isinstance(part, pd.Series)):
         return None
-    seconds, wrong_seconds = floats(frame.iloc[:, whole])
-    nanoseconds, wrong_nanoseconds = floats(frame.iloc[:, part])
+    seconds, wrong_seconds = floats(whole)
+    nanoseconds, wrong_nanoseconds = floats(part)
     if wrong_seconds or wrong_nanoseconds:
         return None
     result: NDArray[np.float64] = (seconds - seconds[0]) + (nanoseconds - nanoseconds[0]) * 1e-9

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 RATE_TOLERANCE = 0.03  # of the others' rate: recordings within it have one rate
 MANY = 10  # recordings, among which both labels are expected
+SHORT = 0.7  # of the usual length: recordings below it may be pieces, if they are few
+FEW = 0.1  # of all recordings
 FAR = 50.0  # times the usual largest value: a recording beyond has another unit or is none
 MAX_RATE_RATIO = 2.0  # a recording at a rate further from the others' is not resampled
 UNKNOWN_RATE = (
@@ -313,10 +315,8 @@ class LoadOptions:
         expect_data(self.fit in (None, *FITS), f"fit to be one of {', '.join(FITS)}", self.fit)
         expect_data(self.rate_hz is None or self.rate_hz > 0, "a rate above 0 Hz", self.rate_hz)
         expect_data(self.samples is None or self.samples >= 1, "1 or more samples", self.samples)
-        is_distinct = len(set(self.channels)) == len(self.channels)
-        expect_data(is_distinct, "each channel once", self.channels)
-        is_distinct = len(set(self.columns)) == len(self.columns)
-        expect_data(is_distinct, "each of the columns once", self.columns)
+        for names in (self.channels, self.columns):
+            expect_data(len(set(names)) == len(names), "each column once", names)
         expect_data(self.decimal in (None, ".", ","), "a decimal mark, '.' or ','", self.decimal)
         marks = (None, ".", ",", "'", "’", " ", "")
         valid = self.thousands in marks
@@ -590,10 +590,8 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     recordings = collector.recordings
     _note_scales(collector)
     if fit == "resample" and lengths.max() - lengths.min() > RATE_TOLERANCE * samples:
-        text = (
-            f"Recordings of {lengths.min()} to {lengths.max()} samples are stretched to {samples}"
-        )
-        collector.notes[f"{text}: the rate is that of their median length"] += 1
+        text = f"{lengths.min()} to {lengths.max()} samples are stretched to {samples}"
+        collector.notes[f"Recordings of {text}: the rate is that of their median length"] = 1
     X = np.stack([_fit_array(recording.trace, samples, fit) for recording in recordings])
     rates = np.array([recording.rate_hz or np.nan for recording in recordings])
     notes = [f"{text}{f' ({n} times)' if n > 1 else ''}." for text, n in collector.notes.items()]
@@ -643,7 +641,8 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
 def _note_scales(collector: RecordingCollector) -> None:
     """Note recordings whose largest value is far from that of most: their unit may be another.
 
-    Also note one first sample of all that is larger than the others, as a row of rates is.
+    Also note one first sample of all that is larger than the others, as a row of rates is, and few
+    recordings that are shorter than most.
     """
     with np.errstate(invalid="ignore"):
         peaks = np.array([np.nan_to_num(np.abs(r.trace)).max() for r in collector.recordings])
@@ -653,12 +652,18 @@ def _note_scales(collector: RecordingCollector) -> None:
     )
     if len(firsts) == 1 and is_first and len(peaks) >= MANY:
         collector.notes["All begin with the same largest sample, which may be no measurement"] = 1
+    lengths = np.array([recording.trace.shape[1] for recording in collector.recordings])
+    is_short = lengths < SHORT * np.median(lengths)
     usual = float(np.median(peaks))
-    is_far = (peaks > 0) & ((peaks > FAR * usual) | (peaks * FAR < usual))
-    if usual > 0 and is_far.any():
-        names = [r.source for r, far in zip(collector.recordings, is_far, strict=True) if far]
-        text = f"{len(names)} recordings are {FAR:g} times larger or smaller than most"
-        collector.notes[f"{text}, in another unit or not measured: {listed(names)}"] = 1
+    is_far = (usual > 0) & (peaks > 0) & ((peaks > FAR * usual) | (peaks * FAR < usual))
+    far_text = f"are {FAR:g} times larger or smaller than most, in another unit or not measured"
+    for text, is_odd in (
+        (far_text, is_far),
+        ("are much shorter than most", is_short & (is_short.mean() < FEW)),
+    ):
+        if is_odd.any():
+            names = [r.source for r, odd in zip(collector.recordings, is_odd, strict=True) if odd]
+            collector.notes[f"{len(names)} recordings {text}: {listed(names)}"] = 1
 
 
 def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) -> str:
@@ -745,7 +750,11 @@ def _bring_to_one_rate(
             n_unknown
         )
     usual = float(max(clocked, key=lambda r: (np.abs(clocked - r) <= RATE_TOLERANCE * r).sum()))
-    if options.fit != "resample" or not (np.abs(clocked - usual) > RATE_TOLERANCE * usual).any():
+    has_one_rate = (np.abs(clocked - usual) <= RATE_TOLERANCE * usual).all()
+    lengths = [recording.trace.shape[1] for recording in collector.recordings]
+    has_one_length = max(lengths) - min(lengths) <= RATE_TOLERANCE * max(lengths)
+    is_strict = options.fit != "resample"
+    if is_strict or (has_one_rate and (has_one_length or options.samples is not None)):
         wanted = f"timestamps at {usual:g} Hz, as the others have"
         do = "; fit='resample' puts all on one rate by their own times"
         do = "" if options.fit == "resample" else do
@@ -754,7 +763,7 @@ def _bring_to_one_rate(
         kept = [recording.rate_hz for recording in collector.recordings if recording.rate_hz]
         return options, float(np.median(kept))
     # Two digits, so that recordings that are added change neither the rate nor all samples.
-    usual = float(f"{np.median(clocked):.2g}")
+    usual = usual if has_one_rate else float(f"{np.median(clocked):.2g}")
     is_far = (rates > MAX_RATE_RATIO * usual) | (rates * MAX_RATE_RATIO < usual)
     wanted = f"timestamps at about {usual:g} Hz"
     far = np.flatnonzero(is_far).tolist()

@@ -785,7 +785,7 @@ def labels_in_file(
         If the file cannot be read as one of labels.
     """
     source = Path(path).name
-    rows, faults, column = _read_label_rows(path, options, names)
+    rows, faults, column, header = _read_label_rows(path, options, names)
     notes = Counter[str]()
     if any(len(row.lines) > 1 for row in rows):
         notes[f"{source} names recordings more than once: their labels must be equal"] = 1
@@ -824,9 +824,17 @@ def labels_in_file(
     files = ", ".join(row.file for row in rows[:3]) or "no files"
     do = "call its columns file and label, and the files as they are"
     advice = f"{source} names {files}: {do}"
-    return LabelSource(
+    listing = LabelSource(
         find, advice, source, faults, notes=notes, trust=listing_to_trust(source, column)
     )
+    if options.label is not None:
+        return listing
+    others = [
+        replace(labels_in_file(path, names, replace(options, label=name)), place=f"column {name}")
+        for name in header
+        if name != column and name.lower() in LABEL_COLUMNS
+    ]
+    return labels_that_agree(listing, others, listing.trust)
 
 
 def _label_of_row(row: _LabelRow, column: LabelColumn, where: str) -> SourcedLabel:
@@ -861,7 +869,7 @@ def read_ordered_labels(
 
     keys : texts of each trace, as serial numbers, by the names of their arrays.
     """
-    rows, faults, column = _read_label_rows(path, options)
+    rows, faults, column, _ = _read_label_rows(path, options)
     label_of_key = {row.file: row.labels[0] for row in rows if len(row.lines) == 1}
     for texts in keys.values():
         if len(texts) == len(rows) and set(texts) == set(label_of_key):
@@ -880,12 +888,12 @@ def read_ordered_labels(
 
 def _read_label_rows(
     path: str | os.PathLike[str], options: LoadOptions, names: Sequence[str] = ()
-) -> tuple[list[_LabelRow], list[Fault], str]:
+) -> tuple[list[_LabelRow], list[Fault], str, list[str]]:
     """Return the rows of a file of labels, file by file, and the faults of its other lines.
 
-    The name of the column of labels comes last. `options` name the columns of labels and parts;
-    `names`, those of recordings, help to find the column of files. Raises DataError if the file
-    cannot be read, or a column cannot be found.
+    The name of the column of labels and those of all columns come last. `options` name the columns
+    of labels and parts; `names`, those of recordings, help to find the column of files. Raises
+    DataError if the file cannot be read, or a column cannot be found.
     """
     try:
         table = read_table(Path(path), replace(options, columns=()), as_text=True)
@@ -916,7 +924,7 @@ def _read_label_rows(
         row = rows.get(words, _LabelRow((), words, file, (), number or None))
         lines = (*row.lines, line)
         rows[words] = row._replace(lines=lines, labels=(*row.labels, values[of_label]))
-    return list(rows.values()), faults, header[of_label]
+    return list(rows.values()), faults, header[of_label], header
 
 
 def _path_words(path: str) -> tuple[str, ...]:

@@ -261,11 +261,7 @@ def _find_file_reader(
         raise DataError(f"Expected {wanted}, or a folder of CSV files, got {path}.")
     if path.is_file() and is_database(path):
         return (), partial(_read_store, path, name, options)
-    by_kind = {file.suffix.lower() in TABLES: file for file in named.values()}
-    if len(by_kind) > 1:
-        actual = f"{by_kind[True].name} and {by_kind[False].name}"
-        raise DataError(f"Expected tables or .npz files in {path}, got {actual}.")
-    if True in by_kind:
+    if any(file.suffix.lower() in TABLES for file in named.values()):
         read = partial(read_tables, named, name, options)
         return ("label", "labels", "time", *TEXT_FORMAT), read
     if path.is_dir() or path.suffix.lower() == ".npz" or zipfile.is_zipfile(path):
@@ -494,11 +490,7 @@ def _missing_arrays(named: Files, options: LoadOptions) -> str:
         fewest_values = min(single, key=lambda name: len(set(arrays[name].tolist())))
         label = f"label={fewest_values!r}"
     elif traces:
-        keys = _keys_of_traces(arrays)
-        for path in sorted(next(iter(named.values())).parent.glob("*.csv")):
-            with suppress(DataError):
-                if not label and len(read_ordered_labels(path, options, keys)[0]) in lengths:
-                    label = f"labels={str(path)!r}, in the order of the traces"
+        label = "a CSV file of labels in the order of the traces (labels)"
     shapes = ", ".join(f"{name} {arrays[name].shape}" for name in all_names) or "none"
     channel = "" if "X" in all_names or not traces else f"channel={traces[0]!r} and "
     example = f", or their names, as in {channel}{label}" if label else ""

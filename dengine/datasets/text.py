@@ -288,14 +288,10 @@ def _pad_units(units_row: list[str], n: int) -> list[str]:
 
 def _columns_advice(rows: list[list[str]]) -> str:
     """Return advice, for an error, on how to name the columns of a file without a header."""
-    sample = [row for row in rows[:200] if len(row) == len(rows[0])]
-    try:
-        first = [float(row[0].replace(",", ".")) for row in sample]
-    except ValueError:
-        first = []
     names = [f"c{i}" for i in range(len(rows[0]))]
-    if is_rising(np.array(first)):
-        names[0] = "time"
+    first = [row[0].replace(",", ".") for row in rows[:200] if len(row) == len(names)]
+    with suppress(ValueError):
+        names[0] = "time" if is_rising(np.array(first, dtype=np.float64)) else "c0"
     return f"write one above, or name its {len(names)} columns, columns={','.join(names)[:200]!r}"
 
 
@@ -352,6 +348,9 @@ def read_table(
         for i, row in cells.rows.items()
         if i not in complete
     }
+    decimals = [len(row[-1].replace(",", ".").partition(".")[2]) for row in complete.values()]
+    if text[-1:] != "\n" and len(decimals) > 2 and decimals[-1] < min(decimals[:-1]):
+        wrong[max(complete)] = "Expected as many decimals as above, the last number is cut off"
     frame = pd.DataFrame(
         list(complete.values()), index=list(complete), columns=header, dtype=object
     )
@@ -427,10 +426,10 @@ def read_recording(
     rows = _without_summary(frame, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
     timed = rows_to_trace(rows, places, options, notes, table.units)
-    n_below = len(frame) - len(rows)
+    n_out = len(frame) - len(rows)
     left_out = (
         f"header in line {table.line}" if table.line > 1 else "",
-        f"{n_below} left out below" if n_below else "",
+        f"{n_out} left out" if n_out else "",
         timed.reading.rows,
     )
     reading = timed.reading._replace(rows=", ".join(filter(None, left_out)), numbers=table.numbers)
@@ -467,9 +466,9 @@ def _beside_their_clock(
 def _without_summary(
     frame: pd.DataFrame, options: LoadOptions, notes: Counter[str]
 ) -> pd.DataFrame:
-    """Return a recording without rows at its end that are no samples, as `Max;48.2`.
+    """Return a recording without rows at an end of it that are no samples, as `Max;48.2`.
 
-    Such rows have no time. They are left out, with a note, only if all rows above them have a time
+    Such rows have no time. They are left out, with a note, only if all other rows have a time
     and are at least ten times as many. Without a clock the first column of numbers to which this
     applies takes its place; then one of the cells left out must hold text.
     """
@@ -478,17 +477,19 @@ def _without_summary(
         place = place_of_clock(frame, options.time)
     for i in range(frame.shape[1]) if place is None else [place]:
         cells = frame.iloc[:, i].astype(str).tolist()
-        reverse = (_is_value(cell) and cell != "" for cell in reversed(cells))
-        n_last = next((n for n, is_value in enumerate(reverse) if is_value), 0)
-        samples = cells[: len(cells) - n_last]
-        has_words = place is not None or any(cells[len(samples) :])
-        if not (has_words and 0 < n_last <= len(samples) / SUMMARY_SHARE):
+        is_value = [cell != "" and _is_value(cell) for cell in cells]
+        n_samples = sum(is_value)
+        n_out = len(cells) - n_samples
+        first = is_value.index(True) if n_samples else 0
+        has_words = place is not None or any(set(cells) - set(cells[first : first + n_samples]))
+        if not (has_words and 0 < n_out <= n_samples / SUMMARY_SHARE):
             continue
-        if all(cell != "" and _is_value(cell) for cell in samples):
+        if all(is_value[first : first + n_samples]):
             what = "time" if place is not None else f"number in column {frame.columns[i]}"
-            text = f"The last {n_last} rows have no {what}: they are no samples, and left out"
+            where = "first" if first else "last"
+            text = f"The {where} {n_out} rows have no {what}: they are no samples, and left out"
             notes[text] += 1
-            return frame.iloc[: len(samples)]
+            return frame.iloc[first : first + n_samples]
     return frame
 
 

@@ -1350,15 +1350,60 @@ def test_that_no_recording_is_bad_is_said(small: Dataset, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("rate_hz", [None, 250.0])
-def test_a_word_among_the_times_is_a_fault_also_with_a_stated_rate(
-    rate_hz: float | None, few: Path
+def test_a_summary_above_the_samples_is_no_sample_also_with_a_stated_rate(
+    rate_hz: float | None, few: Path, small: Dataset
 ) -> None:
     path = min(few.iterdir())
     header, *rows = path.read_text("utf-8").splitlines()
     path.write_text("\n".join([header, "Max,9.0", "Min,0.0", *rows]) + "\n")
     data = load_dataset(few, rate_hz=rate_hz)
-    assert [(f.source, f.line) for f in data.faults] == [(path.name, 2)]
-    assert "got 'Max'; leave such rows out of the file" in data.faults[0].message
+    np.testing.assert_array_equal(data.X, small.X[:4])
+    assert "The first 2 rows have no time: they are no samples, and left out." in data.notes
+    stated = load_dataset(few, rate_hz=250.0, time="none")
+    np.testing.assert_array_equal(stated.X, small.X[:4])
+
+
+def test_a_number_that_is_cut_off_at_the_end_of_a_file_is_a_fault(tmp_path: Path) -> None:
+    for i, end in enumerate(("30.62\n", "3", "30.62")):
+        rows = [f"{0.004 * k:.3f},{30 + 0.01 * k:.2f}" for k in range(50)]
+        text = "\n".join(["time,FZ", *rows, f"0.200,{end}"])
+        (tmp_path / f"{i}_OK.csv").write_text(text)
+    data = load_dataset(tmp_path)
+    assert [(f.source, f.line) for f in data.faults] == [("1_OK.csv", 52)]
+
+
+def test_columns_of_a_listing_that_contradict_each_other_are_faults(few: Path) -> None:
+    names = sorted(path.name for path in few.iterdir())
+    for path in few.iterdir():
+        path.rename(path.with_name(path.name.replace("True", "a").replace("False", "b")))
+    names = sorted(path.name for path in few.iterdir())
+    rows = [f"{name},OK,{'NOK' if i == 1 else 'OK'}" for i, name in enumerate(names)]
+    path = few.parent / "list.csv"
+    path.write_text("\n".join(["file,label,verdict", *rows]))
+    data = load_dataset(few, labels=path)
+    assert [fault.source for fault in data.faults] == [names[1]]
+    assert "name the column to trust" in data.faults[0].message
+    assert len(load_dataset(few, labels=path, label="verdict")) == len(names)
+
+
+def test_recordings_of_one_rate_and_several_lengths_are_not_stretched(tmp_path: Path) -> None:
+    for i in range(6):
+        t = 0.001 * np.arange(380 + 10 * i)
+        frame = pd.DataFrame({"time": t, "FZ": np.sin(20 * t)})
+        frame.to_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False)
+    data = load_dataset(tmp_path, fit="resample")
+    assert data.rate_hz == 1000.0
+    np.testing.assert_allclose(
+        data.X[:, :380], np.tile(np.sin(0.02 * np.arange(380)), (6, 1)), atol=1e-5
+    )
+
+
+def test_few_recordings_that_are_shorter_than_most_are_noted(tmp_path: Path) -> None:
+    for i in range(20):
+        frame = pd.DataFrame({"FZ": np.sin(0.1 * i + 0.1 * np.arange(70 if i == 3 else 120))})
+        frame.to_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False)
+    notes = load_dataset(tmp_path).notes
+    assert "1 recordings are much shorter than most: 3_NOK.csv." in notes
 
 
 def test_a_row_of_rates_above_the_samples_is_noted(small: Dataset, tmp_path: Path) -> None:
@@ -1418,7 +1463,7 @@ def test_data_says_how_a_folder_was_read(small: Dataset, tmp_path: Path) -> None
     expected = {
         "labels": "file name: OK -> good 3, NOK -> bad 2",
         "clock": "column Zeit [ms] (ms)",
-        "rows": "header in line 2, 1 left out below",
+        "rows": "header in line 2, 1 left out",
         "numbers": "decimal mark ',', ';' between cells",
         "order": "by name, numbers by size",
         "first": f"Teil_0_OK.csv: Kraft [N] {round(1000 + float(small.X[0, 0]), 2):.6g} to "
