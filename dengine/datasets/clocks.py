@@ -506,8 +506,10 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
         if not _is_counter_full(usual - steps[i], usual):
             wanted = f"a later time in column {clock.name} than that of the row before"
             actual = f"{-steps[i]:.3g} s earlier"
-            do = f"time={clock.name!r} puts rows in the order of their times, if they differ"
-            do = f"{do}; time={NO_CLOCK!r} with a stated rate (rate_hz) leaves them as they are"
+            do = (
+                f"time={clock.name!r} puts rows in the order of their times, if they differ; "
+                f"time={NO_CLOCK!r} with a stated rate (rate_hz) leaves them as they are"
+            )
             raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", lines[rows[i + 1]])
     gaps = np.flatnonzero(steps > MAX_GAP * usual)
     # After a late row others come sooner, so that none are missing.

@@ -265,8 +265,7 @@ def _find_file_reader(
         read = partial(read_tables, named, name, options)
         return ("label", "labels", "time", *TEXT_FORMAT), read
     if path.is_dir() or path.suffix.lower() == ".npz" or zipfile.is_zipfile(path):
-        is_each = len(named) > 1 and hold_one_each(named, options)
-        read_npz = read_archive_each if is_each else _read_npz
+        read_npz = read_archive_each if hold_one_each(named, options) else _read_npz
         return ("label", "labels", "time"), partial(read_npz, named, name, options)
     raise DataError(f"Expected a file {FORMS}, got {path}; save it as one of these.")
 
@@ -563,11 +562,6 @@ def _from_arrays(
     return replace(data, reading=reading)
 
 
-def _index_as_column(frame: Any) -> Any:
-    """Return a DataFrame with its index as a column if it holds numbers or times: maybe a clock."""
-    return frame.reset_index() if frame.index.dtype.kind in "fMm" else frame
-
-
 def _from_list(traces: list[Any], labels: list[Any], options: LoadOptions) -> Dataset:
     """Make a data set of a list of arrays, Series or DataFrames of any length.
 
@@ -597,7 +591,9 @@ def _from_list(traces: list[Any], labels: list[Any], options: LoadOptions) -> Da
         collector.channels = collector.channels or spec_of(x, selected).columns
         clock = rate = None
         if hasattr(trace, "iloc") and trace.ndim == 2 and not options.rate_hz:
-            clock = clock_of(_index_as_column(trace), options.time)
+            # An index of numbers or times may be the clock.
+            has_index = trace.index.dtype.kind in "fMm"
+            clock = clock_of(trace.reset_index() if has_index else trace, options.time)
             rate = None if clock is None else rate_of(clock, trace.index)
         channel_units = tuple(units.split(name)[1] for name in collector.channels)
         text = "" if clock is None else f"column {clock.name} ({clock.form})"

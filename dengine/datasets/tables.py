@@ -296,18 +296,14 @@ def _label_source(
     if options.label is not None:
         return labels.labels_in_names(options.label, options.words), []
     columns = _verdict_columns(named, heads, options)
-    if set(_count_labels(named, in_names)) <= {None, ""}:
+    has_names = not set(_count_labels(named, in_names)) <= {None, ""}
+    if not has_names:
         columns = columns or _usual_label_columns(heads.header)[:1]
-        sources = [labels.labels_in_column(named, column, options) for column in columns]
-        if not sources:
-            return in_names, []
-        do = f"name the one to trust: label={columns[0]!r}"
-        return labels.labels_that_agree(sources[0], sources[1:], do), columns
-    if not columns:
-        return in_names, []
     sources = [labels.labels_in_column(named, column, options) for column in columns]
-    do = f"name the one to trust: label={columns[0]!r}, or a pattern of the path (label)"
-    return labels.labels_that_agree(in_names, sources, do, fills_in=True), columns
+    if has_names or not columns:
+        sources = [in_names, *sources]
+    do = f"name the one to trust: label={listed(columns[:1])!r}, or a pattern of the path (label)"
+    return labels.labels_that_agree(sources[0], sources[1:], do, fills_in=has_names), columns
 
 
 def _usual_label_columns(header: Sequence[str]) -> list[str]:
