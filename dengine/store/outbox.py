@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import NotTakenError, StoreError
+from ..errors import NotTakenError, StoreError, listed
 from .journal import (
     HEADER,
     Journal,
@@ -162,6 +162,9 @@ class Outbox:
         self._labels: dict[str, tuple[NewLabel, int]] = {}
         self._times: deque[float] = deque()  # when each undrained record was appended
         self._unwritten: deque[Record] = deque()
+        # Synced and not drained, in order: offset and end in the journal, and a copy of the record,
+        # or the id of a decision.
+        self._undrained: deque[tuple[int, int, Record | str]] = deque()
         # Numbers of records so far, and up to which of them somebody waits for a sync or a drain.
         self._appended = self._synced = self._drained = 0
         self._to_sync = self._to_drain = 0
@@ -192,13 +195,14 @@ class Outbox:
         """
         try:
             self._compare_with_ledger(journal)  # before anything is drained
-            for offset, _, blob in journal.undrained_records():
+            for offset, end, blob in journal.undrained_records():
+                record = decode_record(blob)
                 self._appended += 1
-                self._synced += 1
                 self._times.append(time.monotonic())
-                if isinstance(record := decode_record(blob), StoredDecision):
+                if isinstance(record, StoredDecision):
                     # A later decision of the same id replaces an earlier one.
-                    self._decisions[record.decision.id] = offset
+                    self._decisions[record.decision.id] = record
+                self._mark_synced(record, offset, end)
             while not self.is_drained:
                 self._drain_chunk(journal)
             if journal.dropped:
@@ -880,17 +884,27 @@ class Outbox:
                 "journal", f"{error} It was created again with what the store lacked."
             )
         with self._changed:
-            for record, offset in zip(batch, offsets, strict=True):
+            ends = [*offsets[1:], journal.end]
+            for record, offset, end in zip(batch, offsets, ends, strict=True):
                 self._unwritten.popleft()
-                if (
-                    isinstance(record, StoredDecision)
-                    and self._decisions.get(record.decision.id) is record
-                ):
-                    self._decisions[record.decision.id] = offset
-            self._synced += len(batch)
+                self._mark_synced(record, offset, end)
             self._journal_error = ""
             self._sync_began = math.inf
             self._changed.notify_all()
+
+    def _mark_synced(self, record: Record, offset: int, end: int) -> None:
+        """Count a record as synced, and note where it is in the journal; the caller has the lock.
+
+        Of a decision only the offset stays in memory, and nothing if it was replaced meanwhile.
+        """
+        self._synced += 1
+        if not isinstance(record, StoredDecision):
+            self._undrained.append((offset, end, record))
+            return
+        id_ = record.decision.id
+        self._undrained.append((offset, end, id_))
+        if self._decisions.get(id_) is record:
+            self._decisions[id_] = offset
 
     # The thread that drains the journal into the store
 
@@ -936,30 +950,50 @@ class Outbox:
     def _drain_chunk(self, journal: Journal) -> None:
         """Have the store commit the oldest synced records, at most DRAIN_CHUNK, in one transaction.
 
-        Decisions that were replaced are left out. Journal, counters and memory are updated. Raise
-        StoreError if the store refuses; nothing is updated then.
+        Decisions that were replaced are left out. A record that is damaged on disk is taken from
+        memory, and an event is stored, too; it names the decisions that are not in memory any more
+        and so are lost. Journal, counters and memory are updated. Raise StoreError if the store
+        refuses; nothing is updated then.
         """
+        records: list[Record] = []
+        lost: list[str] = []
+        n_damaged = 0
         with self._changed:
-            n = min(DRAIN_CHUNK, self._synced - self._drained)
-        entries = [
-            (offset, end, decode_record(blob))
-            for offset, end, blob in islice(journal.undrained_records(), n)
-        ]
-        with self._changed:  # without the decisions that were replaced
-            records = [
-                record
-                for offset, _, record in entries
-                if not isinstance(record, StoredDecision)
-                or self._decisions.get(record.decision.id) == offset
+            chunk = list(islice(self._undrained, DRAIN_CHUNK))
+            to_read = [
+                (offset, copy)
+                for offset, _, copy in chunk
+                if not isinstance(copy, str) or self._decisions.get(copy) == offset
             ]
+        for offset, copy in to_read:
+            try:
+                records.append(decode_record(journal.read(offset)))
+            except StoreError:
+                n_damaged += 1
+                with self._changed:
+                    record = self._recent.get(copy) if isinstance(copy, str) else copy
+                if record is None:
+                    lost.append(str(copy))
+                else:
+                    records.append(record)
+        if n_damaged:
+            others = f"all but the decisions {listed(lost)}, which are lost," if lost else "all"
+            text = f"{n_damaged} records of {journal.path} were damaged on disk"
+            text = f"{text}; {others} were stored from memory"
+            records.append(Event(0, self.store.clock(), "journal", as_text(text)))
         numbers = self.store.apply_records(records)
+        if n_damaged:
+            log.error("journal: %s", text)
         with self._changed:
-            journal.drained_to = entries[-1][1]
+            journal.drained_to = chunk[-1][1]
             self._save_newest_entry()
             self._remove_drained(records, numbers)
-            for _ in range(n):
+            for decision_id in lost:
+                self._decisions.pop(decision_id)
+            for _ in chunk:
                 self._times.popleft()
-            self._drained += n
+                self._undrained.popleft()
+            self._drained += len(chunk)
             self._changed.notify_all()
 
     def _run_call(self, future: Future[Any], call: Callable[[], Any]) -> None:
