@@ -444,6 +444,9 @@ def _stated_unit(name: str, unit: str) -> float | None:
 def rate_of(clock: Clock, lines: pd.Index) -> float:
     """Return the sampling rate in hertz, to four digits, by a clock's usual step.
 
+    That is the median step. If the mean of the steps that are not late differs from it by 0.5 % or
+    more, as for a clock of whole milliseconds, it is this mean.
+
     Parameters
     ----------
     clock : Clock

@@ -276,9 +276,10 @@ def _label_source(
 ) -> tuple[labels.LabelSource, list[str]]:
     """Return the source of a folder's labels, and the columns of its files that tell labels.
 
-    The source is the file of labels, the names, or a column, in this order, or what the user
-    states. What the user does not state is compared with all others: they must not contradict each
-    other. Columns tell the labels of files whose names do not.
+    The source is the file of labels if one is given, else what `options.label` states (a column, or
+    a pattern of the names), else the names, with columns for files whose names tell no label.
+    Unless `options.label` is given, the source is compared with all others: its `find` raises
+    SeveralLabelsError for a recording whose labels contradict each other.
     """
     in_names = labels.labels_in_names(None, options.words)
     if options.labels is not None:

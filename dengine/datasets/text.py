@@ -443,11 +443,12 @@ def read_recording(
 def _beside_their_clock(
     frame: pd.DataFrame, places: Sequence[int]
 ) -> tuple[pd.DataFrame, list[int]]:
-    """Return a recording without the clocks of other channels, and the places of what is kept.
+    """Return a recording with the clock of the channels at `places`, without clocks of others.
 
     Only clocks of one name are several, as in Time;Way;Time;Force, where each stands to the left of
-    its channels. Rows at the end in which clock and channels are empty are left out. Raises
-    UnreadableError if channels have different clocks.
+    its channels. Rows at the end in which this clock and these channels are empty are left out, too;
+    all other columns stay. The second value is the place in `frame` of each column that is kept.
+    Raises UnreadableError if the channels at `places` have different clocks.
     """
     names = [str(name).lower() for name in frame.columns]
     clocks = [i for i, name in enumerate(names) if is_time_column(name) and names.count(name) > 1]

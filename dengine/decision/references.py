@@ -452,6 +452,7 @@ class RadiusIndex(nn.Module):
         Returns
         -------
         n_success, n_failure : array of int64, shape (n,)
+            Rounded votes if any part in the index came more than once, as of `count_near`.
         """
         z = torch.from_numpy(np.array(queries, dtype=np.float32))
         z = z[:, None, :] if z.dim() == 2 else z  # (n, K, d)

@@ -390,8 +390,9 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
 def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw n kernels from `choices` (N, 9), and the channels that each reads: float32 (n, C * 9).
 
-    Unless n exceeds N, no kernel is drawn twice. A kernel reads between one and all channels,
-    equally weighted, and has unit size; its weights on the other channels are 0.
+    Each of the N is drawn n / N times, rounded up or down: none twice unless n exceeds N. A kernel
+    reads between one and all channels, few more often than many, equally weighted, and has unit
+    size; its weights on the other channels are 0.
     """
     drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)
     kernels = choices[torch.from_numpy(drawn)]

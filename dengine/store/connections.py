@@ -776,9 +776,9 @@ class Database:
         return [(id_, numbers[id_]) for id_ in dict.fromkeys(labelled)]
 
     def _insert_late_stops(self, connection: sa.Connection, ids: Sequence[str]) -> None:
-        """Correct to failure the labels of parts that silence had confirmed and that stopped later.
+        """Correct the labels of these decisions to failure: their parts stopped the line late.
 
-        Such a label was "confirmed" since no line stop had been reported in time. Insert a
+        Silence had confirmed each of them as a success, which the caller has checked. Insert a
         correction and an event of kind "late stop" for each.
         """
         now = float(self._clock())
