@@ -446,7 +446,7 @@ def _beside_their_clock(
     """Return a recording with the clock of the channels at `places`, without clocks of others.
 
     Only clocks of one name are several, as in Time;Way;Time;Force, where each stands to the left of
-    its channels. Rows at the end in which this clock and these channels are empty are left out, too;
+    its channels. Rows at the end in which this clock and these channels are empty are left out;
     all other columns stay. The second value is the place in `frame` of each column that is kept.
     Raises UnreadableError if the channels at `places` have different clocks.
     """
