@@ -826,9 +826,9 @@ def choose_fit(lengths: NDArray[np.int64], fit: str | None, samples: int | None)
     Returns
     -------
     fit : str
-        The stated one. Else strict for equal lengths; cut for stated samples that all have; else
-        pad, which leaves each sample at its own time, and takes live traces that are a little
-        shorter.
+        The stated one. Else strict for equal lengths, unless other samples are stated; cut for
+        stated samples that all have; else pad, which leaves each sample at its own time, and takes
+        live traces that are a little shorter.
     samples : int
         The stated ones. Else the median length for pad and resample; for cut the shortest that is
         at least half of the median.

@@ -277,9 +277,12 @@ def _label_source(
     """Return the source of a folder's labels, and the columns of its files that tell labels.
 
     The source is the file of labels if one is given, else what `options.label` states (a column, or
-    a pattern of the names), else the names, with columns for files whose names tell no label.
-    Unless `options.label` is given, the source is compared with all others: its `find` raises
-    SeveralLabelsError for a recording whose labels contradict each other.
+    a pattern of the names), else the names, with columns for files whose names tell no label. If no
+    name tells one, it is a column. Unless `options.label` is given, the source is compared with all
+    others: its `find` raises SeveralLabelsError for a recording whose labels contradict each other.
+
+    All columns are returned, also if the source is another one. Only where `options.label` is the
+    source it is that column alone, or none for a pattern.
     """
     in_names = labels.labels_in_names(None, options.words)
     if options.labels is not None:
@@ -626,9 +629,9 @@ def _add_wide_rows(
     """Add each row of a wide table to a collector as a recording, and set its channels.
 
     An empty cell before others is NaN, which the engine finds. A row whose last cells are empty is
-    a shorter trace. A row with text among its samples, or with an unknown label, is a fault; one
-    without a label yet is only counted. Raises DataError if the columns of labels, parts or samples
-    are not found.
+    a shorter trace. A row with text among its samples, an unknown label, or labels that contradict
+    each other is a fault; one without a label yet is only counted. Raises DataError if the columns
+    of labels, parts or samples are not found, and if each part has several rows, one per signal.
     """
     frame = table.frame
     label_column = _label_column(frame, options)
