@@ -162,9 +162,9 @@ class Outbox:
         self._labels: dict[str, tuple[NewLabel, int]] = {}
         self._times: deque[float] = deque()  # when each undrained record was appended
         self._unwritten: deque[Record] = deque()
-        # Synced and not drained, in order: offset and end in the journal, and a copy of the record,
-        # or the id of a decision.
-        self._undrained: deque[tuple[int, int, Record | str]] = deque()
+        # Synced and not drained, in order: offset and end in the journal, and the id of a decision,
+        # or "" and a copy of another record.
+        self._undrained: deque[tuple[int, int, str, Record | None]] = deque()
         # Numbers of records so far, and up to which of them somebody waits for a sync or a drain.
         self._appended = self._synced = self._drained = 0
         self._to_sync = self._to_drain = 0
@@ -898,13 +898,12 @@ class Outbox:
         Of a decision only the offset stays in memory, and nothing if it was replaced meanwhile.
         """
         self._synced += 1
-        if not isinstance(record, StoredDecision):
-            self._undrained.append((offset, end, record))
-            return
-        id_ = record.decision.id
-        self._undrained.append((offset, end, id_))
-        if self._decisions.get(id_) is record:
-            self._decisions[id_] = offset
+        id_ = ""
+        if isinstance(record, StoredDecision):
+            id_ = record.decision.id
+            if self._decisions.get(id_) is record:
+                self._decisions[id_] = offset
+        self._undrained.append((offset, end, id_, None if id_ else record))
 
     # The thread that drains the journal into the store
 
@@ -956,43 +955,37 @@ class Outbox:
         refuses; nothing is updated then.
         """
         records: list[Record] = []
-        lost: list[str] = []
-        n_damaged = 0
+        damaged: list[str] = []
         with self._changed:
             chunk = list(islice(self._undrained, DRAIN_CHUNK))
-            to_read = [
-                (offset, copy)
-                for offset, _, copy in chunk
-                if not isinstance(copy, str) or self._decisions.get(copy) == offset
-            ]
-        for offset, copy in to_read:
+        for offset, _, id_, copy in chunk:
+            if self._decisions.get(id_, offset) != offset:
+                continue  # it was replaced
             try:
                 records.append(decode_record(journal.read(offset)))
             except StoreError:
-                n_damaged += 1
-                with self._changed:
-                    record = self._recent.get(copy) if isinstance(copy, str) else copy
-                if record is None:
-                    lost.append(str(copy))
-                else:
-                    records.append(record)
-        if n_damaged:
-            others = f"all but the decisions {listed(lost)}, which are lost," if lost else "all"
-            text = f"{n_damaged} records of {journal.path} were damaged on disk"
-            text = f"{text}; {others} were stored from memory"
+                record = copy or self._recent.get(id_)
+                damaged.append("" if record else id_)
+                records += filter(None, [record])
+        if damaged:
+            lost = listed(filter(None, damaged)) or "none"
+            text = (
+                f"{len(damaged)} records of {journal.path} were damaged on disk and are stored "
+                f"from memory; decisions that are lost: {lost}"
+            )
             records.append(Event(0, self.store.clock(), "journal", as_text(text)))
         numbers = self.store.apply_records(records)
-        if n_damaged:
+        if damaged:
             log.error("journal: %s", text)
         with self._changed:
             journal.drained_to = chunk[-1][1]
             self._save_newest_entry()
             self._remove_drained(records, numbers)
-            for decision_id in lost:
-                self._decisions.pop(decision_id)
             for _ in chunk:
                 self._times.popleft()
                 self._undrained.popleft()
+            for id_ in damaged:
+                self._decisions.pop(id_, None)
             self._drained += len(chunk)
             self._changed.notify_all()
 
