@@ -80,11 +80,12 @@ class ForceLimits:
         An empty LOW or HIGH is no limit. `:channel=1`, `:along=2` and `:reject` may follow. Raises
         SettingError for any other text, and for values that are no limits.
         """
-        pairs = [field.partition("=") for field in text.split(":")]
+        fields = text.split(":")
         options: dict[str, Any] = {}
         try:
-            start, end, low, high = (field for field, _, _ in pairs[:4])
-            for name, _, value in pairs[4:]:
+            start, end, low, high = fields[:4]
+            for field in fields[4:]:
+                name, _, value = field.partition("=")
                 options[name] = int(value) if value.isdecimal() else value or True
             limits = float(low or "-inf"), float(high or "inf")
             return cls(float(start), float(end), *limits, **options)

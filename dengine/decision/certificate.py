@@ -150,8 +150,7 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     Page (1954), Biometrika 41; that it is the soonest: Moustakides (1986), Annals of Statistics 14.
     """
     doubled = min(2.0 * share, 0.99)
-    odds = math.log((1.0 - share) / (1.0 - doubled))
-    step = max(1, round(math.log(doubled / share) / odds))
+    step = max(1, round(math.log(doubled / share) / math.log((1.0 - share) / (1.0 - doubled))))
     too_low = 1
     limit = 1
     while _run_length(share, step, limit) < parts:
@@ -353,9 +352,8 @@ class Certificate:
             return f"Of {parts} {which} nothing can be said{but}, for {unknown}."
         if group.shadowed:
             which = f"that the model would {verb}, each of which was checked"
-        elif group.propensity < 1.0:
-            audited = f"{group.n_with_outcome:,} were audited"
-            which = f"that the model would {verb}, of which {audited}"
+        elif group.propensity < 1.0 or group.n_unchecked < group.n:
+            which = f"that the model would {verb}, of which {group.n_with_outcome:,} were audited"
         if group.upper >= 1.0:
             return f"Of {parts} {which}, nothing can be said yet: too few were looked at."
         confidence = percent(1.0 - self.alpha, ".6g")

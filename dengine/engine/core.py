@@ -370,8 +370,7 @@ class EngineCore:
                 spec = self.outbox.call_store(lambda: read_peers_trace_spec(self.store)) or spec
         except StoreError:  # the cell's own first trace stands
             log.exception("the product's contract of traces cannot be had")
-        settings = replace(self.settings.now, trace=spec, inferred=inferred)
-        self.settings.change(settings)
+        self.settings.change(replace(self.settings.now, trace=spec, inferred=inferred))
         self.settings.save()
         return spec
 

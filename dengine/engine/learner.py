@@ -209,8 +209,7 @@ class Learner:
         self.store_labels()
         begin = self._clock()
         self._begin_retrain()
-        trained = self._retrainer.train(self.live.newest, begin)
-        candidate = self._as_candidate_of(trained)
+        candidate = self._as_candidate_of(self._retrainer.train(self.live.newest, begin))
         self._candidate = candidate
         self._report = None
         self._advance(to_the_end=True)

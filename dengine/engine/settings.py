@@ -155,7 +155,7 @@ class EngineSettings:
         Raises
         ------
         StoreError
-            For an unused store, a damaged seed, and a recipe that lacks settings.
+            For an unused store, a damaged number, and a recipe that lacks settings.
         SettingError
             For a text that is no recipe; where an object is missing or another than the engine was
             made with, or a model is not needed.
@@ -171,22 +171,22 @@ class EngineSettings:
         recipe = _with_objects(recipe, texts, name, reducer, model)
         allowed = allow_import is True or {*(allow_import or ()), *named_classes(reducer)}
         check_imports(recipe, name, allowed)
-        seed = texts.get("seed", "0")
-        is_seed = seed.isdecimal() and seed.isascii() and len(seed) < 100
-        do = "restore the store from a copy"
-        expect(is_seed, "a seed in the store's settings", seed, do, StoreError)
-        evidence = EvidenceWindow(
-            int(texts.get("evidence_since", "0")), int(texts.get("began_in", "0"))
-        )
+        numbers: list[int] = []
+        for setting in ("seed", "policy_since", "evidence_since", "began_in"):
+            text = texts.get(setting, "0")
+            is_valid = text.isdecimal() and text.isascii() and len(text) < 100
+            wanted = f"a {setting} in the store's settings"
+            expect(is_valid, wanted, text, "restore the store from a copy", StoreError)
+            numbers.append(int(text))
         return cls(
             recipe,
-            int(seed),
+            numbers[0],
             texts.get("model"),
             texts.get("described"),
             stored_trace_spec(texts),
             "inferred" in texts,
-            int(texts.get("policy_since", "0")),
-            evidence,
+            numbers[1],
+            EvidenceWindow(*numbers[2:]),
         )
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
@@ -363,8 +363,7 @@ def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
     """Return the trace contract of a product's other cells; None where there is none, or no
     product.
     """
-    specs = map(stored_trace_spec, store.peers_settings().values())
-    return next(filter(None, specs), None)
+    return next(filter(None, map(stored_trace_spec, store.peers_settings().values())), None)
 
 
 def fill_from_peers(

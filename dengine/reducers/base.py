@@ -542,8 +542,7 @@ class LabelFree(_Wrapping):
         return self
 
     def transform(self, X: ArrayLike) -> Floats:
-        inputs = self.as_input(self.check_traces(X))
-        return as_points(self.reducer_.transform(inputs))
+        return as_points(self.reducer_.transform(self.as_input(self.check_traces(X))))
 
 
 @dataclass(eq=False, repr=False)

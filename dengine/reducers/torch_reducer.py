@@ -92,17 +92,14 @@ class Augmentation:
         batch, members, _, length = x.shape
         size = (batch, members, 1, 1)
         offset = torch.from_numpy(rng.integers(-self.shift, self.shift + 1, size=size))
-        frame = (torch.arange(length) + offset).clamp(0, length - 1)
-        x = x.gather(3, frame.expand_as(x))
+        x = x.gather(3, (torch.arange(length) + offset).clamp(0, length - 1).expand_as(x))
         x = x * (1.0 + self.gain * standard_normal(rng, *size))
         x = x + self.noise * standard_normal(rng, *x.shape)
         if self.mixup <= 0.0:
             return x, y
         share = rng.beta(self.mixup, self.mixup, size=(batch, members)).astype(np.float32)
         weight = torch.from_numpy(np.maximum(share, 1.0 - share))
-        other_x = x.roll(1, 0)
-        other_y = y.roll(1, 0)
-        return other_x.lerp(x, weight[:, :, None, None]), other_y.lerp(y, weight)
+        return x.roll(1, 0).lerp(x, weight[:, :, None, None]), y.roll(1, 0).lerp(y, weight)
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -447,8 +444,9 @@ class TorchReducer(Reducer):
         that are not finite.
         """
         check_is_fitted(self, "encoder_")
-        traces = torch.from_numpy(self.check_traces(X))
-        chunks = torch.split(traces, CHUNK)
+        chunks = torch.split(torch.from_numpy(self.check_traces(X)), CHUNK)
+        if not len(X):
+            return np.empty((0, self.n_spaces, self.n_components), np.float32)
         return torch.cat([self.encoder_(chunk) for chunk in chunks]).numpy()
 
     def warm_up(self) -> None:

@@ -82,8 +82,7 @@ def frames_for(traces: Floats) -> Frames:
     one for each sample, of traces shorter than that.
     """
     _, channels, samples = traces.shape
-    n_frames = samples // averaging(torch.from_numpy(traces), MIN_FRAMES)
-    return Frames(channels, samples, n_frames)
+    return Frames(channels, samples, samples // averaging(torch.from_numpy(traces), MIN_FRAMES))
 
 
 @dataclass(frozen=True, eq=False)

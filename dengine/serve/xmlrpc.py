@@ -90,12 +90,10 @@ def routes(service: CellService, recorder: Recorder | None = None) -> list[Route
         Another media type or a compressed body gets 415.
         """
         if media_type(request) not in ("text/xml", "application/xml"):
-            text = "Expected an XML-RPC call, Content-Type: text/xml.\n"
-            return PlainTextResponse(text, 415)
+            return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
         if request.headers.get("content-encoding", "identity") != "identity":
             return PlainTextResponse("Expected a call that is not compressed.\n", 415)
-        xml = await call_method(calls, await request.body())
-        return Response(xml, media_type="text/xml")
+        return Response(await call_method(calls, await request.body()), media_type="text/xml")
 
     return [Route(RPC, rpc, methods=["POST"])]
 

@@ -206,14 +206,16 @@ class Outbox:
             while not self.is_drained:
                 self._drain_chunk(journal)
             if journal.dropped:
-                text = (
-                    f"{journal.dropped} bytes at its end were dropped: a process was killed "
-                    "as it wrote them"
+                self._log_event(
+                    "journal",
+                    f"{journal.dropped} bytes at its end were dropped: a process was killed as it "
+                    "wrote them",
                 )
-                self._log_event("journal", text)
             if journal.damaged:
-                text = f"{journal.damaged} records that are not as they were written were left out"
-                self._log_event("journal", text)
+                self._log_event(
+                    "journal",
+                    f"{journal.damaged} records that are not as they were written were left out",
+                )
             journal.clear()
             journal.reserve()
             self.n_decisions = self.store.n_decisions()
@@ -255,20 +257,17 @@ class Outbox:
         ]
         database = self.store.database
         if missing := [entry for entry in entries if not database.has_entry(*entry)]:
-            text = (
-                f"the ledger lacks entry {missing[0][0]}, which this cell's journal knows: "
-                "the store was cut off"
+            self._log_event(
+                "lost",
+                f"the ledger lacks entry {missing[0][0]}, which this cell's journal knows: the "
+                "store was cut off, or restored from a copy; labels may be missing",
             )
-            self._log_event("lost", f"{text}, or restored from a copy; labels may be missing")
             journal.drained_to = HEADER  # the journal may still hold some of them
         elif len(entries) < 2 and database.newest_entry is not None:
-            text = (
-                f"the journal {journal.path}, or its head beside it, is new here, and the "
-                "store is not"
-            )
             self._log_event(
                 "journal",
-                f"{text}: whether the store was cut off, or labels are elsewhere, is unknown",
+                f"the journal {journal.path}, or its head beside it, is new here, and the store is "
+                "not: whether the store was cut off, or labels are elsewhere, is unknown",
             )
 
     def check_integrity(self, since: int | None = None) -> None:
@@ -323,8 +322,9 @@ class Outbox:
         "" if it can.
         """
         seconds = time.monotonic() - self._sync_began
-        hangs = f"the disk has not answered for {seconds:.1f} s." if seconds > self.limit else ""
-        return self._journal_error or hangs
+        if self._journal_error or seconds <= self.limit:
+            return self._journal_error
+        return f"the disk has not answered for {seconds:.1f} s."
 
     @property
     def lag(self) -> float:
@@ -345,12 +345,10 @@ class Outbox:
         LAG_SECONDS.
         """
         lag = self.lag
-        late = (
-            f"no answer from the store for {lag:.1f} s."
-            if lag > max(LAG_SECONDS, self.limit)
-            else ""
-        )
-        return self._journal_fault or self._store_error or late
+        fault = self._journal_fault or self._store_error
+        if fault or lag <= max(LAG_SECONDS, self.limit):
+            return fault
+        return f"no answer from the store for {lag:.1f} s."
 
     @property
     def is_usable(self) -> bool:
@@ -966,17 +964,15 @@ class Outbox:
             except StoreError:
                 record = copy or self._recent.get(id_)
                 damaged.append("" if record else id_)
-                records += filter(None, [record])
-        if damaged:
-            lost = listed(filter(None, damaged)) or "none"
-            text = (
-                f"{len(damaged)} records of {journal.path} were damaged on disk and are stored "
-                f"from memory; decisions that are lost: {lost}"
-            )
-            records.append(Event(0, self.store.clock(), "journal", as_text(text)))
+                if record is not None:
+                    records.append(record)
         numbers = self.store.apply_records(records)
         if damaged:
-            log.error("journal: %s", text)
+            self._log_event(
+                "journal",
+                f"{len(damaged)} records of the journal were damaged on disk and are stored from "
+                f"memory; decisions that are lost: {listed(filter(None, damaged)) or 'none'}",
+            )
         with self._changed:
             journal.drained_to = chunk[-1][1]
             self._save_newest_entry()

@@ -76,9 +76,11 @@ def test_every_reducer_but_umap_learn_is_exported_restored_and_decides_at_once(n
     assert can == 3 * (name != "umap-learn",)
 
 
-def test_umap_learn_embeds_no_traces_as_no_points() -> None:
+@every_reducer
+def test_no_traces_are_embedded_as_no_points(name: str) -> None:
     X, y = toy_traces()
-    assert new("umap-learn").fit(X, y).embed(X[:0]).shape == (0, 1, 2)
+    reducer = new(name).fit(X, y)
+    assert reducer.embed(X[:0]).shape == (0, reducer.n_spaces, 2)
 
 
 @pytest.mark.parametrize("name", [*EXPORTED, "umap-learn"])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from dengine import Action, DataEngine, Policy, Reason, Recipe, TraceSpec
 from dengine.errors import SettingError
+from dengine.limits import ForceLimits
 from dengine.traces import ForceLimitsGate
 from tests.support.exports import SAMPLES, recipe, trained
 
@@ -126,3 +127,10 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
         SettingError, match=r"\(windows 0:0\.1::.*:reject\), got windows 0:0\.2:0:;"
     ):
         DataEngine.open_or_create(tmp_path / "cell.db", recipe=recipe(windows=["0:0.2:0:"]))
+
+
+@pytest.mark.parametrize("text", ["0.2=9:0.4::60", "0.2:0.4::60=7", "0.2:0.4::60:channel=1=2"])
+def test_a_text_behind_an_equals_sign_that_does_not_belong_there_is_refused(text: str) -> None:
+    with pytest.raises(SettingError) as error:
+        ForceLimits.parse(text)
+    assert len(str(error.value).splitlines()) == 1

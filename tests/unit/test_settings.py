@@ -25,7 +25,8 @@ from dengine import (
     replay,
     run_grid,
 )
-from dengine.errors import ImportRefusedError, SettingError
+from dengine.engine.settings import EngineSettings
+from dengine.errors import ImportRefusedError, SettingError, StoreError
 from dengine.recipe import RECIPES
 from dengine.store.records import address
 from tests.support.command_line import dengine
@@ -297,3 +298,10 @@ def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was
     report = engine.retrain()
     assert report.n_steps == 0  # its budget is over before the first step
     assert report.seconds in range(2, next(ticks) - before)  # whole seconds: of no other clock
+
+
+@pytest.mark.parametrize("name", ["seed", "policy_since", "evidence_since", "began_in"])
+def test_a_damaged_number_among_the_stores_settings_is_named(name: str) -> None:
+    texts = EngineSettings(Recipe("pca")).to_store() | {name: "3x"}
+    with pytest.raises(StoreError, match=f"Expected a {name} in the store's settings, got '3x'"):
+        EngineSettings.from_store(texts, "cell.db")
