@@ -356,11 +356,10 @@ class Certificate:
             which = f"that the model would {verb}, of which {group.n_with_outcome:,} were audited"
         if group.upper >= 1.0:
             return f"Of {parts} {which}, nothing can be said yet: too few were looked at."
-        confidence = percent(1.0 - self.alpha, ".6g")
         return (
             f"Of {parts} {which}, at most {_round_up(group.upper)} were {wrong} on average, with "
-            f"{confidence} confidence, however often one looks; the tolerance is "
-            f"{percent(self.tolerance, '.6g')}."
+            f"{percent(1.0 - self.alpha, '.6g')} confidence, however often one looks; the "
+            f"tolerance is {percent(self.tolerance, '.6g')}."
         )
 
 

@@ -99,7 +99,9 @@ class Augmentation:
             return x, y
         share = rng.beta(self.mixup, self.mixup, size=(batch, members)).astype(np.float32)
         weight = torch.from_numpy(np.maximum(share, 1.0 - share))
-        return x.roll(1, 0).lerp(x, weight[:, :, None, None]), y.roll(1, 0).lerp(y, weight)
+        other_x = x.roll(1, 0)
+        other_y = y.roll(1, 0)
+        return other_x.lerp(x, weight[:, :, None, None]), other_y.lerp(y, weight)
 
 
 @dataclass(eq=False, repr=False, kw_only=True)

@@ -306,9 +306,12 @@ class HttpApi:
         source = await self.service.call(copy_model)
         content = await asyncio.to_thread(_zip_export, source)
         await self.service.call(lambda engine: engine.store.put_event(*notes[0], author=by))
-        name = f"model_{source.model_version}.zip"
-        headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-        return Response(content, media_type="application/zip", headers=headers)
+        disposition = f'attachment; filename="model_{source.model_version}.zip"'
+        return Response(
+            content,
+            media_type="application/zip",
+            headers={"Content-Disposition": disposition},
+        )
 
     async def status(
         self,
