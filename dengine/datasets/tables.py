@@ -63,6 +63,7 @@ SECONDS_COLUMN = "\0seconds"
 RUN_COLUMN = "\0run"  # number of the rows of a part that stand together and in the order of time
 MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered ones
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
+NEAR = 0.01  # of the largest number: numbers that differ by less are rounded in two ways
 TRIED = 20  # recordings, on which advice about a column is tried
 MAX_STATIONS = 12  # more different values in the rows of a part are no stations
 # What a column is called that tells where a part was made.
@@ -584,8 +585,8 @@ def _from_tables(
             wanted = f"the same columns in {first} and in {source}"
             raise DataError(f"Expected {wanted}, only one of them has {differing}.")
     if options.time is not None or options.labels is not None:
-        frame = _concatenate_long(_without_repeated_parts(frames, options, collector), options)
-        return _from_long(frame, options, collector, first, tables[first])
+        frame, is_repeated = _concatenate_long(frames, options)
+        return _from_long(frame, is_repeated, options, collector, first, tables[first])
     if advice := _long_table_advice(frames[first], options, collector.label_file):
         columns = listed(frames[first].columns)
         actual = f"a row a sample: {columns}"
@@ -708,61 +709,58 @@ def _check_single_signal(frame: pd.DataFrame, names: Sequence[str], options: Loa
             raise DataError(f"Expected {wanted}; keep the rows of one in the table.")
 
 
-def _without_repeated_parts(
-    tables: Mapping[str, pd.DataFrame], options: LoadOptions, collector: RecordingCollector
-) -> dict[str, pd.DataFrame]:
-    """Return long tables without the parts that an earlier one has with equal rows and dates.
-
-    So they count once if two exports overlap; a note of the collector says how many do. A table
-    without other parts is left out. One whose times are no dates keeps all its parts.
-    """
-    import pandas as pd
-
-    seen = set[tuple[str, bytes]]()
-    result = dict(tables)
-    for source, frame in tables.items() if len(tables) > 1 else ():
-        time = _time_column(frame, options)
-        if options.part not in frame or time not in frame or not holds_dates(frame[time]):
-            continue
-        hashes = pd.util.hash_pandas_object(frame.astype(str), index=False)
-        groups = hashes.groupby(frame[options.part].astype(str).to_numpy(), sort=False)
-        contents = {str(part): (str(part), rows.to_numpy().tobytes()) for part, rows in groups}
-        repeated = [part for part, content in contents.items() if content in seen]
-        seen.update(contents.values())
-        result[source] = frame[~frame[options.part].astype(str).isin(repeated)]
-        if repeated:
-            text = "Parts are in two files with equal rows and times: they count once"
-            collector.notes[text] += len(repeated)
-    return {source: frame for source, frame in result.items() if len(frame)}
-
-
-def _concatenate_long(tables: Mapping[str, pd.DataFrame], options: LoadOptions) -> pd.DataFrame:
-    """Return long tables as one, in their order.
+def _concatenate_long(
+    tables: Mapping[str, pd.DataFrame], options: LoadOptions
+) -> tuple[pd.DataFrame, NDArray[np.bool_]]:
+    """Return long tables as one, in their order, and which of its rows repeat a file before.
 
     The same part's number in two files means two parts: both get their file's name before the
-    number. But a part that ends one file and begins the next is one part.
+    number. But a part that ends one file and begins the next is one part, and so is one that has
+    rows of the same date and nearly the same numbers in both, as exports that overlap have: these
+    rows are the repeated ones.
     """
     import pandas as pd
 
     frame = pd.concat(tables.values())
     if len(tables) == 1 or options.part not in frame:
-        return frame
+        return frame, np.zeros(len(frame), dtype=np.bool_)
+    time = _time_column(frame, options)
+    files = np.repeat(list(tables), [len(table) for table in tables.values()])
+    parts = frame[options.part].astype(str).to_numpy()
+    first_files = files
+    if time in frame and holds_dates(frame[time]):
+        keys = [parts, frame[time].astype(str).to_numpy()]
+        numbers = frame.drop(columns=[options.part, time]).apply(pd.to_numeric, errors="coerce")
+        differences = (numbers - numbers.groupby(keys).transform("first")).abs()
+        is_near = (differences <= numbers.abs().max() * NEAR).loc[:, numbers.notna().any()]
+        owners = pd.Series(files).groupby(keys).transform("first").to_numpy()
+        if is_near[owners != files].mean(axis=None) > 0.5:  # else of two stations
+            first_files = owners
+    is_repeated = first_files != files
     file_of = dict[str, str]()  # of each part of the file before
     last = ""
     full_names = list[str]()
-    for source, table in tables.items():
-        parts = table[options.part].astype(str).tolist()
-        file_of = {part: file_of[last] if part == last == parts[0] else source for part in parts}
-        full_names += [f"{file_of[part]}/{part}" for part in parts]
-        last = parts[-1]
+    for source in tables:
+        in_file = files == source
+        own_parts = parts[in_file].tolist()
+        repeated = dict(
+            zip(parts[in_file & is_repeated], first_files[in_file & is_repeated], strict=True)
+        )
+        file_of = {
+            part: file_of[last] if part == last == own_parts[0] else repeated.get(part, source)
+            for part in own_parts
+        }
+        full_names += [f"{file_of[part]}/{part}" for part in own_parts]
+        last = own_parts[-1]
     part = frame[options.part].astype(str).where(frame[options.part].notna())
     full_name = pd.Series(full_names, frame.index)
-    is_repeated = full_name.groupby(part.to_numpy()).transform("nunique") > 1
-    return frame.assign(**{options.part: part.where(~is_repeated, full_name)})
+    is_ambiguous = full_name.groupby(part.to_numpy()).transform("nunique") > 1
+    return frame.assign(**{options.part: part.where(~is_ambiguous, full_name)}), is_repeated
 
 
 def _from_long(
     frame: pd.DataFrame,
+    is_repeated: NDArray[np.bool_],
     options: LoadOptions,
     collector: RecordingCollector,
     source: str,
@@ -773,6 +771,8 @@ def _from_long(
     Its label is in a column, or in a file of parts. Raises DataError if the column of parts or of
     times is not found.
 
+    is_repeated : which rows are in another file, too: their label is compared with that of the
+        part, but their samples are left out, and a note of the collector says so.
     first : the first of the tables that `frame` is of, for the units of columns.
     """
     column_units = dict(zip(first.frame.columns, first.units, strict=False))
@@ -785,6 +785,12 @@ def _from_long(
             raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
     label = None if options.labels is not None else _label_column(frame, options)
     label_columns = [*([label] if label else []), *_compared_columns(frame, label, options)]
+    all_rows = {str(part): rows for part, rows in frame.groupby(options.part, sort=False)}
+    label_source = _label_source_of_parts(all_rows, label_columns, options)
+    if is_repeated.any():
+        text = "Parts are in two files at the same times: they count once"
+        collector.notes[text] = frame[options.part][is_repeated].nunique()
+        frame = frame[~is_repeated]
     frame = _pivot_signals(frame, [options.part, time, *label_columns], options)
     others = [name for name in frame.columns if name not in (options.part, time, *label_columns)]
     numeric = [name for name in others if not floats(frame[name])[1]]
@@ -799,20 +805,18 @@ def _from_long(
     _check_single_station(rows_of_part, [name for name in others if name not in no_stations])
     rows_of_part = _order_by_time(rows_of_part, holds_dates(frame[time]), collector)
     places = [frame.columns.get_loc(name) for name in collector.channels]
-    read_options = replace(options, time=time)
 
     def read(rows: pd.DataFrame) -> Recording:
         """Return the rows of a part as a trace, in the order of their times."""
         rows = rows.sort_values(SECONDS_COLUMN, kind="stable")
         rows = rows.drop(columns=[SECONDS_COLUMN, RUN_COLUMN])
         units_row = [column_units.get(name, "") for name in rows.columns]
-        timed = rows_to_trace(rows, places, read_options, collector.notes, units_row)
+        timed = rows_to_trace(rows, places, replace(options, time=time), collector.notes, units_row)
         channels = collector.channels
         channel_units = (column_units.get(name) or units.split(name)[1] for name in channels)
         reading = timed.reading._replace(numbers=first.numbers)
         return timed._replace(units=tuple(channel_units), reading=reading)
 
-    label_source = _label_source_of_parts(rows_of_part, label_columns, options)
     labels.collect_recordings(rows_of_part, read, label_source, collector)
     return as_dataset(collector, options)
 

@@ -1214,17 +1214,33 @@ def test_a_part_whose_times_begin_again_is_refused(
         load_dataset(table, time="time", rate_hz=rate_hz)
 
 
-def test_a_part_in_two_exports_counts_once(small: Dataset, tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["equal", "cut", "rounded", "contradicting", "two stations"])
+def test_a_part_in_two_exports_counts_once(form: str, small: Dataset, tmp_path: Path) -> None:
     stamp = pd.Timestamp("2026-03-01 06:00")
     table = long_table(
         small, lambda i: stamp + i * pd.Timedelta(minutes=1), pd.Timedelta(milliseconds=4)
     )
-    table[table["part"] <= 15].to_csv(tmp_path / "a.csv", index=False)
-    table[table["part"] > 10].to_csv(tmp_path / "b.csv", index=False)
+    first = table[table["part"] <= 15]
+    second = table[table["part"] > 10]
+    if form == "cut":
+        second = second.iloc[20:]
+    elif form == "rounded":
+        second = second.round({"FZ": 1})
+    elif form == "contradicting":
+        second = second.assign(label=second["label"].where(second["part"] > 12, "pass"))
+    elif form == "two stations":
+        second = second.assign(FZ=200.0 - second["FZ"])
+    first.to_csv(tmp_path / "a.csv", index=False)
+    second.to_csv(tmp_path / "b.csv", index=False)
     data = load_dataset(tmp_path, time="time")
-    np.testing.assert_array_equal(data.X, small.X)
-    text = "Parts are in two files with equal rows and times: they count once (5 times)."
-    assert text in data.notes
+    text = "Parts are in two files at the same times: they count once (5 times)."
+    assert (text in data.notes) is (form != "two stations")
+    if form == "two stations":
+        assert len(data) == 24 + 5
+        return
+    failed = np.flatnonzero(small.y[10:12] == 0) + 10 if form == "contradicting" else []
+    assert [fault.source for fault in data.faults] == [str(i + 1) for i in failed]
+    np.testing.assert_allclose(data.X, np.delete(small.X, failed, axis=0), atol=0.051)
 
 
 def test_labels_of_an_archive_are_joined_by_its_serial_numbers(
