@@ -70,7 +70,8 @@ def toy_traces(
     y = (rng.random(n) >= failures).astype(np.int64)
     t = np.linspace(0.0, 1.0, samples)[None, None, :]
     onset = np.where(y == 1, 0.7, 0.35)[:, None, None] + rng.normal(0.0, 0.03, (n, 1, 1))
-    X = rng.normal(20.0, 2.0, (n, channels, 1)) / (1.0 + np.exp(-40.0 * (t - onset)))
+    height = rng.normal(20.0, 2.0, (n, channels, 1))
+    X = height / (1.0 + np.exp(-40.0 * (t - onset)))
     X = X + rng.normal(0.0, noise, (n, channels, samples))
     return X.astype(np.float32), y
 
@@ -156,7 +157,8 @@ def fit_starts_afresh(reducer: Any) -> None:
     B, labels_b = toy_traces(seed=2)
     once = as_reducer(clone(reducer), FOLDS).fit(B, labels_b)
     twice = as_reducer(clone(reducer), FOLDS).fit(A, labels_a).fit(B, labels_b)
-    np.testing.assert_array_equal(np.asarray(twice.transform(A)), np.asarray(once.transform(A)))
+    points = np.asarray(twice.transform(A))
+    np.testing.assert_array_equal(points, np.asarray(once.transform(A)))
 
 
 def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:

@@ -463,7 +463,8 @@ class ForceLimitsGate(nn.Module):
         values, where = torch.cat([x, self.time])[self.channels].unbind(1)  # (W, T) each
         inside = (where >= start) & (where <= end)
         broken = inside & ((values < low) | (values > high))
-        return int(torch.where(inside.any(1) & ~broken.any(1), 0, self.action).max().item())
+        kept = inside.any(1) & ~broken.any(1)
+        return int(torch.where(kept, 0, self.action).max().item())
 
 
 def convert_trace(

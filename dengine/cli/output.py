@@ -254,7 +254,8 @@ def format_value(name: str, value: Any) -> str:
         counts = [f"{key} {format_value(key, item)}" for key, item in value.items() if item != 0]
         return ", ".join(counts) or "none"
     if isinstance(value, list | tuple):
-        pairs = zip(TUPLE_TITLES.get(name, ("",) * len(value)), value, strict=True)
+        titles = TUPLE_TITLES.get(name, ("",) * len(value))
+        pairs = zip(titles, value, strict=True)
         return ", ".join(f"{title} {format_value(name, item)}".strip() for title, item in pairs)
     if isinstance(value, bool):
         return "yes" if value else "no"

@@ -150,7 +150,8 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     Page (1954), Biometrika 41; that it is the soonest: Moustakides (1986), Annals of Statistics 14.
     """
     doubled = min(2.0 * share, 0.99)
-    step = max(1, round(math.log(doubled / share) / math.log((1.0 - share) / (1.0 - doubled))))
+    odds = math.log((1.0 - share) / (1.0 - doubled))
+    step = max(1, round(math.log(doubled / share) / odds))
     too_low = 1
     limit = 1
     while _run_length(share, step, limit) < parts:

@@ -175,7 +175,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
         On a tie, and without neighbours, it is the first of two classes, the failure.
         """
-        return np.asarray(self.classes_[self.predict_proba(Z).argmax(axis=1)])
+        rates = self.predict_proba(Z)
+        return np.asarray(self.classes_[rates.argmax(axis=1)])
 
     def policy(self) -> Policy:
         """Return the policy of these settings; SettingError if one of them is out of range."""

@@ -61,7 +61,8 @@ def _user_code(module: nn.Module) -> Iterator[Any]:
 def _is_of_library(value: Any) -> bool:
     """Return whether a module, class or function belongs to a package in `LIBRARIES`."""
     attribute = "__name__" if isinstance(value, ModuleType) else "__module__"
-    return str(getattr(value, attribute, None)).partition(".")[0] in LIBRARIES
+    name = getattr(value, attribute, None)
+    return str(name).partition(".")[0] in LIBRARIES
 
 
 def _code_text(unit: Any) -> str:

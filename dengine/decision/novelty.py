@@ -124,7 +124,8 @@ class NoveltyGate(nn.Module):
         plain = self.plain_features(x)
         features = torch.cat([plain, plain @ self.discriminants])
         z = torch.addcmul(self.offset, features, self.gain)  # (4, P + D)
-        return torch.addmm(self.norms, z, self.points, alpha=-2.0).amin(1) + (z * z).sum(1)
+        nearest = torch.addmm(self.norms, z, self.points, alpha=-2.0).amin(1)
+        return nearest + (z * z).sum(1)
 
     def plain_features(self, x: Tensor) -> Tensor:
         """Return the features of traces (..., C, T) that are not distortions, (..., P) float32.

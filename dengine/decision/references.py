@@ -495,7 +495,8 @@ class RadiusIndex(nn.Module):
         The bytes are points (d, n) float32, labels float32 and spaces int64, one after the other.
         """
         points = self.column("points").T
-        arrays = (points, self.column("labels").astype(np.float32), self.column("spaces"))
+        labels = self.column("labels").astype(np.float32)
+        arrays = (points, labels, self.column("spaces"))
         return hashlib.sha256(
             b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
         ).hexdigest()

@@ -370,7 +370,8 @@ class EngineCore:
                 spec = self.outbox.call_store(lambda: read_peers_trace_spec(self.store)) or spec
         except StoreError:  # the cell's own first trace stands
             log.exception("the product's contract of traces cannot be had")
-        self.settings.change(replace(self.settings.now, trace=spec, inferred=inferred))
+        settings = replace(self.settings.now, trace=spec, inferred=inferred)
+        self.settings.change(settings)
         self.settings.save()
         return spec
 

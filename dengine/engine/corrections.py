@@ -198,7 +198,8 @@ class Corrections:
             return self._as_unchanged("rollback", f"Version {version} answers already")
         new = self._core.live.next_version
         text = f"version {version} answers again, as version {new} after {before}"
-        event = Change("rollback", text, {"to": int(version), "was": before, "now": new}, author)
+        data = {"to": int(version), "was": before, "now": new}
+        event = Change("rollback", text, data, author)
         self._core.learner.roll_back(int(version), event)
         return self._finish_change(event)
 

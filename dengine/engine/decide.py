@@ -114,7 +114,8 @@ class DecisionMaker:
         conditions = self._settings.conditions or self._first_conditions
         assert conditions is not None  # a trace has come
         if verify_reason is not None:
-            verdict = _verify(x, replace(conditions, force_limits=()), verify_reason)
+            unlimited = replace(conditions, force_limits=())
+            verdict = _verify(x, unlimited, verify_reason)
         elif model is None:
             verdict = _verify(x, conditions, Reason.NO_MODEL)
         else:

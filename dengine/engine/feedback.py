@@ -290,7 +290,8 @@ class Feedback:
         recorded. Each decision is counted once; one with the bound (0, 1), which says nothing, or
         from before the present rule began, is not counted.
         """
-        overdue_to = self._outbox.n_decisions - self._settings.now.recipe.policy.label_within
+        label_within = self._settings.now.recipe.policy.label_within
+        overdue_to = self._outbox.n_decisions - label_within
         pending = self._awaiting_check
         while pending and next(iter(pending.values())).number <= overdue_to:
             _, stored = pending.popitem(last=False)

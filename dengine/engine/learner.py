@@ -209,7 +209,8 @@ class Learner:
         self.store_labels()
         begin = self._clock()
         self._begin_retrain()
-        candidate = self._as_candidate_of(self._retrainer.train(self.live.newest, begin))
+        trained = self._retrainer.train(self.live.newest, begin)
+        candidate = self._as_candidate_of(trained)
         self._candidate = candidate
         self._report = None
         self._advance(to_the_end=True)

@@ -363,7 +363,8 @@ def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
     """Return the trace contract of a product's other cells; None where there is none, or no
     product.
     """
-    return next(filter(None, map(stored_trace_spec, store.peers_settings().values())), None)
+    specs = map(stored_trace_spec, store.peers_settings().values())
+    return next(filter(None, specs), None)
 
 
 def fill_from_peers(

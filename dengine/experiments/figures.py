@@ -373,7 +373,8 @@ def _draw_replays(
     counts = [replay.stretch() for replay in replays]
     x = np.arange(1, len(lines["certain"]) + 1)  # cycles are counted from 1
     low = lines["certain_low"]
-    top.fill_between(x, low, lines["certain_high"], color=colour, alpha=0.15, linewidth=0)
+    high = lines["certain_high"]
+    top.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
     top.plot(x, lines["certain"], color=colour, label=f"{prefix}certain, of all cycles")
     label = f"{prefix}precision, of accepted"
     top.plot(x, lines["precision"], color=colour, linestyle="--", label=label)
@@ -567,7 +568,8 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     limits = (min(0.0, *means), 1.25 * max(curve.costs.check, *means))
     finish(top, n_columns, ylim=limits, ylabel=f"cost a part [{unit}]")
     highest = max(10.0, 110 * max(row.certain for row in curve.rows))
-    finish(bottom, n_columns, ylim=(0, highest), ylabel="decided without a check\n[% of parts]")
+    y_label = "decided without a check\n[% of parts]"
+    finish(bottom, n_columns, ylim=(0, highest), ylabel=y_label)
     names = [f"{100 * bound:g}" for bound in bounds] + ["by cost"] * len(by_cost)
     bottom.set_xticks(range(len(names)), names)
     bottom.set_xlabel("LB [% of accepted parts that are to be good]")
@@ -647,7 +649,8 @@ def _draw_trace(axes: Axes, explanation: Explanation, channel: int) -> None:
         high = envelope.high[channel]
         label = f"95 % of {envelope.n:,} successes"
         axes.fill_between(x, low, high, color=GREEN, alpha=0.22, linewidth=0, label=label)
-        axes.plot(x, envelope.median[channel], color=GREEN, linewidth=1.0, label="their median")
+        median = envelope.median[channel]
+        axes.plot(x, median, color=GREEN, linewidth=1.0, label="their median")
     for success, name, colour, line, _ in LABEL_STYLES:
         traces = [
             neighbour.trace
@@ -762,7 +765,8 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
                 axes.fill_between(time, low, high, color=colour, alpha=0.18, linewidth=0)
                 label = f"{name} ({len(traces)})"
                 axes.plot(time, median, line, color=colour, linewidth=1.2, label=label)
-        finish(axes, legend=3 if finite.any() and not i else 0, xlabel=x_label, ylabel=labels[i])
+        n_columns = 3 if finite.any() and not i else 0
+        finish(axes, legend=n_columns, xlabel=x_label, ylabel=labels[i])
     _draw_drift(below, X, y, finite, labels[0])
     return figure
 

@@ -356,7 +356,8 @@ def run_grid(
     ----------
     The paper's experiments: 30 shuffled repeats of a 3 x 3 grid.
     """
-    tasks = grid_tasks(recipes, alphas, lower_bounds, intervals, range(repeats), cycles=cycles)
+    seeds = range(repeats)
+    tasks = grid_tasks(recipes, alphas, lower_bounds, intervals, seeds, cycles=cycles)
     return frame_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep))
 
 

@@ -86,7 +86,8 @@ def signature(content: bytes, key: KeyFile) -> str:
 
     Raises ExportError for a file that cannot be read or is too short to be a key.
     """
-    return PREFIX + hmac.new(read_key(key, ExportError), content, hashlib.sha256).hexdigest()
+    secret = read_key(key, ExportError)
+    return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
 
 
 def sibling_path(path: str | os.PathLike[str], suffix: str) -> Path:

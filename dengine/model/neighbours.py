@@ -502,7 +502,8 @@ class ModelPrediction(EngineModel):
         ValueError
             If nothing was fitted.
         """
-        conditions = conditions or DecisionConditions(self.trace_spec)
+        unlimited = DecisionConditions(self.trace_spec)
+        conditions = conditions or unlimited
         encoder = self.spaces.module()
         neighbours: Any = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
         scale = torch.from_numpy(self.scale)
@@ -559,7 +560,8 @@ class ModelPrediction(EngineModel):
         ReportError for another label. Samples are not checked: a NaN makes a reference of NaN.
         """
         X = as_traces(np.asarray(x)[None], self.trace_spec)
-        self.add_reference(X[0], int(as_success(np.asarray(y))), int(content_hash(X)[0]))
+        hash_ = int(content_hash(X)[0])
+        self.add_reference(X[0], int(as_success(np.asarray(y))), hash_)
         return self
 
     def add_reference(
@@ -734,7 +736,8 @@ class ModelPrediction(EngineModel):
         """
         predictions = self.predict_many(X)
         lower = np.array([prediction.lower for prediction in predictions])
-        return lower, np.array([prediction.upper for prediction in predictions])
+        upper = np.array([prediction.upper for prediction in predictions])
+        return lower, upper
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:
         """Return an array of `Action`, shape (n,): what the model would do with each trace."""

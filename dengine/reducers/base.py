@@ -542,7 +542,8 @@ class LabelFree(_Wrapping):
         return self
 
     def transform(self, X: ArrayLike) -> Floats:
-        return as_points(self.reducer_.transform(self.as_input(self.check_traces(X))))
+        inputs = self.as_input(self.check_traces(X))
+        return as_points(self.reducer_.transform(inputs))
 
 
 @dataclass(eq=False, repr=False)

@@ -195,7 +195,8 @@ class Tower(NamedTuple):
         """
         w = self.w[:, :-1]
         bias = self.w[:, -1]
-        return (self.axes.double() @ w.T).float(), (bias + w @ self.centre.double()).float()
+        weights = (self.axes.double() @ w.T).float()
+        return weights, (bias + w @ self.centre.double()).float()
 
 
 def weigh_towers(
@@ -355,7 +356,8 @@ class RocketReducer(Reducer):
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
         raw = self.raw_features(self._check_and_start(X), numbers)
-        self._fit_heads(raw, binary_labels(y, len(X), type(self).__name__), folds, stop, numbers)
+        labels = binary_labels(y, len(X), type(self).__name__)
+        self._fit_heads(raw, labels, folds, stop, numbers)
         with torch.inference_mode():
             points = apply_in_chunks(self._embed_raw, raw, 16 * CHUNK)
             return points_in_fold_space(points.numpy(), folds)

@@ -394,7 +394,8 @@ def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generato
     reads between one and all channels, few more often than many, equally weighted, and has unit
     size; its weights on the other channels are 0.
     """
-    kernels = choices[torch.from_numpy(rng.permutation(max(n, len(choices)))[:n] % len(choices))]
+    drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)
+    kernels = choices[torch.from_numpy(drawn)]
     weights = torch.zeros(n, channels)
     for row in range(n):
         order = rng.permutation(channels)

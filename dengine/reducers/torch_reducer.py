@@ -92,7 +92,8 @@ class Augmentation:
         batch, members, _, length = x.shape
         size = (batch, members, 1, 1)
         offset = torch.from_numpy(rng.integers(-self.shift, self.shift + 1, size=size))
-        x = x.gather(3, (torch.arange(length) + offset).clamp(0, length - 1).expand_as(x))
+        frame = (torch.arange(length) + offset).clamp(0, length - 1)
+        x = x.gather(3, frame.expand_as(x))
         x = x * (1.0 + self.gain * standard_normal(rng, *size))
         x = x + self.noise * standard_normal(rng, *x.shape)
         if self.mixup <= 0.0:
@@ -446,7 +447,8 @@ class TorchReducer(Reducer):
         that are not finite.
         """
         check_is_fitted(self, "encoder_")
-        chunks = torch.split(torch.from_numpy(self.check_traces(X)), CHUNK)
+        traces = torch.from_numpy(self.check_traces(X))
+        chunks = torch.split(traces, CHUNK)
         if not len(X):
             return np.empty((0, self.n_spaces, self.n_components), np.float32)
         return torch.cat([self.encoder_(chunk) for chunk in chunks]).numpy()

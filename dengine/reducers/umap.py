@@ -138,7 +138,8 @@ class UmapEncoder(nn.Module):
         total_after = totals.gather(1, after)
         share = (total_before - self.total_strength) / (total_before - total_after + 1e-12)
         rate_before = self.rates[after - 1]
-        rate = rate_before + share.clamp(0.0, 1.0) * (self.rates[after] - rate_before)
+        rate_after = self.rates[after]
+        rate = rate_before + share.clamp(0.0, 1.0) * (rate_after - rate_before)
         return torch.exp(-beyond * rate)
 
 
@@ -261,7 +262,8 @@ class UmapReducer(Reducer):
         if self.n_epochs is not None:
             return self.n_epochs
         largest = min(MAX_EPOCHS, max(1, MAX_WORK // n_traces))
-        return min(self.n_steps_left_ or max(MIN_EPOCHS, WORK // n_traces), largest)
+        wanted = self.n_steps_left_ or max(MIN_EPOCHS, WORK // n_traces)
+        return min(wanted, largest)
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Search the neighbours of traces X (n, C, T), and keep them for the next training.

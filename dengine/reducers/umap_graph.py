@@ -82,7 +82,8 @@ def frames_for(traces: Floats) -> Frames:
     one for each sample, of traces shorter than that.
     """
     _, channels, samples = traces.shape
-    return Frames(channels, samples, samples // averaging(torch.from_numpy(traces), MIN_FRAMES))
+    n_frames = samples // averaging(torch.from_numpy(traces), MIN_FRAMES)
+    return Frames(channels, samples, n_frames)
 
 
 @dataclass(frozen=True, eq=False)

@@ -251,7 +251,8 @@ def negative_samples(
     """
     order = torch.randperm(points.size(1), generator=generator)
     shuffled = points[:, order]
-    return order, torch.cat([shuffled, shuffled[:, :count]], 1).unfold(1, count, 1)[:, 1:]
+    circle = torch.cat([shuffled, shuffled[:, :count]], 1)
+    return order, circle.unfold(1, count, 1)[:, 1:]
 
 
 def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
@@ -335,7 +336,8 @@ def optimize_layout(
     """
     a, b = find_ab_params(min_dist)
     edges = Edges.from_graph(graph)
-    count = min(NEGATIVE_SAMPLES, len(points) - 1)
+    n = len(points)
+    count = min(NEGATIVE_SAMPLES, n - 1)
     weight = NEGATIVE_SAMPLE_RATE * edges.sum_by_head(edges.strength.unsqueeze(0))  # (1, n)
     points = points.T.contiguous()  # (d, n)
     n_taken = 0

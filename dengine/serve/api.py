@@ -253,7 +253,8 @@ def _look_like_float64(words: NDArray[np.float32]) -> bool:
         return bool(high.view(np.uint32).any())
     low = low[np.isfinite(low)]
     largest = np.float64(np.abs(high[np.isfinite(high)]).max(initial=1.0))
-    return int((np.abs(low) > LARGE_FACTOR * largest).sum()) >= LARGE_SHARE * len(words)
+    n_large = int((np.abs(low) > LARGE_FACTOR * largest).sum())
+    return n_large >= LARGE_SHARE * len(words)
 
 
 # Responses
@@ -269,7 +270,8 @@ def _response_type(
     """
     members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
-    doc = "\n\n".join(filter(None, [about, (getdoc(record) or "") if record else ""]))
+    docs = [about, (getdoc(record) or "") if record else ""]
+    doc = "\n\n".join(filter(None, docs))
     return msgspec.defstruct(name, (types | more).items(), namespace={"__doc__": doc}, kw_only=True)
 
 
@@ -465,7 +467,8 @@ def _error_response(request: Request, error: Any) -> Response:
     for error_type, status in STATUSES.items():
         if isinstance(error, error_type):
             return problem_response(status, as_options(str(error)))
-    log.error("a request failed: %s %s", request.method, request.scope["path"], exc_info=error)
+    path = request.scope["path"]
+    log.error("a request failed: %s %s", request.method, path, exc_info=error)
     return problem_response(500, "The server failed at this request; its log says why.")
 
 

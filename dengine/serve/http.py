@@ -181,7 +181,8 @@ class HttpApi:
         deadline is VERIFY, late; one that the store cannot take VERIFY, no_store. 503: the queue is
         full or the server is closing, nothing was recorded, verify the part.
         """
-        response = await self.service.decide(api.as_samples(trace, channels), request, part)
+        samples = api.as_samples(trace, channels)
+        response = await self.service.decide(samples, request, part)
         return response_fields(
             "DecideResponse", response.decision, late=response.late, seconds=response.seconds
         )
@@ -297,21 +298,16 @@ class HttpApi:
             """Return the exportable model as a copy, which later learning does not change."""
             exported = core_of(engine).exported()
             # The engine goes on learning while the copy is exported.
-            return replace(
-                exported, model=copy.deepcopy(exported.model), note=lambda *note: notes.append(note)
-            )
+            return replace(exported, model=copy.deepcopy(exported.model))
 
         by = _checked_author(author)
-        notes: list[tuple[str, str]] = []
         source = await self.service.call(copy_model)
         content = await asyncio.to_thread(_zip_export, source)
-        await self.service.call(lambda engine: engine.store.put_event(*notes[0], author=by))
-        disposition = f'attachment; filename="model_{source.model_version}.zip"'
-        return Response(
-            content,
-            media_type="application/zip",
-            headers={"Content-Disposition": disposition},
-        )
+        text = f"version {source.model_version} was downloaded"
+        await self.service.call(lambda engine: engine.store.put_event("export", text, author=by))
+        name = f"model_{source.model_version}.zip"
+        headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+        return Response(content, media_type="application/zip", headers=headers)
 
     async def status(
         self,

@@ -311,7 +311,8 @@ def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
 
     # OSError includes ssl.SSLError.
     with instead(SettingError, f"Cannot use {cert} and {key} for TLS", OSError):
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, refuse_password)
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(cert, key, refuse_password)
     return {"ssl_certfile": str(cert), "ssl_keyfile": str(key)}
 
 

@@ -90,10 +90,12 @@ def routes(service: CellService, recorder: Recorder | None = None) -> list[Route
         Another media type or a compressed body gets 415.
         """
         if media_type(request) not in ("text/xml", "application/xml"):
-            return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
+            text = "Expected an XML-RPC call, Content-Type: text/xml.\n"
+            return PlainTextResponse(text, 415)
         if request.headers.get("content-encoding", "identity") != "identity":
             return PlainTextResponse("Expected a call that is not compressed.\n", 415)
-        return Response(await call_method(calls, await request.body()), media_type="text/xml")
+        xml = await call_method(calls, await request.body())
+        return Response(xml, media_type="text/xml")
 
     return [Route(RPC, rpc, methods=["POST"])]
 
