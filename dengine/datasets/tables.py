@@ -583,7 +583,11 @@ def _from_tables(
         _check_columns(frame, source)
         if differing := listed(sorted(_column_forms(frame) ^ _column_forms(frames[first]))):
             wanted = f"the same columns in {first} and in {source}"
-            raise DataError(f"Expected {wanted}, only one of them has {differing}.")
+            constant = [name for name in frame if len(set(frame[name])) == 1]
+            do = ""
+            if constant:
+                do = f"; if a file is one recording, name its label's column: label={constant[0]!r}"
+            raise DataError(f"Expected {wanted}, only one of them has {differing}{do}.")
     if options.time is not None or options.labels is not None:
         frame, is_repeated = _concatenate_long(frames, options)
         return _from_long(frame, is_repeated, options, collector, first, tables[first])

@@ -8,9 +8,10 @@ of rows of any table.
 from __future__ import annotations
 
 import csv
+import itertools
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -53,7 +54,9 @@ SAMPLED_LINES = 30  # from the end, by which the delimiter is found
 SAMPLED_CELLS = 40  # of each of these lines
 # A word between blanks; a unit in brackets belongs to the name before it.
 WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')
+MIN_TIMES = 8  # in a header that names samples by their times, beside other columns
 SUMMARY_SHARE = 10  # samples for each row of a summary below them, at least
+LABVIEW_END = "***End_of_Header***"
 COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 # A cell of a row of units, beside the units that `units.parse` knows.
@@ -111,13 +114,15 @@ class TextTable(NamedTuple):
 def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
     """Split a text into cells; blank lines are left out.
 
-    A first line sep=; states the delimiter, which is found otherwise. Raises UnreadableError for a
-    cell of more than 131,072 characters, and for numbers without a header; the header of an empty
-    text is empty.
+    A first line sep=; states the delimiter, which is found otherwise. What stands above LabVIEW's
+    last ***End_of_Header*** is left out. Raises UnreadableError for a cell of more than 131,072
+    characters, and for numbers without a header; the header of an empty text is empty.
 
     columns : names of the columns, if the file has no header or another one.
     """
     lines = {i: line for i, line in enumerate(text.splitlines(), start=1) if line.strip()}
+    end = max((i for i, line in lines.items() if line.startswith(LABVIEW_END)), default=0)
+    lines = {i: line for i, line in lines.items() if i > end}
     stated = DELIMITER_LINE.fullmatch(next(iter(lines.values()), "").strip())
     if stated:
         del lines[min(lines)]
@@ -167,7 +172,7 @@ def _find_delimiter(lines: Sequence[str]) -> str:
         has_header = any(
             2 * sum(map(_is_value, row[:SAMPLED_CELLS])) <= min(len(row), SAMPLED_CELLS)
             for row in headers
-            if len(row) in (n_names, width)
+            if len(row) - _ends_in_comment(row) in (n_names, width)
         )
         return n_values / len(cells) * n_rows / len(rows) * (1.0 if has_header else 0.5)
 
@@ -180,6 +185,11 @@ def _find_delimiter(lines: Sequence[str]) -> str:
         if widths.most_common(1)[0][0] > 1:
             return delimiter
     return ","
+
+
+def _ends_in_comment(names: Sequence[str]) -> bool:
+    """Return whether the last name of a header is that of a column of comments."""
+    return bool(names) and names[-1].lower() in COMMENT_COLUMNS
 
 
 def _is_value(cell: str) -> bool:
@@ -209,7 +219,9 @@ def _find_header(
 
     A row is data if it has numbers in most of the columns that are numeric in the last 20 rows.
     What stands above the header is left out. If two lines stand above the data and the first can be
-    the header, it is the header, and the second is a damaged row. Raises UnreadableError for
+    the header, it is the header, and the second is a damaged row; a first line in which a name
+    occurs twice, as of groups of columns, cannot be. In a header of evenly rising times, as that of
+    a wide table, these are replaced by 0, 1, 2, ... Raises UnreadableError for
     numbers without a header if no `columns` are given; without rows the header is empty.
     """
     lines = list(rows_by_line)
@@ -225,7 +237,9 @@ def _find_header(
     is_remark = (
         header == 1 and units.COMMENT_MARK.match(rows[0][0]) and not _numeric_columns(rows[1])
     )
-    if header == 1 and len(rows[0]) >= len(rows[data]) and not (is_units[0] or is_remark):
+    has_groups = len(set(filter(None, rows[0]))) < len(list(filter(None, rows[0]))) if rows else 0
+    is_no_header = is_remark or has_groups or (header == 1 and is_units[0])
+    if header == 1 and len(rows[0]) >= len(rows[data]) and not is_no_header:
         header = data = 0
     if not columns and above and _numeric_columns(above[header]):
         header, data = _true_header(above, is_units, header, data)
@@ -236,14 +250,18 @@ def _find_header(
     names = above[header] if above else []
     numbered = _numeric_columns(names)
     # Whole numbers may be names.
-    if 2 * len(numbered) > len(names) and not all(names[i].isdecimal() for i in numbered):
+    if MIN_TIMES <= len(numbered) < len(names) and _are_even(names[i] for i in sorted(numbered)):
+        numbers = itertools.count()
+        names = [str(next(numbers)) if i in numbered else name for i, name in enumerate(names)]
+    elif 2 * len(numbered) > len(names) and not all(names[i].isdecimal() for i in numbered):
         message = f"Expected a header, its first line is of numbers; {_columns_advice(rows)}"
         raise UnreadableError(message, lines[header])
     first = max(data, 1)
     data_rows = dict(zip(lines[first:], rows[first:], strict=True))
-    is_narrower = all(len(row) < len(names) for row in data_rows.values())
-    if names[-1:] and names[-1].lower() in COMMENT_COLUMNS and is_narrower:
-        names = names[:-1]  # LabVIEW's, which its rows leave out
+    n_narrower = sum(len(row) < len(names) for row in data_rows.values())
+    if _ends_in_comment(names) and 2 * n_narrower > len(data_rows):
+        names = names[:-1]  # LabVIEW's, which most of its rows leave out
+        data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
     line = lines[header] if lines else 0
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter)
 
@@ -265,6 +283,13 @@ def _true_header(
         if len(names) == len(row) and all(names) and not _numeric_columns(names):
             return i, i + 1 + is_units[i + 1]
     return header, data
+
+
+def _are_even(cells: Iterable[str]) -> bool:
+    """Return whether numbers as texts rise by steps that are equal to 1 %."""
+    numbers = [float(cell.replace(",", ".")) for cell in cells]
+    steps = np.diff(numbers)
+    return bool(steps[0] > 0) and bool(np.ptp(steps) < 0.01 * steps[0])
 
 
 def _numeric_columns(row: list[str]) -> frozenset[int]:

@@ -824,3 +824,46 @@ def test_a_channel_is_read_by_the_clock_to_its_left(tmp_path: Path) -> None:
     assert (data.X.tolist(), data.rate_hz) == ([list(range(30))], 62.5)
     with pytest.raises(DataError, match="Expected channels beside one clock"):
         load_dataset(tmp_path, channel="Way,Force")
+
+
+def test_what_labview_writes_above_its_last_header_is_left_out(tmp_path: Path) -> None:
+    above = ["LabVIEW Measurement\t", "Separator\tTab", "***End_of_Header***\t", "Delta_X\t0,004"]
+    lines = [*above, "***End_of_Header***\t\t", "X_Value\tForce\tComment"]
+    cells = german(texts())
+    lines += [f"\t{cells[0]}\tlot 12", *(f"\t{cell}" for cell in cells[1:])]
+    (tmp_path / "a_OK.txt").write_text("\n".join(lines))
+    data = load_dataset(tmp_path, rate_hz=250)
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    assert data.channels == ("Force",)
+
+
+def test_a_row_of_groups_above_the_header_is_none(tmp_path: Path) -> None:
+    above = [";Sensor A;Sensor A;Sensor B", "t [ms];Fx;Fz;Fx"]
+    cells = (times(), texts(-VALUES), texts(-VALUES), texts())
+    write(tmp_path / "a_OK.csv", ["", "N", "N", "N"], *cells, delimiter=";", above=above)
+    advised = re.search(r"--columns '(.+?)'", one_line("data", tmp_path, "--channel", "Fx"))[1]
+    for columns, channel in ((advised, "Fx_3"), ("t,AFx,AFz,BFx", "BFx")):
+        data = load_dataset(tmp_path, columns=columns, channel=channel, time="none")
+        np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+
+
+def test_the_samples_of_a_wide_table_may_be_named_by_their_times(tmp_path: Path) -> None:
+    header = ["Serial", "Result", *german(times())]
+    rows = [[f"S{i}", "OK" if i % 2 else "NOK", *german(texts())] for i in range(4)]
+    (tmp_path / "w.csv").write_text("\n".join(";".join(row) for row in [header, *rows]))
+    data = load_dataset(tmp_path / "w.csv", part="Serial")
+    np.testing.assert_array_equal(data.X, np.tile(VALUES.astype(np.float32), (4, 1)))
+    assert (data.y.tolist(), data.rate_hz) == ([0, 1, 0, 1], None)
+
+
+def test_files_of_other_columns_are_told_how_to_name_their_label(tmp_path: Path) -> None:
+    for i in range(6):
+        unit, scale = ("N", 1) if i % 2 else ("kN", 1000)
+        steps = [str(8 * j // N) for j in range(N)]
+        columns = (times(), steps, texts(VALUES / scale, "{:.4f}"), [str(i % 2 + 1)] * N)
+        header = ["Time [s]", "Step", f"M [{unit}]", "Status"]
+        write(tmp_path / f"screw{i}.csv", header, *columns)
+    assert "name its label's column: --label Status" in one_line("data", tmp_path)
+    words = {"label": "Status", "label_map": "1=good,2=bad"}
+    data = load_dataset(tmp_path, channel="M", unit="N", **words)
+    np.testing.assert_allclose(data.X, np.tile(VALUES, (6, 1)), rtol=1e-3, atol=0.06)
