@@ -68,6 +68,11 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
         Name of the data set.
     options : LoadOptions
 
+    Returns
+    -------
+    Dataset
+        In the natural order of the names; an archive that cannot be read is among its faults.
+
     Raises
     ------
     DataError

@@ -639,10 +639,11 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
 
 
 def _note_scales(collector: RecordingCollector) -> None:
-    """Note recordings whose largest value is far from that of most: their unit may be another.
+    """Add notes to the collector about recordings that look odd beside the others.
 
-    Also note one first sample of all that is larger than the others, as a row of rates is, and few
-    recordings that are shorter than most.
+    These are recordings whose largest value is far from that of most, so that their unit may be
+    another, and a few that are much shorter than most. Another note says that all begin with the
+    same sample, larger than all others, as a row of rates is.
     """
     with np.errstate(invalid="ignore"):
         peaks = np.array([np.nan_to_num(np.abs(r.trace)).max() for r in collector.recordings])
@@ -656,14 +657,14 @@ def _note_scales(collector: RecordingCollector) -> None:
     is_short = lengths < SHORT * np.median(lengths)
     usual = float(np.median(peaks))
     is_far = (usual > 0) & (peaks > 0) & ((peaks > FAR * usual) | (peaks * FAR < usual))
-    far_text = f"are {FAR:g} times larger or smaller than most, in another unit or not measured"
+    far_text = f"{FAR:g} times larger or smaller than most, in another unit or not measured"
     for text, is_odd in (
         (far_text, is_far),
-        ("are much shorter than most", is_short & (is_short.mean() < FEW)),
+        ("Much shorter than most", is_short & (is_short.mean() < FEW)),
     ):
         if is_odd.any():
             names = [r.source for r, odd in zip(collector.recordings, is_odd, strict=True) if odd]
-            collector.notes[f"{len(names)} recordings {text}: {listed(names)}"] = 1
+            collector.notes[f"{text}: {listed(names)}"] = 1
 
 
 def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) -> str:
@@ -936,7 +937,10 @@ def _convert_unit(data: Dataset, unit: str) -> Dataset:
 
 
 def _fit_array(x: NDArray[np.float32], samples: int, fit: str) -> NDArray[np.float32]:
-    """Fit an array (..., T) to (..., samples) by `traces.fit_length`, as live traces are."""
+    """Fit an array (..., T) to (..., samples) by `traces.fit_length`, as live traces are.
+
+    Returns the same array if it has as many samples already.
+    """
     if x.shape[-1] == samples:
         return x
     tensor = torch.from_numpy(np.array(x, order="C"))

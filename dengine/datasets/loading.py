@@ -478,7 +478,7 @@ def _missing_arrays(named: Files, options: LoadOptions) -> str:
     """Return the message of an error: the arrays X and y are missing, and which could be them.
 
     An array of two or three dimensions may hold the traces; one of one dimension, as long as an
-    axis of the traces, the labels.
+    axis of the traces, the labels; so may a CSV file beside the archive, which is named then.
     """
     arrays, all_names = _read_archives(named, options, every=True)
     traces = [name for name, x in arrays.items() if x.ndim in (2, 3) and len(x)]
@@ -490,6 +490,11 @@ def _missing_arrays(named: Files, options: LoadOptions) -> str:
         label = f"label={fewest_values!r}"
     elif traces:
         label = "a CSV file of labels in the order of the traces (labels)"
+        keys = _keys_of_traces(arrays)
+        for path in next(iter(named.values())).parent.glob("*.csv"):
+            with suppress(DataError):
+                if len(read_ordered_labels(path, options, keys)[0]) in lengths:
+                    label = f"labels={str(path)!r}, in the order of the traces"
     shapes = ", ".join(f"{name} {arrays[name].shape}" for name in all_names) or "none"
     channel = "" if "X" in all_names or not traces else f"channel={traces[0]!r} and "
     example = f", or their names, as in {channel}{label}" if label else ""
@@ -556,7 +561,8 @@ def _from_arrays(
         words = words[is_labelled]
     data = make_dataset(X, labels, name=name, **about)
     clock = "none, the array rate_hz" if data.rate_hz and not options.rate_hz else ""
-    readings = [Reading(label, str(word), clock) for word in words.tolist()]
+    place = f"{'column' if options.labels else 'array'} {label}"
+    readings = [Reading(place, str(word), clock) for word in words.tolist()]
     stated = options.rate_hz
     reading = describe_reading(readings, data.y.tolist(), "as the rows", rate_hz=stated)
     return replace(data, reading=reading)
@@ -597,7 +603,7 @@ def _from_list(traces: list[Any], labels: list[Any], options: LoadOptions) -> Da
             rate = None if clock is None else rate_of(clock, trace.index)
         channel_units = tuple(units.split(name)[1] for name in collector.channels)
         text = "" if clock is None else f"column {clock.name} ({clock.form})"
-        reading = Reading("y", str(word), text)
+        reading = Reading("array y", str(word), text)
         source = f"trace {number}"
         return Recording(x, rate, channel_units, reading=reading, label=label, source=source)
 

@@ -904,7 +904,13 @@ def _check_single_station(rows_of_part: Mapping[str, pd.DataFrame], columns: Seq
 
 
 def _are_stations(rows: pd.DataFrame, name: str) -> bool:
-    """Return whether the values of a column stand for several recordings that overlap in time."""
+    """Return whether the values of a column stand for several recordings that overlap in time.
+
+    The rows of each value must rise or fall in time throughout. That is enough if a time occurs
+    twice; else each value must have times without gaps, and their spans must overlap.
+
+    rows : of one part, with `SECONDS_COLUMN`. name : the column.
+    """
     times = rows[SECONDS_COLUMN].to_numpy()
     runs = [run for _, run in rows.groupby(name)[SECONDS_COLUMN]]
     all_steps = [np.diff(run.to_numpy()) for run in runs]

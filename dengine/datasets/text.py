@@ -374,7 +374,8 @@ def read_table(
         if i not in complete
     }
     decimals = [len(row[-1].replace(",", ".").partition(".")[2]) for row in complete.values()]
-    if text[-1:] != "\n" and len(decimals) > 2 and decimals[-1] < min(decimals[:-1]):
+    is_cut = len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
+    if text[-1:] != "\n" and len(decimals) > 2 and is_cut:
         wrong[max(complete)] = "Expected as many decimals as above, the last number is cut off"
     frame = pd.DataFrame(
         list(complete.values()), index=list(complete), columns=header, dtype=object

@@ -478,7 +478,7 @@ def test_numbers_that_are_missing_in_an_array_of_labels_are_unlabelled_and_other
     for labels in (y, pd.Series(y), [None if np.isnan(item) else bool(item) for item in y]):
         dataset = load_dataset((data.X, labels))
         assert (dataset.y.tolist(), dataset.unlabelled) == (data.y[::3].tolist(), 20)
-    with pytest.raises(DataError, match="Expected labels in data .*, got '-1' 7 times"):
+    with pytest.raises(DataError, match=r"Expected labels in data .*, got '-1' 7 times"):
         load_dataset((data.X, 2 * data.y - 1))
 
 

@@ -1334,7 +1334,7 @@ def test_a_wide_table_says_which_columns_are_not_read(small: Dataset) -> None:
 def test_recordings_of_another_scale_are_named_in_a_note(few: Path, small: Dataset) -> None:
     write_csv(few / "small_OK.csv", small.X[5] / 1000)
     data = load_dataset(few)
-    text = "1 recordings are 50 times larger or smaller than most, in another unit or not measured"
+    text = "50 times larger or smaller than most, in another unit or not measured"
     assert f"{text}: small_OK.csv." in data.notes
     (few / "small_OK.csv").unlink()
     assert load_dataset(few).notes == ()
@@ -1419,7 +1419,7 @@ def test_few_recordings_that_are_shorter_than_most_are_noted(tmp_path: Path) -> 
         frame = pd.DataFrame({"FZ": np.sin(0.1 * i + 0.1 * np.arange(70 if i == 3 else 120))})
         frame.to_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False)
     notes = load_dataset(tmp_path).notes
-    assert "1 recordings are much shorter than most: 3_NOK.csv." in notes
+    assert "Much shorter than most: 3_NOK.csv." in notes
 
 
 def test_a_row_of_rates_above_the_samples_is_noted(small: Dataset, tmp_path: Path) -> None:
@@ -1516,10 +1516,10 @@ def test_data_says_how_each_form_was_read(small: Dataset, tmp_path: Path) -> Non
     by_name = "by name, numbers by size"
     for name, labels, clock, order in (
         ("wide", f"column verdict: {counted}", "none", "as the rows"),
-        ("array", f"y: {counted}", "none, the array rate_hz", "as the rows"),
+        ("array", f"array y: {counted}", "none, the array rate_hz", "as the rows"),
         ("archives", "file name: ", "column time (s)", by_name),
-        ("pair", f"y: {counted}", "none", "as the rows"),
-        ("list", f"y: {counted}", "none, the rate is stated", "as the rows"),
+        ("pair", f"array y: {counted}", "none", "as the rows"),
+        ("list", f"array y: {counted}", "none, the rate is stated", "as the rows"),
     ):
         reading = readings[name]
         assert reading["labels"].startswith(labels), name
