@@ -232,7 +232,6 @@ class Outbox:
             journal.close()
             raise
         self._label_numbers.clear()  # an engine that resumes reads these labels from the store
-        self.store.before_use = self._drain_before_use
         loops = {
             "journal": self._write_loop,
             "store": self._drain_loop,
@@ -244,6 +243,8 @@ class Outbox:
             )
             self._threads.append(thread)
             thread.start()
+        # Only now: a check of the pages that takes long uses the store as well, and needs them.
+        self.store.before_use = self._drain_before_use
 
     def _compare_with_ledger(self, journal: Journal) -> None:
         """Check that the store's ledger has the entries that the journal and its head name.
