@@ -358,6 +358,8 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
     """Return seconds since the first time of a column, shape (n,), and which cells are no time.
 
     Times are ISO 8601, dates as 02.03.2026 or 3/2/2026 with or without a time, or times of day.
+    Of 3/2/2026 the first number is the month, unless one is beyond 12, or months go back from row
+    to row so, and do not if it is the day.
     """
     import pandas as pd
 
@@ -377,8 +379,10 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
                 DAY_FIRST, lambda m: f"{m[3]}-{m[2]:0>2}-{m[1]:0>2}", regex=True
             )
             parts = text.str.extract(SLASHED_DATE).astype(float)
-            # A first number beyond 12 is a day, as Europeans write it; else it is the month.
-            day, month = (1, 2) if (parts[0] > 12).any() else (2, 1)
+            # Beyond 12 it is a day. Of two readings dates do not go back in the right one.
+            goes_back = [(372 * parts[2] + 31 * parts[m]).diff().min() < 0 for m in (0, 1)]
+            is_day_first = (parts[0] > 12).any() or goes_back == [True, False]
+            day, month = (1, 2) if is_day_first and not (parts[1] > 12).any() else (2, 1)
             text = text.str.replace(
                 SLASHED_DATE, lambda m: f"{m[3]}-{m[month]:0>2}-{m[day]:0>2}", regex=True
             )

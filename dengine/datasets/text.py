@@ -237,10 +237,11 @@ def _find_header(
     is_remark = (
         header == 1 and units.COMMENT_MARK.match(rows[0][0]) and not _numeric_columns(rows[1])
     )
-    has_groups = len(set(filter(None, rows[0]))) < len(list(filter(None, rows[0]))) if rows else 0
-    is_no_header = is_remark or has_groups or (header == 1 and is_units[0])
-    if header == 1 and len(rows[0]) >= len(rows[data]) and not is_no_header:
-        header = data = 0
+    if header == 1 and len(rows[0]) >= len(rows[data]):
+        group_names = list(filter(None, rows[0]))
+        has_groups = len(set(group_names)) < len(group_names)
+        if not (has_groups or is_remark or is_units[0]):
+            header = data = 0
     if not columns and above and _numeric_columns(above[header]):
         header, data = _true_header(above, is_units, header, data)
     units_row = above[header + 1] if header + 1 < data else []

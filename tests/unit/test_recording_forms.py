@@ -837,6 +837,21 @@ def test_what_labview_writes_above_its_last_header_is_left_out(tmp_path: Path) -
     assert data.channels == ("Force",)
 
 
+def test_dates_with_slashes_are_read_so_that_they_do_not_go_back(tmp_path: Path) -> None:
+    rows = [
+        f"{part},{date} 06:00:00.{4 * i:03d},{value},OK"
+        for part, date in ((1, "12/2/2026"), (2, "1/3/2026"))
+        for i, value in enumerate(texts(VALUES))
+    ]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["part,time,FZ,label", *rows]))
+    data = load_dataset(path, time="time")
+    assert data.source.tolist() == ["1", "2"]
+    assert data.reading["order"] == "by the dates of their clocks"
+    path.write_text(path.read_text().replace("12/2/", "12/13/").replace("1/3/", "11/3/"))
+    assert load_dataset(path, time="time").source.tolist() == ["2", "1"]
+
+
 def test_a_row_of_groups_above_the_header_is_none(tmp_path: Path) -> None:
     above = [";Sensor A;Sensor A;Sensor B", "t [ms];Fx;Fz;Fx"]
     cells = (times(), texts(-VALUES), texts(-VALUES), texts())
