@@ -769,7 +769,9 @@ def labels_in_file(
     A row names a recording by its full path, by the end of it, or by a path with more leading
     folders. The suffix may be left out, and case is ignored. A file without a header, whose first
     line names a .csv, has files and labels in this order. A column of files that has another name
-    is found by the names of recordings in it. A recording may have several rows of one label.
+    is found by the names of recordings in it. A recording may have several rows of one label. A
+    row that matches several recordings labels only one whose full path it gives; for the others
+    `find` raises UnreadableError.
 
     Parameters
     ----------
@@ -777,7 +779,8 @@ def labels_in_file(
     names : sequence of str
         Names of all recordings. A row of the file that names none of them is a fault of the source.
     options : LoadOptions
-        `label` and `part` are columns of the file.
+        `label` and `part` are columns of the file. If `label` is None, the columns whose names are
+        those of labels (`LABEL_COLUMNS`) must not contradict each other.
 
     Raises
     ------

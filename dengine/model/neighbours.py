@@ -781,11 +781,11 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        References, scale, rule and gate are restored, and the reducer if its state is there, else
-        it must be fitted (`needs_refit`); the decider is dropped. A state of a stale rule leaves
-        the rule as it is; `rule_is_stale` always stays as it is. Raises StoreError if the fitted
-        reducer keeps a state but this one lacks it, and for a rule or gate of other sizes; KeyError
-        or ValueError for the state of another reducer.
+        References, scale, rule and gate are restored, and the reducer if its state is there; else
+        (`needs_refit`) train this model on the same traces before the call. The decider is dropped.
+        A state of a stale rule leaves the rule as it is; `rule_is_stale` always stays as it is.
+        Raises StoreError if the fitted reducer keeps a state but this one lacks it, and for a rule
+        or gate of other sizes; KeyError or ValueError for the state of another reducer.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))

@@ -1,5 +1,6 @@
 """`ConnectionPool` and its `Connection`s limit what uvicorn does not: the number of connections,
-and the time of a request's head. uvicorn makes a `Connection` for each client (`uvicorn_options`).
+and the time of a request's head. uvicorn makes a `Connection` for each client, as
+`server.uvicorn_options` tells it.
 
 If all places are taken, a new connection replaces the oldest one that is idle and was never
 authorized, so that clients without a token cannot keep out one that has it. A connection is closed

@@ -156,8 +156,8 @@ class RtdeClient:
     def _receive_packages(self) -> Iterator[Package]:
         """Yield packages as they arrive, without an end, but texts, of which the newest is kept.
 
-        Raise CellError if the connection is lost, silent for `timeout` seconds, or sends no RTDE;
-        its message quotes the newest text.
+        Raise CellError if the connection is lost or silent for `timeout` seconds, with a message
+        that quotes the newest text, or if it sends no RTDE.
         """
         packages = PackageReader()
         while True:
