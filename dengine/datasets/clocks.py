@@ -514,8 +514,9 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
             wanted = f"a later time in column {clock.name} than that of the row before"
             actual = f"{-steps[i]:.3g} s earlier"
             do = (
-                f"time={clock.name!r} puts rows in the order of their times, if they differ; "
-                f"time={NO_CLOCK!r} with a stated rate (rate_hz) leaves them as they are"
+                f"time={clock.name!r} puts rows in the order of their times, if all differ; "
+                f"time={NO_CLOCK!r} with a stated rate (rate_hz) leaves them as they are; "
+                "rows that are no samples, as zeros behind the last one, are to be deleted"
             )
             raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", lines[rows[i + 1]])
     gaps = np.flatnonzero(steps > MAX_GAP * usual)

@@ -522,7 +522,9 @@ class RecordingCollector:
         is_one_sided = len(labels) == 1
         if sum(self.unknown_words.values()) <= (n_known / 9 if is_one_sided else n_known):
             return
-        words = [word for word, _ in self.unknown_words.most_common()]
+        # Without known labels a dash may mean that there is no fault.
+        dashes = {"-": self.unlabelled_words["-"] * (not labels)}
+        words = [word for word, _ in (self.unknown_words + Counter(dashes)).most_common()]
         if is_one_sided:
             bad = set(words) if 1 in labels else set()
         else:

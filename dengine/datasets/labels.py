@@ -977,9 +977,10 @@ def _label_file_columns(
     if of_label is None and len(bad_columns) == 1:
         of_label = bad_columns[0]
     if of_file is None or of_label is None:
-        wanted = "file" if of_file is None else "label"
-        actual = ", ".join(header)
-        raise DataError(f"Expected a column {wanted} in {path}, got {actual}; call it so.")
+        raise DataError(
+            f"Expected columns file and label in {path}, got {', '.join(header)}; "
+            "call that of files' names file, and name that of labels (label)."
+        )
     return of_file, of_label
 
 

@@ -1530,3 +1530,28 @@ def test_data_says_how_each_form_was_read(small: Dataset, tmp_path: Path) -> Non
         "column time (dates)",
         "by the dates of their clocks",
     )
+
+
+def test_a_listing_with_other_columns_is_one_error_that_says_what_each_needs(
+    few: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "mes.csv").write_text("DMC,Line,Finding\nA1,L3,x\n")
+    with pytest.raises(DataError, match=r"got DMC, Line, Finding; call that of files' names file"):
+        load_dataset(few, labels=tmp_path / "mes.csv")
+
+
+def test_the_map_for_words_of_faults_has_the_dash_of_parts_without_one(tmp_path: Path) -> None:
+    for i, word in enumerate(["-", "-", "-", "jammed", "tilted"]):
+        frame = pd.DataFrame({"FZ_Base": np.arange(30.0), "Fault": word})
+        frame.to_csv(tmp_path / f"{i}.csv", index=False)
+    with pytest.raises(DataError, match=r"label_map='-=good,jammed=bad,tilted=bad'"):
+        load_dataset(tmp_path, label="Fault")
+
+
+def test_an_earlier_time_is_said_to_be_perhaps_of_zeros_behind_the_last_sample(
+    tmp_path: Path,
+) -> None:
+    cells = {"time": np.r_[np.arange(30) / 500, np.zeros(9)], "FZ_Base": np.r_[1:31, np.zeros(9)]}
+    pd.DataFrame(cells).to_csv(tmp_path / "1_OK.csv", index=False)
+    with pytest.raises(DataError, match="as zeros behind the last one, are to be deleted"):
+        load_dataset(tmp_path, time="time")
