@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RATE_TOLERANCE = 0.03  # of the others' rate: recordings within it have one rate
+ZEROS = 10  # that many samples of 0 at the end of a recording may be no measurements
 MANY = 10  # recordings, among which both labels are expected
 SHORT = 0.7  # of the usual length: recordings below it may be pieces, if they are few
 FEW = 0.1  # of all recordings
@@ -644,8 +645,9 @@ def _note_scales(collector: RecordingCollector) -> None:
     """Add notes to the collector about recordings that look odd beside the others.
 
     These are recordings whose largest value is far from that of most, so that their unit may be
-    another, and a few that are much shorter than most. Another note says that all begin with the
-    same sample, larger than all others, as a row of rates is.
+    another, a few that are much shorter than most, and those that end in zeros, as a buffer does
+    that was not filled. Another note says that all begin with the same sample, larger than all
+    others, as a row of rates is.
     """
     with np.errstate(invalid="ignore"):
         peaks = np.array([np.nan_to_num(np.abs(r.trace)).max() for r in collector.recordings])
@@ -657,12 +659,15 @@ def _note_scales(collector: RecordingCollector) -> None:
         collector.notes["All begin with the same largest sample, which may be no measurement"] = 1
     lengths = np.array([recording.trace.shape[1] for recording in collector.recordings])
     is_short = lengths < SHORT * np.median(lengths)
+    ends_in_zeros = np.array([not r.trace[:, -ZEROS:].any() for r in collector.recordings])
+    ends_in_zeros &= (lengths > ZEROS) & (peaks > 0)
     usual = float(np.median(peaks))
     is_far = (usual > 0) & (peaks > 0) & ((peaks > FAR * usual) | (peaks * FAR < usual))
     far_text = f"{FAR:g} times larger or smaller than most, in another unit or not measured"
     for text, is_odd in (
         (far_text, is_far),
         ("Much shorter than most", is_short & (is_short.mean() < FEW)),
+        ("The last samples are all 0, which may be no measurements", ends_in_zeros),
     ):
         if is_odd.any():
             names = [r.source for r, odd in zip(collector.recordings, is_odd, strict=True) if odd]

@@ -386,6 +386,19 @@ class LabelColumn:
         self.notes[note] = 1
         return int(not flag)
 
+    def has_labels(self, cells: Iterable[Any]) -> bool:
+        """Return whether cells are nothing but labels and words of parts that were not checked.
+
+        False if none of them is a label.
+        """
+        labels = set[int]()
+        with suppress(UnknownWordError):
+            for cell in cells:
+                with suppress(UnlabelledError):
+                    labels.add(self.label_of(cell))
+            return bool(labels)
+        return False
+
     def find(self, cells: Iterable[Any], place: str = "") -> SourcedLabel:
         """Return the label that all cells mean; those of a part that is not checked do not count.
 
@@ -909,12 +922,20 @@ def _read_label_rows(
         cells = {1: header, **cells}
         header = ["file", "label", *header[2:]]
     files = {_path_words(name)[0] for name in names}
+    columns = [list(dict.fromkeys(column)) for column in zip(*cells.values(), strict=True)]
     with_names = [
         i
-        for i in range(len(header))
-        if any(_path_words(row[i])[0] in files for row in cells.values())
+        for i, column in enumerate(columns)
+        if any(_path_words(cell)[0] in files for cell in column)
     ]
-    of_file, of_label = _label_file_columns(header, path, with_names, options.label)
+    full_names = {} if with_names else {i: _names_with(x, names) for i, x in enumerate(columns)}
+    with_names = with_names or [i for i, name_of in full_names.items() if name_of]
+    with_labels = [
+        i
+        for i, column in enumerate(columns)
+        if LabelColumn(header[i], options.words, Counter()).has_labels(column)
+    ]
+    of_file, of_label = _label_file_columns(header, path, with_names, with_labels, options.label)
     part = options.part
     if part != "part" and part not in header:
         wanted = f"a column {part} of parts' numbers in {path}"
@@ -923,7 +944,7 @@ def _read_label_rows(
     for line, values in cells.items():
         number = values[header.index(part)] if part in header else ""
         file = values[of_file]
-        words = _path_words(file)
+        words = _path_words(full_names.get(of_file, {}).get(file, file))
         row = rows.get(words, _LabelRow((), words, file, (), number or None))
         lines = (*row.lines, line)
         rows[words] = row._replace(lines=lines, labels=(*row.labels, values[of_label]))
@@ -943,6 +964,25 @@ def _path_words(path: str) -> tuple[str, ...]:
     return file.removesuffix(suffix), *reversed(words)
 
 
+def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Return for each text, as a serial number, the one name of a file in which it stands, word by
+    word; empty if a text stands in several names, or most texts in none.
+    """
+
+    def words_of(text: str) -> str:
+        return re.sub(r"[\W_]+", "_", f"_{normalized(text).lower()}_")
+
+    name_of = {}
+    words = {name: words_of(PurePosixPath(name).name) for name in names}
+    for text in texts:
+        matches = [name for name in names if "_" != words_of(text) in words[name]]
+        if len(matches) > 1:
+            return {}
+        if matches:
+            name_of[text] = matches[0]
+    return name_of if 2 * len(set(name_of.values())) > len(texts) else {}
+
+
 def column_among(header: Sequence[str], names: Sequence[str]) -> int | None:
     """Return where the first of some names stands in a header, in any case; None if none does."""
     lower = [column.lower() for column in header]
@@ -953,14 +993,17 @@ def _label_file_columns(
     header: Sequence[str],
     path: str | os.PathLike[str],
     with_names: Sequence[int],
+    with_labels: Sequence[int],
     column: str | None = None,
 ) -> tuple[int, int]:
     """Return the positions of the column of files and of the column of labels.
 
-    They are found by their names; of two columns that have other names, files come first. The only
-    column whose name means the bad outcome has the labels if none is called so. Raises DataError if
-    one is not found. with_names : the columns in which recordings are named. column : the one of
-    labels, if the user stated it.
+    They are found by their names; of two columns that have other names, files come first. If none
+    is called so, the only column whose name means the bad outcome has the labels, else the only one
+    that holds nothing else. Raises DataError if one is not found.
+
+    with_names, with_labels : the columns in which recordings are named, and those of labels alone.
+    column : the one of labels, if the user stated it.
     """
     of_file = column_among(header, LISTS["file_columns"])
     of_label = column_among(header, LABEL_COLUMNS if column is None else (column.lower(),))
@@ -974,8 +1017,9 @@ def _label_file_columns(
             of_file = 0 if of_label is None else 1 - of_label
         of_label = 1 - of_file
     bad_columns = [i for i, column in enumerate(header) if i != of_file and means_bad(column)]
-    if of_label is None and len(bad_columns) == 1:
-        of_label = bad_columns[0]
+    likely = bad_columns or [i for i in with_labels if i != of_file]
+    if of_label is None and len(likely) == 1:
+        of_label = likely[0]
     if of_file is None or of_label is None:
         raise DataError(
             f"Expected columns file and label in {path}, got {', '.join(header)}; "

@@ -867,14 +867,7 @@ def _compared_columns(frame: pd.DataFrame, label: str | None, options: LoadOptio
     columns = []
     for name in sorted({*_usual_label_columns(list(frame.columns))} - {label}):
         column = labels.LabelColumn(name, options.words, Counter())
-        has_labels = False
-        with suppress(UnknownWordError):
-            for cell in frame[name].unique().tolist():
-                with suppress(UnlabelledError):
-                    column.label_of(cell)
-                    has_labels = True
-            if has_labels:
-                columns.append(name)
+        columns += [name] if column.has_labels(frame[name].unique().tolist()) else []
     return columns
 
 

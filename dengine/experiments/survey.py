@@ -80,6 +80,8 @@ class Survey:
         Files, or rows, of those that are not finite.
     duplicates, contradicting : int
         Traces equal to an earlier one, sample by sample; and those of them with another label.
+    duplicates_in : tuple of str
+        Files, or rows, of the traces that equal an earlier one.
     near_repeats, looked_at : int
         Among the newest `looked_at` usable traces: those that are much nearer to another part's
         trace than parts are to each other.
@@ -111,6 +113,7 @@ class Survey:
     too_large: int
     duplicates: int
     contradicting: int
+    duplicates_in: tuple[str, ...]
     near_repeats: int
     looked_at: int
     parts: int | None
@@ -138,11 +141,11 @@ def survey_dataset(data: Dataset) -> Survey:
     parts: list[str | None] = [None] * len(data) if data.part is None else data.part.tolist()
     pairs = zip(hashes.tolist(), parts, strict=True)
     part_hashes = np.array([trace_hash(content, part) for content, part in pairs], dtype=np.int64)
-    first_labels: dict[int, int] = {}  # the label of each content's first trace
-    n_contradicting = 0
-    for content, label in zip(hashes[usable].tolist(), data.y[usable].tolist(), strict=True):
-        n_contradicting += first_labels.setdefault(content, label) != label
-    n_usable = int(usable.sum())
+    _, firsts, contents = np.unique(hashes[usable], return_index=True, return_inverse=True)
+    n_usable = len(contents)
+    is_duplicate = np.zeros(len(data), dtype=np.bool_)
+    is_duplicate[usable] = firsts[contents] != np.arange(n_usable)
+    labels = data.y[usable]
     return Survey(
         **{
             name: getattr(data, name)
@@ -159,8 +162,9 @@ def survey_dataset(data: Dataset) -> Survey:
         not_finite_in=() if data.source is None else tuple(data.source[~finite].tolist()),
         constant=int(constant.sum()),
         too_large=int(too_large.sum()),
-        duplicates=n_usable - len(first_labels),
-        contradicting=n_contradicting,
+        duplicates=int(is_duplicate.sum()),
+        contradicting=int((labels != labels[firsts[contents]]).sum()),
+        duplicates_in=() if data.source is None else tuple(data.source[is_duplicate].tolist()),
         near_repeats=near_repeats(X[usable], part_hashes[usable]),
         looked_at=min(n_usable, NEWEST),
         parts=None if data.part is None else len(set(parts)),

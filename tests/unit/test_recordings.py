@@ -1555,3 +1555,41 @@ def test_an_earlier_time_is_said_to_be_perhaps_of_zeros_behind_the_last_sample(
     pd.DataFrame(cells).to_csv(tmp_path / "1_OK.csv", index=False)
     with pytest.raises(DataError, match="as zeros behind the last one, are to be deleted"):
         load_dataset(tmp_path, time="time")
+
+
+def test_a_listing_by_serial_numbers_finds_the_files_that_have_them_in_their_names(
+    small: Dataset, tmp_path: Path
+) -> None:
+    numbers = [f"DMC93{i:03d}A" for i in (0, 11, 7, 5)]
+    for number, x in zip(numbers, small.X, strict=False):
+        write_csv(tmp_path / "cell" / f"20260301_{number}.csv", x)
+    path = tmp_path / "mes.csv"
+
+    def write_rows(*rows: str) -> None:
+        path.write_text("\n".join(["DMC;Line;Prüfurteil;Shift", *rows]) + "\n", "utf-8")
+
+    words = ("gut", "schlecht", "gut", "schlecht")
+    write_rows(*(f"{n};L3;{word};2" for n, word in zip(numbers, words, strict=True)))
+    data = load_dataset(tmp_path / "cell", labels=path)
+    assert data.source is not None
+    verdicts = dict(zip(data.source.tolist(), data.y.tolist(), strict=True))
+    assert verdicts == {
+        f"20260301_{n}.csv": int(w == "gut") for n, w in zip(numbers, words, strict=True)
+    }
+    assert "Prüfurteil: gut -> good 2, schlecht -> bad 2" in data.reading["labels"]
+    # Several files have the words of a row, and no column holds labels alone: one error says all.
+    write_rows(*(f"20260301;L3;{word};2" for word in ("Riss", "gut", "heil", "gut")))
+    with pytest.raises(
+        DataError, match="got DMC, Line, Prüfurteil, Shift; call that of files' names file"
+    ):
+        load_dataset(tmp_path / "cell", labels=path)
+
+
+def test_samples_of_zero_behind_the_last_one_are_noted(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for i in range(4):
+        force = np.r_[rng.normal(20.0, 5.0, 60), np.zeros(20 if i < 2 else 0)]
+        pd.DataFrame({"FZ_Base": force}).to_csv(tmp_path / f"{i}_OK.csv", index=False)
+    notes = load_dataset(tmp_path, rate_hz=500.0, fit="pad").notes
+    expected = "The last samples are all 0, which may be no measurements: 0_OK.csv, 1_OK.csv."
+    assert expected in notes, notes
