@@ -170,8 +170,9 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
 def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:
     """Return the number of features of each member, by embedding two traces of zeros.
 
-    Leaves the networks in training mode. Raises SettingError if their output does not have three
-    dimensions, (B, K, features).
+    They are embedded in evaluation mode, so that no statistics change; afterwards the networks are
+    in training mode. Raises SettingError if their output does not have three dimensions,
+    (B, K, features).
     """
     networks.eval()
     with torch.no_grad():
