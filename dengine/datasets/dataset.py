@@ -362,11 +362,14 @@ def describe_reading(
     *,
     rate_hz: float | None = None,
 ) -> dict[str, str]:
-    """Return how recordings were read, as `Dataset.reading` has it.
+    """Return how recordings were read, in words, for `Dataset.reading`.
 
-    readings, labels : one for each recording.
+    The keys are labels, clock, rows, numbers, order and first; empty texts are left out, and rows
+    if no line of any recording was left out.
+
+    readings, labels : one for each recording; there is at least one.
     order, first : by what they are ordered, and `describe_ends` of the first.
-    rate_hz : that the user stated.
+    rate_hz : that the user stated; it says why there is no clock.
     """
     words = dict[str, Counter[str]]()
     for reading, label in zip(readings, labels, strict=True):
@@ -389,9 +392,9 @@ def _with_counts(counts: Counter[str]) -> str:
 def describe_ends(
     source: str, trace: NDArray[np.float32], channels: Sequence[str], all_units: Sequence[str]
 ) -> str:
-    """Return the first and last value of each channel of a trace (C, T) in words, with its unit.
+    """Return in words the first and last value of each channel of a trace (C, T), and its length.
 
-    all_units : one for each channel.
+    source : the file or row of the trace. all_units : one for each channel.
     """
     rows = zip(channels or [""] * len(trace), trace, all_units, strict=True)
     texts = (f"{name} {row[0]:.6g} to {row[-1]:.6g} {unit}".strip() for name, row, unit in rows)
@@ -503,7 +506,7 @@ class RecordingCollector:
     def order_by_start(self) -> None:
         """Put the recordings in the order of their first times, if all are known and differ.
 
-        Then `ordered` is True.
+        Then `ordered` is True, and `order` says so; otherwise nothing changes.
         """
         starts = [r.start for r in self.recordings if r.start is not None]
         if len(set(starts)) < len(self.recordings):

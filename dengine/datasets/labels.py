@@ -387,9 +387,9 @@ class LabelColumn:
         return int(not flag)
 
     def has_labels(self, cells: Iterable[Any]) -> bool:
-        """Return whether cells are nothing but labels and words of parts that were not checked.
+        """Return whether cells hold nothing but labels and words of parts that were not checked.
 
-        False if none of them is a label.
+        Empty cells are such words, too. False if no cell is a label.
         """
         labels = set[int]()
         with suppress(UnknownWordError):
@@ -965,17 +965,24 @@ def _path_words(path: str) -> tuple[str, ...]:
 
 
 def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """Return for each text, as a serial number, the one name of a file in which it stands, word by
-    word; empty if a text stands in several names, or most texts in none.
+    """Return for texts, for example serial numbers, the one file in whose name each stands.
+
+    It must stand there as one or more whole words, in upper or lower case; folders do not count. A
+    text that stands in no name is left out. The result is empty if a text stands in several names,
+    or if the texts stand in no more than half as many files as there are texts.
     """
 
     def words_of(text: str) -> str:
+        """Return the words of a text in lower case, each between underscores."""
         return re.sub(r"[\W_]+", "_", f"_{normalized(text).lower()}_")
 
     name_of = {}
-    words = {name: words_of(PurePosixPath(name).name) for name in names}
+    words_of_name = {name: words_of(PurePosixPath(name).name) for name in names}
     for text in texts:
-        matches = [name for name in names if "_" != words_of(text) in words[name]]
+        wanted = words_of(text)
+        if wanted == "_":  # it has no words
+            continue
+        matches = [name for name, words in words_of_name.items() if wanted in words]
         if len(matches) > 1:
             return {}
         if matches:
@@ -998,9 +1005,10 @@ def _label_file_columns(
 ) -> tuple[int, int]:
     """Return the positions of the column of files and of the column of labels.
 
-    They are found by their names; of two columns that have other names, files come first. If none
-    is called so, the only column whose name means the bad outcome has the labels, else the only one
-    that holds nothing else. Raises DataError if one is not found.
+    They are found by their names. Without a column of files by its name, it is the only one of
+    `with_names`. Of two columns, the one that is not of files has the labels; if both have other
+    names, files come first. Of more columns, the only one whose name means the bad outcome has the
+    labels, else the only one of `with_labels`. Raises DataError if one is not found.
 
     with_names, with_labels : the columns in which recordings are named, and those of labels alone.
     column : the one of labels, if the user stated it.

@@ -331,7 +331,8 @@ def _verdict_columns(
     columns = []
     for name in _usual_label_columns(heads.header):
         counts = _count_labels(sample, labels.labels_in_column(named, name, options))
-        columns += [name] if counts[0] + counts[1] else []
+        if counts[0] + counts[1]:
+            columns.append(name)
     return columns + [name for name, values in heads.verdicts.items() if values == {0, 1}]
 
 
@@ -867,7 +868,8 @@ def _compared_columns(frame: pd.DataFrame, label: str | None, options: LoadOptio
     columns = []
     for name in sorted({*_usual_label_columns(list(frame.columns))} - {label}):
         column = labels.LabelColumn(name, options.words, Counter())
-        columns += [name] if column.has_labels(frame[name].unique().tolist()) else []
+        if column.has_labels(frame[name].unique().tolist()):
+            columns.append(name)
     return columns
 
 

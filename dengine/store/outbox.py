@@ -949,9 +949,10 @@ class Outbox:
         """Have the store commit the oldest synced records, at most DRAIN_CHUNK, in one transaction.
 
         Decisions that were replaced are left out. A record that is damaged on disk is taken from
-        memory, and an event is stored, too; it names the decisions that are not in memory any more
-        and so are lost. Journal, counters and memory are updated. Raise StoreError if the store
-        refuses; nothing is updated then.
+        memory; after the records an event is committed, which names the decisions that are not in
+        memory any more and so are lost. Journal, counters and memory are updated. Raise StoreError
+        if the store refuses records or event; nothing is updated then, and the next call commits
+        the same records again.
         """
         records: list[Record] = []
         damaged: list[str] = []
