@@ -169,10 +169,13 @@ class EngineCore:
     def wait_until_warm(self) -> None:
         """Wait until the first retrain can begin at once, some two seconds after the start.
 
-        What it imports is loaded then, and what it needs of stored traces is computed.
+        What it imports is loaded then, what it needs of stored traces is computed, and the code
+        that will decide is compiled.
         """
         if self._warm_up.ident is not None:
             self._warm_up.join()
+        if self.new_labels and not self.live.version:
+            self.learner.precompute()
         self.learner.wait_until_precomputed()
 
     def resume(self) -> None:

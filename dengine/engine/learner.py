@@ -107,7 +107,7 @@ class Learner:
         newest_version = max((report.version for report in reports), default=0)
         self.live.resume(version, newest_version, label_within, policy_since)
         if self.live.answering is not None or len(labelled.seq) >= IMPORTED:
-            self._precompute(labelled)
+            self.precompute()
         self.labels.resume(self._counts_from)
         if self._peers is not None:
             self._peers.resume()
@@ -121,8 +121,14 @@ class Learner:
         trained_on = self.live.trained_on
         return 0 if trained_on is None else trained_on.counts_from
 
-    def _precompute(self, labelled: LabelledTraces) -> None:
-        """Start a thread that computes what the next retrain begins with; do not wait for it."""
+    def precompute(self) -> None:
+        """Start a thread that computes what the next retrain begins with; do not wait for it.
+
+        Nothing is started if one was, and no retrain has waited for it since. There must be labels.
+        """
+        if self._precomputed is not None:
+            return
+        labelled = self._window.snapshot()
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
         model = GuardedModel(self.live.newest)
         self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)

@@ -8,12 +8,27 @@ from multiprocessing import get_context
 from pathlib import Path
 from threading import Event
 from threading import enumerate as living_threads
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from sklearn.decomposition import PCA
 
-from dengine import Action, DataEngine, Dataset, Reason, ReplayCell, Source, TraceError, TraceSpec
+from dengine import (
+    Action,
+    DataEngine,
+    Dataset,
+    Reason,
+    Recipe,
+    ReplayCell,
+    Source,
+    TraceError,
+    TraceSpec,
+    load_dataset,
+)
+from dengine.datasets.importing import import_labelled
+from dengine.decision.scripting import script
 from dengine.engine.engine import core_of
 from dengine.errors import ReportError, SettingError, StoreError
 from dengine.folds import COIN_BITS, audit_salt, content_hash, toss
@@ -493,3 +508,26 @@ def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data: Dataset) -> No
     with DataEngine("conv") as engine:
         next(engine.run(ReplayCell(data), 1))
         assert "dengine-warm-up" not in {thread.name for thread in living_threads()}
+
+
+def test_the_first_retrain_of_a_few_imported_labels_compiles_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Scripting takes longer than the time budget leaves."""
+    data = load_dataset("insertion")
+    X = data.X[:60, ..., :640]  # no other test compiles for this length
+    parts = Dataset(X, data.y[:60])
+    import_labelled(tmp_path / "e.db", parts, Recipe.load("conv"))
+    compiled = []
+
+    def counting(module: torch.nn.Module) -> Any:
+        compiled.append(module)
+        return script(module)
+
+    monkeypatch.setattr("dengine.model.neighbours.script", counting)
+    with DataEngine.open(tmp_path / "e.db") as engine:
+        core_of(engine).wait_until_warm()
+        assert compiled
+        compiled.clear()
+        assert engine.retrain().accepted
+    assert not compiled
