@@ -346,8 +346,8 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         )
     recipe = Recipe.from_store(settings)
     policy = recipe.policy
-    counts = store.status()
-    tally = store.tally()
+    tally = store.tally(within=policy.label_within)  # seconds, in a store of a million decisions
+    counts = store.status(tally)
     outcomes = tally.outcomes
     events = store.events()
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
@@ -355,7 +355,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     last_seq = retrains[-1].last_seq if retrains else 0
     accepted = [report.version for report in store.retrains() if report.accepted]
     since = int(settings.get("policy_since", 0))
-    certified = store.tally(since_version=since, within=policy.label_within).outcomes
+    in_force = tally if not since else store.tally(None, since, policy.label_within)
     return Status(
         cell=store.cell_id,
         product=store.product,
@@ -372,7 +372,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         newest=_count_span(store.tally(last), retrains, policy),
         ever=_count_span(tally, retrains, policy),
         unreported=outcomes.accepted - outcomes.false_accepts - outcomes.confirmed,
-        certificate=policy.certificate(certified),
+        certificate=policy.certificate(in_force.outcomes),
         retrains=tuple(retrains),
         events=tuple(events[-N_EVENTS:]),
         watch=read_watch(store, recipe) if watching else None,
@@ -575,7 +575,7 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
         With the newest 120 stretches at most.
     """
     modes = [event for event in store.events() if event.kind in MODES]
-    n = max(1, min(MAX_STRETCHES, store.tally().count() // MIN_STRETCH))
+    n = max(1, min(MAX_STRETCHES, store.n_decisions() // MIN_STRETCH))
     stretches = store.stretches(n, **by)[-MAX_STRETCHES:]
     retrains = store.versions(cell_only=True)
     return Course(stretches, retrains, modes, recipe.policy.tolerances[0], last)

@@ -621,8 +621,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             self._read(query.where(is_counted, LABEL.c.model_version >= since_version))[0][0]
         )
 
-    def status(self) -> dict[str, Any]:
+    def status(self, tally: Tally | None = None) -> dict[str, Any]:
         """Return counts of all decisions and labels of the cell.
+
+        Parameters
+        ----------
+        tally : Tally or None
+            Of all decisions of the cell, if it has been read already; None: it is read.
 
         Returns
         -------
@@ -631,7 +636,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             whose label was corrected or forgotten; actions, reasons, sources: dicts of numbers by
             value, 0 included. Forgotten labels are not among labels and sources.
         """
-        tally = self.tally()
+        tally = tally or self.tally()
         actions = tally.by("action")
         reasons = tally.by("reason")
         sources: Counter[Any] = Counter()
@@ -1188,10 +1193,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         -------
         list of Stretch
         """
-        total = self._read(sa.select(sa.func.count()).where(DECISION.c.cell_id == self.cell_id))[0][
-            0
-        ]
-        rows = self._read(stretches_query(self.cell_id, max(1, -(-int(total) // n)), **by))
+        length = max(1, -(-self.n_decisions() // n))
+        rows = self._read(stretches_query(self.cell_id, length, **by))
         return [Stretch(*row) for row in rows]
 
     # The one engine that owns the cell
