@@ -1,10 +1,12 @@
 """Compare this checkout with another revision in one interleaved run.
 
-    python training/benchmark_against.py c01287f --rounds 5
+    python training/benchmark_against.py c01287f --rounds 20
 
-It times retrains, decisions and reports. Each round runs both revisions, one after the other, each
-in a process of its own; run it on idle cores. It prints the median and the worst of each quantity
-for both, and the median over the rounds of the ratio here / there.
+It times decisions, reports and retrains. Each revision runs in a process of its own, and both stay
+alive: in each round one does 300 decisions, then the other, and so on, so that whatever disturbs
+the machine disturbs both. Run it on idle cores. It prints the median, the 99th percentile and the
+worst time of each quantity for both, and two ratios here / there: the median over the rounds of
+the ratio of the medians, and the ratio of the 99th percentiles over all rounds.
 """
 
 import argparse
@@ -15,54 +17,116 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import TracebackType
+from typing import IO, Self
+
+import numpy as np
 
 REPO = Path(__file__).resolve().parents[1]
-# The measurement, run in each revision. It uses only names that every revision has.
+# How often each quantity is measured in a round.
+BLOCKS = {"decide": 300, "report": 100, "retrain": 1}
+# The measurement, run in each revision. It uses only names that every revision has. It prints the
+# seconds of the first retrain; then it answers each line, a quantity and a number, with seconds.
 MEASUREMENT = """
-import gc, json, tempfile, time
+import gc, json, sys, tempfile, time
 import numpy as np
-from dengine import Action, DataEngine, Policy, load_dataset
+from dengine import DataEngine, Policy, load_dataset
 
 data = load_dataset("insertion")
+
+def trace(k):
+    return data.X[k % len(data.X)] + np.float32(0.01 * (1 + k // len(data.X)))
+
+def seconds_of(call, *arguments):
+    begin = time.perf_counter()
+    call(*arguments)
+    return time.perf_counter() - begin
+
 policy = Policy(alpha=0.1, lower_bound=0.9)
 engine = DataEngine("conv", policy=policy, retrain_every=10**6, budget=30.0)
-seconds = {}
 for x, y in zip(data.X, data.y):
     decision = engine.decide(x)
     engine.report(decision.id, bool(y))
-for name in ("first retrain", "warm retrain", "warm retrain again"):
-    begin = time.perf_counter()
-    engine.retrain()
-    seconds[name] = time.perf_counter() - begin
-
+print(json.dumps([seconds_of(engine.retrain)]), flush=True)
+engine.retrain()
 gc.collect()
 gc.freeze()
 gc.disable()  # as in a loop that must not wait
-durations = []
-for k in range(DECISIONS):
-    x = data.X[k % len(data.X)] + np.float32(0.01 * (1 + k // len(data.X)))
-    begin = time.perf_counter()
-    engine.decide(x)
-    durations.append(time.perf_counter() - begin)
-durations = np.array(durations[100:])
-seconds["decide p50"] = np.quantile(durations, 0.5)
-seconds["decide p99"] = np.quantile(durations, 0.99)
-seconds["decide worst"] = durations.max()
-
-# Each label is on the disk when `report` returns; nothing else starts a retrain.
 with tempfile.TemporaryDirectory() as folder:
-    engine = DataEngine("pca", store=folder + "/engine.db", retrain_every=10**6)
-    durations = []
-    for x, y in zip(data.X[:REPORTS], data.y):
-        decision = engine.decide(x)
-        begin = time.perf_counter()
-        engine.report(decision.id, bool(y))
-        durations.append(time.perf_counter() - begin)
-    engine.close()
-seconds["report p50"] = np.quantile(durations, 0.5)
-seconds["report p99"] = np.quantile(durations, 0.99)
-print(json.dumps({name: float(value) for name, value in seconds.items()}))
+    # Each label is on the disk when `report` returns; nothing else starts a retrain.
+    stored = DataEngine("pca", store=folder + "/engine.db", retrain_every=10**6)
+    n = 0
+    for line in sys.stdin:
+        quantity, number = line.split()
+        seconds = []
+        for k in range(n, n + int(number)):
+            if quantity == "decide":
+                seconds.append(seconds_of(engine.decide, trace(k)))
+            elif quantity == "report":
+                decision = stored.decide(trace(k))
+                label = bool(data.y[k % len(data.y)])
+                seconds.append(seconds_of(stored.report, decision.id, label))
+            else:
+                seconds.append(seconds_of(engine.retrain))
+        n += int(number)
+        print(json.dumps(seconds), flush=True)
+    stored.close()
 """
+
+
+class Revision:
+    """A process that measures the dengine of one folder; a context manager.
+
+    Parameters
+    ----------
+    root : Path
+        The folder that has `dengine` in it.
+    """
+
+    def __init__(self, root: Path) -> None:
+        environment = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", MEASUREMENT],
+            env=environment,
+            cwd=root,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.first_retrain = self._read()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._pipe(self._process.stdin).close()
+        self._process.wait()
+
+    @staticmethod
+    def _pipe(pipe: IO[str] | None) -> IO[str]:
+        """Return a pipe of the process, which is there, because the process was started with it."""
+        assert pipe is not None
+        return pipe
+
+    def _read(self) -> list[float]:
+        """Return the seconds of the next answer; SystemExit if the process has failed."""
+        line = self._pipe(self._process.stdout).readline()
+        if not line:
+            raise SystemExit("A revision failed; its error is above.")
+        seconds: list[float] = json.loads(line)
+        return seconds
+
+    def measure(self, quantity: str) -> list[float]:
+        """Measure one block of a quantity of `BLOCKS`; return the seconds of each call."""
+        stdin = self._pipe(self._process.stdin)
+        stdin.write(f"{quantity} {BLOCKS[quantity]}\n")
+        stdin.flush()
+        return self._read()
 
 
 def check_out(revision: str, folder: Path) -> None:
@@ -72,25 +136,20 @@ def check_out(revision: str, folder: Path) -> None:
     subprocess.run(["tar", "-x", "-C", str(folder)], input=archive, check=True)
 
 
-def measure(root: Path, decisions: int, reports: int) -> dict[str, float]:
-    """Measure the dengine in a folder, in a new process; return the seconds of each quantity.
-
-    Raises SystemExit if that process fails.
-    """
-    code = MEASUREMENT.replace("DECISIONS", str(decisions)).replace("REPORTS", str(reports))
-    environment = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
-    process = subprocess.run(
-        [sys.executable, "-c", code],
-        env=environment,
-        cwd=root,
-        capture_output=True,
-        text=True,
-        check=False,
+def table_row(quantity: str, blocks: tuple[list[list[float]], list[list[float]]]) -> str:
+    """Return a line of the table from the seconds of each round, here and there."""
+    columns = []
+    tails = []
+    for rounds in blocks:
+        milliseconds = 1000 * np.concatenate(rounds)
+        median, tail = np.quantile(milliseconds, [0.5, 0.99])
+        tails.append(tail)
+        columns.append(f"{median:9.3f} {tail:9.3f} {milliseconds.max():9.3f}")
+    ratio = statistics.median(
+        statistics.median(here) / statistics.median(there)
+        for here, there in zip(*blocks, strict=True)
     )
-    if process.returncode:
-        raise SystemExit(f"The revision at {root} failed: {process.stderr[-2000:]}")
-    seconds: dict[str, float] = json.loads(process.stdout.splitlines()[-1])
-    return seconds
+    return f"{quantity:<14} {columns[0]} {columns[1]} {ratio:7.2f} {tails[0] / tails[1]:7.2f}"
 
 
 def main() -> None:
@@ -99,26 +158,27 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("revision", help="what to compare with: a commit, a tag or a branch")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--decisions", type=int, default=5000)
-    parser.add_argument("--reports", type=int, default=1000)
+    parser.add_argument("--rounds", type=int, default=20)
     arguments = parser.parse_args()
-    here = []
-    there = []
     with tempfile.TemporaryDirectory() as folder:
         check_out(arguments.revision, Path(folder))
-        for _ in range(arguments.rounds):
-            here.append(measure(REPO, arguments.decisions, arguments.reports))
-            there.append(measure(Path(folder), arguments.decisions, arguments.reports))
+        with Revision(REPO) as here, Revision(Path(folder)) as there:
+            revisions = (here, there)
+            blocks: dict[str, tuple[list[list[float]], list[list[float]]]] = {
+                "first retrain": ([here.first_retrain], [there.first_retrain])
+            }
+            for quantity in BLOCKS:
+                blocks[quantity] = ([], [])
+                for number in range(arguments.rounds):
+                    for i in (0, 1) if number % 2 else (1, 0):  # each begins in every other round
+                        blocks[quantity][i].append(revisions[i].measure(quantity))
     name = arguments.revision[:9]
-    print(f"{'milliseconds':<20} {'here':>9} {'worst':>9} {name:>9} {'worst':>9} {'ratio':>7}")
-    for quantity in here[0]:
-        ours = [1000 * seconds[quantity] for seconds in here]
-        theirs = [1000 * seconds[quantity] for seconds in there]
-        ratio = statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
-        columns = (statistics.median(ours), max(ours), statistics.median(theirs), max(theirs))
-        text = " ".join(f"{milliseconds:9.3f}" for milliseconds in columns)
-        print(f"{quantity:<20} {text} {ratio:7.2f}")
+    print(
+        f"{'milliseconds':<14} {'here':>9} {'p99':>9} {'worst':>9} {name:>9} {'p99':>9} "
+        f"{'worst':>9} {'ratio':>7} {'of p99':>7}"
+    )
+    for quantity, both in blocks.items():
+        print(table_row(quantity, both))
 
 
 if __name__ == "__main__":
