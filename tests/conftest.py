@@ -1,4 +1,6 @@
-"""Data that many tests share: small, synthetic, insertion-like; the real set where it is at hand."""
+"""Data that many tests share: small, synthetic, insertion-like; the real set where it is
+at hand.
+"""
 
 import os
 
@@ -30,7 +32,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the backgro
 SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 
-# Files that take longest come first: a long one that begins last keeps one core waiting for the other.
+# Files that take longest come first: a long one that begins last keeps one core waiting for the
+# other.
 LONG = (
     "test_docs",
     "test_null",
@@ -43,15 +46,17 @@ LONG = (
     "test_serve_process",
     "test_without_posix",
 )
-# The C++ programs are built once, by one worker; each process that uses umap-learn compiles it anew, for 25 s.
+# The C++ programs are built once, by one worker; each process that uses umap-learn compiles it
+# anew, for 25 s.
 PROGRAMS = ("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program", "test_golden")
 GROUPS = dict.fromkeys(PROGRAMS, "cpp")
 GROUPS |= dict.fromkeys(("test_estimators", "test_reducers", "test_umap"), "umap-learn")
-# `make test` leaves out what is slow: these folders, and the cases of other tests that have these names.
+# `make test` leaves out what is slow: these folders, and the cases of other tests that have these
+# names.
 SLOW = REPO / "tests" / "slow"
 SLOW_CASES = ("umap-learn", "postgres", "minirocket")
-# What is slow and yet run before each merge: tests that start many processes, a browser or a compiler.
-# Single tests are marked where they stand.
+# What is slow and yet run before each merge: tests that start many processes, a browser or a
+# compiler. Single tests are marked where they stand.
 MERGE = (
     "test_without_posix",
     "test_serve_process",
@@ -85,7 +90,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_node_collection_finished(node, ids: list[str]) -> None:
-    """End where the groups are not in force: files would be split, and two workers build the same programs at once."""
+    """End where the groups are not in force: files would be split, and two workers build the same
+    programs at once.
+    """
     if node.config.getoption("dist") == "loadgroup" and not all("@" in name for name in ids):
         pytest.exit(
             "these versions of pytest and pytest-xdist do not keep groups of tests together",
@@ -102,7 +109,9 @@ def insertion_like(
     failures: float = 0.2,
     noise: float = 0.5,
 ) -> Dataset:
-    """n traces as `toy_traces` has them: a failure that met the rim early stays on a plateau (newtons)."""
+    """n traces as `toy_traces` has them: a failure that met the rim early stays on a plateau
+    (newtons).
+    """
     X, y = toy_traces(n, samples, channels, seed, failures, noise)
     return Dataset(X[:, 0] if channels == 1 else X, y.astype("int8"), name="insertion-like")
 

@@ -1,4 +1,6 @@
-"""Baselines in the same loop: what each promises to the engine, and what its method says by hand."""
+"""Baselines in the same loop: what each promises to the engine, and what its method says
+by hand.
+"""
 
 import copy
 import subprocess
@@ -144,7 +146,8 @@ def test_neighbours_decide_only_where_all_k_agree() -> None:
 
 
 def test_a_narrow_kernel_counts_a_label_at_the_very_place_twice(traces: Any) -> None:
-    # The published effective sample size in two dimensions is 2 sum w: Wilson's interval of twice the counts.
+    # The published effective sample size in two dimensions is 2 sum w: Wilson's interval of twice
+    # the counts.
     X, y = traces
     baseline = new("wskde", bandwidth=1e-5).fit(X[:120], y[:120])
     good = X[:120][y[:120] == 1][:1]

@@ -1,4 +1,6 @@
-"""One contract over every entry of `REDUCERS`, and over reducers that come from outside: whoever joins keeps it."""
+"""One contract over every entry of `REDUCERS`, and over reducers that come from outside: whoever
+joins keeps it.
+"""
 
 from contextlib import closing
 from pathlib import Path

@@ -1,4 +1,6 @@
-"""One contract over every store: in memory, SQLite in a file, PostgreSQL where DENGINE_TEST_POSTGRES names one."""
+"""One contract over every store: in memory, SQLite in a file, PostgreSQL where
+DENGINE_TEST_POSTGRES names one.
+"""
 
 import hashlib
 import sqlite3

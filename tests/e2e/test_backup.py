@@ -1,4 +1,6 @@
-"""`dengine backup`: a copy that holds what the store and its journals hold, and a plain copy that is not taken for one."""
+"""`dengine backup`: a copy that holds what the store and its journals hold, and a plain copy that
+is not taken for one.
+"""
 
 import itertools
 import shutil
@@ -23,7 +25,9 @@ IN_STORE, IN_JOURNAL = 40, 25  # parts
 
 @pytest.fixture
 def in_use(tmp_path: Path, data: Dataset) -> Iterator[DataEngine]:
-    """An engine whose newest labels are in its journal alone: another process holds the database."""
+    """An engine whose newest labels are in its journal alone: another process holds the
+    database.
+    """
     with DataEngine("pca", retrain_every=1000, store=str(tmp_path / "engine.db")) as engine:
         learn(engine, data, range(IN_STORE))
         engine.store.flush()

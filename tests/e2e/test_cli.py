@@ -104,7 +104,9 @@ def example_of(verb: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What examples name: a trained engine.db of the bundled set, and cell.csv, a journal of two of its traces."""
+    """What examples name: a trained engine.db of the bundled set, and cell.csv, a journal of two of
+    its traces.
+    """
     folder = tmp_path_factory.mktemp("examples")
     succeed("train", "--data", "insertion", "--store", folder / "engine.db", "--reducer", "pca")
     traces = load_dataset("insertion")

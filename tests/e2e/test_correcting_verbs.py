@@ -1,4 +1,7 @@
-"""The verbs that put things right: correct, forget, rollback, policy, retrain. Real commands on a small store."""
+"""The verbs that put things right: correct, forget, rollback, policy, retrain.
+
+Real commands on a small store.
+"""
 
 import getpass
 import shutil

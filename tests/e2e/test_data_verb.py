@@ -25,7 +25,9 @@ from training.make_recordings import write_plants, write_recordings
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """80 recordings as UR cells make them, three of them broken; beside them those of five plants."""
+    """80 recordings as UR cells make them, three of them broken; beside them those of
+    five plants.
+    """
     path = tmp_path_factory.mktemp("recordings") / "cell_3"
     write_recordings(path, 80, 3, 0)
     write_plants(path.parent, 60, 0)
@@ -108,7 +110,9 @@ def test_each_plants_recordings_are_replayed_by_one_command_or_as_the_errors_say
 
 
 def as_advised(*asked: str) -> tuple[Result, dict[str, str]]:
-    """What a command comes to where one types what its errors say, one by one; and what that was."""
+    """What a command comes to where one types what its errors say, one by one; and what
+    that was.
+    """
     answer = dict[str, str]()
     while (done := dengine(*asked, *(word for pair in answer.items() for word in pair))).exit_code:
         advice = re.findall(r"(--[a-z-]+) ('[^']*'|\S+?)(?=[.,;]?(?:\s|$))", done.stderr)
@@ -271,7 +275,9 @@ def test_words_are_told_apart_by_the_map_that_the_error_says(
 
 
 def file_each(folder: Path, data: Dataset, name: str, **columns: Callable[[int], Any]) -> None:
-    """A file an insertion. name : with i, y, ok, own and k, a number of an attempt, in it.  columns : by label."""
+    """A file an insertion. name : with i, y, ok, own and k, a number of an attempt, in it.  columns
+    : by label.
+    """
     for i, (x, y) in enumerate(zip(data.X, data.y.tolist(), strict=True)):
         path = folder / name.format(
             i=i, y=y, ok="OK" if y else "NOK", own="heil" if y else "Riss", k=i // 3 % 2

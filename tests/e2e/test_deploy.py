@@ -1,4 +1,7 @@
-"""The container file and the service: every file, option and name in them is there. No image is built and none is run."""
+"""The container file and the service: every file, option and name in them is there.
+
+No image is built and none is run.
+"""
 
 import json
 import re
@@ -49,7 +52,9 @@ def settings(name: str) -> list[str]:
 
 
 def parse(words: list[str]) -> click.Context:
-    """`dengine serve ...` as the command line reads it; UsageError for an option that does not exist."""
+    """`dengine serve ...` as the command line reads it; UsageError for an option that does not
+    exist.
+    """
     with click.Context(main, **main.context_settings) as parent:
         return main.commands[words[0]].make_context(words[0], list(words[1:]), parent=parent)
 

@@ -1,8 +1,9 @@
-"""Every command and snippet of the README and of the site runs, page by page, as a newcomer would type it; only smaller.
+"""Every command and snippet of the README and of the site runs, page by page, as a newcomer would
+type it; only smaller.
 
-Each page has a desk, stores and folders of its own, and runs from top to bottom. A long command gets options
-behind its own, of which the last counts. `make test` runs two pages, `make test-merge` README and two others in one
-folder, `make test-all` every one.
+Each page has a desk, stores and folders of its own, and runs from top to bottom. A long command
+gets options behind its own, of which the last counts. `make test` runs two pages, `make test-merge`
+README and two others in one folder, `make test-all` every one.
 """
 
 import json
@@ -104,7 +105,9 @@ def name(page: Path) -> str:
 
 @pytest.fixture
 def desk(tmp_path: Path) -> Path:
-    """A folder that looks like a clone to whoever types in it, and keeps what the commands write."""
+    """A folder that looks like a clone to whoever types in it, and keeps what the
+    commands write.
+    """
     for folder in ("training", "tests", "models", "notebooks"):
         (tmp_path / folder).symlink_to(REPO / folder)
     X, y = recordings()
@@ -151,7 +154,9 @@ def shell(command: str, desk: Path) -> None:
 
 
 def python(words: list[str], desk: Path) -> None:
-    """Run a script or `dengine` in a fork of a process that has imported torch already: eighty would wait for it."""
+    """Run a script or `dengine` in a fork of a process that has imported torch already: eighty
+    would wait for it.
+    """
     text, typed = desk / "said.txt", REPO / "tests" / "support" / "typed.py"
     given = {"WHERE": str(desk), "ARGV": words, "SAID": str(text)}
     process = FORKS.Process(

@@ -1,4 +1,6 @@
-"""The exported file decides as the engine does, goes on learning honestly, and is refused where it must not be used."""
+"""The exported file decides as the engine does, goes on learning honestly, and is refused where it
+must not be used.
+"""
 
 import hashlib
 import json
@@ -93,7 +95,9 @@ def test_the_file_decides_exactly_as_the_engine(
 def a_stream(
     make_data: Callable[..., Dataset], n: int, seed: int
 ) -> Iterator[tuple[np.ndarray, bool, str | int | None]]:
-    """Traces, labels and parts' numbers: parts that come again, bad traces, novel ones, and a world that changes."""
+    """Traces, labels and parts' numbers: parts that come again, bad traces, novel ones, and a world
+    that changes.
+    """
     rng, data = np.random.default_rng(seed), make_data(n, SAMPLES, seed=seed, noise=3.0)
     for i, (x, y) in enumerate(zip(data.X.copy(), data.y, strict=True)):
         part = (None, f"P{i}", i)[i % 3]

@@ -1,4 +1,6 @@
-"""`dengine history`, `explain` and `status`: what they print, of a store that has seen a little of everything."""
+"""`dengine history`, `explain` and `status`: what they print, of a store that has seen a little of
+everything.
+"""
 
 import re
 from dataclasses import replace
@@ -18,7 +20,9 @@ from tests.support.driving import RECIPE, drive, easy_parts
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """700 parts; from the 301st to the 400th the sensor is hit by a wave, which puts the engine into safe mode."""
+    """700 parts; from the 301st to the 400th the sensor is hit by a wave, which puts the engine
+    into safe mode.
+    """
     data = easy_parts(700, 1, wave=slice(300, 400))
     data.X[650, 3] = np.nan
     data.y[np.random.default_rng(2).random(700) < 0.02] ^= 1

@@ -1,4 +1,6 @@
-"""Malformed files: recipes, archives, tables, settings; each an error of ours, and nothing large is unpacked."""
+"""Malformed files: recipes, archives, tables, settings; each an error of ours, and nothing large is
+unpacked.
+"""
 
 import io
 import sqlite3
@@ -115,7 +117,9 @@ def npy(values: np.ndarray) -> bytes:
 
 
 def with_field(local: int, central: int, value: int) -> bytes:
-    """An archive whose members' heads say something else at a place: their flags, or how they are packed."""
+    """An archive whose members' heads say something else at a place: their flags, or how they are
+    packed.
+    """
     content = bytearray(npz(X=np.zeros((3, 9)), y=np.ones(3)))
     for magic, place in ((b"PK\x03\x04", local), (b"PK\x01\x02", central)):
         at = content.find(magic)

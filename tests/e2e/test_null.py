@@ -1,4 +1,5 @@
-"""The null test, which stays for ever: labels that are independent of the trace yield next to nothing certain.
+"""The null test, which stays for ever: labels that are independent of the trace yield next to
+nothing certain.
 
 Beside it a deliberately dishonest configuration, which the same test catches.
 """
@@ -29,7 +30,9 @@ BY_CHANCE = (
 
 
 def noise_labels(make_data, seed: int) -> Dataset:
-    """Traces of two shapes, as real ones; labels, 80 % successes, that have nothing to do with them."""
+    """Traces of two shapes, as real ones; labels, 80 % successes, that have nothing to do with
+    them.
+    """
     data = make_data(CYCLES, samples=100, seed=seed, noise=2.0)
     labels = np.random.default_rng(seed + 10_000).random(CYCLES) < 0.8
     return Dataset(data.X, labels.astype(np.int8), name="noise labels")

@@ -1,4 +1,6 @@
-"""The ONNX twin decides as the model does, says what it cannot carry, and is refused where it must not be used."""
+"""The ONNX twin decides as the model does, says what it cannot carry, and is refused where it must
+not be used.
+"""
 
 import hashlib
 from collections.abc import Callable

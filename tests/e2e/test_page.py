@@ -88,7 +88,9 @@ def browser() -> Iterator[Browser]:
 
 @contextmanager
 def looking(browser: Browser, **options: Any) -> Iterator[Page]:
-    """A page of its own, which opens no dialog, for strange numbers stay text, and asks nobody but its own server."""
+    """A page of its own, which opens no dialog, for strange numbers stay text, and asks nobody but
+    its own server.
+    """
     context = browser.new_context(
         **{"viewport": {"width": 1280, "height": 720}, "locale": "en-GB"} | options
     )
@@ -310,7 +312,8 @@ STRANGE = "<img src=x onerror=alert(1)> 7"
 def played(service: CellService, data: Dataset, n: int = 70, broken: int | None = None) -> Decision:
     """The newest accepted one of n parts with strange numbers, up to a safe mode.
 
-    broken : from this part on accepted ones are said to have stopped the line; None: nothing is heard of accepted ones.
+    broken : from this part on accepted ones are said to have stopped the line; None: nothing is
+    heard of accepted ones.
     """
 
     async def cell() -> Decision:
@@ -363,7 +366,9 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
 
 
 def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
-    """A part that came back is found by its number, reported, and looked at; the cell verifies all for a while."""
+    """A part that came back is found by its number, reported, and looked at; the cell verifies all
+    for a while.
+    """
     opened(page, demo, "history")
     expect(page.locator("#history tbody tr")).to_have_count(50)
     page.get_by_role("link", name="Older").click()
@@ -500,7 +505,9 @@ def test_each_channel_is_drawn_in_its_own_unit_and_is_no_force_for_being_drawn(
 
 
 def must_be_above_the_fold(page: Page) -> None:
-    """Of a screen of 1280 x 720, as the fixture has it: every figure is seen whole without scrolling."""
+    """Of a screen of 1280 x 720, as the fixture has it: every figure is seen whole without
+    scrolling.
+    """
     boxes = [
         page.locator(f"#{name}").bounding_box()
         for name in ("verified", "accepted", "bad", "pace", "saved")

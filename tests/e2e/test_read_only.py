@@ -1,4 +1,6 @@
-"""A store in a folder, or a file, that cannot be written is read; who would write to it is refused."""
+"""A store in a folder, or a file, that cannot be written is read; who would write to it
+is refused.
+"""
 
 import json
 import os
@@ -24,14 +26,16 @@ AS_A_USER = [
     "--inh-caps=-all",
     "--ambient-caps=-all",
 ]
-# What is there: all that a closed store leaves, what a killed process leaves, and that without its index of the log.
+# What is there: all that a closed store leaves, what a killed process leaves, and that without its
+# index of the log.
 LEFT = {"closed": ("",), "killed": ("", "-wal", "-shm"), "copied with its log": ("", "-wal")}
 LOCKED = {"a folder": (0o555, 0o644), "a file": (0o755, 0o444), "both": (0o555, 0o444)}
 CASES = [(left, locked) for left in LEFT for locked in LOCKED]
 CASE_NAMES = [f"{locked} of what was {left}" for left, locked in CASES]
 
 
-# Writes an event to each store; prints a line that says why this is refused, or how many there are then.
+# Writes an event to each store; prints a line that says why this is refused, or how many there are
+# then.
 WRITE = """
 import sys
 from dengine.errors import StoreError

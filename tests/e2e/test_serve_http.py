@@ -1,4 +1,6 @@
-"""The server over HTTP, by a real uvicorn and a real client: what it takes, what it refuses, what it remembers."""
+"""The server over HTTP, by a real uvicorn and a real client: what it takes, what it refuses, what
+it remembers.
+"""
 
 import asyncio
 import json
@@ -88,7 +90,9 @@ def validate(value: Any, schema: str, client: Client) -> None:
 
 
 def must_be_problem(answer: Any, status: int) -> dict[str, Any]:
-    """A problem as RFC 9457 has it, with what the cell does all the same, and nothing of the server's inside."""
+    """A problem as RFC 9457 has it, with what the cell does all the same, and nothing of the
+    server's inside.
+    """
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == PROBLEM
     text: dict[str, Any] = answer.json()
@@ -284,7 +288,8 @@ def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another
             pages += [decision["id"] for decision in page["decisions"]]
             older = page["older"]
         assert len(pages) == len(set(pages)) == client.get("/status").json()["ever"]["decisions"]
-        # An accepted part that comes back is reported by its number; one with several decisions needs the id.
+        # An accepted part that comes back is reported by its number; one with several decisions
+        # needs the id.
         problem = must_be_problem(
             client.post("/report", json={"part": "F0", "success": False}), 409
         )

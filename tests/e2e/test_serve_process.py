@@ -61,7 +61,9 @@ def is_alive(pid: int) -> bool:
 
 @dataclass
 class Robots:
-    """Several that ask and report until the server is gone; what they were answered, and which labels were acknowledged."""
+    """Several that ask and report until the server is gone; what they were answered, and which
+    labels were acknowledged.
+    """
 
     ask: Callable[[str, Any], dict[str, Any]]
     parts: Dataset
@@ -168,7 +170,9 @@ class Insertions:
 
 
 def inserted(robot: Any, program: Insertions, trace: np.ndarray) -> dict[str, Any]:
-    """The answer to what was recorded of an insertion; another one where the recording came too late, on a busy machine."""
+    """The answer to what was recorded of an insertion; another one where the recording came too
+    late, on a busy machine.
+    """
 
     def decided() -> dict[str, Any] | None:
         part = robot.begin()

@@ -1,4 +1,6 @@
-"""A Universal Robots controller: its protocol, its force recorded sample for sample, a cell of orders; over real TCP."""
+"""A Universal Robots controller: its protocol, its force recorded sample for sample, a cell of
+orders; over real TCP.
+"""
 
 import socket
 import struct
@@ -325,7 +327,9 @@ def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_
 def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its_number(
     parts: Dataset,
 ) -> None:
-    """The first owner goes while its order is carried out; what the next one orders has the next number."""
+    """The first owner goes while its order is carried out; what the next one orders has the next
+    number.
+    """
     program = RobotProgram(parts, approach=4000)
     with FakeController(program, speed=20.0) as fake:
         with cell_of(fake) as first:

@@ -1,7 +1,8 @@
-"""The robot's program that asks over XML-RPC: its calls are there, and a robot of paper plays it in Python.
+"""The robot's program that asks over XML-RPC: its calls are there, and a robot of paper plays it in
+Python.
 
-URScript reads nearly as Python: the program is turned into it line by line, and run against a real server. What only a real
-controller shows is listed in docs/howto/plc_and_robot.md.
+URScript reads nearly as Python: the program is turned into it line by line, and run against a real
+server. What only a real controller shows is listed in docs/howto/plc_and_robot.md.
 """
 
 import re
@@ -76,7 +77,9 @@ def test_remote_calls_are_made_in_threads_alone() -> None:
 
 
 def as_python(code: list[str]) -> str:
-    """The program as Python: the outermost function is the module, and every function may set its globals."""
+    """The program as Python: the outermost function is the module, and every function may set its
+    globals.
+    """
     names = sorted({*re.findall(r"global (\w+)", "\n".join(code))})
     lines = []
     for line in code[next(i for i, line in enumerate(code) if line.startswith("def ")) + 1 :]:
@@ -116,7 +119,9 @@ class EndOfShiftError(Exception):
 
 
 class Robot:
-    """A robot of paper: its bin is a data set, its height check knows the labels; what it did with each part is noted."""
+    """A robot of paper: its bin is a data set, its height check knows the labels; what it did with
+    each part is noted.
+    """
 
     def __init__(
         self, data: Dataset, parts: int, cell: SimpleNamespace, patience: float = 600.0

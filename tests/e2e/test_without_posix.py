@@ -1,6 +1,8 @@
-"""Nobody runs Windows here: what it lacks is hidden from dengine's modules, which do their work without.
+"""Nobody runs Windows here: what it lacks is hidden from dengine's modules, which do their work
+without.
 
-`tests/support/without_posix` says what is hidden; there is a lock as Windows has it, or none of Python's own.
+`tests/support/without_posix` says what is hidden; there is a lock as Windows has it, or none of
+Python's own.
 """
 
 import json

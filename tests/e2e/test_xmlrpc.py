@@ -1,4 +1,6 @@
-"""XML-RPC over a real server: what a robot's program calls, and what it is told when something is wrong."""
+"""XML-RPC over a real server: what a robot's program calls, and what it is told when something is
+wrong.
+"""
 
 import asyncio
 import http.client

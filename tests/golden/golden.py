@@ -1,13 +1,14 @@
 """Decisions that must never change by accident: made once, kept, and played again by the test.
 
-Most are of `rocket`, whose training is convex: its decisions are the same on every machine but for a few. A network that
-is trained by gradient carries the last digit of a float from step to step, so `conv` has no golden decisions.
+Most are of `rocket`, whose training is convex: its decisions are the same on every machine but for
+a few. A network that is trained by gradient carries the last digit of a float from step to step, so
+`conv` has no golden decisions.
 
     OMP_NUM_THREADS=1 python tests/golden/golden.py tests/golden/default    # makes them anew; only where that is meant
 
-Novelty is on, as nobody who names no recipe turns it off. Everything here goes through names that `dengine` itself
-exports, so that the same lines run before and after. Only decisions are kept, no store and no exported file: their forms
-may change, what they answer may not.
+Novelty is on, as nobody who names no recipe turns it off. Everything here goes through names that
+`dengine` itself exports, so that the same lines run before and after. Only decisions are kept, no
+store and no exported file: their forms may change, what they answer may not.
 """
 
 import json
@@ -63,7 +64,9 @@ def plain(seed: int) -> Dataset:
 
 
 def numbered(seed: int) -> Dataset:
-    """The same with part numbers: some parts come again, some traces are novel, one is not finite, one is constant."""
+    """The same with part numbers: some parts come again, some traces are novel, one is not finite,
+    one is constant.
+    """
     rng, data = np.random.default_rng(seed), plain(seed)
     origin = np.arange(len(data))
     for i in np.flatnonzero(rng.random(len(data)) < 0.2)[1:]:
@@ -75,7 +78,9 @@ def numbered(seed: int) -> Dataset:
 
 
 def turned(seed: int, begin: int = 150) -> Dataset:
-    """The same in a world that becomes another one: most labels are the other way round from a part on."""
+    """The same in a world that becomes another one: most labels are the other way round from a part
+    on.
+    """
     data = numbered(seed)
     other = (np.arange(len(data)) >= begin) & (np.random.default_rng(seed).random(len(data)) < 0.9)
     return replace(data, y=data.y ^ other)
@@ -150,7 +155,9 @@ class Story:
 
 
 class Late(Story):
-    """A program that asks and reports by itself: labels come late, and people retrain before the last parts."""
+    """A program that asks and reports by itself: labels come late, and people retrain before the
+    last parts.
+    """
 
     def play(self, folder: Path) -> Arrays:
         data, decisions, retrains = (
@@ -175,7 +182,9 @@ class Late(Story):
 
 @dataclass(frozen=True)
 class Replayed:
-    """One `replay` of the bundled set, with whole traces.  changes : of the recipe's fields.  options : of `replay`."""
+    """One `replay` of the bundled set, with whole traces.  changes : of the recipe's fields.
+    options : of `replay`.
+    """
 
     name: str
     seed: int
@@ -200,7 +209,9 @@ class Exported(Story):
             return export_torchscript(engine, folder / "model.ts")
 
     def told(self) -> tuple[Dataset, list[str]]:
-        """The parts after the engine's, and what is heard of each: 1, 0, or nothing, which is most of the good ones."""
+        """The parts after the engine's, and what is heard of each: 1, 0, or nothing, which is most
+        of the good ones.
+        """
         data = self.parts(self.seed)
         rest = Dataset(data.X[CYCLES:], data.y[CYCLES:], part=data.part[CYCLES:])
         heard = np.random.default_rng(self.seed).random(len(rest)) < np.where(rest.y == 1, 0.4, 1.0)

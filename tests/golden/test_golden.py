@@ -1,4 +1,6 @@
-"""Engines and exported files decide as they did before the modules were moved and merged, bit for bit."""
+"""Engines and exported files decide as they did before the modules were moved and merged, bit for
+bit.
+"""
 
 import json
 import sys
@@ -22,7 +24,8 @@ from golden import (
 )  # the very lines that made what is kept
 
 KEPT = GOLDEN / "default"
-# Another processor or another NumPy may add in another order: one decision that differs moves the retrains after it.
+# Another processor or another NumPy may add in another order: one decision that differs moves the
+# retrains after it.
 SAME_MACHINE = json.loads((KEPT / "machine.json").read_text(encoding="utf-8")) == machine()
 MOVED = 0.03  # share of decisions that another machine may take otherwise
 EXPORTED = [name for name, story in STORIES.items() if isinstance(story, Exported)]

@@ -1,4 +1,6 @@
-"""Every public estimator keeps scikit-learn's habits: its own checks, and what they do not ask of traces."""
+"""Every public estimator keeps scikit-learn's habits: its own checks, and what they do not ask of
+traces.
+"""
 
 from typing import Any
 
@@ -38,7 +40,8 @@ ESTIMATORS = (
     CrossFitted(NeighborhoodComponentsAnalysis(n_components=2, max_iter=20, random_state=0), 2),
 )
 
-# Each row alone would mend this and break `fit_transform(X) == fit(X).transform(X)`; an engine asks for one at a time.
+# Each row alone would mend this and break `fit_transform(X) == fit(X).transform(X)`; an engine asks
+# for one at a time.
 BATCH = (
     "umap-learn lays the rows of a batch out together, so a row's place depends on those beside it."
 )
@@ -80,7 +83,9 @@ def test_scikit_learns_estimator_checks_pass(estimator: Any, check: Any) -> None
 def traces(
     n: int = 80, channels: int = 1, samples: int = 30, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, C, T) float32 ramps with noise, of two heights; y (n,): the higher ones are the successes."""
+    """(n, C, T) float32 ramps with noise, of two heights; y (n,): the higher ones are the
+    successes.
+    """
     rng = np.random.default_rng(seed)
     y = (np.arange(n) % 3 > 0).astype(np.int64)
     ramp = np.linspace(0.0, 1.0, samples) * (5.0 + 3.0 * y)[:, None, None]

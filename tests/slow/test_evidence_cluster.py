@@ -1,4 +1,6 @@
-"""`training/evidence.py --cluster`: the same rows from dask workers, through a kill of each part."""
+"""`training/evidence.py --cluster`: the same rows from dask workers, through a kill of
+each part.
+"""
 
 import os
 import signal

@@ -1,4 +1,7 @@
-"""What is PostgreSQL's alone; its contract is in test_store.py, its faults in faults/. Needs DENGINE_TEST_POSTGRES."""
+"""What is PostgreSQL's alone; its contract is in test_store.py, its faults in faults/.
+
+Needs DENGINE_TEST_POSTGRES.
+"""
 
 import os
 import uuid

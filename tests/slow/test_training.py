@@ -1,4 +1,6 @@
-"""The scripts in training/: what they say of themselves is so, and small data does not break them."""
+"""The scripts in training/: what they say of themselves is so, and small data does not
+break them.
+"""
 
 import importlib
 import json

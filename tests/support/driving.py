@@ -1,4 +1,6 @@
-"""What several tests do with an engine: a model that only counts, and a run over a stretch of a dataset's parts."""
+"""What several tests do with an engine: a model that only counts, and a run over a stretch of a
+dataset's parts.
+"""
 
 from collections.abc import Iterable
 
@@ -10,7 +12,9 @@ RECIPE = Recipe("pca", radius=0.5, policy=Policy(alpha=0.1, lower_bound=0.9), re
 
 
 class Counting:
-    """A model that verifies every part, and counts what it was trained on as successes, what joined since as failures."""
+    """A model that verifies every part, and counts what it was trained on as successes, what joined
+    since as failures.
+    """
 
     def __init__(self) -> None:
         self.fitted, self.added = 0, 0
@@ -70,7 +74,9 @@ def learn(engine: DataEngine, data: Dataset, rows: Iterable[int]) -> None:
 
 
 def easy_parts(n: int, seed: int, wave: slice = slice(0)) -> Dataset:
-    """Traces of 40 samples in two easy shapes, each of a part of its own. wave : where the sensor was hit by one."""
+    """Traces of 40 samples in two easy shapes, each of a part of its own. wave : where the sensor
+    was hit by one.
+    """
     rng = np.random.default_rng(seed)
     y = rng.random(n) < 0.6
     X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(

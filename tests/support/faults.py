@@ -4,8 +4,9 @@
     python tests/support/faults.py --only "own space" --jobs 1
     python tests/support/faults.py --tier test                  # only by the tests that `make test` runs
 
-A fault is a text that occurs once in a file, and what stands there instead. It is put into a copy of the tree, where its
-tests are run: caught, where one of them fails. Exit code 0: all were caught; 1: some were not; 2: the list is wrong.
+A fault is a text that occurs once in a file, and what stands there instead. It is put into a copy
+of the tree, where its tests are run: caught, where one of them fails. Exit code 0: all were caught;
+1: some were not; 2: the list is wrong.
 """
 
 import argparse
@@ -41,7 +42,9 @@ class ListError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault. tests : paths or node ids that must catch it.  hangs : whether to run out of time is to be caught."""
+    """One fault. tests : paths or node ids that must catch it.  hangs : whether to run out of time
+    is to be caught.
+    """
 
     name: str
     file: str
@@ -80,7 +83,9 @@ class Trial:
 
 
 def read_faults(only: Sequence[str]) -> list[Fault]:
-    """The faults of the list whose names contain one of `only`; ListError for one that fits no longer."""
+    """The faults of the list whose names contain one of `only`; ListError for one that fits no
+    longer.
+    """
     faults = [Fault(**row) for row in tomllib.loads(LIST.read_text(encoding="utf-8"))["fault"]]
     wrong = [item for fault in faults for item in fault.wrong()]
     wrong += [
@@ -105,7 +110,8 @@ def copied(folder: Path) -> Path:
         if (source := REPO / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source, folder / name)
-    # By content: a file and its fault may be of one size and one second, and one's bytecode be taken for the other's.
+    # By content: a file and its fault may be of one size and one second, and one's bytecode be
+    # taken for the other's.
     compileall.compile_dir(
         folder / "dengine", quiet=2, invalidation_mode=PycInvalidationMode.CHECKED_HASH
     )
@@ -176,7 +182,9 @@ def check_without(tests: Sequence[str], tree: Path, tier: str) -> str:
 
 
 def tests_by_file(faults: Sequence[Fault]) -> list[list[str]]:
-    """The different tests of all faults, those of one file together: they share what is made for them once."""
+    """The different tests of all faults, those of one file together: they share what is made for
+    them once.
+    """
     groups: dict[str, list[str]] = {}
     for test in dict.fromkeys(test for fault in faults for test in fault.tests):
         groups.setdefault(test.partition("::")[0], []).append(test)
@@ -186,7 +194,9 @@ def tests_by_file(faults: Sequence[Fault]) -> list[list[str]]:
 def side_by_side(
     work: Callable[[Any, Path, str], Any], items: Sequence[Any], trees: Sequence[Path], tier: str
 ) -> Iterator[Any]:
-    """Do work on each item in a tree of its own for that time; the results in the order of the items."""
+    """Do work on each item in a tree of its own for that time; the results in the order of the
+    items.
+    """
     free: SimpleQueue[Path] = SimpleQueue()
     for tree in trees:
         free.put(tree)

@@ -1,4 +1,6 @@
-"""How SQLite finds what a store asks for: the plan of every query, caught on its way to the database."""
+"""How SQLite finds what a store asks for: the plan of every query, caught on its way to the
+database.
+"""
 
 import sqlite3
 from collections.abc import Iterator
@@ -11,7 +13,9 @@ import sqlalchemy as sa
 
 @contextmanager
 def plans(database: Path) -> Iterator[list[tuple[str, list[str]]]]:
-    """Fill a list, once its block has ended, with the SELECTs that were sent in it and the steps of their plans."""
+    """Fill a list, once its block has ended, with the SELECTs that were sent in it and the steps of
+    their plans.
+    """
     sent: list[tuple[str, Any]] = []
     results: list[tuple[str, list[str]]] = []
 

@@ -36,7 +36,9 @@ class Program:
         return text.rstrip("\n") if text.endswith("\n") else ""
 
     def decide(self, x: np.ndarray, part: str | None = None) -> list[str]:
-        """The words of a decision: its id, action, reason, ...; no more than "" where the program is gone."""
+        """The words of a decision: its id, action, reason, ...; no more than "" where the program
+        is gone.
+        """
         return self.ask(asked(x, part)).split(",")
 
     def end(self) -> tuple[int, str]:
@@ -56,7 +58,9 @@ def asked(x: np.ndarray, part: str | None = None) -> str:
 
 
 def must_agree(answers: Iterable[list[str]], decisions: list[Any], accuracy: float = 1e-6) -> None:
-    """Assert that answers are these decisions, embeddings where they are told, and say how long they took."""
+    """Assert that answers are these decisions, embeddings where they are told, and say how long
+    they took.
+    """
     for i, (words, decision) in enumerate(zip(answers, decisions, strict=True)):
         assert words[1:3] == [str(decision.action), str(decision.reason)], i
         assert list(map(float, words[3:5])) == pytest.approx(

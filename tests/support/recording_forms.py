@@ -179,7 +179,8 @@ TIMES: Mapping[str, Callable[[int], str]] = {
     "00:00.008": lambda i: f"{_at(i):%M:%S}.{4 * i % 1000:03d}",
     "46082.25000009 (Excel's days)": lambda i: f"{46082.25 + STEP * i / 86400:.12f}",
 }
-# How a header says a unit, of a channel FZ in kN; `` over it stands for a row of units below the header.
+# How a header says a unit, of a channel FZ in kN; `` over it stands for a row of units below the
+# header.
 UNITS = ("FZ [kN]", "FZ (kN)", "FZ_kN", "FZ/kN", "FZ in kN", "FZ kN", "a row of units")
 
 

@@ -12,7 +12,9 @@ TIMES = ("decide_seconds", "retrains", "seconds")
 
 
 def replay_of(action: Sequence[str], truth: Sequence[Any], **values: Any) -> Replay:
-    """A replay of these actions and truths, with `known` of its other fields; a part of number i is the i-th."""
+    """A replay of these actions and truths, with `known` of its other fields; a part of number i is
+    the i-th.
+    """
     n, rng = len(action), np.random.default_rng(values.get("seed", 0))
     zeros, never = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
     evidence = {

@@ -1,4 +1,6 @@
-"""Servers for tests: a service, an application at a port of its own, `dengine serve` as it is typed, and a certificate."""
+"""Servers for tests: a service, an application at a port of its own, `dengine serve` as it is
+typed, and a certificate.
+"""
 
 import http.client
 import json
@@ -91,7 +93,9 @@ class Process:
         return document
 
     def end(self, number: int = signal.SIGTERM, group: bool = False) -> int:
-        """Send a signal, to its whole group as a terminal does where asked, and return its exit code."""
+        """Send a signal, to its whole group as a terminal does where asked, and return its exit
+        code.
+        """
         (os.killpg if group else os.kill)(self.process.pid, number)
         self.output, _ = self.process.communicate(timeout=WAIT)
         return self.process.returncode
@@ -101,7 +105,9 @@ class Process:
 def started(
     folder: Path, *words: str, wait: bool = True, python_path: str = str(REPO)
 ) -> Iterator[Process]:
-    """`dengine serve` and words, as they are typed in a folder. wait : until it says where it listens."""
+    """`dengine serve` and words, as they are typed in a folder. wait : until it says where it
+    listens.
+    """
     command = [
         sys.executable,
         "-m",

@@ -1,4 +1,5 @@
-"""One Python command of a page, in a process that has its heavy imports behind it; `test_docs.py` gives the globals.
+"""One Python command of a page, in a process that has its heavy imports behind it; `test_docs.py`
+gives the globals.
 
 WHERE : the folder that it is typed in.  ARGV : the words after `python`, or those of `dengine …`.
 SAID : the file for what it prints.
@@ -25,5 +26,6 @@ try:
         sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
         runpy.run_path(sys.argv[0], run_name="__main__")
 finally:
-    # A forked process waits for joblib's idle workers at its end, one that was started by itself sends them home.
+    # A forked process waits for joblib's idle workers at its end, one that was started by itself
+    # sends them home.
     get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)

@@ -1,4 +1,6 @@
-"""One long recording of a wrench, as ROS 2 writes it: cut into insertions, its gaps said; in files that mcap writes."""
+"""One long recording of a wrench, as ROS 2 writes it: cut into insertions, its gaps said; in files
+that mcap writes.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,7 +30,9 @@ def vector(values: np.ndarray) -> dict[str, float]:
 
 
 class Bag:
-    """Writes a recording of n insertions; what a test changes of it are the times, and which messages are left out."""
+    """Writes a recording of n insertions; what a test changes of it are the times, and which
+    messages are left out.
+    """
 
     def __init__(self, n: int = 8, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)

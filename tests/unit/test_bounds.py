@@ -1,4 +1,6 @@
-"""The four intervals: the paper's numbers, SciPy and statsmodels as oracles, and the mathematics as properties."""
+"""The four intervals: the paper's numbers, SciPy and statsmodels as oracles, and the mathematics as
+properties.
+"""
 
 import math
 

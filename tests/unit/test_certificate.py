@@ -1,4 +1,6 @@
-"""Evidence by betting, and what is certified of accepted and rejected parts: the bound, what is known, the words."""
+"""Evidence by betting, and what is certified of accepted and rejected parts: the bound, what is
+known, the words.
+"""
 
 import math
 

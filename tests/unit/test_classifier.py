@@ -1,4 +1,6 @@
-"""The estimator: the empty ball, and one bound whoever computes it; scikit-learn's checks are in test_estimators."""
+"""The estimator: the empty ball, and one bound whoever computes it; scikit-learn's checks are in
+test_estimators.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""The first trace sets the contract of all that follow: not a bad one, not one of three samples, and not in silence."""
+"""The first trace sets the contract of all that follow: not a bad one, not one of three samples,
+and not in silence.
+"""
 
 from pathlib import Path
 

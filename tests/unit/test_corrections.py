@@ -1,4 +1,6 @@
-"""Correct, forget, roll back, another policy: what counts at once, what is kept, what opening the store again gives."""
+"""Correct, forget, roll back, another policy: what counts at once, what is kept, what opening the
+store again gives.
+"""
 
 import sqlite3
 from contextlib import closing
@@ -307,7 +309,9 @@ def test_a_late_stop_leaves_the_same_references_as_a_reopened_engine_has(data: D
 
 
 def test_a_transformer_that_is_fitted_again_is_fitted_on_what_it_saw(data: Dataset) -> None:
-    """Its labels are corrected and forgotten afterwards; its places, and its references, stay where they were."""
+    """Its labels are corrected and forgotten afterwards; its places, and its references, stay where
+    they were.
+    """
     custom = LinearDiscriminantAnalysis()
     engine = DataEngine(custom, RECIPE.policy, retrain_every=40, replaying=True)
     cycles = play(engine, data, 0, 90, confirm=True)

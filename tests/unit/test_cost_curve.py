@@ -1,4 +1,6 @@
-"""What a part costs under each policy: sums by hand, the choice, what it says, its picture and its verb."""
+"""What a part costs under each policy: sums by hand, the choice, what it says, its picture and its
+verb.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -43,7 +45,9 @@ def played(
 def curve(
     lax: Sequence[tuple[int, int]], strict: Sequence[tuple[int, int]] = ((100, 0),) * 4
 ) -> CostCurve:
-    """Of two policies; for each shuffle of 100 parts, how many were verified, and how many of the others were bad."""
+    """Of two policies; for each shuffle of 100 parts, how many were verified, and how many of the
+    others were bad.
+    """
     replays = [
         played(policy, seed, verified, 100 - verified, bad)
         for policy, item in ((LAX, lax), (STRICT, strict))

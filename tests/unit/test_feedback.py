@@ -1,4 +1,6 @@
-"""What becomes of parts: silence, confirmation, late stops, safe mode, parts that come twice, the certificate."""
+"""What becomes of parts: silence, confirmation, late stops, safe mode, parts that come twice, the
+certificate.
+"""
 
 import shutil
 import sqlite3
@@ -63,7 +65,9 @@ def spoiled(stream: Dataset) -> Dataset:
 
 
 def beyond(engine: DataEngine) -> list[int]:
-    """Members of LB's own level that the rule counts beyond those of which the store has labels, and the bad ones."""
+    """Members of LB's own level that the rule counts beyond those of which the store has labels,
+    and the bad ones.
+    """
     records = engine.store.outcomes_since(0)
     n, bad = engine.model.rule.evidence.level_counts_since_alarm[0, 0].sum(0).tolist()
     reached = [item.success for item in records if item.lower >= 0.9]
@@ -223,9 +227,11 @@ def learned(engine: DataEngine, probes: np.ndarray) -> tuple:
 
 
 class RandomHistory:
-    """A cell whose checks come late or never, whose people correct, and which is opened again now and then.
+    """A cell whose checks come late or never, whose people correct, and which is opened again now
+    and then.
 
-    compared : how often a copy of its store was opened while checks were overdue, and was as the engine that ran.
+    compared : how often a copy of its store was opened while checks were overdue, and was as the
+    engine that ran.
     """
 
     def __init__(self, policy: Policy, folder: Path, probes: np.ndarray, seed: int) -> None:

@@ -1,4 +1,6 @@
-"""Cells of one product in one database: what they share, what stays their own, and what is never mixed."""
+"""Cells of one product in one database: what they share, what stays their own, and what is never
+mixed.
+"""
 
 import uuid
 from collections.abc import Callable, Iterator
@@ -33,7 +35,9 @@ POOLED = RECIPE.with_policy(guarantee="pooled", stops="all", lower_bound=0.7)
 
 
 def ticks() -> Callable[[], float]:
-    """A clock that goes on by two seconds whenever it is asked, so that it is always time for news."""
+    """A clock that goes on by two seconds whenever it is asked, so that it is always time
+    for news.
+    """
     return count(2.0, 2.0).__next__
 
 

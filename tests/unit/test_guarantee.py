@@ -50,7 +50,8 @@ def test_a_level_opens_with_the_part_that_makes_the_evidence_enough(
     assert rule.action(lower_bound, 1.0) == VERIFY
     tell(rule, lower_bound, True)
     assert rule.action(lower_bound, 1.0) == ACCEPT
-    # Each is a member of all looser levels too, so the loosest holds as well: what looks worse was never seen to fail.
+    # Each is a member of all looser levels too, so the loosest holds as well: what looks worse was
+    # never seen to fail.
     assert rule.action(LOWEST_LEVEL + 0.05, 1.0) == ACCEPT
 
 
@@ -112,7 +113,9 @@ def test_a_pooled_guarantee_of_which_nobody_hears_is_refused() -> None:
 
 
 def adversary(rule: PooledRule, rng: np.random.Generator, tolerance: float) -> bool:
-    """Whether anything ever passes, where every part is beyond the tolerance: who sees the levels tries one by one."""
+    """Whether anything ever passes, where every part is beyond the tolerance: who sees the levels
+    tries one by one.
+    """
     for level in reversed(rule.evidence.levels[0]):
         for _ in range(60):
             rule.update(level, 1.0, bool(rng.random() >= 1.02 * tolerance))
@@ -275,7 +278,8 @@ def test_silence_is_no_success_for_a_level_and_no_failure_for_the_watch() -> Non
     torch.testing.assert_close(
         silent.evidence.detector_sums[0], answer.evidence.detector_sums[0]
     )  # fifty at once, or one by one
-    # Every twentieth accepted part stops the system: within the tolerance, though no success is ever heard of.
+    # Every twentieth accepted part stops the system: within the tolerance, though no success is
+    # ever heard of.
     watched = WatchedRule(0.1, 0.9)
     for _ in range(30):
         watched.observe(19, False)

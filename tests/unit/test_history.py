@@ -33,7 +33,9 @@ N = 60
 
 @pytest.fixture
 def store(store: SqlStore) -> SqlStore:
-    """60 decisions of all kinds, three of each moment; half of them labelled; a retrain after each tenth; two events."""
+    """60 decisions of all kinds, three of each moment; half of them labelled; a retrain after each
+    tenth; two events.
+    """
     seconds = count(1000)
     store.clock = lambda: float(next(seconds) // 3)
     rng = np.random.default_rng(0)

@@ -40,7 +40,9 @@ def test_the_package_keeps_its_size_in_syntax_nodes() -> None:
 
 
 def names(module: str) -> dict[str, str]:
-    """The classes of a module and what it imports from ours, each with the module that it comes from."""
+    """The classes of a module and what it imports from ours, each with the module that it comes
+    from.
+    """
     sources = {
         node.name: f"{module}.{node.name}"
         for node in MODULES[module].body
@@ -105,7 +107,8 @@ def test_the_engine_keeps_a_public_face_of_at_most_25_members() -> None:
 
 
 def test_no_module_is_imported_by_a_string() -> None:
-    # The one table of names by string is `dengine/__init__.pyi`; a user's own `module:Class` is imported by `import_class`.
+    # The one table of names by string is `dengine/__init__.pyi`; a user's own `module:Class` is
+    # imported by `import_class`.
     strings = {
         f"{node.value} ({module}, line {node.lineno})"
         for module, tree in MODULES.items()

@@ -1,4 +1,6 @@
-"""A version that was trained beside the cell comes in by steps: none of them waits for the store or for many labels."""
+"""A version that was trained beside the cell comes in by steps: none of them waits for the store or
+for many labels.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -38,7 +40,9 @@ class Held(ThreadPoolExecutor):
 
 @pytest.fixture
 def engine(data: Dataset) -> DataEngine:
-    """Forty labels set a retrain off beside it, sixteen came in meanwhile, and it has ended; nobody has looked yet."""
+    """Forty labels set a retrain off beside it, sixteen came in meanwhile, and it has ended; nobody
+    has looked yet.
+    """
     pool = Held()
     engine = DataEngine(model=Slow(), recipe=RECIPE, executor=pool, clock=lambda: Slow.now)
     learn(engine, data, range(56))

@@ -33,7 +33,9 @@ def store(data: Dataset, tmp_path: Path) -> str:
 
 
 def write_lines(path: Path, X: np.ndarray, lines: list[str]) -> Path:
-    """A journal: `part` lines without their samples, of one trace after the other, and `label` lines."""
+    """A journal: `part` lines without their samples, of one trace after the other, and `label`
+    lines.
+    """
     traces = iter(X.reshape(len(X), -1))
     whole = [
         f"{line},{','.join(f'{v:.9g}' for v in next(traces))}"

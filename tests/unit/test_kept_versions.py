@@ -1,4 +1,6 @@
-"""Versions that keep their states: which they are, how one is loaded, and what becomes of a damaged one."""
+"""Versions that keep their states: which they are, how one is loaded, and what becomes of a damaged
+one.
+"""
 
 from pathlib import Path
 
@@ -144,7 +146,9 @@ def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_no
 def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damaged(
     data: Dataset, tmp_path: Path
 ) -> None:
-    """Fitted on the others, its references would lie elsewhere: the engine verifies, and learns anew."""
+    """Fitted on the others, its references would lie elsewhere: the engine verifies, and learns
+    anew.
+    """
     file = tmp_path / "engine.db"
     baseline = AgreeingNeighbours(Policy(0.1, 0.9))
     with DataEngine(model=baseline, store=file, retrain_every=40) as engine:

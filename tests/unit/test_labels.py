@@ -1,4 +1,6 @@
-"""What a report may say: a label that is one, an id that is one; anything else is refused before it is stored."""
+"""What a report may say: a label that is one, an id that is one; anything else is refused before it
+is stored.
+"""
 
 import re
 from fractions import Fraction

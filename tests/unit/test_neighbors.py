@@ -16,7 +16,9 @@ def points(n: int, d: int = 2, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def distances(Z: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Squared, in float32, one dimension after the other: the arithmetic that the index promises."""
+    """Squared, in float32, one dimension after the other: the arithmetic that the index
+    promises.
+    """
     out = np.zeros(len(Z), dtype=np.float32)
     for j in range(Z.shape[1]):
         out += np.square(Z[:, j] - q[j])
@@ -107,7 +109,9 @@ def test_a_query_beyond_all_measure_has_no_neighbours_however_large_the_ball(rad
 
 
 def repeats(n_parts: int, times: int, agree: float, seed: int = 0) -> tuple[np.ndarray, ...]:
-    """Points in no order, labels 80 % good; each is its part's common draw with probability `agree`, else its own."""
+    """Points in no order, labels 80 % good; each is its part's common draw with probability
+    `agree`, else its own.
+    """
     rng = np.random.default_rng(seed)
     part = np.repeat(np.arange(1, n_parts + 1), times)
     common, custom = rng.random(n_parts) < 0.8, rng.random(n_parts * times) < 0.8
@@ -129,7 +133,8 @@ def test_agreement_is_what_it_was_planted_as_and_one_where_few_parts_came_again(
 
 @pytest.mark.parametrize(("n_parts", "n_spaces"), [(60, 3), (FEWEST_PARTS, 5)])
 def test_the_bound_lies_above_the_truth_in_nearly_all_draws(n_parts: int, n_spaces: int) -> None:
-    # Both labels of a pair are the common draw with probability agree squared: that is their correlation.
+    # Both labels of a pair are the common draw with probability agree squared: that is their
+    # correlation.
     draws = [repeats(n_parts, 4, agree=0.6, seed=seed) for seed in range(40)]
     bounds = [
         label_agreement(points, labels, part % n_spaces, part) for points, labels, _, part in draws

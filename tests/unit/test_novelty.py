@@ -1,4 +1,6 @@
-"""The novelty gate: what is like no reference is called novel, what is like one is not, and no label is asked."""
+"""The novelty gate: what is like no reference is called novel, what is like one is not, and no
+label is asked.
+"""
 
 from collections.abc import Callable
 

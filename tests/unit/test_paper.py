@@ -19,7 +19,9 @@ from dengine.experiments.paper import (
 def frame(
     interval: str = "wilson", recipe: str = "conv", retrain: float = 0.1, **cells
 ) -> pd.DataFrame:
-    """Two replays a cell: those of the paper, one a little above and one below; or what `cells` says of all."""
+    """Two replays a cell: those of the paper, one a little above and one below; or what `cells`
+    says of all.
+    """
     rows = []
     for alpha in ALPHAS:
         for bound in LOWER_BOUNDS:

@@ -1,4 +1,6 @@
-"""The model prediction: no label is counted in an embedding that saw it, and states and processes carry it unchanged."""
+"""The model prediction: no label is counted in an embedding that saw it, and states and processes
+carry it unchanged.
+"""
 
 import numpy as np
 import pytest

@@ -66,7 +66,9 @@ def test_rejects_are_a_side_of_their_own() -> None:
 
 
 def test_the_interval_covers_the_true_share_of_other_parts() -> None:
-    """Of 300 worlds of 200 parts, each shuffled into five replays that accept three in four: 95 % up to noise."""
+    """Of 300 worlds of 200 parts, each shuffled into five replays that accept three in four: 95 %
+    up to noise.
+    """
     rng, share, covered = np.random.default_rng(0), 0.1, 0
     for _ in range(300):
         truth = rng.random(200) >= share

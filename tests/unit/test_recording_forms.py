@@ -1,4 +1,6 @@
-"""Every form of a recording gives the values that were measured, or an error that says what to state."""
+"""Every form of a recording gives the values that were measured, or an error that says what to
+state.
+"""
 
 import re
 from collections.abc import Callable, Sequence

@@ -1,4 +1,6 @@
-"""Recordings as people have them: every form gives the same traces, and what cannot be read is named and alone is lost."""
+"""Recordings as people have them: every form gives the same traces, and what cannot be read is
+named and alone is lost.
+"""
 
 import re
 import tempfile

@@ -1,4 +1,6 @@
-"""The decision rule: one formula in every form it takes, and an object that is asked, told and restored."""
+"""The decision rule: one formula in every form it takes, and an object that is asked, told and
+restored.
+"""
 
 import importlib
 import linecache

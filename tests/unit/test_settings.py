@@ -1,4 +1,6 @@
-"""What is given to an engine counts, or it is an error: recipes with settings beside them, own reducers, models, stores."""
+"""What is given to an engine counts, or it is an error: recipes with settings beside them, own
+reducers, models, stores.
+"""
 
 import sys
 from collections.abc import Iterator

@@ -1,4 +1,6 @@
-"""One contract over every store: a correction is a later row, and the newest one of a decision counts."""
+"""One contract over every store: a correction is a later row, and the newest one of a decision
+counts.
+"""
 
 import uuid
 from pathlib import Path

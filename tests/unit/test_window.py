@@ -1,4 +1,6 @@
-"""The window of the newest labelled traces: what was handed out stays as it was, whatever comes in afterwards."""
+"""The window of the newest labelled traces: what was handed out stays as it was, whatever comes in
+afterwards.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""The sources are written, built and installed; a controller in C finds the package and decides as Python does."""
+"""The sources are written, built and installed; a controller in C finds the package and decides as
+Python does.
+"""
 
 import os
 import shutil

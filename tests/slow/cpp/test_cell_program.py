@@ -1,4 +1,6 @@
-"""dengine-cell answers lines: labels that come late, stops that count, nothing acknowledged lost, whatever kills it."""
+"""dengine-cell answers lines: labels that come late, stops that count, nothing acknowledged lost,
+whatever kills it.
+"""
 
 import random
 import resource
@@ -66,7 +68,9 @@ def X(make_data: Callable[..., Dataset]) -> np.ndarray:  # noqa: N802  # as ever
 def stream(
     make_data: Callable[..., Dataset], n: int
 ) -> tuple[np.ndarray, np.ndarray, list[str | None], list[list[int]]]:
-    """Traces, labels, parts, and after each trace the indices of the parts whose label comes then: late, or never."""
+    """Traces, labels, parts, and after each trace the indices of the parts whose label comes then:
+    late, or never.
+    """
     rng, data = np.random.default_rng(8), make_data(n, SAMPLES, seed=2, noise=1.5)
     X = data.X.copy()
     X[rng.random(n) < 0.04] *= 5.0

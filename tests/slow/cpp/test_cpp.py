@@ -1,4 +1,6 @@
-"""The cell program without Python decides as the engine does, learns, and refuses what it must not use."""
+"""The cell program without Python decides as the engine does, learns, and refuses what it must not
+use.
+"""
 
 import hashlib
 import hmac

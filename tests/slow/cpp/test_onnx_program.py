@@ -1,4 +1,6 @@
-"""dengine-onnx decides by files in ONNX as Python does, without libtorch, and refuses what it must not use."""
+"""dengine-onnx decides by files in ONNX as Python does, without libtorch, and refuses what it must
+not use.
+"""
 
 import os
 import shutil

@@ -1,4 +1,6 @@
-"""The documentation site: it builds without a warning, leaves nothing out, and asks nothing of the network."""
+"""The documentation site: it builds without a warning, leaves nothing out, and asks nothing of the
+network.
+"""
 
 import re
 import subprocess

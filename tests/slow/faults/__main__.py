@@ -1,14 +1,16 @@
-"""Fault by fault: what is lost, what is decided wrongly, what reaches the cell, and how long it waits.
+r"""Fault by fault: what is lost, what is decided wrongly, what reaches the cell, how long it waits.
 
     python -m tests.slow.faults --trials 3 --kills 20
     . .ci/postgres.sh
-    python -m tests.slow.faults --kills 200 --others 200 --ids 1000000 --postgres "$DENGINE_TEST_POSTGRES"
+    python -m tests.slow.faults --kills 200 --others 200 --ids 1000000 \
+        --postgres "$DENGINE_TEST_POSTGRES"
     python -m tests.slow.faults --mutations
 
---program names a built dengine-cell, whose journal is then tried too (`dengine export --cpp`). A trial of a fault plays a
-cell before, in and after it, opens the store again, and compares labels with what was acknowledged and decisions with those
-of the engine before. Exit code 1 if anything was lost, decided otherwise, or raised, or a call took over two seconds.
---mutations breaks dengine in each of `MUTATIONS`' ways in a copy of the tree, where the row that it names must fail.
+--program names a built dengine-cell, whose journal is then tried too (`dengine export --cpp`). A
+trial of a fault plays a cell before, in and after it, opens the store again, and compares labels
+with what was acknowledged and decisions with those of the engine before. Exit code 1 if anything
+was lost, decided otherwise, or raised, or a call took over two seconds. --mutations breaks dengine
+in each of `MUTATIONS`' ways in a copy of the tree, where the row that it names must fail.
 """
 
 import argparse
@@ -112,7 +114,9 @@ def faults(
 
 
 def between(program: list[str]) -> None:
-    """Begin this program again with a library between it and its disk, which hangs or fails when a file says so."""
+    """Begin this program again with a library between it and its disk, which hangs or fails when a
+    file says so.
+    """
     folder = Path(tempfile.mkdtemp(prefix="dengine-faults-"))
     source = Path(__file__).with_name("sync.c")
     subprocess.run(

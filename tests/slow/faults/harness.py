@@ -1,4 +1,6 @@
-"""A small cell under test: it notes what was acknowledged and how long it waited, and is looked at afterwards."""
+"""A small cell under test: it notes what was acknowledged and how long it waited, and is looked at
+afterwards.
+"""
 
 import time
 from collections.abc import Callable
@@ -24,10 +26,11 @@ PATIENCE = 60.0  # seconds for a store to come back
 class Outcome:
     """What became of one kind of fault.
 
-    labels : acknowledged.  lost : of these, not stored as they were acknowledged.  wrong : decisions that a reopened engine
-    makes otherwise, and faults that were not noticed.  raised : exceptions that reached the cell.  longest : wait for a
-    decision or a report that set off no retrain, in seconds.  versions : swapped in between kills.
-    told : the first of what went wrong, in words.
+    labels : acknowledged.  lost : of these, not stored as they were acknowledged.  wrong :
+    decisions that a reopened engine makes otherwise, and faults that were not noticed.  raised :
+    exceptions that reached the cell.  longest : wait for a decision or a report that set off no
+    retrain, in seconds.  versions : swapped in between kills. told : the first of what went wrong,
+    in words.
     """
 
     injected: int = 0
@@ -121,7 +124,9 @@ class Cell:
         self.outcome.must(not fault, fault)
 
     def finish(self) -> None:
-        """Close, open again, and compare: labels with what was acknowledged, decisions with those of the engine before."""
+        """Close, open again, and compare: labels with what was acknowledged, decisions with those
+        of the engine before.
+        """
         before = bounds(self.engine)
         self.engine.close()
         with DataEngine.open(self.place.store()) as again:

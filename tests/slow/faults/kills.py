@@ -1,8 +1,11 @@
-"""SIGKILL at random moments: of the cell, served or not, in an outage, of an import, an export, the C++ journal.
+"""SIGKILL at random moments: of the cell, served or not, in an outage, of an import, an export, the
+C++ journal.
 
-Then, too, what a killed cell leaves is damaged: its write-ahead log is cut, or a bit of its journal flipped.
+Then, too, what a killed cell leaves is damaged: its write-ahead log is cut, or a bit of its journal
+flipped.
 
-The children come from a server of forks that has imported everything, so that a kill costs what it kills and no start.
+The children come from a server of forks that has imported everything, so that a kill costs what it
+kills and no start.
 """
 
 import http.client
@@ -36,7 +39,8 @@ from tests.support.serving import served
 from .harness import PROBE, RECIPE, Cell, Outcome, Place, missing, stream
 from .kinds import flipped
 
-# The server of forks looks for what it loads beforehand along PYTHONPATH, not along this program's path.
+# The server of forks looks for what it loads beforehand along PYTHONPATH, not along this program's
+# path.
 HERE = str(Path(__file__).resolve().parents[3])
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (HERE, os.environ.get("PYTHONPATH"))))
 LOADED = (
@@ -70,7 +74,8 @@ def _acknowledge(path: str, *words: object) -> None:
 def cell(
     place: Place, told: str, seed: int, recipe: Recipe = SOON, locked_after: int | None = None
 ) -> None:
-    """Decide and report on and on, under ids of its own, and tell of each once it was answered and acknowledged.
+    """Decide and report on and on, under ids of its own, and tell of each once it was answered and
+    acknowledged.
 
     After each report it decides on a probe; or, `locked_after` so many parts, its store is locked.
     """
@@ -178,7 +183,9 @@ def exporting(place: Place, told: str, seed: int) -> None:
 
 
 def _at_home(surroundings: dict[str, str], child: Callable[..., None], *words: object) -> None:
-    """Run a child where its killer looks for its journal: the server of forks keeps the surroundings of its start."""
+    """Run a child where its killer looks for its journal: the server of forks keeps the
+    surroundings of its start.
+    """
     os.environ.update(surroundings)
     child(*words)
 
@@ -186,7 +193,9 @@ def _at_home(surroundings: dict[str, str], child: Callable[..., None], *words: o
 def killed(
     child: Callable[..., None], place: Place, seed: int, most: float = 0.5
 ) -> list[list[str]]:
-    """Run a child until a random moment after its first word, kill it, and return what it, and who asked it, told."""
+    """Run a child until a random moment after its first word, kill it, and return what it, and who
+    asked it, told.
+    """
     answer = f"{place.url if '://' not in place.url else f'/tmp/dengine-{os.getpid()}-{place.cell}'}.told"
     Path(answer).write_text("")
     process = CONTEXT.Process(target=_at_home, args=(dict(os.environ), child, place, answer, seed))
@@ -226,7 +235,8 @@ def flip_journal(place: Place, seed: int) -> str:
 
 
 def check_cell(outcome: Outcome, place: Place, told: list[list[str]], excuse: str = "") -> None:
-    """Every acknowledged label is there, every id has its answer; an engine to which nothing came decides as before.
+    """Every acknowledged label is there, every id has its answer; an engine to which nothing came
+    decides as before.
 
     excuse : what an event must say where labels, ids or decisions may differ.
     """
@@ -267,7 +277,8 @@ def kill_cells(
 ) -> None:
     """Kill so often; a store is killed `IN_ONE` times in a row, then there is a new one.
 
-    damage : done to what was left, of a store of its own each time; returns what is to be said of it.
+    damage : done to what was left, of a store of its own each time; returns what is to be said of
+    it.
     """
     for seed in range(times):
         custom = next_place(place, seed if damage else seed - seed % IN_ONE)
@@ -335,7 +346,9 @@ def kill_exports(outcome: Outcome, place: Place, times: int) -> None:
 
 
 def kill_programs(outcome: Outcome, place: Place, times: int, program: Path) -> None:
-    """Kill the controller's C++ program at random moments of one journal that grows; its labels are imported at the end."""
+    """Kill the controller's C++ program at random moments of one journal that grows; its labels are
+    imported at the end.
+    """
     model = exported(place)
     journal, acknowledged = Path(place.url).with_suffix(".csv"), {}
     for seed in range(times):

@@ -1,4 +1,6 @@
-"""Faults of a running cell's store, disk, server, clock and processes; and what is found changed when it is opened."""
+"""Faults of a running cell's store, disk, server, clock and processes; and what is found changed
+when it is opened.
+"""
 
 import contextlib
 import json
@@ -279,7 +281,9 @@ def _before_a_disk(outcome: Outcome, place: Place, full: bool = False) -> Cell:
 
 
 def _unsynced(cell: Cell, i: int) -> Decision:
-    """Decide and report while nothing is synced: what is not on the disk is verified, and not acknowledged."""
+    """Decide and report while nothing is synced: what is not on the disk is verified, and not
+    acknowledged.
+    """
     engine, outcome, x, good = cell.engine, cell.outcome, stream().X[i], bool(stream().y[i])
     cell.timed(lambda: engine.decide(x))
     earlier: Decision = cell.timed(lambda: engine.decide(x, decision_id=f"part-{i}"))

@@ -1,4 +1,6 @@
-"""The store fails while the cell runs: nothing is lost, nothing raises, nobody waits long, and two never own one cell."""
+"""The store fails while the cell runs: nothing is lost, nothing raises, nobody waits long, and two
+never own one cell.
+"""
 
 import contextlib
 import os
@@ -133,7 +135,9 @@ def test_an_executor_that_was_shut_down_is_replaced_by_retrains_in_line(place: P
 
 
 def left(path: Path) -> tuple[list[bytes], int, bool]:
-    """What a journal holds when it is opened again, how much of it is damaged, and whether its end was dropped."""
+    """What a journal holds when it is opened again, how much of it is damaged, and whether its end
+    was dropped.
+    """
     with contextlib.closing(Journal(path)) as again:
         return (
             [record for _, _, record in again.undrained_records()],

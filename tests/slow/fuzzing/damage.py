@@ -57,7 +57,9 @@ traces = (
 
 
 def tries(share: float = 1.0) -> Callable[[Any], Any]:
-    """How often a test is tried: DENGINE_FUZZ times its share; without it 100 times, the same ones each time."""
+    """How often a test is tried: DENGINE_FUZZ times its share; without it 100 times, the same ones
+    each time.
+    """
     n = max(5, int(share * int(ASKED or 100)))
     options: dict[str, Any] = {
         "deadline": None,

@@ -1,4 +1,6 @@
-"""Malformed inputs of every kind: each is refused by an error of dengine's own, or its part is verified."""
+"""Malformed inputs of every kind: each is refused by an error of dengine's own, or its part is
+verified.
+"""
 
 import io
 from collections.abc import Callable, Iterator

@@ -1,4 +1,6 @@
-"""Malformed requests over every interface: each is answered by what it is refused with, and nothing else changes."""
+"""Malformed requests over every interface: each is answered by what it is refused with, and nothing
+else changes.
+"""
 
 import json
 import re
@@ -235,7 +237,9 @@ class Cell:
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    """After all that was sent, what was decided before is as it was, and the same traces are decided on alike."""
+    """After all that was sent, what was decided before is as it was, and the same traces are
+    decided on alike.
+    """
     file = tmp_path_factory.mktemp("cell") / "cell.db"
     learned(file)
     with closing(CellService(lambda: DataEngine.open(file), file, deadline=60.0)) as service:

@@ -1,4 +1,6 @@
-"""The certificate's bound is ever wrong in at most alpha of the streams, wherever the true rates go."""
+"""The certificate's bound is ever wrong in at most alpha of the streams, wherever the true rates
+go.
+"""
 
 import math
 
@@ -23,7 +25,9 @@ def test_the_bound_is_ever_wrong_in_at_most_alpha_of_the_streams(
 
 
 def test_an_adversary_who_reacts_to_every_outcome_gains_nothing(proof_repeats: int) -> None:
-    """Each part's true probability depends on the past: as bad as can be once luck has made the evidence large."""
+    """Each part's true probability depends on the past: as bad as can be once luck has made the
+    evidence large.
+    """
     rng, alpha, parts, streams = np.random.default_rng(0), 0.1, 300, 100 * min(proof_repeats, 20)
     wrong = 0
     for _ in range(streams):

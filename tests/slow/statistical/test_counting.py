@@ -1,7 +1,9 @@
-"""Honest counting, and nine ways to cheat: each one is seen by the very check that the honest engine passes beside it.
+"""Honest counting, and nine ways to cheat: each one is seen by the very check that the honest
+engine passes beside it.
 
-The count-only statistic sees labels that are counted where they were learned; the blindness check, what is chosen by them,
-however little it is worth; the guarantee's replay, evidence that was taken after its label or came unasked.
+The count-only statistic sees labels that are counted where they were learned; the blindness check,
+what is chosen by them, however little it is worth; the guarantee's replay, evidence that was taken
+after its label or came unasked.
 """
 
 from collections.abc import Callable, Iterator
@@ -57,7 +59,9 @@ def peeks(*strengths: float, folds: tuple[int, ...] = (3,), reducer: str = "conv
 
 
 def worse_than_allowed(replays: int, case: Case = JUST_BEYOND) -> float:
-    """Share of replays in which accepted parts were worse than the tolerance, as where every part is."""
+    """Share of replays in which accepted parts were worse than the tolerance, as where every part
+    is.
+    """
     return (
         count_broken([judge(seed, case) for seed in range(replays)], "passed, end", 0.2) / replays
     )
@@ -71,7 +75,8 @@ def test_labels_of_noise_are_counted_as_chance_says(reducer: str, seeds: int) ->
 
 
 def test_labels_of_noise_are_counted_by_a_trained_network_as_chance_says() -> None:
-    # A network says the same of all noise: the balls of a seed hold the same labels, and z^2 varies between seeds.
+    # A network says the same of all noise: the balls of a seed hold the same labels, and z^2 varies
+    # between seeds.
     assert 0.5 <= z2("conv", 2 * SEEDS) <= HONEST[1]
 
 

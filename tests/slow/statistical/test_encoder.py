@@ -15,7 +15,9 @@ PROOF = int(os.environ.get("DENGINE_PROOF_REPEATS", "2")) >= 20
 def resonant(
     n: int, samples: int, low: float, high: float, *, channels: int = 1, seed: int = 0
 ) -> Dataset:
-    """Noise through one of two resonances a little apart, in cycles a sample; the lower one is the success."""
+    """Noise through one of two resonances a little apart, in cycles a sample; the lower one is the
+    success.
+    """
     rng = np.random.default_rng(seed)
     y = (rng.random(n) < 0.6).astype(np.int8)
     X = np.zeros((n, channels, samples), dtype=np.float32)

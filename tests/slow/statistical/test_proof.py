@@ -1,4 +1,6 @@
-"""The long proof, `make proof`, in small: planted truths, garbage, a collapse, and going on after an interruption."""
+"""The long proof, `make proof`, in small: planted truths, garbage, a collapse, and going on after
+an interruption.
+"""
 
 from pathlib import Path
 

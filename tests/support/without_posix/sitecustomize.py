@@ -1,6 +1,8 @@
-"""Hides from dengine's modules what Windows lacks, in a process and those that it starts, by PYTHONPATH.
+"""Hides from dengine's modules what Windows lacks, in a process and those that it starts, by
+PYTHONPATH.
 
-Libraries keep this system. DENGINE_TEST_MSVCRT=1: there is an `msvcrt`, whose `locking` fails as Windows' does.
+Libraries keep this system. DENGINE_TEST_MSVCRT=1: there is an `msvcrt`, whose `locking` fails as
+Windows' does.
 """
 
 import builtins
