@@ -355,11 +355,12 @@ class HttpApi:
         selection = HistoryFilter(label=label, **where)
         before_id = (await self._find(before)).decision.id if before else None
         stored = await self.service.read(
-            lambda store: _read_newest(store, selection, limit, before_id, open_)
+            lambda store: _read_newest(store, selection, limit + 1, before_id, open_)
         )
+        page = stored[:limit]
         return {
-            "decisions": [response_fields("Decision", item, trace=None) for item in stored],
-            "older": stored[-1].decision.id if len(stored) == limit else None,
+            "decisions": [response_fields("Decision", item, trace=None) for item in page],
+            "older": page[-1].decision.id if len(stored) > limit else None,
         }
 
     async def explanation(
