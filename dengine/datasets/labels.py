@@ -422,10 +422,14 @@ class LabelColumn:
 def _read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
     """Read a file and return the cells of one of its columns as texts.
 
-    Raises UnreadableError if the file or the column cannot be read.
+    Without such a column it is the value of a line outside the table, as `Result;OK`. Raises
+    UnreadableError if the file or the column cannot be read.
     """
     # Without stated columns the label needs no number format.
-    frame = read_table(path, options, as_text=not options.columns).frame
+    table = read_table(path, options, as_text=not options.columns)
+    frame = table.frame
+    if column in table.fields and column not in frame:
+        return [table.fields[column]]
     return list(map(str, frame.iloc[:, column_place(column, list(frame.columns))]))
 
 

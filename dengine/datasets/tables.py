@@ -42,6 +42,7 @@ from .encodings import decode
 from .numerals import UndecidedError
 from .text import SUFFIXES as TEXTS
 from .text import (
+    TextCells,
     TextTable,
     parse_numbers,
     read_recording,
@@ -110,16 +111,24 @@ class FolderHeads(NamedTuple):
     """What the heads of a folder's text files tell, each of which is read once.
 
     header : list of str
-        Columns of the first file.
+        Columns of the first file that has those of most, as a sample of 20 files or more tells.
     channel_choices : Counter
         The columns of a file that are no clock, with the number of files that have these.
     verdicts : dict
-        The labels in all heads for each column whose head is one verdict in each file.
+        The labels in all heads for each column or field whose head is one verdict in each file.
+    fields : list of str
+        What lines above the header of that file state, as `TextCells.fields`.
     """
 
     header: list[str]
     channel_choices: Counter[tuple[str, ...]]
     verdicts: dict[str, set[int]]
+    fields: list[str]
+
+    @property
+    def label_places(self) -> list[str]:
+        """The columns and the fields above the header, in which a label may stand."""
+        return [*self.header, *(name for name in self.fields if name not in self.header)]
 
 
 def read_heads(named: Mapping[str, Path], options: LoadOptions) -> FolderHeads:
@@ -129,28 +138,28 @@ def read_heads(named: Mapping[str, Path], options: LoadOptions) -> FolderHeads:
     """
     paths = [path for path in named.values() if path.suffix.lower() in TEXTS]
     if not paths:
-        return FolderHeads([], Counter(), {})
+        return FolderHeads([], Counter(), {}, [])
     _check_encoding(paths, options)
-    header, *rows = _first_rows(paths[0], options)
-    usual = _usual_label_columns(header)
-    verdicts: dict[str, set[int]] = {
-        name: set()
-        for i, name in enumerate(header)
-        if name not in usual and labels.is_verdict(name, _column_cells(rows, i), options.words)
-    }
-    heads = FolderHeads(header, Counter(), verdicts)
+    sample = [_first_rows(path, options) for path in paths[:: max(len(paths) // TRIED, 1)]]
+    usual_header, _ = Counter(tuple(cells.header) for cells in sample).most_common(1)[0]
+    first = next(cells for cells in sample if tuple(cells.header) == usual_header)
+    heads = FolderHeads(first.header, Counter(), {}, list(first.fields))
+    usual = _usual_label_columns(heads.label_places)
+    for name in heads.label_places:
+        if name not in usual and labels.is_verdict(name, _cells_of(first, name), options.words):
+            heads.verdicts[name] = set()
     for path in paths:
-        header, *rows = _first_rows(path, options)
-        heads.channel_choices[_columns_without_clock(header, rows, options)] += 1
-        for name in [name for name in verdicts if name in header]:
+        cells = _first_rows(path, options)
+        rows = list(cells.rows.values())
+        heads.channel_choices[_columns_without_clock(cells.header, rows, options)] += 1
+        for name in [name for name in heads.verdicts if {name} & {*cells.header, *cells.fields}]:
             column = labels.LabelColumn(name, options.words, Counter())
             try:
-                cells = _column_cells(rows, header.index(name))
-                verdicts[name].add(column.find(cells).label)
+                heads.verdicts[name].add(column.find(_cells_of(cells, name)).label)
             except UnlabelledError:
                 continue
             except UnreadableError:
-                del verdicts[name]
+                del heads.verdicts[name]
     return heads
 
 
@@ -264,7 +273,7 @@ def read_folder(
         if not (options.label or options.labels):
             advice = _label_file_advice(folder, named, options)
             if advice is None and not collector.unknown_words:
-                advice = _label_advice(named, heads.header, options)
+                advice = _label_advice(named, heads.label_places, options)
         if advice is None:
             raise
         raise DataError(f"{str(error).rpartition(';')[0]}; {advice}.") from error
@@ -296,14 +305,14 @@ def _label_source(
         words = {word: good for word, good in options.words.items() if not word.isdecimal()}
         sources.append(labels.labels_in_names(None, words))
         return labels.labels_that_agree(listing, sources, listing.trust), columns
-    if options.label in heads.header:
+    if options.label in heads.label_places:
         return labels.labels_in_column(named, options.label, options), [options.label]
     if options.label is not None:
         return labels.labels_in_names(options.label, options.words), []
     columns = _verdict_columns(named, heads, options)
     has_names = not set(_count_labels(named, in_names)) <= {None, ""}
     if not has_names:
-        columns = columns or _usual_label_columns(heads.header)[:1]
+        columns = columns or _usual_label_columns(heads.label_places)[:1]
     sources = [labels.labels_in_column(named, column, options) for column in columns]
     if has_names or not columns:
         sources = [in_names, *sources]
@@ -329,16 +338,19 @@ def _verdict_columns(
     """
     sample = list(named)[:: max(len(named) // TRIED, 1)]
     columns = []
-    for name in _usual_label_columns(heads.header):
+    for name in _usual_label_columns(heads.label_places):
         counts = _count_labels(sample, labels.labels_in_column(named, name, options))
         if counts[0] + counts[1]:
             columns.append(name)
     return columns + [name for name, values in heads.verdicts.items() if values == {0, 1}]
 
 
-def _column_cells(rows: Iterable[Sequence[str]], i: int) -> list[str]:
-    """Return the cells of a column, of those rows that have it."""
-    return [row[i] for row in rows if i < len(row)]
+def _cells_of(cells: TextCells, name: str) -> list[str]:
+    """Return the cells of a column, of those rows that have it, or the one value of a field."""
+    if name not in cells.header:
+        return [cells.fields[name]]
+    i = cells.header.index(name)
+    return [row[i] for row in cells.rows.values() if i < len(row)]
 
 
 def _has_label_column(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptions) -> bool:
@@ -389,7 +401,8 @@ def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOpt
     """
     stems = {path.stem.lower() for path in named.values()}
     for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in TEXTS):
-        last_row = _first_rows(path, LoadOptions())[-1]
+        cells = _first_rows(path, LoadOptions())
+        last_row = cells.rows[max(cells.rows)] if cells.rows else cells.header
         words = {word.lower().removesuffix(path.suffix) for word in last_row}
         if words.isdisjoint(stems - {path.stem.lower()}):
             continue
@@ -456,18 +469,17 @@ def _unread_files_note(folder: Path, named: Mapping[str, Path], options: LoadOpt
     return [f"Not read, for most files are {suffix}: {listed(unread)}"] if unread else []
 
 
-def _first_rows(path: Path, options: LoadOptions) -> list[list[str]]:
+def _first_rows(path: Path, options: LoadOptions) -> TextCells:
     """Return the header and the first rows of a text file, of up to 100 lines and 256 KiB.
 
-    The last row may be cut off. One empty row is returned if they cannot be read: the error comes
-    when the whole file is read.
+    The last row may be cut off. The header is empty if they cannot be read: the error comes when
+    the whole file is read.
     """
     with suppress(UnreadableError, OSError), path.open("rb") as file:
         lines = file.read(2**18).split(b"\n")[:100]
         text, _ = decode(b"\n".join(lines), options.encoding)
-        cells = split_cells(text, options.columns)
-        return [cells.header, *cells.rows.values()]
-    return [[]]
+        return split_cells(text, options.columns)
+    return TextCells([], 0, [], {}, "", {})
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -980,10 +992,14 @@ def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -
         for name in texts
         if not STATION.fullmatch(name) and not frame.duplicated([*keys[:2], name]).any()
     ]
-    values = [name for name in others if name not in texts]
-    if not tags or len(values) != 1:
+    if not tags:
         return frame
     tag = tags[0]
+    # A column that is constant for each signal, as InfluxDB's number of its table, has no samples.
+    is_constant = frame.groupby(tag)[others].nunique().max() <= 1
+    values = [name for name in others if name not in texts and not is_constant[name]]
+    if len(values) != 1:
+        return frame
     signals = frame[tag].unique().tolist()
     if not options.channels or not set(options.channels) <= set(signals):
         have = f"{listed(signals)}, as column {tag} calls them"

@@ -11,7 +11,7 @@ import csv
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -56,6 +56,11 @@ SAMPLED_CELLS = 40  # of each of these lines
 WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')
 MIN_TIMES = 8  # in a header that names samples by their times, beside other columns
 SUMMARY_SHARE = 10  # samples for each row of a summary below them, at least
+REMARK = re.compile(r"\s*(#+|%+|//+|\*+|--+)\s*")  # by which programs mark a comment
+# What a line outside the table is about: no number, no path.
+FIELD_KEY = re.compile(r"[^\W\d][^\d:;=\\]{0,40}")
+FIELD_MARK = re.compile(r"\s*[:;=\t,|]\s*")  # the first of them stands before the value
+CELL_MARK = re.compile(r"[;,\t|]")
 LABVIEW_END = "***End_of_Header***"
 COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
@@ -75,8 +80,12 @@ class TextCells(NamedTuple):
     units : list of str
         Unit of each column, "" where the row of units states none.
     rows : dict of int to list of str
-        The data rows by their line.
+        The data rows by their line, without remarks, as a line //END or the header again.
     delimiter : str
+    fields : dict of str to str
+        What lines above the header and below the samples state, as `Result;OK` or `# Operator: A`.
+    n_remarks : int
+        Number of the remarks that were left out below the header.
     """
 
     header: list[str]
@@ -84,6 +93,8 @@ class TextCells(NamedTuple):
     units: list[str]
     rows: dict[int, list[str]]
     delimiter: str
+    fields: dict[str, str]
+    n_remarks: int = 0
 
 
 class TextTable(NamedTuple):
@@ -101,6 +112,10 @@ class TextTable(NamedTuple):
         The decimal mark that its cells prove, "" where they prove none.
     numbers : str
         As in `Reading`.
+    fields : mapping of str to str
+        As in `TextCells`.
+    n_remarks : int
+        As in `TextCells`.
     """
 
     frame: pd.DataFrame
@@ -109,6 +124,8 @@ class TextTable(NamedTuple):
     units: list[str]
     decimal: str
     numbers: str = ""
+    fields: Mapping[str, str] = {}
+    n_remarks: int = 0
 
 
 def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
@@ -131,7 +148,57 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
         rows = {i: _split_line(line, delimiter) for i, line in lines.items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
-    return _find_header(rows, delimiter, list(columns))
+    cells = _find_header(rows, delimiter, list(columns))
+    remarks = _remarks(cells)
+    last = max(cells.rows.keys() - remarks, default=0)
+    outside = [line for i, line in lines.items() if i < cells.line or i > last]
+    kept = {i: row for i, row in cells.rows.items() if i not in remarks}
+    return cells._replace(rows=kept, fields=_fields_in(outside), n_remarks=len(remarks))
+
+
+def _remarks(cells: TextCells) -> set[int]:
+    """Return the lines of the data rows that are remarks of the program that wrote the file.
+
+    These are the header again, rows with a comment mark and without numbers, rows that are but one
+    word, as `//END`, and narrower rows without digits in their first cell behind all others, as
+    `Result;OK`. In a file of one column there are none, except the header.
+    """
+    remarks = set[int]()
+    is_at_end = True
+    for i, row in reversed(cells.rows.items()):
+        words = list(filter(None, row))
+        is_word = words == row[:1] and not any(map(str.isdigit, row[0]))
+        is_comment = REMARK.match(row[0]) is not None and not _numeric_columns(row)
+        is_field = is_at_end and len(words) == 2 and len(words) < len(cells.header)
+        is_field = is_field and FIELD_KEY.fullmatch(row[0]) is not None
+        if row == cells.header or (len(cells.header) > 1 and (is_word or is_comment or is_field)):
+            remarks.add(i)
+        else:
+            is_at_end = False
+    return remarks
+
+
+def _fields_in(lines: Iterable[str]) -> dict[str, str]:
+    """Return what lines outside the table state, by its name: the first of each name counts.
+
+    A line states it as `Result: OK`, `# Result = OK` or `Result;OK`, or a line of names stands above
+    one of as many values.
+    """
+    fields = dict[str, str]()
+    above: list[str] = []
+    for line in lines:
+        plain = REMARK.sub("", line.strip().strip("\"'"))
+        cells = [cell.strip(" \"'") for cell in CELL_MARK.split(plain)]
+        name, *values = (cell.strip(" \"'") for cell in FIELD_MARK.split(plain))
+        value = next(filter(None, values), "")
+        if FIELD_KEY.fullmatch(name) and value:
+            fields.setdefault(name, value)
+        if 1 < len(cells) == len(above):
+            for key, cell in zip(above, cells, strict=True):
+                if FIELD_KEY.fullmatch(key) and cell:
+                    fields.setdefault(key, cell)
+        above = cells
+    return fields
 
 
 def _split_line(line: str, delimiter: str) -> list[str]:
@@ -247,7 +314,7 @@ def _find_header(
     units_row = above[header + 1] if header + 1 < data else []
     if columns:
         data_rows = dict(zip(lines[data:], rows[data:], strict=True))
-        return TextCells(columns, 0, _pad_units(units_row, len(columns)), data_rows, delimiter)
+        return TextCells(columns, 0, _pad_units(units_row, len(columns)), data_rows, delimiter, {})
     names = above[header] if above else []
     numbered = _numeric_columns(names)
     # Whole numbers may be names.
@@ -264,7 +331,7 @@ def _find_header(
         names = names[:-1]  # LabVIEW's, which most of its rows leave out
         data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
     line = lines[header] if lines else 0
-    return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter)
+    return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter, {})
 
 
 def _true_header(
@@ -403,7 +470,8 @@ def read_table(
     stated = units.stated_in_preamble(preamble, header, without)
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
-    return TextTable(frame, faults, cells.line, column_units, mark, numbers)
+    about = (cells.fields, cells.n_remarks)
+    return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
 
 
 def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
@@ -453,7 +521,7 @@ def read_recording(
     rows = _without_summary(frame, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
     timed = rows_to_trace(rows, places, options, notes, table.units)
-    n_out = len(frame) - len(rows)
+    n_out = len(frame) - len(rows) + table.n_remarks
     left_out = (
         f"header in line {table.line}" if table.line > 1 else "",
         f"{n_out} left out" if n_out else "",
