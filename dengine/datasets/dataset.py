@@ -9,7 +9,7 @@ import codecs
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -292,7 +292,7 @@ class LoadOptions:
     """The options of `load_dataset`, by the same names.
 
     `channels` are those of `channel`, `words` is the parsed `label_map`: words in lower case, and
-    whether they are good. Raises DataError for values that are out of range or contradict.
+    whether they are good, or None. Raises DataError for values that are out of range or contradict.
     """
 
     samples: int | None = None
@@ -306,7 +306,7 @@ class LoadOptions:
     topic: str | None = None
     time: str | None = None
     unit: str | None = None
-    words: Mapping[str, bool] = field(default_factory=dict)
+    words: Mapping[str, bool | None] = field(default_factory=dict)
     columns: tuple[str, ...] = ()
     decimal: str | None = None
     thousands: str | None = None
@@ -399,6 +399,23 @@ def describe_ends(
     rows = zip(channels or [""] * len(trace), trace, all_units, strict=True)
     texts = (f"{name} {row[0]:.6g} to {row[-1]:.6g} {unit}".strip() for name, row, unit in rows)
     return f"{source}: {listed(texts)} in {trace.shape[1]} samples"
+
+
+def label_map_of(words: Counter[str], labels: Collection[int] = ()) -> str:
+    """Return a label map that users may take, as "heil=good,Riss=bad", for words without meaning.
+
+    The most frequent is good, and all others bad, unless one is another with something before it:
+    then this is bad. Beside labels of one side all words are of the other.
+
+    labels : those that are known.
+    """
+    ordered = [word for word, _ in words.most_common()]
+    if len(set(labels)) == 1:
+        bad = set(ordered) if 1 in labels else set()
+    else:
+        bad = {w for w in ordered if any(v and w != v and w.endswith(v) for v in ordered)}
+        bad = bad or set(ordered[1:])
+    return ",".join(f"{word}={'bad' if word in bad else 'good'}" for word in ordered)
 
 
 class Recording(NamedTuple):
@@ -526,16 +543,11 @@ class RecordingCollector:
         is_one_sided = len(labels) == 1
         if sum(self.unknown_words.values()) <= (n_known / 9 if is_one_sided else n_known):
             return
-        # Without known labels a dash may mean that there is no fault.
-        dashes = {"-": self.unlabelled_words["-"] * (not labels)}
-        words = [word for word, _ in (self.unknown_words + Counter(dashes)).most_common()]
-        if is_one_sided:
-            bad = set(words) if 1 in labels else set()
-        else:
-            # A word that is another one with something before it is more often the bad one.
-            bad = {w for w in words if any(w != other and w.endswith(other) for other in words)}
-            bad = bad or set(words[1:])
-        label_map = ",".join(f"{word}={'bad' if word in bad else 'good'}" for word in words)
+        # Without known labels a dash, or an empty cell, may mean that there is no fault.
+        no_fault = {word: self.unlabelled_words[word] * (not labels) for word in ("-", "")}
+        no_fault[""] *= no_fault[""] > self.unknown_words.total()
+        words = self.unknown_words + Counter(no_fault)
+        label_map = label_map_of(words, labels)
         or_else = "" if is_one_sided else " or the other way round"
         do = f"say what they mean, label_map={label_map!r}{or_else}"
         if len(words) > MAX_LABEL_WORDS:

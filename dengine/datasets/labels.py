@@ -38,6 +38,7 @@ from .dataset import (
     UnlabelledError,
     UnreadableError,
     expect_data,
+    label_map_of,
 )
 from .text import SUFFIXES, column_place, read_table
 
@@ -89,12 +90,20 @@ FLAGS = {**dict.fromkeys(LISTS["yes"], True), **dict.fromkeys(LISTS["no"], False
 SIGNAL_COLUMNS = ("y", "class", "status", "ok")
 FEW_NAMES = 5  # in fewer names each word may be a label
 
-LabelMap = Mapping[str, bool]
+# A word, and whether it is good; None: it is that of a part that was not checked yet.
+LabelMap = Mapping[str, bool | None]
 NO_WORDS: LabelMap = {}
 
 
 class SeveralLabelsError(UnreadableError):
-    """A recording whose labels contradict each other, in one place or in two."""
+    """A recording whose labels contradict each other, in one place or in two.
+
+    words : the words of the one place in their order; empty for two places.
+    """
+
+    def __init__(self, message: str, words: Sequence[str] = ()) -> None:
+        super().__init__(message)
+        self.words = tuple(words)
 
 
 class NoLabelError(UnreadableError):
@@ -180,19 +189,24 @@ def label_of(word: Any, words: LabelMap = NO_WORDS) -> int:
     ----------
     word : object
         Text in upper or lower case, a number or a boolean: OK, n.i.O., not ok, 1.0.
-    words : mapping of str to bool
-        The user's own words in lower case, and whether they are good; they go first.
+    words : mapping of str to bool or None
+        The user's own words in lower case, and whether they are good; they go first. "" is that of
+        an empty cell. None is that of a part that was not checked yet.
 
     Raises
     ------
     UnknownWordError
         If the meaning of the word is unknown.
     UnlabelledError
-        If it is empty or in `UNCHECKED`, as the cell of a part that was not checked yet.
+        If it is empty or in `UNCHECKED`, or the user says so, as of a part that was not checked.
     """
     text = normalized(word).strip().lower()
-    if text in words:
-        return int(words[text])
+    key = "" if text in EMPTY_CELLS and text not in words else text
+    if key in words:
+        meaning = words[key]
+        if meaning is None:
+            raise UnlabelledError(text)
+        return int(meaning)
     if text in UNCHECKED:
         raise UnlabelledError("" if text in EMPTY_CELLS else text)
     match = IN_CELL.fullmatch(text.removesuffix(".0").removesuffix("."))
@@ -218,13 +232,14 @@ def _label_of_match(match: re.Match[str]) -> int:
     return int(MEANING[word] != bool(groups["not"]))
 
 
-def parse_label_map(label_map: Mapping[str, Any] | str | None) -> dict[str, bool]:
+def parse_label_map(label_map: Mapping[str, Any] | str | None) -> dict[str, bool | None]:
     """Parse the user's own label words: "i.O.=good,n.i.O.=bad", or a dict of words and labels.
 
-    Returns each word in lower case, and whether it is good; an empty dict for None. Raises
+    In "0=" the word is that of a part that was not checked yet; in "=good" it is an empty cell.
+    Returns each word in lower case, and whether it is good, or None; an empty dict for None. Raises
     DataError for another form.
     """
-    wanted = "word=good or word=bad, with commas between"
+    wanted = "word=good or word=bad, or word= for a part not checked yet, with commas between"
     if isinstance(label_map, Mapping):
         pairs = dict(label_map)
     else:
@@ -233,12 +248,14 @@ def parse_label_map(label_map: Mapping[str, Any] | str | None) -> dict[str, bool
         expect_data(not pair.sub("", label_map or ""), wanted, label_map)
         pairs = dict(pair.findall(label_map or ""))
     words = {
-        normalized(word).strip().lower(): str(label).strip().lower()
+        normalized(word).strip().lower(): "" if label is None else str(label).strip().lower()
         for word, label in pairs.items()
+        if word or label
     }
     for word, label in words.items():
-        expect_data(bool(word) and IN_CELL.fullmatch(label) is not None, wanted, label_map)
-    return {word: bool(label_of(label)) for word, label in words.items()}
+        is_form = IN_CELL.fullmatch(label) is not None or (bool(word) and not label)
+        expect_data(is_form, wanted, label_map)
+    return {word: bool(label_of(label)) if label else None for word, label in words.items()}
 
 
 def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> LabelSource:
@@ -261,8 +278,10 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
     where = "give the pattern of it in the path (label)"
     advice = f"{where}, or list the files and their labels in a CSV file (labels)"
     if pattern is None:
-        find_label = partial(_find_label, words=words)
-        remove_label = partial(_remove_label, words=words)
+        known = {word: good for word, good in words.items() if good is not None}
+        unchecked = words.keys() - known.keys()
+        find_label = partial(_find_label, words=known, unchecked=unchecked)
+        remove_label = partial(_remove_label, words=known)
         return LabelSource(find_label, advice, "its name", without_label=remove_label)
     message = f"Expected a regular expression for the label, got {pattern!r}"
     with instead(DataError, message, re.error):
@@ -364,7 +383,8 @@ class LabelColumn:
         self.notes = notes
         self.is_inverted = means_bad(name) and FLAGS.keys().isdisjoint(words)
         self.is_ambiguous = not (means_bad(name) or means_good(name))
-        self.unchecked = set(UNCHECKED) - set(words)
+        stated_unchecked = {word for word, good in words.items() if good is None}
+        self.unchecked = (set(UNCHECKED) - set(words)) | stated_unchecked
 
     def label_of(self, cell: Any) -> int:
         """Return the label that a cell means, 1 or 0.
@@ -408,15 +428,16 @@ class LabelColumn:
         """
         place = place or f"column {self.name}"
         texts = list(dict.fromkeys(str(cell).strip() for cell in cells))
-        stated = [text for text in texts if text.lower() not in self.unchecked]
+        stated = [text for text in texts if text and text.lower() not in self.unchecked]
         if len(stated) < 2:
             word = next(filter(None, stated or texts), "")
-            return SourcedLabel(self.label_of(word), place, word)
+            return SourcedLabel(self.label_of(word), place, word or "empty")
         with suppress(UnknownWordError):
             labels = {self.label_of(text) for text in stated}
             if len(labels) == 1:
                 return SourcedLabel(labels.pop(), place, listed(stated))
-        raise SeveralLabelsError(f"Expected one label in {place}, got {listed(stated)}")
+        message = f"Expected one label in {place}, got {listed(stated)}"
+        raise SeveralLabelsError(message, tuple(stated))
 
 
 def _read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
@@ -591,16 +612,21 @@ class _FoundLabel(NamedTuple):
     is_user_word: bool = False
 
 
-def _find_label(name: str, words: LabelMap) -> SourcedLabel:
+def _find_label(name: str, words: LabelMap, unchecked: Collection[str] = ()) -> SourcedLabel:
     """Return the label in a path.
 
-    Raises NoLabelError if there is none, UnlabelledError if there is only a word of `UNCHECKED`,
+    Raises NoLabelError if there is none, UnlabelledError if there is only a word of `UNCHECKED` or
+    of `unchecked`, the user's,
     UnknownWordError if a word before it may be a not, as in ikke_ok, and UnreadableError if several
     labels contradict each other.
     """
     labels = _found_labels(name, words)
     deciding = [label for label in labels if label.decides]
     if not deciding:
+        unchecked_words = dict.fromkeys(unchecked, False)
+        for label in _found_labels(name, unchecked_words) if unchecked else ():
+            if label.is_user_word or label.text in unchecked:
+                raise UnlabelledError(label.text.lower())
         beginnings = (start for text, _ in _components(name) for start in _name_beginnings(text))
         for match in filter(None, map(UNCHECKED_AT_END.search, beginnings)):
             raise UnlabelledError(match[0].lower())
@@ -686,7 +712,7 @@ def _labels_in_file(file: str, start: int, words: LabelMap) -> list[_FoundLabel]
     digit = re.search(r"(?:^|(?<=[_\- ]))\d+$", file)
     numbers = []
     if digit and digit[0] in words:
-        label = int(words[digit[0]])
+        label = int(bool(words[digit[0]]))
         numbers.append(_FoundLabel(digit[0], label, start + digit.start()))
     if user_word := _find_user_word(file, start, words):
         return [user_word, *numbers]
@@ -710,7 +736,7 @@ def _labels_in_folder(folder: str, start: int, words: LabelMap) -> list[_FoundLa
     The name begins at `start` of the path.
     """
     if folder in words and folder.isdecimal():
-        return [_FoundLabel(folder, int(words[folder]), start)]
+        return [_FoundLabel(folder, int(bool(words[folder])), start)]
     if user_word := _find_user_word(folder, start, words):
         return [user_word]
     match = AT_END.search(re.sub(r"[\W_]+$", "", folder))
@@ -1065,6 +1091,7 @@ def collect_recordings(
         If most recordings have no label, and the words of their names are no likely ones.
     """
     unlabelled = dict[str, Sequence[str]]()
+    changing = list[Sequence[str]]()  # words of the places whose label changes
     n_contradictions = 0
     collector.faults.extend(source.faults)
 
@@ -1077,7 +1104,10 @@ def collect_recordings(
             raise
         except UnreadableError as error:
             unlabelled[name] = getattr(error, "words", ())
-            n_contradictions += isinstance(error, SeveralLabelsError)
+            if isinstance(error, SeveralLabelsError):
+                n_contradictions += 1
+                changing.append(error.words)
+                unlabelled[name] = ()
             raise
         recording = read(place)
         reading = recording.reading._replace(place=label.reading.place, word=label.word)
@@ -1094,8 +1124,31 @@ def collect_recordings(
         actual = f"{len(unlabelled)} of {len(places)} have none, as {why}; {source.advice}"
         if n_contradictions > len(unlabelled) / 2:
             actual = f"{n_contradictions} of {len(places)} have labels that differ, as {why}"
+            actual += _changing_label_advice(changing)
         raise DataError(f"Expected a label for each recording, {actual}.")
     return collector
+
+
+def _changing_label_advice(changing: Sequence[Sequence[str]]) -> str:
+    """Return advice, for an error, if all labels that change do so from one word to another.
+
+    The word before is then that of a part that is not checked yet. "" if they change otherwise.
+
+    changing : the words of each recording, in their order.
+    """
+    firsts = {words[0] for words in changing if words}
+    lasts = Counter(words[-1] for words in changing if words)
+    if len(firsts) != 1 or firsts & set(lasts) or any(len(words) != 2 for words in changing):
+        return ""
+    first = firsts.pop()
+    unknown = Counter[str]()
+    for word, n in lasts.items():
+        if _flag_of(word) is not None or IN_CELL.fullmatch(word.lower()) is None:
+            unknown[word] = n
+    pairs = [label_map_of(unknown)] if unknown else []
+    label_map = ",".join([*pairs, f"{first}="])
+    or_else = ", or with good and bad the other way round" if unknown else ""
+    return f"; if {first} means that it is not checked yet, label_map={label_map!r}{or_else}"
 
 
 def _likely_label_words(
