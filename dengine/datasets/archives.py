@@ -98,7 +98,7 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
         unit = (str(arrays["unit"]),) * len(channels) if "unit" in arrays else ()
         rate = float(arrays["rate_hz"]) if "rate_hz" in arrays else timed.rate_hz
         if "rate_hz" in arrays and not options.rate_hz:
-            timed = timed._replace(reading=Reading(clock="none, the array rate_hz"))
+            timed = timed._replace(reading=Reading(clock="none, an array tells the rate"))
         return timed._replace(rate_hz=None if options.rate_hz else rate, units=unit)
 
     collector.order = "by name, numbers by size"

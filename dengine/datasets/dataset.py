@@ -733,9 +733,9 @@ def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) ->
     if options.unit:
         return options.unit
     if not any(targets):
-        return _guess_unit(collector.channels)
+        return guess_unit(collector.channels)
     channel_units = [
-        target or _guess_unit(collector.channels[c : c + 1]) for c, target in enumerate(targets)
+        target or guess_unit(collector.channels[c : c + 1]) for c, target in enumerate(targets)
     ]
     return channel_units[0] if len(set(channel_units)) == 1 else ", ".join(channel_units)
 
@@ -824,7 +824,7 @@ def _resample(
     return replace(options, samples=samples, fit="resample" if is_even else "pad"), target
 
 
-def _guess_unit(channels: Sequence[str]) -> str:
+def guess_unit(channels: Sequence[str]) -> str:
     """Return "N·m", "N" or "mixed units" for channels, by their names; for people.
 
     Names that begin with mx, mux or tx (or y, z) are torques, all others are forces.

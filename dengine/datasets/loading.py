@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..errors import DataError, instead, listed
 from ..files import is_database, read_archive, read_errors
 from ..records import stored_trace_spec
-from ..traces import as_trace, as_traces, spec_of
+from ..traces import as_trace, as_traces, is_time_column, spec_of
 from . import units
 from .archives import hold_one_each, read_archive_each
 from .bags import is_stream, read_bag
@@ -41,6 +41,7 @@ from .dataset import (
     describe_ends,
     describe_reading,
     expect_data,
+    guess_unit,
     make_dataset,
     refit,
     split_names,
@@ -73,6 +74,7 @@ TEXT_FORMAT = ("columns", "decimal", "thousands", "encoding")
 SIMULATED = ("height_mm", "cycle", "conditions", "condition_names", "seed", "scenario", "simulated")
 Files = Mapping[str, Path]
 TABLES = (*TEXTS, ".parquet", ".pq")
+RATES = ("fs", "f_s", "fs_hz", "rate", "samplerate", "sample_rate", "sampling_rate", "frequency")
 MIN_PADDING = 5  # zeros at the end of a trace that are no measurement
 FORMS = ".npz, .csv, .tsv, .txt, .dat, .parquet or .mcap"
 
@@ -323,6 +325,7 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         if label in arrays and options.label is None:
             _check_same_labels(arrays[label], label_words, label_column, options)
         arrays[label] = np.array(label_words)
+    arrays |= _arrays_by_meaning(named, arrays, label, options)
     channels = () if "X" in arrays else options.channels
     traces = channels or ("X",)
     if not {label, *traces} <= set(arrays):
@@ -338,17 +341,60 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         about: dict[str, Any] = {"part": arrays.get(options.part), "cause": arrays.get("cause")}
         if "rate_hz" in arrays:
             about["rate_hz"] = float(arrays["rate_hz"])
+        names = tuple(map(str, arrays.get("channels", ())))
         if "unit" in arrays:
             stored_unit = arrays["unit"]
             about["unit"] = ", ".join(map(str, np.atleast_1d(stored_unit).tolist()))
-        if len(channels) == 1 and X.ndim == 3:  # an array of several channels names none of them
+        elif names and X.ndim == 3:
+            guesses = [guess_unit((channel,)) for channel in names]
+            about["unit"] = guesses[0] if len(set(guesses)) == 1 else ", ".join(guesses)
+        if len(channels) == 1 and X.ndim == 3:  # it is the name of an array of several channels
             channels = ()
             options = replace(options, channels=())
-        about["channels"] = channels or tuple(map(str, arrays.get("channels", ())))
+        about["channels"] = channels or names
         data = _from_arrays(X, arrays[label], options, name, label_column, **about)
         data = refit(data, options, has_unit="unit" in arrays)
-    read = {label, *traces, options.part, *ARRAYS, *SIMULATED}
+    read = {label, *traces, options.part, *ARRAYS, *SIMULATED, *arrays}
     return replace(data, notes=(*data.notes, *_archive_notes(data, all_names, read)))
+
+
+def _arrays_by_meaning(
+    named: Files, arrays: Mapping[str, NDArray[Any]], label: str, options: LoadOptions
+) -> dict[str, NDArray[Any]]:
+    """Return arrays that archives have under other names, by the names of `ARRAYS` and their own.
+
+    They are `rate_hz`, as `fs` or of an array of times; `channels` and `unit`, arrays of texts that
+    are as long as the axis of the channels; and `X`, if the user names channels of it.
+
+    arrays : those that are there by the usual names. label : the array of labels.
+    """
+    import pandas as pd
+
+    if label not in arrays:
+        return {}
+    stored, _ = _read_archives(named, options, every=True)
+    n = len(arrays[label])
+    blocks = [key for key, x in stored.items() if x.ndim == 3]
+    blocks = [key for key in ("X", *options.channels) if key in blocks] or blocks
+    traces = [key for key in (*blocks, *options.channels, "X") if key in stored]
+    lengths = set(stored[traces[0]].shape) - {n} if traces else set()
+    result = dict[str, NDArray[Any]]()
+    for key, x in stored.items():
+        if x.ndim == 1 and len(x) in lengths and x.dtype.kind in "US":
+            is_unit = all(units.parse(units.spelling(text)) for text in map(str, x.tolist()))
+            result |= {"unit" if is_unit else "channels": x, key: x}
+        elif x.size == 1 and key.lower() in RATES:
+            result |= {"rate_hz": x.reshape(()), key: x}
+        elif x.ndim == 1 and len(x) in lengths and is_time_column(key) and x.dtype.kind in "iuf":
+            with suppress(UnreadableError):
+                clock = clock_of(pd.DataFrame({key: x}))
+                if clock is not None:
+                    result |= {"rate_hz": np.array(rate_of(clock, pd.RangeIndex(len(x)))), key: x}
+    names = set(map(str, result.get("channels", ())))
+    if blocks and "X" not in arrays and options.channels and names.issuperset(options.channels):
+        whole, _ = _read_archives(named, replace(options, channels=(blocks[0],)))
+        result |= {"X": whole[blocks[0]], blocks[0]: whole[blocks[0]]}
+    return {key: x for key, x in result.items() if key not in arrays}
 
 
 def _archive_notes(data: Dataset, names: Sequence[str], read: set[str]) -> list[str]:
@@ -496,7 +542,13 @@ def _missing_arrays(named: Files, options: LoadOptions) -> str:
                 if len(read_ordered_labels(path, options, keys)[0]) in lengths:
                     label = f"labels={str(path)!r}, in the order of the traces"
     shapes = ", ".join(f"{name} {arrays[name].shape}" for name in all_names) or "none"
+    texts = [x for x in arrays.values() if x.ndim == 1 and len(x) in lengths[1:]]
+    channel_names = [name for x in texts if x.dtype.kind in "US" for name in map(str, x.tolist())]
+    if channel_names:
+        shapes = f"{shapes}; channels are {listed(channel_names)}"
     channel = "" if "X" in all_names or not traces else f"channel={traces[0]!r} and "
+    if options.channels and {*channel_names, *all_names}.issuperset(options.channels):
+        channel = f"channel={','.join(options.channels)!r} and "
     example = f", or their names, as in {channel}{label}" if label else ""
     return f"arrays X and y in {listed(named)}{example}; found {shapes}."
 
@@ -560,7 +612,7 @@ def _from_arrays(
         labels = labels[is_labelled]
         words = words[is_labelled]
     data = make_dataset(X, labels, name=name, **about)
-    clock = "none, the array rate_hz" if data.rate_hz and not options.rate_hz else ""
+    clock = "none, an array tells the rate" if data.rate_hz and not options.rate_hz else ""
     place = f"{'column' if options.labels else 'array'} {label}"
     readings = [Reading(place, str(word), clock) for word in words.tolist()]
     stated = options.rate_hz

@@ -9,6 +9,7 @@ and a column of parts. `load_dataset` calls `read_folder`, `read_tables` and `fr
 from __future__ import annotations
 
 import itertools
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -470,13 +471,21 @@ def _unread_files_note(folder: Path, named: Mapping[str, Path], options: LoadOpt
 
 
 def _first_rows(path: Path, options: LoadOptions) -> TextCells:
-    """Return the header and the first rows of a text file, of up to 100 lines and 256 KiB.
+    """Return the header and rows of a text file: up to 100 lines of 256 KiB, and the last KiB.
 
-    The last row may be cut off. The header is empty if they cannot be read: the error comes when
-    the whole file is read.
+    Behind 100 lines the numbers of lines are wrong, and the last row may be cut off. The header is
+    empty if they cannot be read: the error comes when the whole file is read.
     """
     with suppress(UnreadableError, OSError), path.open("rb") as file:
-        lines = file.read(2**18).split(b"\n")[:100]
+        content = file.read(2**18)
+        lines = content.split(b"\n")[:100]
+        start = len(b"\n".join(lines))
+        end = file.seek(0, os.SEEK_END)
+        if (
+            start < end and b"\0" not in content[:400]
+        ):  # in UTF-16 a line may begin in mid-character
+            file.seek(max(start, end - 2**10))
+            lines += file.read().split(b"\n")[1:]
         text, _ = decode(b"\n".join(lines), options.encoding)
         return split_cells(text, options.columns)
     return TextCells([], 0, [], {}, "", {})

@@ -1131,9 +1131,9 @@ def test_an_archive_says_what_of_it_is_not_read_and_that_its_rate_is_unknown(
 ) -> None:
     X = small.X.copy()
     X[3:5, 40:] = 0.0
-    np.savez(tmp_path / "x.npz", X=X, y=small.y, fs=500.0, length=np.full(24, 50))
+    np.savez(tmp_path / "x.npz", X=X, y=small.y, gain=500.0, length=np.full(24, 50))
     notes = " ".join(load_dataset(tmp_path / "x.npz").notes)
-    assert "Not read: the arrays fs, length." in notes
+    assert "Not read: the arrays gain, length." in notes
     assert "2 of 24 traces end in up to 10 zeros" in notes
     assert "The rate is unknown" in notes
     assert "rate_hz=..." in notes
@@ -1518,7 +1518,7 @@ def test_data_says_how_each_form_was_read(small: Dataset, tmp_path: Path) -> Non
     by_name = "by name, numbers by size"
     for name, labels, clock, order in (
         ("wide", f"column verdict: {counted}", "none", "as the rows"),
-        ("array", f"array y: {counted}", "none, the array rate_hz", "as the rows"),
+        ("array", f"array y: {counted}", "none, an array tells the rate", "as the rows"),
         ("archives", "file name: ", "column time (s)", by_name),
         ("pair", f"array y: {counted}", "none", "as the rows"),
         ("list", f"array y: {counted}", "none, the rate is stated", "as the rows"),
@@ -1595,3 +1595,91 @@ def test_samples_of_zero_behind_the_last_one_are_noted(tmp_path: Path) -> None:
     notes = load_dataset(tmp_path, rate_hz=500.0, fit="pad").notes
     expected = "The last samples are all 0, which may be no measurements: 0_OK.csv, 1_OK.csv."
     assert expected in notes, notes
+
+
+@pytest.mark.parametrize(
+    "line", ["Result total;{}", "# Verdict: {}", "Prüfung = {}", "Part;Check\nA;{}"]
+)
+@pytest.mark.parametrize("place", ["above", "below"])
+def test_a_verdict_in_a_line_outside_the_samples_is_the_label(
+    line: str, place: str, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = "".join(f"{k * 2},{x[k % 50]},{k}\n" for k in range(150))
+        table = f"Time [ms],FZ,WZ\n{rows}"
+        text = line.format(word)
+        above = f"Press 4\nDate;2026-03-01\n{text}\n\n"
+        (tmp_path / f"SN{i:03}.csv").write_text(above + table if place == "above" else table + text)
+    data = load_dataset(tmp_path, channel="FZ")
+    np.testing.assert_array_equal(data.y, small.y)
+    np.testing.assert_array_equal(data.X, np.tile(small.X, 3))
+    label = re.split(r" ?[;:=\n]", line.removeprefix("# "))["Part" in line]
+    np.testing.assert_array_equal(load_dataset(tmp_path, channel="FZ", label=label).y, small.y)
+
+
+def test_annotations_repeated_headers_and_end_marks_are_no_rows(
+    small: Dataset, tmp_path: Path
+) -> None:
+    blocks = []
+    for number, scale in enumerate((0.5, 1.0)):
+        header = ",result,table,_time,_value,_field,serial,verdict"
+        rows = [
+            f",,{number},2026-03-02T06:{i:02}:00.{2 * k:03}Z,{scale * v},F{'XZ'[number]},S{i},{word}"
+            for i, (x, word) in enumerate(zip(small.X, words(small), strict=True))
+            for k, v in enumerate(x)
+        ]
+        blocks += ["#datatype,string,long,dateTime,double,string,string,string", header, *rows, ""]
+    path = tmp_path / "influx.csv"
+    path.write_text("\n".join([*blocks, "//END,,,,,,,"]))
+    data = load_dataset(path, channel="FZ", part="serial", time="_time", label="verdict")
+    np.testing.assert_array_equal(data.y, small.y)
+    np.testing.assert_array_equal(data.X, small.X)
+    assert not data.unlabelled
+
+
+def test_a_word_of_a_part_that_is_not_checked_yet_is_stated_and_proposed(
+    small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, y) in enumerate(zip(small.X, small.y, strict=True)):
+        rows = [f"{k * 2},{v},{0 if k < 45 else 2 - y}" for k, v in enumerate(x)]
+        text = "\n".join(["time_ms,FZ,register", *rows])
+        (tmp_path / f"{i:03}.csv").write_text(text)
+    with pytest.raises(DataError) as error:
+        load_dataset(tmp_path, channel="FZ", label="register")
+    label_map = re.search(r"label_map='([^']*,0=)'", str(error.value))
+    assert label_map is not None, error.value
+    swapped = "1=good,2=bad,0="
+    data = load_dataset(tmp_path, channel="FZ", label="register", label_map=swapped)
+    np.testing.assert_array_equal(data.y, small.y)
+    (tmp_path / "025_waits.csv").write_text("time_ms,FZ,verdict\n" + "2,1,\n" * 5)
+    assert parse_label_map({"0": None, "ok": 1}) == {"0": None, "ok": True}
+
+
+def test_an_empty_cell_is_the_good_one_where_the_user_says_so(
+    small: Dataset, tmp_path: Path
+) -> None:
+    causes = np.where(small.y == 1, "", "E12 force too high")
+    table = wide(small).drop(columns="label").assign(fault_text=causes)
+    table.to_csv(tmp_path / "wide.csv", index=False)
+    with pytest.raises(DataError, match="=good,E12 force too high=bad"):
+        load_dataset(tmp_path / "wide.csv", label="fault_text")
+    label_map = "=good,E12 force too high=bad"
+    data = load_dataset(tmp_path / "wide.csv", label="fault_text", label_map=label_map)
+    np.testing.assert_array_equal(data.y, small.y)
+
+
+@pytest.mark.parametrize("axes", [(0, 1, 2), (0, 2, 1)])
+def test_an_archive_names_its_channels_in_an_array_of_texts(
+    axes: tuple[int, ...], small: Dataset, tmp_path: Path
+) -> None:
+    wrench = np.stack([-small.X, small.X, 0.1 * small.X], axis=1).transpose(axes)
+    path = tmp_path / "session.npz"
+    np.savez(path, wrench=wrench, ok=small.y, fs=250, names=np.array(["fx", "fz", "tz"]))
+    with pytest.raises(DataError, match="channel='fz' and label='ok'; found .*fx, fz, tz"):
+        load_dataset(path, channel="fz")
+    data = load_dataset(path, channel="fz", label="ok")
+    np.testing.assert_array_equal(data.X, small.X)
+    assert (data.rate_hz, data.channels, data.unit) == (250.0, ("fz",), "N")
+    whole = load_dataset(path, channel="wrench", label="ok")
+    assert (whole.X.shape[1], whole.channels, whole.unit) == (3, ("fx", "fz", "tz"), "N, N, N·m")
+    assert not whole.notes
