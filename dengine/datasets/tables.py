@@ -26,7 +26,16 @@ from ..errors import DataError, listed
 from ..files import read_errors
 from ..traces import is_time_column
 from . import labels, units
-from .clocks import MAX_GAP, floats, holds_dates, is_rising, place_of_clock, seconds_of
+from .clocks import (
+    MAX_GAP,
+    clock_of,
+    floats,
+    holds_dates,
+    is_rising,
+    place_of_clock,
+    rate_of,
+    seconds_of,
+)
 from .dataset import (
     MAX_LABEL_WORDS,
     Dataset,
@@ -556,10 +565,12 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
         collector.label_file = next(others, collector.label_file)
     first = next(iter(tables))
     for source, table in tables.items():
-        if table.units != tables[first].units:
-            actual = [", ".join(tables[s].units) or "none" for s in (first, source)]
-            wanted = f"the same units in {first} and in {source}"
-            raise DataError(f"Expected {wanted}, got {' and '.join(actual)}; convert one.")
+        units_of = dict(zip(tables[first].frame.columns, tables[first].units, strict=False))
+        for column, unit in zip(table.frame.columns, table.units, strict=False):
+            if unit != (other := units_of.get(column, unit)):
+                wanted = f"the same unit of {column} in {first} and in {source}"
+                actual = f"{other or 'none'} and {unit or 'none'}"
+                raise DataError(f"Expected {wanted}, got {actual}; convert one.")
     return _from_tables(tables, options, collector)
 
 
@@ -599,6 +610,10 @@ def _from_tables(
 
     tables : by the names of their files, or "row" for a DataFrame; the index is the line.
     """
+    turned = {source: _turned(table, options) for source, table in tables.items()}
+    if any(table is not tables[source] for source, table in turned.items()):
+        tables = turned
+        options = replace(options, time=None)
     frames = {source: table.frame for source, table in tables.items()}
     first = next(iter(frames))
     for source, frame in frames.items():
@@ -620,6 +635,60 @@ def _from_tables(
     for source, table in tables.items():
         _add_wide_rows(table, options, collector, source)
     return as_dataset(collector, options)
+
+
+def _turned(table: TextTable, options: LoadOptions) -> TextTable:
+    """Return a table with a column for each part as a wide table, with a row for each part.
+
+    Such a table has times in its first column, eight or more columns of numbers beside it, and
+    labels in the names of these, or in a row without a time. Any other table is returned as it is.
+    The index of the new rows counts the columns.
+    """
+    import pandas as pd
+
+    frame = table.frame
+    if not frame.columns.is_unique or frame.shape[1] <= MIN_NUMBERED or options.part in frame:
+        return table
+    first = str(frame.columns[0])
+    numbers = frame.apply(pd.to_numeric, errors="coerce")
+    is_sample = numbers.iloc[:, 0].notna()
+    times = numbers[is_sample].iloc[:, 0]
+    if not is_rising(times.to_numpy(dtype=np.float64)) or not numbers[is_sample].any().all():
+        return table
+    about = frame[~is_sample].set_index(first).T
+    in_names = labels.labels_in_names(None, options.words)
+    label_counts = _count_labels(frame.columns[1:], in_names)
+    has_names = label_counts[None] < len(about) / 2
+    unique = about.loc[:, about.columns.duplicated(keep=False) ^ True]
+    rows = [
+        name
+        for name in unique
+        if labels.LabelColumn(str(name), options.words, Counter()).has_labels(unique[name])
+    ]
+    if not (has_names or rows):  # words whose meaning the error asks for
+        few = min(MAX_LABEL_WORDS, len(about) / 2)
+        rows = [name for name in unique if 2 <= unique[name].nunique() <= few]
+    if not (has_names or rows or options.label in about):
+        return table
+    samples = frame[is_sample].iloc[:, 1:].T.set_axis(list(map(str, range(len(times)))), axis=1)
+    wide = pd.concat([about, samples], axis=1).assign(**{options.part: frame.columns[1:]})
+    if has_names and not rows:
+        wide["label"] = [_word_in_name(name, in_names) for name in frame.columns[1:]]
+    elif options.label is None:
+        wide = wide.rename(columns={rows[0]: "label"})
+    rate = None
+    with suppress(UnreadableError):
+        clock = clock_of(frame[is_sample].iloc[:, :1], first, table.units)
+        rate = None if clock is None else rate_of(clock, times.index)
+    wide = wide.set_axis(range(2, len(wide) + 2))
+    return table._replace(frame=wide, units=[], rate_hz=None if options.rate_hz else rate)
+
+
+def _word_in_name(name: str, source: labels.LabelSource) -> str:
+    """Return the word that is the label in a name, or "" if it has none."""
+    with suppress(UnreadableError):
+        return source.find(name).word
+    return ""
 
 
 def _check_columns(frame: pd.DataFrame, source: str) -> None:
@@ -693,9 +762,11 @@ def _add_wide_rows(
             for column, word in zip(label_cells, words, strict=True)
         }
         label = labels.agreed_label(finders, do, collector.notes)
-        reading = label.reading._replace(numbers=table.numbers)
+        clock = "" if table.rate_hz is None else "the first column, a column for each part"
+        reading = label.reading._replace(numbers=table.numbers, clock=clock)
         return Recording(
             _without_trailing_nan(trace),
+            table.rate_hz,
             reading=reading,
             label=label.label,
             source=f"{source}, line {line}",

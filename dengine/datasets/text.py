@@ -116,6 +116,8 @@ class TextTable(NamedTuple):
         As in `TextCells`.
     n_remarks : int
         As in `TextCells`.
+    rate_hz : float, optional
+        Of a wide table whose samples have times.
     """
 
     frame: pd.DataFrame
@@ -126,6 +128,7 @@ class TextTable(NamedTuple):
     numbers: str = ""
     fields: Mapping[str, str] = {}
     n_remarks: int = 0
+    rate_hz: float | None = None
 
 
 def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
@@ -181,8 +184,8 @@ def _remarks(cells: TextCells) -> set[int]:
 def _fields_in(lines: Iterable[str]) -> dict[str, str]:
     """Return what lines outside the table state, by its name: the first of each name counts.
 
-    A line states it as `Result: OK`, `# Result = OK` or `Result;OK`, or a line of names stands above
-    one of as many values.
+    A line states it as `Result: OK`, `# Result = OK` or `Result;OK`, or a line of names stands
+    above one of as many values.
     """
     fields = dict[str, str]()
     above: list[str] = []
@@ -309,6 +312,9 @@ def _find_header(
         has_groups = len(set(group_names)) < len(group_names)
         if not (has_groups or is_remark or is_units[0]):
             header = data = 0
+    is_wide = all(all(row[1:]) and len(row) == len(rows[data]) for row in above)
+    if header > 1 and is_wide and len(above[0]) > MIN_TIMES and len({*above[0]}) == len(above[0]):
+        header = data = 0  # a column for each part, and rows of what is known of it
     if not columns and above and _numeric_columns(above[header]):
         header, data = _true_header(above, is_units, header, data)
     units_row = above[header + 1] if header + 1 < data else []
@@ -318,10 +324,15 @@ def _find_header(
     names = above[header] if above else []
     numbered = _numeric_columns(names)
     # Whole numbers may be names.
-    if MIN_TIMES <= len(numbered) < len(names) and _are_even(names[i] for i in sorted(numbered)):
+    is_named = all(names[i].isdecimal() for i in numbered)
+    if (
+        not is_named
+        and MIN_TIMES <= len(numbered) < len(names)
+        and _are_even(names[i] for i in sorted(numbered))
+    ):
         numbers = itertools.count()
         names = [str(next(numbers)) if i in numbered else name for i, name in enumerate(names)]
-    elif 2 * len(numbered) > len(names) and not all(names[i].isdecimal() for i in numbered):
+    elif 2 * len(numbered) > len(names) and not is_named:
         message = f"Expected a header, its first line is of numbers; {_columns_advice(rows)}"
         raise UnreadableError(message, lines[header])
     first = max(data, 1)

@@ -1675,7 +1675,7 @@ def test_an_archive_names_its_channels_in_an_array_of_texts(
     wrench = np.stack([-small.X, small.X, 0.1 * small.X], axis=1).transpose(axes)
     path = tmp_path / "session.npz"
     np.savez(path, wrench=wrench, ok=small.y, fs=250, names=np.array(["fx", "fz", "tz"]))
-    with pytest.raises(DataError, match="channel='fz' and label='ok'; found .*fx, fz, tz"):
+    with pytest.raises(DataError, match=r"channel='fz' and label='ok'; found .*fx, fz, tz"):
         load_dataset(path, channel="fz")
     data = load_dataset(path, channel="fz", label="ok")
     np.testing.assert_array_equal(data.X, small.X)
@@ -1683,3 +1683,45 @@ def test_an_archive_names_its_channels_in_an_array_of_texts(
     whole = load_dataset(path, channel="wrench", label="ok")
     assert (whole.X.shape[1], whole.channels, whole.unit) == (3, ("fx", "fz", "tz"), "N, N, N·m")
     assert not whole.notes
+
+
+@pytest.mark.parametrize(
+    "form", ["words in names", "a row of verdicts", "rows of serials and words"]
+)
+def test_a_table_with_a_column_for_each_part_is_read(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    names = [f"P{i:03}" for i in range(24)]
+    rows = [[f"{k * 2}", *map(str, column)] for k, column in enumerate(small.X.T)]
+    how = {}
+    if form == "words in names":
+        names = [f"{name} {word}" for name, word in zip(names, words(small), strict=True)]
+    elif form == "a row of verdicts":
+        rows.insert(0, ["Verdict", *words(small)])
+    else:
+        rows.insert(0, ["Bewertung", *np.where(small.y == 1, "heil", "Riss")])
+        rows.insert(0, ["Serial", *(f"A{i}" for i in range(24))])
+        with pytest.raises(DataError, match="label_map='heil=good,Riss=bad'|Riss=good,heil=bad"):
+            load_dataset(write_rows(tmp_path / "a.csv", [["t [ms]", *names], *rows]))
+        how = {"label_map": "heil=good,Riss=bad"}
+    path = write_rows(tmp_path / "a.csv", [["t [ms]", *names], *rows])
+    data = load_dataset(path, **how)
+    np.testing.assert_array_equal(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
+    assert data.rate_hz == 500.0
+    assert data.part is not None
+    assert data.part.tolist() == names
+
+
+def write_rows(path: Path, rows: list[list[str]]) -> Path:
+    path.write_text("\n".join(map(";".join, rows)))
+    return path
+
+
+def test_a_file_in_another_unit_is_named_with_the_column(small: Dataset, tmp_path: Path) -> None:
+    table = wide(small)
+    for name, unit in (("a", "N"), ("b", "kN")):
+        rows = [list(table), [*[unit] * 50, ""], *table.astype(str).to_numpy().tolist()]
+        write_rows(tmp_path / f"{name}.csv", rows)
+    with pytest.raises(DataError, match=r"same unit of FZ_0 in a.csv and in b.csv, got N and kN"):
+        load_dataset(tmp_path)
