@@ -312,9 +312,8 @@ def _find_header(
         has_groups = len(set(group_names)) < len(group_names)
         if not (has_groups or is_remark or is_units[0]):
             header = data = 0
-    is_wide = all(all(row[1:]) and len(row) == len(rows[data]) for row in above)
-    if header > 1 and is_wide and len(above[0]) > MIN_TIMES and len({*above[0]}) == len(above[0]):
-        header = data = 0  # a column for each part, and rows of what is known of it
+    if header > 1 and _have_a_column_each(above, len(rows[data])):
+        header = data = 0
     if not columns and above and _numeric_columns(above[header]):
         header, data = _true_header(above, is_units, header, data)
     units_row = above[header + 1] if header + 1 < data else []
@@ -343,6 +342,15 @@ def _find_header(
         data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
     line = lines[header] if lines else 0
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter, {})
+
+
+def _have_a_column_each(above: Sequence[Sequence[str]], n: int) -> bool:
+    """Return whether rows above data of n columns tell something of each of many columns.
+
+    So they do in a table with a column for each part. The first must tell the columns apart.
+    """
+    is_full = all(all(row[1:]) and len(row) == n for row in above)
+    return is_full and n > MIN_TIMES and len({*above[0]}) == n
 
 
 def _true_header(
