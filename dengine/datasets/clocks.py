@@ -33,6 +33,7 @@ SLOWEST_STEP = 0.5  # seconds: a clock without a unit whose steps are longer cou
 RATES = (1.0, 1e6)  # hertz that are plausible
 SPANS = (1e-3, 3600.0)  # plausible durations of a recording, in seconds
 DAY = units.SECONDS["d"]
+HALF_DAY = 12  # hours
 EXCEL_DAYS = (2e4, 8e4)  # since 1900: the years 1954 to 2119
 # Counts since an epoch: the seconds in one, and the seconds from the epoch to 1970. Those of 100 ns
 # are Windows' FILETIME, since 1601, and .NET's ticks, since year 1.
@@ -53,6 +54,9 @@ SLASHED_DATE = re.compile(r"^(\d\d?)/(\d\d?)/(\d{4})")
 TIME_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
 DATE_FORM = r"\d{4}-?\d\d-?\d\d|\d{4}/\d\d?/\d\d?|\d\d?[./]\d\d?[./]\d{2,4}"
 TIME_FORM = r"\d{1,2}:?\d\d(:?\d\d([.,]\d+)?)?\s*(Z|UTC|AM|PM|[+\-−]\d\d(:?\d\d)?)?"
+# Two columns of which one is the date of the other's time of day.
+DATE = re.compile(r"(19|20)\d\d([-/.]?)[01]?\d\2[0-3]?\d|[0-3]?\d[./-][01]?\d[./-](19|20)?\d\d")
+DAY_TIME = re.compile(r"\d{1,2}:\d\d:\d\d(?P<fraction>[.,]\d+)?( ?[AaPp][Mm])?")
 TIMESTAMP = re.compile(
     rf"({DATE_FORM})([T ]\s*{TIME_FORM})?|\d{{1,2}}:\d\d(:\d\d)?([.,]\d+)?", re.IGNORECASE
 )
@@ -95,6 +99,34 @@ def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
             if str(cell).strip().lower() not in EMPTY_CELLS:
                 wrong.append(index)
     return values, wrong
+
+
+def join_date_and_time(frame: pd.DataFrame) -> None:
+    """Join a column of dates and one of times of day, in place, in a table of texts.
+
+    Both columns get date and time. A column of whole milliseconds, called ms, is added to times
+    without a fraction. The columns stay as they are if the time passes midnight but the date stays,
+    as that of the first row.
+    """
+    import pandas as pd
+
+    if len(frame) < 2:
+        return
+    ends = frame.iloc[[0, -1]].astype(str)
+    dates = [i for i in range(frame.shape[1]) if ends.iloc[:, i].str.fullmatch(DATE).all()]
+    times = [i for i in range(frame.shape[1]) if ends.iloc[:, i].str.fullmatch(DAY_TIME).all()]
+    if len(dates) != 1 or len(times) != 1:
+        return
+    date = frame.iloc[:, dates[0]]
+    time = frame.iloc[:, times[0]]
+    hours = pd.to_numeric(time.str.partition(":")[0], errors="coerce")
+    if ((hours.diff() <= -HALF_DAY) & (date == date.shift())).any():
+        return
+    names = [str(name).lower() for name in frame.columns]
+    if "ms" in names and not ends.iloc[:, times[0]].str.contains("[.,]").any():
+        time = time + "." + frame.iloc[:, names.index("ms")].str.zfill(3)
+    for place in (dates[0], times[0]):
+        frame.isetitem(place, date + " " + time)
 
 
 def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
@@ -313,6 +345,9 @@ def seconds_of(
             return _elapsed(column, times) * scale, wrong, note, unit
     seconds, missing = _parse_timestamps(column)
     form = "dates" if holds_dates(column) else "times of day"
+    parts = column.astype(str).str.strip().str.extract(SLASHED_DATE).astype(float)
+    if parts.notna().all(axis=None):
+        form = f"dates, {'day' if _is_day_first(parts) else 'month'} first"
     return seconds, column.index[missing].tolist(), "", form
 
 
@@ -379,10 +414,7 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
                 DAY_FIRST, lambda m: f"{m[3]}-{m[2]:0>2}-{m[1]:0>2}", regex=True
             )
             parts = text.str.extract(SLASHED_DATE).astype(float)
-            # Beyond 12 it is a day. Of two readings dates do not go back in the right one.
-            goes_back = [(372 * parts[2] + 31 * parts[m]).diff().min() < 0 for m in (0, 1)]
-            is_day_first = (parts[0] > 12).any() or goes_back == [True, False]
-            day, month = (1, 2) if is_day_first and not (parts[1] > 12).any() else (2, 1)
+            day, month = (1, 2) if _is_day_first(parts) else (2, 1)
             text = text.str.replace(
                 SLASHED_DATE, lambda m: f"{m[3]}-{m[month]:0>2}-{m[day]:0>2}", regex=True
             )
@@ -393,8 +425,31 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
     valid = stamps[~missing]
     if not len(valid):
         return np.full(len(column), np.nan), missing
-    elapsed = stamps - valid.iloc[0]
-    return elapsed.dt.total_seconds().to_numpy(dtype=np.float64), missing
+    elapsed = (stamps - valid.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
+    return (_over_midnight(elapsed) if stamps.dtype.kind == "m" else elapsed), missing
+
+
+def _is_day_first(parts: pd.DataFrame) -> bool:
+    """Return whether the first number of dates as 3/2/2026 is the day.
+
+    parts : the three numbers of each date.
+    """
+    # Beyond 12 it is a day. Of two readings dates do not go back in the right one.
+    goes_back = [(372 * parts[2] + 31 * parts[m]).diff().min() < 0 for m in (0, 1)]
+    is_day_first = bool((parts[0] > 12).any()) or goes_back == [True, False]
+    return is_day_first and not (parts[1] > 12).any()
+
+
+def _over_midnight(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return times of day, shape (n,), as times that go on where a step is one over midnight.
+
+    Such a step goes back by a day, but for at most five usual steps.
+    """
+    steps = np.diff(seconds, prepend=seconds[:1])
+    forward = steps[steps > 0]
+    usual = float(np.median(forward)) if len(forward) else 0.0
+    is_over = (steps < 0) & (steps + DAY <= MAX_GAP * usual)
+    return seconds + DAY * np.cumsum(is_over)
 
 
 def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tuple[float, str]:

@@ -401,14 +401,27 @@ def describe_ends(
     return f"{source}: {listed(texts)} in {trace.shape[1]} samples"
 
 
-def label_map_of(words: Counter[str], labels: Collection[int] = ()) -> str:
+def label_map_of(
+    words: Counter[str], labels: Collection[int] = (), unlabelled: Mapping[str, int] | None = None
+) -> str:
     """Return a label map that users may take, as "heil=good,Riss=bad", for words without meaning.
 
     The most frequent is good, and all others bad, unless one is another with something before it:
     then this is bad. Beside labels of one side all words are of the other.
 
-    labels : those that are known.
+    Parameters
+    ----------
+    words : Counter
+    labels : collection of int
+        Those that are known. Without any a dash, or an empty cell in most rows, may mean that there
+        is no fault: the map says so.
+    unlabelled : mapping of str to int
+        How often each word of an unchecked part is there.
     """
+    no_fault = {word: (unlabelled or {}).get(word, 0) for word in ("-", "") if not labels}
+    if no_fault.get("", 0) <= words.total():
+        no_fault.pop("", None)
+    words = words + Counter(no_fault)
     ordered = [word for word, _ in words.most_common()]
     if len(set(labels)) == 1:
         bad = set(ordered) if 1 in labels else set()
@@ -520,17 +533,24 @@ class RecordingCollector:
             line = line or getattr(error, "line", 0)
             self.faults.append(Fault(source, line, str(error).rstrip(".")))
 
-    def order_by_start(self) -> None:
+    def order_by_start(self, *, apart: bool = False) -> None:
         """Put the recordings in the order of their first times, if all are known and differ.
 
-        Then `ordered` is True, and `order` says so; otherwise nothing changes.
+        Then `ordered` is True, and `order` says so; otherwise nothing changes. With `apart` they
+        must not overlap; if they do, `order` says that it is not that of their times.
         """
-        starts = [r.start for r in self.recordings if r.start is not None]
-        if len(set(starts)) < len(self.recordings):
+        in_order = sorted(self.recordings, key=lambda recording: recording.start or 0.0)
+        starts = [r.start for r in in_order if r.start is not None]
+        if len(set(starts)) < len(in_order):
+            return
+        spans = [(r.trace.shape[1] - 1) / (r.rate_hz or np.inf) for r in in_order]
+        if apart and (np.diff(starts) <= spans[:-1]).any():
+            is_other = any(a is not b for a, b in zip(in_order, self.recordings, strict=True))
+            self.order = "as the rows, not by their times" if is_other else self.order
             return
         self.ordered = True
         self.order = "by the dates of their clocks"
-        self.recordings.sort(key=lambda recording: recording.start or 0.0)
+        self.recordings = in_order
 
     def check_label_words(self) -> None:
         """Raise DataError if too many labels are words whose meaning is unknown.
@@ -543,11 +563,8 @@ class RecordingCollector:
         is_one_sided = len(labels) == 1
         if sum(self.unknown_words.values()) <= (n_known / 9 if is_one_sided else n_known):
             return
-        # Without known labels a dash, or an empty cell, may mean that there is no fault.
-        no_fault = {word: self.unlabelled_words[word] * (not labels) for word in ("-", "")}
-        no_fault[""] *= no_fault[""] > self.unknown_words.total()
-        words = self.unknown_words + Counter(no_fault)
-        label_map = label_map_of(words, labels)
+        words = self.unknown_words
+        label_map = label_map_of(words, labels, self.unlabelled_words)
         or_else = "" if is_one_sided else " or the other way round"
         do = f"say what they mean, label_map={label_map!r}{or_else}"
         if len(words) > MAX_LABEL_WORDS:

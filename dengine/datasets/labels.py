@@ -440,7 +440,7 @@ class LabelColumn:
         raise SeveralLabelsError(message, tuple(stated))
 
 
-def _read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
+def read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
     """Read a file and return the cells of one of its columns as texts.
 
     Without such a column it is the value of a line outside the table, as `Result;OK`. Raises
@@ -465,7 +465,7 @@ def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOption
 
     def find(name: str) -> SourcedLabel:
         """Return the label that all cells of a recording's column mean."""
-        return label_column.find(_read_cells(paths[name], column, options), place)
+        return label_column.find(read_cells(paths[name], column, options), place)
 
     advice = f"column {column} has none; name another column (label)"
     return LabelSource(find, advice, place, notes=notes)

@@ -8,11 +8,10 @@ and a column of parts. `load_dataset` calls `read_folder`, `read_tables` and `fr
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -27,6 +26,7 @@ from ..files import read_errors
 from ..traces import is_time_column
 from . import labels, units
 from .clocks import (
+    HEAD,
     MAX_GAP,
     clock_of,
     floats,
@@ -47,6 +47,7 @@ from .dataset import (
     UnlabelledError,
     UnreadableError,
     as_dataset,
+    label_map_of,
 )
 from .encodings import decode
 from .numerals import UndecidedError
@@ -76,6 +77,7 @@ MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered 
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 NEAR = 0.01  # of the largest number: numbers that differ by less are rounded in two ways
 TRIED = 20  # recordings, on which advice about a column is tried
+MIN_RUN = 8  # rows on average that stand together in a table that is in the order of its parts
 MAX_STATIONS = 12  # more different values in the rows of a part are no stations
 # What a column is called that tells where a part was made.
 STATION = re.compile(
@@ -254,7 +256,12 @@ def read_folder(
         wanted = f"a file of labels with a column {options.part}"
         raise DataError(f"Expected {wanted}: a folder's names tell no parts' numbers.")
     source, label_columns = _label_source(named, heads, options)
-    channels = options.channels or _usual_channels(heads, options, label_columns)
+    collect = partial(_collect_folder, folder, named, heads, source, options)
+    try:
+        channels = options.channels or _usual_channels(heads, options, label_columns)
+    except DataError as error:
+        check = partial(collect, _read_nothing, RecordingCollector(name, ()))
+        raise _with_label_error(error, check) from error
     collector = RecordingCollector(name, channels)
     in_order = sorted(named, key=lambda name: natural_key(source.without_label(name)))
     collector.ordered = sorted(named, key=natural_key) == in_order
@@ -276,6 +283,24 @@ def read_folder(
         collector.notes.update(notes)
         return recording
 
+    collect(read, collector)
+    collector.order_by_start()
+    return as_dataset(collector, options)
+
+
+def _collect_folder(
+    folder: Path,
+    named: Mapping[str, Path],
+    heads: FolderHeads,
+    source: labels.LabelSource,
+    options: LoadOptions,
+    read: Callable[[Path], Recording],
+    collector: RecordingCollector,
+) -> None:
+    """Read the recordings of a folder with their labels into a collector.
+
+    Raises DataError, with advice, if most have no label, or a word whose meaning is unknown.
+    """
     try:
         labels.collect_recordings(named, read, source, collector).check_label_words()
     except DataError as error:
@@ -287,8 +312,29 @@ def read_folder(
         if advice is None:
             raise
         raise DataError(f"{str(error).rpartition(';')[0]}; {advice}.") from error
-    collector.order_by_start()
-    return as_dataset(collector, options)
+
+
+def _read_nothing(_place: Any) -> Recording:
+    """Return an empty recording, where only labels are to be checked."""
+    return Recording(np.zeros((1, 1), dtype=np.float32))
+
+
+def _check_labels(places: Mapping[str, Any], source: labels.LabelSource, name: str) -> None:
+    """Raise DataError if most recordings have no label, or a word of unknown meaning.
+
+    places, name : of the recordings, and of their data set.
+    """
+    collector = RecordingCollector(name, ())
+    labels.collect_recordings(places, _read_nothing, source, collector).check_label_words()
+
+
+def _with_label_error(error: DataError, check: Callable[[], object]) -> DataError:
+    """Return an error about channels, with what `check` says is wrong with the labels, too."""
+    try:
+        check()
+    except DataError as other:
+        return DataError(f"{error} {other}")
+    return error
 
 
 def _label_source(
@@ -454,7 +500,34 @@ def _label_advice(
     if not likely:
         return None
     column = min(likely, key=lambda column: len(set(counts_by_column[column]) - {0, 1, ""}))
-    return f"if column {column} tells them, name it: label={column!r}"
+    cells = Counter[str]()
+    for path in sample.values():
+        with suppress(UnreadableError, OSError):
+            cells.update(set(labels.read_cells(path, column, options)))
+    return f"if column {column} tells them, name it: {_label_hint(column, cells, options)}"
+
+
+def _label_hint(column: str, cells: Counter[Any], options: LoadOptions) -> str:
+    """Return the options, for an error, that name a column of labels and say what its words mean.
+
+    cells : how often each is there. Those whose meaning is known need no label map.
+    """
+    label_column = labels.LabelColumn(column, options.words, Counter())
+    unknown = Counter[str]()
+    unlabelled = Counter[str]()
+    known = set[int]()
+    for cell, n in cells.items():
+        try:
+            known.add(label_column.label_of(cell))
+        except UnknownWordError as error:
+            unknown[error.word] += n
+        except UnlabelledError as error:
+            unlabelled[error.word] += n
+    if not 1 <= len(unknown) <= MAX_LABEL_WORDS:
+        return f"label={column!r}"
+    label_map = label_map_of(unknown, known, unlabelled)
+    or_else = "" if known else " or the other way round"
+    return f"label={column!r}, label_map={label_map!r}{or_else}"
 
 
 def _common_decimal_mark(paths: Sequence[Path], options: LoadOptions) -> str | None:
@@ -890,32 +963,75 @@ def _from_long(
         frame = frame[~is_repeated]
     frame = _pivot_signals(frame, [options.part, time, *label_columns], options)
     others = [name for name in frame.columns if name not in (options.part, time, *label_columns)]
-    numeric = [name for name in others if not floats(frame[name])[1]]
-    collector.channels = choose_channels(numeric, options)
+    check = partial(_check_labels, all_rows, label_source, collector.name)
+    collector.channels = _channels_of_long(frame, others, options, check)
     seconds, *_ = seconds_of(frame[time], time, column_units.get(time, ""))
-    part = frame[options.part]
-    is_new = (part != part.shift()).to_numpy() | np.r_[False, np.diff(seconds) < 0]
-    with_seconds = frame.assign(**{SECONDS_COLUMN: seconds, RUN_COLUMN: np.cumsum(is_new)})
-    groups = with_seconds.groupby(options.part, sort=False)
-    rows_of_part = {str(part): rows for part, rows in groups}
+    rows_of_part = _rows_by_part(frame, seconds, options)
     no_stations = {options.part, time, *label_columns, *collector.channels}
     _check_single_station(rows_of_part, [name for name in others if name not in no_stations])
-    rows_of_part = _order_by_time(rows_of_part, holds_dates(frame[time]), collector)
+    has_dates = holds_dates(frame[time])
+    if not has_dates:
+        _check_together(rows_of_part)
     places = [frame.columns.get_loc(name) for name in collector.channels]
 
     def read(rows: pd.DataFrame) -> Recording:
         """Return the rows of a part as a trace, in the order of their times."""
         rows = rows.sort_values(SECONDS_COLUMN, kind="stable")
+        start = float(rows[SECONDS_COLUMN].iloc[0]) if has_dates else None
         rows = rows.drop(columns=[SECONDS_COLUMN, RUN_COLUMN])
         units_row = [column_units.get(name, "") for name in rows.columns]
         timed = rows_to_trace(rows, places, replace(options, time=time), collector.notes, units_row)
         channels = collector.channels
         channel_units = (column_units.get(name) or units.split(name)[1] for name in channels)
         reading = timed.reading._replace(numbers=first.numbers)
-        return timed._replace(units=tuple(channel_units), reading=reading)
+        return timed._replace(units=tuple(channel_units), start=start, reading=reading)
 
     labels.collect_recordings(rows_of_part, read, label_source, collector)
+    collector.order_by_start(apart=True)
     return as_dataset(collector, options)
+
+
+def _channels_of_long(
+    frame: pd.DataFrame,
+    names: Sequence[str],
+    options: LoadOptions,
+    check_labels: Callable[[], object],
+) -> tuple[str, ...]:
+    """Return the channels of a long table, among those columns `names` that hold numbers.
+
+    If they must be named, DataError is raised, which also says what `check_labels` finds wrong.
+    """
+    try:
+        return choose_channels([name for name in names if not floats(frame[name])[1]], options)
+    except DataError as error:
+        raise _with_label_error(error, check_labels) from error
+
+
+def _rows_by_part(
+    frame: pd.DataFrame, seconds: NDArray[np.float64], options: LoadOptions
+) -> dict[str, pd.DataFrame]:
+    """Return the rows of each part of a long table, with columns of their times and runs."""
+    part = frame[options.part]
+    is_new = (part != part.shift()).to_numpy() | np.r_[False, np.diff(seconds) < 0]
+    with_seconds = frame.assign(**{SECONDS_COLUMN: seconds, RUN_COLUMN: np.cumsum(is_new)})
+    groups = with_seconds.groupby(options.part, sort=False)
+    return {str(part): rows for part, rows in groups}
+
+
+def _check_together(rows_of_part: Mapping[str, pd.DataFrame]) -> None:
+    """Raise DataError if parts of a table without dates stand in it two or more times.
+
+    That is so if all parts stand in few runs of many rows, and some in several: a number that was
+    given again, whose times go on, would be one long recording.
+    """
+    n_runs = {part: rows[RUN_COLUMN].nunique() for part, rows in rows_of_part.items()}
+    n_rows = sum(map(len, rows_of_part.values()))
+    part = max(n_runs, key=n_runs.__getitem__, default="")
+    if not n_runs or n_runs[part] < 2 or n_rows < MIN_RUN * sum(n_runs.values()):
+        return
+    lines = listed(run.index[0] for _, run in rows_of_part[part].groupby(RUN_COLUMN))
+    wanted = f"the rows of each part together, part {part} begins in lines {lines}"
+    raise DataError(f"Expected {wanted}, other parts between; make the parts' numbers unique.")
 
 
 def _label_source_of_parts(
@@ -1022,36 +1138,23 @@ def _are_stations(rows: pd.DataFrame, name: str) -> bool:
     return not (is_in_order and is_number and STATION.fullmatch(name) is None)
 
 
-def _order_by_time(
-    rows_of_part: dict[str, pd.DataFrame], has_dates: bool, collector: RecordingCollector
-) -> dict[str, pd.DataFrame]:
-    """Return the parts in the order of their first times, if these are dates and no parts overlap;
-    else in that of the rows. The collector's `order` says which it is.
-    """
-    starts = {part: rows[SECONDS_COLUMN].min() for part, rows in rows_of_part.items()}
-    ends = {part: rows[SECONDS_COLUMN].max() for part, rows in rows_of_part.items()}
-    by_time = sorted(starts, key=starts.__getitem__)
-    is_known = np.isfinite([*starts.values(), *ends.values()]).all()
-    is_apart = all(ends[a] < starts[b] for a, b in itertools.pairwise(by_time))
-    if has_dates and is_known and is_apart:
-        collector.order = "by the dates of their clocks"
-        return {part: rows_of_part[part] for part in by_time}
-    if by_time != list(starts):
-        collector.order = "as the rows, not by their times"
-    return rows_of_part
-
-
 def _time_column(frame: pd.DataFrame, options: LoadOptions) -> str:
     """Return the column of times: the one that the user states, in upper or lower case, else by
     its name.
 
-    A stated column that is not there is returned as stated; "" if no name is a clock's.
+    A stated column that is not there is returned as stated. Without a clock's name it is the first
+    column of dates; "" if there is none.
     """
     columns = [str(name) for name in frame.columns]
     if options.time:
         places = units.find_columns(options.time, columns)
         return columns[places[0]] if places else options.time
-    return next((name for name in columns if is_time_column(name)), "")
+    head = frame.iloc[:HEAD]
+    with suppress(UnreadableError):
+        place = place_of_clock(head)
+        if place is not None:
+            return columns[place]
+    return next((name for i, name in enumerate(columns) if holds_dates(head.iloc[:, i])), "")
 
 
 def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -> pd.DataFrame:
@@ -1115,8 +1218,8 @@ def _long_table_advice(frame: pd.DataFrame, options: LoadOptions, label_file: st
         return ""
     rows = frame.mask(frame == "").bfill()  # a label may stand in a part's last row alone
     others = [name for name in frame.columns if name not in (time, part)]
-    changes = {name: int((rows[name] != rows[name].shift()).sum()) for name in others}
-    few = [name for name, n in changes.items() if 2 <= n <= len(frame) / 5]
+    changes = _steady_columns(rows[others], any_order=not part)
+    few = list(changes)
     hints = []
     if not part:
         if not few:
@@ -1129,13 +1232,43 @@ def _long_table_advice(frame: pd.DataFrame, options: LoadOptions, label_file: st
         is_other = {name: name.lower() not in labels.LABEL_COLUMNS for name in few}
         label = min(few, key=lambda name: (is_other[name], changes[name]), default=part)
         if label != part:
-            hints.append(f"label={label!r}")
+            hints.append(_label_hint(label, Counter(frame[label].astype(str)), options))
         else:
             hints.append(_parts_file_advice(frame[part], label_file, options))
     if not hints:
         return ""
+    hints += _channel_hint([name for name in others if name not in few], frame, options)
     which = "the columns that tell which part it is, when, and the label"
     return f"{which}, as in {', '.join(hints)}"
+
+
+def _channel_hint(names: Sequence[str], frame: pd.DataFrame, options: LoadOptions) -> list[str]:
+    """Return a hint to name the channel, in a list, if several columns may be it; else none."""
+    numeric = [name for name in names if not floats(frame[name])[1]]
+    if options.channels or FORCE in numeric or len(numeric) < 2:
+        return []
+    return [f"channel={_likely_channel(numeric)!r}"]
+
+
+def _steady_columns(rows: pd.DataFrame, *, any_order: bool) -> dict[str, int]:
+    """Return how often the value of a column changes, for those that may be of parts or labels.
+
+    They change once or more, and in at most a fifth of the rows. If there is none, with
+    `any_order` the values of columns without fractions are counted, for rows in any order.
+    """
+    most = len(rows) / 5
+    changes = {name: int((rows[name] != rows[name].shift()).sum()) for name in rows}
+    few = {name: n for name, n in changes.items() if 2 <= n <= most}
+    if few or not any_order:
+        return few
+    values = {name: rows[name].nunique() for name in rows if _are_whole(rows[name])}
+    return {name: n for name, n in values.items() if 2 <= n <= most}
+
+
+def _are_whole(cells: pd.Series) -> bool:
+    """Return whether a column has texts or whole numbers, as those of parts, and no fractions."""
+    numbers, wrong = floats(cells)
+    return bool(wrong) or bool((numbers == np.rint(numbers)).all())
 
 
 def _rises_within_parts(frame: pd.DataFrame, part: str, name: str) -> bool:
@@ -1162,6 +1295,11 @@ def _parts_file_advice(parts: pd.Series, label_file: str, options: LoadOptions) 
     return "and a CSV file of parts and labels (labels)"
 
 
+def _likely_channel(names: Sequence[str]) -> str:
+    """Return the first of some channels whose name is that of a force, else the first."""
+    return next((name for name in names if units.FORCE_NAME.fullmatch(name)), names[0])
+
+
 def choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str, ...]:
     """Return the channels that the user stated, else the force, else the only one available.
 
@@ -1175,8 +1313,8 @@ def choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str
         wanted = f"the channel {listed(missing) or 'of the samples'}"
         raise DataError(f"Expected {wanted}, found {listed(available) or 'none'}.")
     if not options.channels and len(chosen) > 1:
-        example = min(chosen, key=chosen.count)  # not a name that occurs twice
-        wanted = f"the channel to be named, as in channel={example!r}"
+        single = [name for name in chosen if chosen.count(name) == 1] or chosen
+        wanted = f"the channel to be named, as in channel={_likely_channel(single)!r}"
         raise DataError(f"Expected {wanted}; there are {listed(available)}.")
     return chosen
 
@@ -1218,7 +1356,8 @@ def _label_column(frame: pd.DataFrame, options: LoadOptions) -> str:
     likely = [name for name, n in counts.items() if 2 <= n <= MAX_LABEL_WORDS]
     do = "add one that is called so"
     if likely:
-        do = f"name it: label={min(likely, key=counts.__getitem__)!r}"
+        column = min(likely, key=counts.__getitem__)
+        do = f"name it: {_label_hint(column, Counter(frame[column].astype(str)), options)}"
     columns = listed(others or frame.columns)
     raise DataError(f"Expected a column of labels, y or label, found {columns}; {do}.")
 

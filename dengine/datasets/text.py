@@ -32,6 +32,7 @@ from .clocks import (
     floats,
     in_order_of_time,
     is_rising,
+    join_date_and_time,
     place_of_clock,
     rate_of,
     resample_evenly,
@@ -460,9 +461,7 @@ def read_table(
         for i, row in cells.rows.items()
         if i not in complete
     }
-    decimals = [len(row[-1].replace(",", ".").partition(".")[2]) for row in complete.values()]
-    is_cut = len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
-    if text[-1:] != "\n" and len(decimals) > 2 and is_cut:
+    if text[-1:] != "\n" and _is_last_number_cut([row[-1] for row in complete.values()]):
         wrong[max(complete)] = "Expected as many decimals as above, the last number is cut off"
     frame = pd.DataFrame(
         list(complete.values()), index=list(complete), columns=header, dtype=object
@@ -477,6 +476,7 @@ def read_table(
         thousands = f"thousands mark {group!r}" if group else ""
         marks = (f"decimal mark {mark!r}" if mark else "whole numbers", thousands, between, other)
         numbers = ", ".join(filter(None, marks))
+        join_date_and_time(frame)
     faults = [Fault(path.name, i, message) for i, message in sorted(wrong.items())]
     frame = frame.drop(index=[i for i in wrong if i in complete])
     column_units = cells.units[:n]
@@ -491,6 +491,15 @@ def read_table(
         column_units[i] = unit
     about = (cells.fields, cells.n_remarks)
     return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
+
+
+def _is_last_number_cut(cells: Sequence[str]) -> bool:
+    """Return whether the last of a column's cells has fewer decimals than all others, as many each.
+
+    False for fewer than three cells.
+    """
+    decimals = [len(cell.replace(",", ".").partition(".")[2]) for cell in cells]
+    return len(decimals) > 2 and len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
 
 
 def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:

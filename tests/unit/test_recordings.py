@@ -1725,3 +1725,89 @@ def test_a_file_in_another_unit_is_named_with_the_column(small: Dataset, tmp_pat
         write_rows(tmp_path / f"{name}.csv", rows)
     with pytest.raises(DataError, match=r"same unit of FZ_0 in a.csv and in b.csv, got N and kN"):
         load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("form", ["folder", "long"])
+def test_one_error_names_channel_label_and_map(form: str, small: Dataset, tmp_path: Path) -> None:
+    frames = [
+        pd.DataFrame(
+            {"t_ms": 2 * np.arange(50), "X": x, "Kraft": x, "Urteil": word, "Teil": f"T{i}"}
+        )
+        for i, (x, word) in enumerate(zip(small.X, np.where(small.y, "heil", "Riss"), strict=True))
+    ]
+    path = tmp_path
+    if form == "folder":
+        for i, frame in enumerate(frames):
+            frame.drop(columns="Teil").to_csv(tmp_path / f"{i:03}.csv", index=False)
+    else:
+        path = tmp_path / "long.csv"
+        pd.concat(frames).to_csv(path, index=False)
+    with pytest.raises(DataError) as error:
+        load_dataset(path)
+    text = as_options(str(error.value))
+    options = dict(re.findall(r"--([a-z-]+) '?([^' ]*\w)", text))
+    how = {name.replace("-", "_"): value for name, value in options.items()}
+    good = "heil=good,Riss=bad"
+    assert how.pop("label_map") in (good, "Riss=good,heil=bad")
+    data = load_dataset(path, **how, label_map=good)
+    np.testing.assert_array_equal(data.y, small.y)
+    np.testing.assert_array_equal(data.X, small.X)
+
+
+@pytest.mark.parametrize("form", ["two columns", "whole seconds and ms", "times alone"])
+def test_a_recording_over_midnight_is_one(form: str, small: Dataset, tmp_path: Path) -> None:
+    start = pd.Timestamp("2026-03-01T23:59:59.900")
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        stamps = start + pd.Timedelta(days=24 - i) + pd.to_timedelta(np.arange(50) * 4, unit="ms")
+        clock = {"Date": stamps.strftime("%d.%m.%Y"), "UTC Time": stamps.strftime("%H:%M:%S.%f")}
+        if form == "whole seconds and ms":
+            clock |= {"UTC Time": stamps.strftime("%H:%M:%S"), "ms": stamps.microsecond // 1000}
+        elif form == "times alone":
+            clock.pop("Date")
+        pd.DataFrame({**clock, "FZ": x}).to_csv(tmp_path / f"{i:03}_{word}.csv", index=False)
+    data = load_dataset(tmp_path, channel="FZ")
+    by_date = slice(None, None, 1 if form == "times alone" else -1)
+    np.testing.assert_array_equal(data.X, small.X[by_date])
+    assert not data.faults
+    assert data.rate_hz == 250.0
+
+
+def test_the_clock_says_whether_the_day_or_the_month_comes_first(
+    small: Dataset, tmp_path: Path
+) -> None:
+    for order in ("%d/%m/%Y", "%m/%d/%Y"):
+        stamps = pd.Timestamp("2026-02-25") + pd.to_timedelta(np.arange(50) * 4, unit="ms")
+        for i, word in enumerate(("OK", "NOK")):
+            clock = stamps.strftime(f"{order} %H:%M:%S.%f")
+            frame = pd.DataFrame({"time": clock, "FZ": small.X[i]})
+            frame.to_csv(tmp_path / f"{i}_{word}.csv", index=False)
+        first = "day" if order.startswith("%d") else "month"
+        assert f"dates, {first} first" in load_dataset(tmp_path).reading["clock"]
+
+
+def table_of_parts(data: Dataset, starts: np.ndarray, number: np.ndarray) -> pd.DataFrame:
+    """A row for each sample: trace i is of part number[i] and begins at starts[i]."""
+    frames = [
+        pd.DataFrame({"part": part, "time": start + np.arange(50) * 0.004, "FZ": x, "label": word})
+        for x, word, start, part in zip(data.X, words(data), starts, number, strict=True)
+    ]
+    return pd.concat(frames)
+
+
+def test_a_part_whose_rows_stand_apart_is_refused_also_if_its_times_go_on(small: Dataset) -> None:
+    good = Dataset(small.X, np.ones(24, dtype=np.int8))
+    table = table_of_parts(good, np.repeat([0.0, 0.2], 12), np.tile(np.arange(12), 2))
+    with pytest.raises(DataError, match=r"part 0 begins in lines 1, 601, other parts between"):
+        load_dataset(table, time="time")
+
+
+def test_a_part_that_cannot_be_read_leaves_the_others_in_the_order_of_their_dates(
+    small: Dataset,
+) -> None:
+    starts = 1_772_344_800.0 + 10.0 * np.arange(24)[::-1]
+    table = table_of_parts(small, starts, np.arange(24)).reset_index(drop=True)
+    table.loc[25:49, "time"] += 500.0  # a gap: this part seems to last as long as all others
+    data = load_dataset(table, time="time")
+    assert len(data.faults) == 1
+    assert data.reading["order"] == "by the dates of their clocks"
+    np.testing.assert_array_equal(data.X, small.X[:0:-1])
