@@ -440,7 +440,8 @@ class Recording(NamedTuple):
     units : tuple of str
         Unit of each channel, "" where unknown.
     start : float or None
-        Its first time in seconds since 1970, if its clock holds dates.
+        Its first time in seconds since 1970, if its clock holds dates; in a long table since the
+        first row.
     reading : Reading
         How it was read.
     label : int
@@ -533,18 +534,19 @@ class RecordingCollector:
             line = line or getattr(error, "line", 0)
             self.faults.append(Fault(source, line, str(error).rstrip(".")))
 
-    def order_by_start(self, *, apart: bool = False) -> None:
+    def order_by_start(self, *, apart: bool = False, has_dates: bool = True) -> None:
         """Put the recordings in the order of their first times, if all are known and differ.
 
         Then `ordered` is True, and `order` says so; otherwise nothing changes. With `apart` they
-        must not overlap; if they do, `order` says that it is not that of their times.
+        must not overlap. If they do, or the times are no dates (`has_dates`), they stay as they
+        are, and `order` says so if their times have another order.
         """
         in_order = sorted(self.recordings, key=lambda recording: recording.start or 0.0)
         starts = [r.start for r in in_order if r.start is not None]
-        if len(set(starts)) < len(in_order):
+        if len(set(starts)) < len(in_order) and has_dates:
             return
         spans = [(r.trace.shape[1] - 1) / (r.rate_hz or np.inf) for r in in_order]
-        if apart and (np.diff(starts) <= spans[:-1]).any():
+        if not has_dates or (apart and (np.diff(starts) <= spans[:-1]).any()):
             is_other = any(a is not b for a, b in zip(in_order, self.recordings, strict=True))
             self.order = "as the rows, not by their times" if is_other else self.order
             return

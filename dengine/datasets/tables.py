@@ -977,7 +977,7 @@ def _from_long(
     def read(rows: pd.DataFrame) -> Recording:
         """Return the rows of a part as a trace, in the order of their times."""
         rows = rows.sort_values(SECONDS_COLUMN, kind="stable")
-        start = float(rows[SECONDS_COLUMN].iloc[0]) if has_dates else None
+        start = float(rows[SECONDS_COLUMN].iloc[0])
         rows = rows.drop(columns=[SECONDS_COLUMN, RUN_COLUMN])
         units_row = [column_units.get(name, "") for name in rows.columns]
         timed = rows_to_trace(rows, places, replace(options, time=time), collector.notes, units_row)
@@ -987,7 +987,7 @@ def _from_long(
         return timed._replace(units=tuple(channel_units), start=start, reading=reading)
 
     labels.collect_recordings(rows_of_part, read, label_source, collector)
-    collector.order_by_start(apart=True)
+    collector.order_by_start(apart=True, has_dates=has_dates)
     return as_dataset(collector, options)
 
 
@@ -1019,16 +1019,22 @@ def _rows_by_part(
 
 
 def _check_together(rows_of_part: Mapping[str, pd.DataFrame]) -> None:
-    """Raise DataError if parts of a table without dates stand in it two or more times.
+    """Raise DataError if parts of a table, whose clock begins anew in each, stand in it twice.
 
-    That is so if all parts stand in few runs of many rows, and some in several: a number that was
-    given again, whose times go on, would be one long recording.
+    That is so if all parts stand in few runs of many rows, and one in several without a gap in
+    time: a number that was given again, whose times go on, would be one long recording.
     """
+    times = [rows[SECONDS_COLUMN] for rows in rows_of_part.values()]
+    if np.median([part_times.min() for part_times in times]) > min(map(max, times)):
+        return  # one clock of all parts
     n_runs = {part: rows[RUN_COLUMN].nunique() for part, rows in rows_of_part.items()}
     n_rows = sum(map(len, rows_of_part.values()))
     part = max(n_runs, key=n_runs.__getitem__, default="")
     if not n_runs or n_runs[part] < 2 or n_rows < MIN_RUN * sum(n_runs.values()):
         return
+    steps = np.diff(np.sort(rows_of_part[part][SECONDS_COLUMN].to_numpy()))
+    if steps.max() > MAX_GAP * np.median(steps):
+        return  # a fault of that part
     lines = listed(run.index[0] for _, run in rows_of_part[part].groupby(RUN_COLUMN))
     wanted = f"the rows of each part together, part {part} begins in lines {lines}"
     raise DataError(f"Expected {wanted}, other parts between; make the parts' numbers unique.")
