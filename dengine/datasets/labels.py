@@ -53,6 +53,7 @@ MEANING = {
 UNCHECKED = (*EMPTY_CELLS, *LISTS["unchecked"])
 # What a file manager adds to the name of a copy.
 COPY_SUFFIX = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)
+FILE_SUFFIX = re.compile(r"\.[A-Za-z]\w{1,5}$")
 LAST_WORD = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # without a number
 LETTER = r"[^\W\d_]"
 # Ends of a word in a name: partOK has the word OK, token does not.
@@ -360,6 +361,12 @@ def _flag_of(cell: Any) -> bool | None:
     return FLAGS.get(str(cell).strip().lower().removesuffix(".0").removesuffix("."))
 
 
+def _is_set_at_end(cells: Sequence[Any]) -> bool:
+    """Return whether cells are first false, no or 0, and then true, yes or 1 up to the last."""
+    flags = [_flag_of(cell) for cell in cells]
+    return set(flags) == {False, True} and flags == sorted(flags, key=bool)
+
+
 class LabelColumn:
     """Reads the labels in the cells of a column.
 
@@ -422,11 +429,20 @@ class LabelColumn:
     def find(self, cells: Iterable[Any], place: str = "") -> SourcedLabel:
         """Return the label that all cells mean; those of a part that is not checked do not count.
 
+        Of true and false, or 1 and 0, the last cell counts if none is false behind a true one, as
+        in the bit of a controller that is set at the end of a cycle; a note says so.
+
         Raises UnlabelledError if the part is not checked, UnknownWordError for a single word of
         unknown meaning, and SeveralLabelsError if labels differ or one of several words is unknown.
         `place` is what the column is called in errors, by default column NAME.
         """
         place = place or f"column {self.name}"
+        cells = list(cells)
+        is_known = not (self.is_ambiguous or FLAGS.keys() & self.words)
+        if is_known and _is_set_at_end(cells):
+            text = "is true or 1 in the last rows alone of some: these count"
+            self.notes[f"Column {self.name} {text}"] = 1
+            cells = cells[-1:]
         texts = list(dict.fromkeys(str(cell).strip() for cell in cells))
         stated = [text for text in texts if text and text.lower() not in self.unchecked]
         if len(stated) < 2:
@@ -965,7 +981,10 @@ def _read_label_rows(
         for i, column in enumerate(columns)
         if LabelColumn(header[i], options.words, Counter()).has_labels(column)
     ]
-    of_file, of_label = _label_file_columns(header, path, with_names, with_labels, options.label)
+    most = min(MAX_LABEL_WORDS, len(cells) / 2)
+    with_words = [i for i, column in enumerate(columns) if 2 <= len(column) <= most]
+    found_in = (with_names, with_labels, with_words)
+    of_file, of_label = _label_file_columns(header, path, *found_in, options.label)
     part = options.part
     if part != "part" and part not in header:
         wanted = f"a column {part} of parts' numbers in {path}"
@@ -1013,6 +1032,9 @@ def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
         if wanted == "_":  # it has no words
             continue
         matches = [name for name, words in words_of_name.items() if wanted in words]
+        if not matches and FILE_SUFFIX.search(text):  # of another file, as a bag
+            wanted = words_of(FILE_SUFFIX.sub("", text.replace("\\", "/").rpartition("/")[2]))
+            matches = [name for name, words in words_of_name.items() if wanted in words]
         if len(matches) > 1:
             return {}
         if matches:
@@ -1031,6 +1053,7 @@ def _label_file_columns(
     path: str | os.PathLike[str],
     with_names: Sequence[int],
     with_labels: Sequence[int],
+    with_words: Sequence[int],
     column: str | None = None,
 ) -> tuple[int, int]:
     """Return the positions of the column of files and of the column of labels.
@@ -1038,9 +1061,11 @@ def _label_file_columns(
     They are found by their names. Without a column of files by its name, it is the only one of
     `with_names`. Of two columns, the one that is not of files has the labels; if both have other
     names, files come first. Of more columns, the only one whose name means the bad outcome has the
-    labels, else the only one of `with_labels`. Raises DataError if one is not found.
+    labels, else the only one of `with_labels`, or of `with_words`. Raises DataError if one is not
+    found.
 
     with_names, with_labels : the columns in which recordings are named, and those of labels alone.
+    with_words : those of a few words, whose meaning may be asked for.
     column : the one of labels, if the user stated it.
     """
     of_file = column_among(header, LISTS["file_columns"])
@@ -1055,13 +1080,18 @@ def _label_file_columns(
             of_file = 0 if of_label is None else 1 - of_label
         of_label = 1 - of_file
     bad_columns = [i for i, column in enumerate(header) if i != of_file and means_bad(column)]
-    likely = bad_columns or [i for i in with_labels if i != of_file]
-    if of_label is None and len(likely) == 1:
-        of_label = likely[0]
+    for likely in (bad_columns, with_labels, with_words):
+        others = [i for i in likely if i != of_file]
+        if of_label is None and len(others) == 1:
+            of_label = others[0]
     if of_file is None or of_label is None:
+        do = "name that of labels (label)"
+        if with_words:
+            do = f"name that of labels, label={header[with_words[0]]!r}"
+        if of_file is None:
+            do = f"call that of files' names file, and {do}"
         raise DataError(
-            f"Expected columns file and label in {path}, got {', '.join(header)}; "
-            "call that of files' names file, and name that of labels (label)."
+            f"Expected columns file and label in {path}, got {', '.join(header)}; {do}."
         )
     return of_file, of_label
 

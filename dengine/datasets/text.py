@@ -11,7 +11,7 @@ import csv
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -152,12 +152,27 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
         rows = {i: _split_line(line, delimiter) for i, line in lines.items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
+    if _is_horizontal(rows.values()):
+        rows = dict(enumerate(map(list, zip(*rows.values(), strict=True)), start=1))
     cells = _find_header(rows, delimiter, list(columns))
     remarks = _remarks(cells)
     last = max(cells.rows.keys() - remarks, default=0)
     outside = [line for i, line in lines.items() if i < cells.line or i > last]
     kept = {i: row for i, row in cells.rows.items() if i not in remarks}
     return cells._replace(rows=kept, fields=_fields_in(outside), n_remarks=len(remarks))
+
+
+def _is_horizontal(rows: Collection[Sequence[str]]) -> bool:
+    """Return whether a text has a line of times and one of samples for each channel.
+
+    Each begins with a name, the first with that of a clock, and goes on with numbers.
+    """
+    n = {len(row) for row in rows}
+    if len(n) != 1 or not 1 < len(rows) < min(n):
+        return False
+    is_named = all(row[0] and not _numeric_columns(row[:1]) for row in rows)
+    is_number = all(len(_numeric_columns(row)) == min(n) - 1 for row in rows)
+    return is_named and is_number and is_time_column(next(iter(rows))[0])
 
 
 def _remarks(cells: TextCells) -> set[int]:
@@ -311,6 +326,7 @@ def _find_header(
     if header == 1 and len(rows[0]) >= len(rows[data]):
         group_names = list(filter(None, rows[0]))
         has_groups = len(set(group_names)) < len(group_names)
+        has_groups |= len(group_names) < len(above[1]) > len({*above[1]}) and all(above[1])
         if not (has_groups or is_remark or is_units[0]):
             header = data = 0
     if header > 1 and _have_a_column_each(above, len(rows[data])):
@@ -321,20 +337,8 @@ def _find_header(
     if columns:
         data_rows = dict(zip(lines[data:], rows[data:], strict=True))
         return TextCells(columns, 0, _pad_units(units_row, len(columns)), data_rows, delimiter, {})
-    names = above[header] if above else []
-    numbered = _numeric_columns(names)
-    # Whole numbers may be names.
-    is_named = all(names[i].isdecimal() for i in numbered)
-    if (
-        not is_named
-        and MIN_TIMES <= len(numbered) < len(names)
-        and _are_even(names[i] for i in sorted(numbered))
-    ):
-        numbers = itertools.count()
-        names = [str(next(numbers)) if i in numbered else name for i, name in enumerate(names)]
-    elif 2 * len(numbered) > len(names) and not is_named:
-        message = f"Expected a header, its first line is of numbers; {_columns_advice(rows)}"
-        raise UnreadableError(message, lines[header])
+    header, names, units_row = _names_in(above, header, units_row)
+    names = _without_times(names, rows, lines[header] if lines else 0)
     first = max(data, 1)
     data_rows = dict(zip(lines[first:], rows[first:], strict=True))
     n_narrower = sum(len(row) < len(names) for row in data_rows.values())
@@ -343,6 +347,63 @@ def _find_header(
         data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
     line = lines[header] if lines else 0
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter, {})
+
+
+def _names_in(
+    above: list[list[str]], header: int, units_row: list[str]
+) -> tuple[int, list[str], list[str]]:
+    """Return the position of the header above the data, the names in it, and the units.
+
+    In rows of pairs, as TwinCAT Scope writes them, each name but the clock's stands behind a word.
+    A name that is there twice gets that of its group before it, if a row of groups stands above.
+    """
+    names = above[header] if above else []
+    if pairs := [row for row in above if _are_pairs(row)]:
+        by_key = {row[0].lower(): row for row in reversed(pairs)}
+        names = [name if i % 2 else "Time" for i, name in enumerate(pairs[0])]
+        units_row = [unit if i % 2 else "" for i, unit in enumerate(by_key.get("unit", []))]
+        return above.index(pairs[0]), names, units_row
+    groups = above[header - 1] if header else []
+    if len(groups) == len(names) > len({*names}):
+        filled = [""]
+        for group in groups:
+            filled.append(group or filled[-1])
+        names = [
+            f"{group} {name}".strip()
+            if names.count(name) > 1 and not is_time_column(name)
+            else name
+            for group, name in zip(filled[1:], names, strict=True)
+        ]
+    return header, names, units_row
+
+
+def _without_times(names: list[str], rows: list[list[str]], line: int) -> list[str]:
+    """Return the names of a header, of which evenly rising times are replaced by 0, 1, 2, ...
+
+    Whole numbers may be names, and stay. Raises UnreadableError, with the header's line, if most of
+    the names are other numbers: then there is no header.
+
+    rows : all rows of the text, for advice.
+    """
+    numbered = _numeric_columns(names)
+    if all(names[i].isdecimal() for i in numbered):
+        return names
+    is_even = MIN_TIMES <= len(numbered) < len(names)
+    if is_even and _are_even(names[i] for i in sorted(numbered)):
+        numbers = itertools.count()
+        return [str(next(numbers)) if i in numbered else name for i, name in enumerate(names)]
+    if 2 * len(numbered) > len(names):
+        message = f"Expected a header, its first line is of numbers; {_columns_advice(rows)}"
+        raise UnreadableError(message, line)
+    return names
+
+
+def _are_pairs(row: Sequence[str]) -> bool:
+    """Return whether a row has one word before a name of each channel, as `Name fx Name fz`.
+
+    So TwinCAT Scope writes it: in the rows of samples a time stands before each value.
+    """
+    return len(row) > 2 and len(row) % 2 == 0 and row[0] != "" and len({*row[::2]}) == 1
 
 
 def _have_a_column_each(above: Sequence[Sequence[str]], n: int) -> bool:
@@ -380,7 +441,7 @@ def _are_even(cells: Iterable[str]) -> bool:
     return bool(steps[0] > 0) and bool(np.ptp(steps) < 0.01 * steps[0])
 
 
-def _numeric_columns(row: list[str]) -> frozenset[int]:
+def _numeric_columns(row: Sequence[str]) -> frozenset[int]:
     """Return the positions at which a row has numbers, or nan."""
     return frozenset(i for i, cell in enumerate(row) if is_numeral(cell) or cell.lower() == "nan")
 

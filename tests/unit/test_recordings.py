@@ -1811,3 +1811,63 @@ def test_a_part_that_cannot_be_read_leaves_the_others_in_the_order_of_their_date
     assert len(data.faults) == 1
     assert data.reading["order"] == "by the dates of their clocks"
     np.testing.assert_array_equal(data.X, small.X[:0:-1])
+
+
+def scope_rows(x: np.ndarray, _word: str) -> list[list[str]]:
+    """A file of TwinCAT Scope: pairs of a word and a channel's attribute above pairs of samples."""
+    pairs = [("Name", "fForce", "fPos"), ("Data-Type", "REAL64", "REAL64"), ("Unit", "N", "mm")]
+    above = [[key, first, key, second] for key, first, second in pairs]
+    return [["File", "a.tcs"], *above, *([f"{k}", f"{v}", f"{k}", "0.5"] for k, v in enumerate(x))]
+
+
+def horizontal_rows(x: np.ndarray, _word: str) -> list[list[str]]:
+    """A line of times and one of samples."""
+    return [["time [ms]", *map(str, range(50))], ["fForce", *map(str, x)]]
+
+
+def bit_rows(x: np.ndarray, word: str) -> list[list[str]]:
+    """A bit of a controller that is set in the last rows of good parts."""
+    rows = [[f"{k}", f"{v}", str(k > 45 and word == "OK")] for k, v in enumerate(x)]
+    return [["time [ms]", "fForce", "bOK"], *rows]
+
+
+@pytest.mark.parametrize("make_rows", [scope_rows, horizontal_rows, bit_rows])
+def test_a_file_of_a_controller_is_read_without_more_than_its_channel(
+    make_rows: Callable[[np.ndarray, str], list[list[str]]], small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        end = "" if make_rows is bit_rows else f"_{word}"
+        write_rows(tmp_path / f"{i:03}{end}.csv", make_rows(x, word))
+    label = "bOK" if make_rows is bit_rows else None
+    data = load_dataset(tmp_path, channel="fForce", label=label)
+    np.testing.assert_array_equal(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
+    assert data.rate_hz == 1000.0
+    has_note = any("in the last rows alone" in note for note in data.notes)
+    assert has_note == (make_rows is bit_rows)
+
+
+def test_a_listing_of_other_files_and_words_is_asked_for_the_words_alone(
+    small: Dataset, tmp_path: Path
+) -> None:
+    table = pd.DataFrame({"time": np.arange(50) / 500, "FZ": small.X[0]})
+    for i in range(6):
+        table.assign(FZ=small.X[i]).to_csv(tmp_path / f"rec_{i:02}_wrench.csv", index=False)
+    rows = [[f"rec_{i:02}.bag", "AB", "inserted" if i % 2 else "jammed"] for i in range(6)]
+    listing = write_rows(tmp_path.parent / "runs.csv", [["bag", "who", "outcome_of_it"], *rows])
+    with pytest.raises(DataError, match=r"label_map='(inserted|jammed)=good"):
+        load_dataset(tmp_path, labels=listing)
+    data = load_dataset(tmp_path, labels=listing, label_map="inserted=good,jammed=bad")
+    np.testing.assert_array_equal(data.y, [0, 1] * 3)
+
+
+def test_channels_of_one_name_are_told_apart_by_the_groups_above(
+    small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        above = [["", "Sensor A", "", "Sensor B", ""], ["t [ms]", "Fx", "Fz", "Fx", "Fz"]]
+        rows = [[f"{2 * k}", "0.1", "0.2", "0.3", f"{v}"] for k, v in enumerate(x)]
+        write_rows(tmp_path / f"{i}_{word}.csv", [*above, ["", "N", "N", "N", "N"], *rows])
+    with pytest.raises(DataError, match="Sensor A Fx, Sensor A Fz, Sensor B Fx, Sensor B Fz"):
+        load_dataset(tmp_path)
+    np.testing.assert_array_equal(load_dataset(tmp_path, channel="Sensor B Fz").X, small.X)
