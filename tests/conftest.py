@@ -2,6 +2,8 @@
 at hand.
 """
 
+from __future__ import annotations
+
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: one thread is steadier at these sizes
@@ -15,6 +17,7 @@ import subprocess
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 REPO = Path(__file__).resolve().parents[1]
 os.environ.setdefault(
@@ -22,11 +25,9 @@ os.environ.setdefault(
 )  # before umap: what it compiled is kept
 
 import pytest
-import torch
 
-from dengine import Dataset, SqlStore
-from dengine.export import export_sources
-from dengine.testing import toy_traces
+if TYPE_CHECKING:  # what loads torch waits: the process that starts the workers runs no test
+    from dengine import Dataset, SqlStore
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
@@ -40,11 +41,22 @@ LONG = (
     "test_notebooks",
     "test_page",
     "test_requests",
+    "test_data_verb",
     "test_golden",
     "test_training",
     "test_cli",
     "test_serve_process",
     "test_without_posix",
+    "test_estimators",
+    "test_feedback",
+    "test_fleet",
+    "test_serve_http",
+    "test_reducers",
+    "test_recordings",
+    "test_export",
+    "test_engine",
+    "test_corrections",
+    "test_settings",
 )
 # The C++ programs are built once, by one worker; each process that uses umap-learn compiles it
 # anew, for 25 s.
@@ -112,6 +124,9 @@ def insertion_like(
     """n traces as `toy_traces` has them: a failure that met the rim early stays on a plateau
     (newtons).
     """
+    from dengine import Dataset
+    from dengine.testing import toy_traces
+
     X, y = toy_traces(n, samples, channels, seed, failures, noise)
     return Dataset(X[:, 0] if channels == 1 else X, y.astype("int8"), name="insertion-like")
 
@@ -125,6 +140,10 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if os.environ.get("DENGINE_REQUIRE_CPP") == "1":
             pytest.fail(message)
         pytest.skip(message)
+    import torch
+
+    from dengine.export import export_sources
+
     sources, build = REPO / "build" / "cell_sources", REPO / "build" / "cell"
     written = export_sources(tmp_path_factory.mktemp("cell") / "sources")
     for file in (path for path in written.rglob("*") if path.is_file()):
@@ -195,6 +214,8 @@ def url_of(kind: str, directory: Path) -> str | None:
 @pytest.fixture(params=["memory", *DATABASES])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SqlStore]:
     """A new store of each kind."""
+    from dengine import SqlStore
+
     cell_id = uuid.uuid4().hex  # one PostgreSQL database serves every test
     created = SqlStore(url_of(request.param, tmp_path), cell_id)
     yield created

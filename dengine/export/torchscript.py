@@ -44,7 +44,6 @@ from .bundle import (
     read_checked,
     write_export,
 )
-from .decision import METHODS
 
 WARM_UP = 3
 TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another order
@@ -124,13 +123,14 @@ def export_torchscript(
     """
     source, module = prepare_export(engine_or_model, trace, path, force)
     with instead(ExportError, "The decision does not compile to TorchScript", RuntimeError):
-        frozen = torch.jit.freeze(script(module.eval()), preserved_attrs=list(METHODS))
+        # Not frozen: a frozen file decides no faster, and takes seconds to load.
+        compiled = script(module.eval())
     x = golden_trace(source.trace)
     with torch.inference_mode():
         # A copy decides, or the golden trace would be the pending decision of the file.
-        embedding = copy.deepcopy(frozen).decide(torch.from_numpy(x))[6]
+        embedding = copy.deepcopy(compiled).decide(torch.from_numpy(x))[6]
     golden = {"trace": x.tolist(), "embedding": embedding.tolist()}
-    content = _content(frozen, describe(source) | {"golden": golden})
+    content = _content(compiled, describe(source) | {"golden": golden})
     return write_export(path, content, force, key, source)
 
 

@@ -135,6 +135,7 @@ def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fi
     page = (repo / "docs" / "howto" / "controller.md").read_text("utf-8")
     table = page.partition("### By torch alone")[2].partition("\n## ")[0]
     assert [name for name in (*FIELDS, *METHODS) if f"`{name}" not in table] == []
+    assert [name for name in METHODS if not hasattr(plain, name)] == []
     for expected in (ACTIONS, REASONS):
         assert ", ".join(f"{i} {item}" for i, item in enumerate(expected)) in " ".join(
             table.split()
@@ -196,9 +197,7 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
         ours = {f"references.{name}": t for name, t in model.index.state_dict().items()}
         ours |= model.rule.state_dict()
         kept = {".".join(name.split(".")[-2:]): t for name, t in exported.module.named_buffers()}
-        for name in (
-            ours.keys() & kept.keys()
-        ):  # what can change; freezing made constants of the rest
+        for name in ours.keys() & kept.keys():
             torch.testing.assert_close(kept[name], ours[name], rtol=0, atol=0)
         assert {
             "references.points",

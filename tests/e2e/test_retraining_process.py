@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import time
+from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -23,6 +24,46 @@ CONV = replace(
 )
 
 
+class Lines(logging.Handler):
+    """Keeps what is logged."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+
+@pytest.fixture(scope="module")
+def logged() -> Iterator[Lines]:
+    """What is logged from before the first process starts."""
+    handler, log = Lines(), logging.getLogger("dengine")
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    yield handler
+    log.removeHandler(handler)
+    log.setLevel(level)
+
+
+@pytest.fixture(scope="module")
+def running(logged: Lines) -> Iterator[list[RetrainingProcess]]:
+    """The process that runs, which serves tests until one of them ends it; its start takes seconds."""
+    processes: list[RetrainingProcess] = []
+    yield processes
+    for process in processes:
+        process.shutdown()
+
+
+@pytest.fixture
+def process(running: list[RetrainingProcess]) -> RetrainingProcess:
+    if not running:
+        running.append(RetrainingProcess())
+        running[0].submit(os.getpid).result(300)
+    return running[0]
+
+
 def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
     learn(engine, data, range(40))
     while core_of(engine).is_retraining:
@@ -30,38 +71,28 @@ def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
         time.sleep(0.01)
 
 
-def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_arrive_writable() -> (
-    None
-):
+def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_arrive_writable(
+    process: RetrainingProcess,
+) -> None:
     x = torch.arange(60_000.0).reshape(300, 200)
     sent = x, x.t()[3:, 5:], torch.empty(0), torch.nn.Linear(3, 4).weight, x.numpy()[:, ::2]
-    with RetrainingProcess() as process:
-        for received, was in zip(process.submit(copy.copy, sent).result(300), sent, strict=True):
-            assert np.array_equal(torch.as_tensor(received).detach(), torch.as_tensor(was).detach())
-            with torch.no_grad():
-                received[:1] = 7.0
-        assert process.submit(os.getpid).result(300) != os.getpid()
-        with pytest.raises(ZeroDivisionError):
-            process.submit(divmod, 17, 0).result(300)
-        with pytest.raises(Exception, match="pickle"):
-            process.submit(lambda: 1).result(300)
-        assert process.submit(divmod, 17, 5).result(300) == (3, 2)
+    for received, was in zip(process.submit(copy.copy, sent).result(300), sent, strict=True):
+        assert np.array_equal(torch.as_tensor(received).detach(), torch.as_tensor(was).detach())
+        with torch.no_grad():
+            received[:1] = 7.0
+    assert process.submit(os.getpid).result(300) != os.getpid()
+    with pytest.raises(ZeroDivisionError):
+        process.submit(divmod, 17, 0).result(300)
+    with pytest.raises(Exception, match="pickle"):
+        process.submit(lambda: 1).result(300)
+    assert process.submit(divmod, 17, 5).result(300) == (3, 2)
 
 
-def test_it_ends_with_whoever_made_it_also_at_work() -> None:
-    with RetrainingProcess() as process:
-        pid = process.submit(os.getpid).result(300)
-        at_work = process.submit(time.sleep, 600)
-    with pytest.raises(ProcessLookupError):
-        os.kill(pid, 0)
-    with pytest.raises(BrokenExecutor):
-        at_work.result(0)
-
-
-def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(data: Dataset) -> None:
+def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(
+    process: RetrainingProcess, data: Dataset
+) -> None:
     decided = []
-    with RetrainingProcess() as process, ThreadPoolExecutor(1) as thread:
-        process.submit(os.getpid).result(300)  # its start is no part of a retrain's time
+    with ThreadPoolExecutor(1) as thread:
         for executor in (process, thread):
             engine = DataEngine(recipe=CONV, replaying=True, executor=executor)
             learn_and_settle(engine, data)
@@ -76,14 +107,27 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(data: Dataset) -> 
 
 
 def test_the_log_tells_when_the_process_is_ready_and_when_the_first_retrain_begins(
-    data: Dataset, caplog
+    process: RetrainingProcess, logged: Lines, data: Dataset
 ) -> None:
-    caplog.set_level(logging.INFO, "dengine")
-    with RetrainingProcess() as process:
-        process.submit(os.getpid).result(300)
-        assert re.search(r"ready to retrain, in a process of its own, after \d+\.\d s", caplog.text)
-        learn_and_settle(DataEngine(recipe=CONV, executor=process), data)
-    assert caplog.text.count("the first retrain begins, on 30 labels") == 1
+    (ready,) = [line for line in logged.lines if "ready to retrain" in line]
+    assert re.search(r"ready to retrain, in a process of its own, after \d+\.\d s", ready)
+    logged.lines.clear()
+    learn_and_settle(DataEngine(recipe=CONV, executor=process), data)
+    (begun,) = [line for line in logged.lines if "retrain begins" in line]
+    assert "the first retrain begins, on 30 labels" in begun
+
+
+def test_it_ends_with_whoever_made_it_also_at_work(
+    process: RetrainingProcess, running: list[RetrainingProcess]
+) -> None:
+    running.clear()
+    with process:
+        pid = process.submit(os.getpid).result(300)
+        at_work = process.submit(time.sleep, 600)
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+    with pytest.raises(BrokenExecutor):
+        at_work.result(0)
 
 
 def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retrains_in_line(

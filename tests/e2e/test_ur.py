@@ -242,14 +242,14 @@ def decisions(cell: Cell, n: int) -> list[dict]:
 def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(
     make_data, confirm: bool
 ) -> None:
-    data = make_data(120, samples=SAMPLES, failures=0.4)
+    data = make_data(60, samples=SAMPLES, failures=0.4)
     with (
         FakeController(RobotProgram(data, confirm=confirm), speed=None) as fake,
         cell_of(fake, timeout=WAIT) as cell,  # a busy machine may be silent for seconds
     ):
         assert isinstance(cell, Cell)
-        live = decisions(cell, 120)
-    assert live == decisions(ReplayCell(data, confirm=confirm), 120)
+        live = decisions(cell, 60)
+    assert live == decisions(ReplayCell(data, confirm=confirm), 60)
     assert {answer["action"] for answer in live} == {"verify", "accept", "reject"}
 
 

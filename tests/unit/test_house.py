@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 from dengine import DataEngine
@@ -16,13 +17,14 @@ FILES = {
     ".".join(file.relative_to(REPO).with_suffix("").parts): file
     for file in sorted(PACKAGE.rglob("*.py"))
 }
-MODULES = {
-    name: ast.parse(file.read_text("utf-8")) for name, file in FILES.items()
-}  # a family's is named NAME.__init__
-
-
 NODES = 263_300
-KNOWN = {name.removesuffix(".__init__") for name in MODULES} - {"dengine"}
+KNOWN = {name.removesuffix(".__init__") for name in FILES} - {"dengine"}
+
+
+@cache
+def parse_modules() -> dict[str, ast.Module]:
+    """Each module by its name; a family's is NAME.__init__. Not parsed before a test needs them."""
+    return {name: ast.parse(file.read_text("utf-8")) for name, file in FILES.items()}
 
 
 def test_at_most_ten_modules_stand_at_the_top() -> None:
@@ -33,7 +35,7 @@ def test_at_most_ten_modules_stand_at_the_top() -> None:
 
 
 def test_the_package_keeps_its_size_in_syntax_nodes() -> None:
-    nodes = sum(1 for tree in MODULES.values() for _ in ast.walk(tree))
+    nodes = sum(1 for tree in parse_modules().values() for _ in ast.walk(tree))
     assert nodes <= NODES, (
         f"dengine has {nodes} syntax nodes, {nodes - NODES} too many: take something out"
     )
@@ -45,13 +47,13 @@ def names(module: str) -> dict[str, str]:
     """
     sources = {
         node.name: f"{module}.{node.name}"
-        for node in MODULES[module].body
+        for node in parse_modules()[module].body
         if isinstance(node, ast.ClassDef)
     }
-    for node in ast.walk(MODULES[module]):
+    for node in ast.walk(parse_modules()[module]):
         if isinstance(node, ast.ImportFrom) and node.level:
             source = ".".join([*module.split(".")[: -node.level], *filter(None, [node.module])])
-            source = source if source in MODULES else f"{source}.__init__"
+            source = source if source in FILES else f"{source}.__init__"
             sources |= {
                 alias.asname or alias.name: f"{source}.{alias.name}" for alias in node.names
             }
@@ -61,21 +63,21 @@ def names(module: str) -> dict[str, str]:
 def origin(name: str) -> str:
     """Where a class is written, of a name that a family may only pass on."""
     module, _, last = name.rpartition(".")
-    source = names(module).get(last, name) if module in MODULES else name
+    source = names(module).get(last, name) if module in FILES else name
     return name if source == name else origin(source)
 
 
 def bases(module: str) -> Iterable[tuple[str, str]]:
     """The classes of a module, each with each of its bases."""
     sources = names(module)
-    for node in ast.walk(MODULES[module]):
+    for node in ast.walk(parse_modules()[module]):
         for base in node.bases if isinstance(node, ast.ClassDef) else ():
             name = ast.unparse(base.value if isinstance(base, ast.Subscript) else base)
             yield f"{module}.{node.name}", origin(sources.get(name, name))
 
 
 def test_no_base_of_ours_has_a_single_subclass() -> None:
-    pairs = [pair for module in MODULES for pair in bases(module)]
+    pairs = [pair for module in FILES for pair in bases(module)]
     aside = {
         name
         for name, base in pairs
@@ -111,7 +113,7 @@ def test_no_module_is_imported_by_a_string() -> None:
     # imported by `import_class`.
     strings = {
         f"{node.value} ({module}, line {node.lineno})"
-        for module, tree in MODULES.items()
+        for module, tree in parse_modules().items()
         for node in ast.walk(tree)
         if isinstance(node, ast.Constant)
         and isinstance(node.value, str)

@@ -2,6 +2,7 @@
 network.
 """
 
+import os
 import re
 import subprocess
 import sys
@@ -22,6 +23,9 @@ TO_BE_MADE = {f"dengine/{folder}/NAME.py" for folder in ("reducers", "cells", "c
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the site: the one that `make docs` has just built where DENGINE_SITE names it, or a new one."""
+    if built := os.environ.get("DENGINE_SITE"):
+        return Path(built)
     for package in ("mkdocs", "material", "mkdocstrings_handlers.python"):
         pytest.importorskip(
             package, reason="the site needs the extra docs: pip install 'dengine[docs]'"
