@@ -246,6 +246,8 @@ def _find_delimiter(lines: Sequence[str]) -> str:
 
     def score(delimiter: str) -> float:
         """Return how well a delimiter splits the lines, from 0 to 1."""
+        if delimiter not in ("", " ") and not any(delimiter in line for line in sample):
+            return 0.0
         rows = [_split_line(line, delimiter) for line in sample]
         width, n_rows = Counter(map(len, rows)).most_common(1)[0]
         if width == 1 and delimiter:

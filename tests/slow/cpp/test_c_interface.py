@@ -98,7 +98,6 @@ def test_libtorch_alone_decides_by_calling_the_module(
         "-B",
         build,
         where,
-        "-DCMAKE_BUILD_TYPE=Debug",
     )
     run("cmake", "--build", build)
     lines = run(build / "plain", file, SAMPLES, tmp_path / "traces.f32").splitlines()
