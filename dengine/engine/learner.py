@@ -24,7 +24,7 @@ from ..model.base import EngineModel
 from ..recipe import Recipe
 from ..records import RetrainReport
 from ..store.outbox import Outbox
-from ..store.records import Change, LabelledTraces, StoredDecision, without_rule
+from ..store.records import Change, StoredDecision, without_rule
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import MOST, ROUNDS, Peers
