@@ -34,6 +34,7 @@ RATES = (1.0, 1e6)  # hertz that are plausible
 SPANS = (1e-3, 3600.0)  # plausible durations of a recording, in seconds
 DAY = units.SECONDS["d"]
 HALF_DAY = 12  # hours
+WINCC_DAYS = 1e-6  # days in a count of WinCC's Time_ms
 EXCEL_DAYS = (2e4, 8e4)  # since 1900: the years 1954 to 2119
 # Counts since an epoch: the seconds in one, and the seconds from the epoch to 1970. Those of 100 ns
 # are Windows' FILETIME, since 1601, and .NET's ticks, since year 1.
@@ -458,6 +459,10 @@ def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tupl
     Its name or the row of units states them; else they follow from its values. Raises
     UnreadableError for counts that are too large for a duration and give no plausible date.
     """
+    low, high = EXCEL_DAYS
+    first = float(times[~np.isnan(times)][0]) if (~np.isnan(times)).any() else 0.0
+    if name.lower() == "time_ms" and low < first * WINCC_DAYS < high:
+        return DAY * WINCC_DAYS, f"The clock {name} is read as millionths of days, as WinCC counts"
     stated = _stated_unit(name, unit)
     if stated is not None:
         return stated, ""
@@ -473,7 +478,6 @@ def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tupl
         do = "write its unit into the header, as in time [ns]"
         raise UnreadableError(f"Expected {wanted}, {times[0]:.4g} is none {epochs}; {do}")
     step = float(np.median(np.abs(np.diff(times))))
-    low, high = EXCEL_DAYS
     if low < times[0] < high and 0 < step * DAY < 1.0:
         return DAY, f"The clock {name} is read as days, as Excel counts them"
     scale = next((scale for scale in (1.0, 1e-3, 1e-6) if step * scale < SLOWEST_STEP), 1e-9)

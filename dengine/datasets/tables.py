@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -55,6 +55,7 @@ from .text import SUFFIXES as TEXTS
 from .text import (
     TextCells,
     TextTable,
+    fields_beside,
     parse_numbers,
     read_recording,
     read_table,
@@ -76,6 +77,7 @@ RUN_COLUMN = "\0run"  # number of the rows of a part that stand together and in 
 MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered ones
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 NEAR = 0.01  # of the largest number: numbers that differ by less are rounded in two ways
+FEW_ROWS = 5  # a text file of as few tells of a recording, and is none
 TRIED = 20  # recordings, on which advice about a column is tried
 MIN_RUN = 8  # rows on average that stand together in a table that is in the order of its parts
 MAX_STATIONS = 12  # more different values in the rows of a part are no stations
@@ -114,6 +116,12 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     # CSV files beside other files are lists of labels.
     others = [name for name, path in named.items() if path.suffix.lower() not in TEXTS]
     counts = Counter(path.suffix.lower() for path in named.values())
+    if len(counts) > 1:  # files of a few lines beside each recording tell of it
+        firsts = {path.suffix.lower(): path for path in reversed(named.values())}
+        tables = [
+            s for s, path in firsts.items() if len(_first_rows(path, options).rows) > FEW_ROWS
+        ]
+        counts = Counter({suffix: counts[suffix] for suffix in tables or counts})
     most = max(counts.values())
     texts = [name for name, path in named.items() if counts[path.suffix.lower()] == most]
     return {name: named[name] for name in sorted(others or texts, key=natural_key)}
@@ -284,8 +292,25 @@ def read_folder(
         return recording
 
     collect(read, collector)
+    _leave_out_copies(collector)
     collector.order_by_start()
     return as_dataset(collector, options)
+
+
+def _leave_out_copies(collector: RecordingCollector) -> None:
+    """Make faults of the recordings that a file manager has copied, as `5_ok - Copy.csv`.
+
+    The samples are those of the file without what it adds to a name.
+    """
+    traces = {recording.source: recording.trace for recording in collector.recordings}
+    reasons = {}
+    for i, recording in enumerate(collector.recordings):
+        path = PurePosixPath(recording.source)
+        original = str(path.with_stem(labels.COPY_SUFFIX.sub("", path.stem) or path.stem))
+        is_other = original != recording.source and original in traces
+        if is_other and np.array_equal(traces[original], recording.trace, equal_nan=True):
+            reasons[i] = f"Expected each recording once, it is a copy of {original}"
+    collector.leave_out(reasons)
 
 
 def _collect_folder(
@@ -569,7 +594,8 @@ def _first_rows(path: Path, options: LoadOptions) -> TextCells:
             file.seek(max(start, end - 2**10))
             lines += file.read().split(b"\n")[1:]
         text, _ = decode(b"\n".join(lines), options.encoding)
-        return split_cells(text, options.columns)
+        cells = split_cells(text, options.columns)
+        return cells._replace(fields=cells.fields | fields_beside(path))
     return TextCells([], 0, [], {}, "", {})
 
 

@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+BESIDE = (".txt", ".json", ".ini", ".yaml", ".yml", ".meta", ".info", ".log")
+SMALL = 2**14  # bytes of a file that tells of a recording
 LARGEST = 128 * 2**20  # bytes of one text file
 NUMBER_PREFIX = re.compile(r"\s*[+-]?\d*\.?\d*(?:(?<=\d)[eE][+-]?\d+)?")  # of a damaged number
 # Of equally good ones the first is taken. " ": any blanks; "": one column.
@@ -218,6 +220,25 @@ def _fields_in(lines: Iterable[str]) -> dict[str, str]:
                     fields.setdefault(key, cell)
         above = cells
     return fields
+
+
+def fields_beside(path: Path) -> dict[str, str]:
+    """Return what a small file beside a recording states, as `result.txt` or a .json of its name.
+
+    It has the same name with another suffix, or both are alone in a folder. Files that cannot be
+    read are passed over.
+    """
+    others = [path.with_suffix(suffix) for suffix in BESIDE if suffix != path.suffix.lower()]
+    with suppress(OSError, UnreadableError):
+        inside = list(itertools.islice(path.parent.iterdir(), 4))
+        if len(inside) == 2:
+            others += [
+                other for other in inside if other.suffix.lower() in BESIDE and other != path
+            ]
+        for other in others:
+            if other.is_file() and other.stat().st_size < SMALL:
+                return _fields_in(decode(other.read_bytes())[0].splitlines())
+    return {}
 
 
 def _split_line(line: str, delimiter: str) -> list[str]:
@@ -552,7 +573,7 @@ def read_table(
     stated = units.stated_in_preamble(preamble, header, without)
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
-    about = (cells.fields, cells.n_remarks)
+    about = (cells.fields | fields_beside(path), cells.n_remarks)
     return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
 
 
@@ -598,7 +619,7 @@ def read_recording(
     UnreadableError, with the line if it is known, for a cell, a row, a clock or a text that cannot
     be read, a channel that is not there, and no samples.
     """
-    table = read_table(path, options, decimal)
+    table = _of_one_signal(read_table(path, options, decimal), channels)
     header = list(table.frame.columns)
     places = [column_place(name, header, table.line) for name in channels]
     if table.faults:
@@ -609,7 +630,7 @@ def read_recording(
     places = [kept.index(place) for place in places]
     table = table._replace(frame=frame, units=[table.units[i] for i in kept])
     header = list(frame.columns)
-    rows = _without_summary(frame, options, notes)
+    rows = _without_unfilled(_without_summary(frame, options, notes), places, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
     timed = rows_to_trace(rows, places, options, notes, table.units)
     n_out = len(frame) - len(rows) + table.n_remarks
@@ -624,6 +645,30 @@ def read_recording(
         place = place_of_clock(rows, options.time)
         start = None if place is None else start_of(rows.iloc[:, place])
     return timed._replace(units=channel_units, start=start, reading=reading)
+
+
+def _of_one_signal(table: TextTable, channels: Sequence[str]) -> TextTable:
+    """Return a table with a row for each value of each signal as that of one of them.
+
+    Such a table has a column of names, among them the channel, and one other column of numbers that
+    change and are no times. The latter gets the channel's name. Any other table, and that of
+    several channels, is returned as it is.
+    """
+    frame = table.frame
+    if len(channels) != 1 or units.find_columns(channels[0], list(frame.columns)):
+        return table
+    tags = [name for name in frame if (frame[name] == channels[0]).any()]
+    if len(tags) != 1:
+        return table
+    rows = frame[frame[tags[0]] == channels[0]]
+    values = [
+        name
+        for name in rows
+        if not (is_time_column(name) or floats(rows[name])[1]) and len({*rows[name]}) > 1
+    ]
+    if len(values) != 1:
+        return table
+    return table._replace(frame=rows.rename(columns={values[0]: channels[0]}))
 
 
 def _beside_their_clock(
@@ -677,6 +722,27 @@ def _without_summary(
             text = f"The {where} {n_out} rows have no {what}: they are no samples, and left out"
             notes[text] += 1
             return frame.iloc[first : first + n_samples]
+    return frame
+
+
+def _without_unfilled(
+    frame: pd.DataFrame, places: Sequence[int], options: LoadOptions, notes: Counter[str]
+) -> pd.DataFrame:
+    """Return a recording without rows behind the last sample in which time and channels are 0.
+
+    A buffer of a controller that was not filled has such rows; a note says that they are left out.
+    """
+    place = None
+    with suppress(UnreadableError):
+        place = place_of_clock(frame, options.time)
+    if place is None or place in places:
+        return frame
+    values = np.stack([floats(frame.iloc[:, i])[0] for i in (place, *places)])
+    used = np.flatnonzero((values != 0).any(axis=0))
+    n = int(used[-1]) + 1 if len(used) else 0
+    if n < len(frame) and n > 1 and values[0, n - 1] > 0:
+        notes["The last rows are 0, and so is their time: they are no samples, and left out"] += 1
+        return frame.iloc[:n]
     return frame
 
 

@@ -1550,11 +1550,15 @@ def test_the_map_for_words_of_faults_has_the_dash_of_parts_without_one(tmp_path:
         load_dataset(tmp_path, label="Fault")
 
 
-def test_an_earlier_time_is_said_to_be_perhaps_of_zeros_behind_the_last_sample(
+def test_rows_of_zeros_with_a_time_of_zero_behind_the_last_sample_are_left_out(
     tmp_path: Path,
 ) -> None:
     cells = {"time": np.r_[np.arange(30) / 500, np.zeros(9)], "FZ_Base": np.r_[1:31, np.zeros(9)]}
     pd.DataFrame(cells).to_csv(tmp_path / "1_OK.csv", index=False)
+    data = load_dataset(tmp_path)
+    np.testing.assert_array_equal(data.X, [np.arange(1, 31)])
+    assert any("The last rows are 0, and so is their time" in note for note in data.notes)
+    pd.DataFrame(cells | {"FZ_Base": np.r_[1:40]}).to_csv(tmp_path / "1_OK.csv", index=False)
     with pytest.raises(DataError, match="as zeros behind the last one, are to be deleted"):
         load_dataset(tmp_path, time="time")
 
@@ -1871,3 +1875,43 @@ def test_channels_of_one_name_are_told_apart_by_the_groups_above(
     with pytest.raises(DataError, match="Sensor A Fx, Sensor A Fz, Sensor B Fx, Sensor B Fz"):
         load_dataset(tmp_path)
     np.testing.assert_array_equal(load_dataset(tmp_path, channel="Sensor B Fz").X, small.X)
+
+
+@pytest.mark.parametrize("form", ["in its folder", "of its name"])
+def test_a_verdict_in_a_small_file_beside_the_recording_is_the_label(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        folder = tmp_path / f"SN{i:03}" if form == "in its folder" else tmp_path
+        write_csv(folder / f"SN{i:03}.csv", x)
+        name = "result.txt" if form == "in its folder" else f"SN{i:03}.json"
+        text = f"Operator: A\nResult: {word}\n"
+        text = text if name.endswith(".txt") else f'{{\n  "part": {i},\n  "verdict": "{word}"\n}}'
+        (folder / name).write_text(text)
+    data = load_dataset(tmp_path)
+    np.testing.assert_array_equal(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
+
+
+def test_a_copy_of_a_file_manager_counts_once(few: Path) -> None:
+    n = len(load_dataset(few))
+    first = min(few.iterdir())
+    first.with_stem(f"{first.stem} - Copy").write_bytes(first.read_bytes())
+    data = load_dataset(few)
+    assert len(data) == n
+    assert "it is a copy of" in data.faults[0].message
+
+
+def test_a_signal_in_rows_of_a_file_is_chosen_by_its_name(small: Dataset, tmp_path: Path) -> None:
+    """As WinCC exports an archive, with times in millionths of days."""
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = [
+            [name, f"{value}", "1", f"{46082.25e6 + k * 0.01 / 86400 * 1e6:.4f}"]
+            for k, v in enumerate(x)
+            for name, value in (("Kraft", v), ("Weg", 0.1 * k))
+        ]
+        header = ["VarName", "VarValue", "Validity", "Time_ms"]
+        write_rows(tmp_path / f"{i:03}_{word}.csv", [header, *rows, ["$RT_OFF$", "0", "2", "0\n"]])
+    data = load_dataset(tmp_path, channel="Kraft")
+    np.testing.assert_array_equal(data.X, small.X)
+    assert data.rate_hz == 100.0
