@@ -37,12 +37,13 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 # other.
 LONG = (
     "test_docs",
-    "test_null",
+    "test_golden",
+    "test_release",
     "test_notebooks",
+    "test_data_verb",
     "test_page",
     "test_requests",
-    "test_data_verb",
-    "test_golden",
+    "test_null",
     "test_training",
     "test_cli",
     "test_serve_process",
