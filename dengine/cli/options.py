@@ -453,7 +453,7 @@ _LABELS = (
 )
 _LABEL_MAP = (
     "What other words mean, as in 'heil=good,Riss=bad'; 1=good,0=bad where a file's name ends in "
-    "the label."
+    "the label; 0= for a part that is not checked yet."
 )
 _TIME = (
     "The column of times: of recordings, or of a long table, which has a row for each sample and "

@@ -124,7 +124,8 @@ def load_dataset(
         channel that there is.
     label : str, optional
         For a folder, a regular expression with one group that finds the label in a file's path, or
-        the name of a column of the files. None: True/False, OK/NOK, pass/fail, good/bad,
+        the name of a column of the files, or of a line above or below their samples. None:
+        True/False, OK/NOK, pass/fail, good/bad,
         success/failure or i.O./n.i.O. at the end of the file's name except for numbers, or of a
         folder's; else a column with the name of a label. For a table the name of the column, for an
         .npz file of the array; with `labels` the column of that file. If the name means the bad
@@ -151,7 +152,7 @@ def load_dataset(
         converted to it.
     label_map : mapping or str, optional
         Meaning of other label words, "heil=good,Riss=bad". "1=good,0=bad" if names end in numbers
-        that are labels.
+        that are labels. "0=" is the word of a part not checked yet, "=good" an empty cell.
     columns : str or sequence of str, optional
         Names of the columns of text files without a header, or with another one: "time,fx,fz".
     decimal, thousands : str, optional
