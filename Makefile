@@ -41,7 +41,7 @@ REPEATS ?= 200
 # A hundred processes import the same modules: they are compiled once.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-merge test-submission test-all lint docs proof evidence audit dist clean
+.PHONY: setup demo test test-merge test-all lint docs proof evidence audit dist clean
 
 setup: $(VENV)/.dev
 
@@ -68,10 +68,6 @@ test: $(VENV)/.dev
 # The slow tests that each merge must pass; a PostgreSQL server is named by DENGINE_TEST_POSTGRES (.ci/postgres.sh).
 test-merge: $(VENV)/.dev
 	$(PYTEST) -m merge
-
-# Both in one run, which collects the tests once.
-test-submission: $(VENV)/.dev
-	$(PYTEST) -m "merge or not slow"
 
 # Everything: each page and notebook, umap-learn, fuzzing, outages, statistics.
 test-all: $(VENV)/.dev
