@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,8 +42,8 @@ def hold_one_each(named: Mapping[str, Path], options: LoadOptions) -> bool:
     """Return whether each archive of a folder holds one insertion, as the first and last tell.
 
     These two have arrays of the same names, and the first a label of one value if any, and traces
-    of one row, or of several channels beside such a label. False for a single archive.
-    Raises DataError if one of the two cannot be read.
+    of one row, or of several channels beside such a label or one in its name. False for a single
+    archive. Raises DataError if one of the two cannot be read.
     """
     paths = list(named.values())
     if len(paths) < 2:
@@ -55,7 +56,11 @@ def hold_one_each(named: Mapping[str, Path], options: LoadOptions) -> bool:
     if (label is not None and label.size > 1) or not traces:
         return False
     dimensions = max(np.squeeze(x).ndim for x in traces)
-    return dimensions == 1 or (dimensions == 2 and label is not None)
+    has_label = label is not None
+    with suppress(UnreadableError):
+        labels.labels_in_names(None, options.words).find(next(iter(named)))
+        has_label = True
+    return dimensions == 1 or (dimensions == 2 and has_label)
 
 
 def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions) -> Dataset:
@@ -110,17 +115,23 @@ def _to_frame(arrays: Mapping[str, NDArray[Any]], options: LoadOptions) -> pd.Da
     """Return the arrays of numbers or times that have an archive's most frequent length, a column
     each.
 
-    An array (C, T), or (T, C) with C < T, has C columns, `X_0`, `X_1`, ...
+    An array (C, T), or (T, C) with C < T, has C columns, `X_0`, `X_1`, ..., or those that an array
+    of C texts names.
     """
     import pandas as pd
 
+    texts = {len(x): x for x in arrays.values() if x.ndim == 1 and x.dtype.kind in "US"}
     columns = dict[str, NDArray[Any]]()
     for name, x in arrays.items():
         x = np.squeeze(x)
         if x.dtype.kind not in "iufMm" or x.size < 2 or name == options.label:
             continue
         rows = x if x.ndim == 1 else x if x.shape[0] < x.shape[-1] else x.T
-        columns |= {name: rows} if x.ndim == 1 else {f"{name}_{c}": r for c, r in enumerate(rows)}
+        if x.ndim == 1:
+            columns[name] = rows
+            continue
+        names = texts.get(len(rows), [f"{name}_{c}" for c in range(len(rows))])
+        columns |= dict(zip(map(str, names), rows, strict=True))
     lengths = Counter(len(x) for x in columns.values())
     length = max(lengths, key=lambda n: (lengths[n], n), default=0)
     return pd.DataFrame({name: x for name, x in columns.items() if len(x) == length})

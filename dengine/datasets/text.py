@@ -59,7 +59,7 @@ SAMPLED_CELLS = 40  # of each of these lines
 WORD = re.compile(r'"((?:[^"]|"")*)"|([^ \t"]+(?: +[\[(][^\])]*[\])])?)')
 MIN_TIMES = 8  # in a header that names samples by their times, beside other columns
 SUMMARY_SHARE = 10  # samples for each row of a summary below them, at least
-REMARK = re.compile(r"\s*(#+|%+|//+|\*+|--+)\s*")  # by which programs mark a comment
+REMARK = re.compile(r"^\s*(#+|%+|//+|\*+|--+|;+)\s*")  # by which programs mark a comment
 # What a line outside the table is about: no number, no path.
 FIELD_KEY = re.compile(r"[^\W\d][^\d:;=\\]{0,40}")
 FIELD_MARK = re.compile(r"\s*[:;=\t,|]\s*")  # the first of them stands before the value

@@ -1915,3 +1915,26 @@ def test_a_signal_in_rows_of_a_file_is_chosen_by_its_name(small: Dataset, tmp_pa
     data = load_dataset(tmp_path, channel="Kraft")
     np.testing.assert_array_equal(data.X, small.X)
     assert data.rate_hz == 100.0
+
+
+def test_archives_of_several_channels_with_the_label_in_their_names(
+    small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        path = tmp_path / f"{i:03}_{word}.npz"
+        t = np.arange(50) / 500
+        np.savez(path, t=t, force=np.stack([-x, x], axis=1), names=np.array(["fx", "fz"]))
+    data = load_dataset(tmp_path, channel="fz")
+    np.testing.assert_array_equal(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
+    assert data.rate_hz == 500.0
+
+
+def test_a_verdict_in_a_comment_with_a_semicolon_is_found(small: Dataset, tmp_path: Path) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = "\n".join(f"{4 * k} 0.1 {v}" for k, v in enumerate(x))
+        text = f"; FANUC log\n; State: {word}\nTick Fx Fz\n{rows}\n; end of log\n"
+        (tmp_path / f"{i:03}.dat").write_text(text)
+    data = load_dataset(tmp_path, channel="Fz")
+    np.testing.assert_array_equal(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
