@@ -279,10 +279,10 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
     where = "give the pattern of it in the path (label)"
     advice = f"{where}, or list the files and their labels in a CSV file (labels)"
     if pattern is None:
-        known = {word: good for word, good in words.items() if good is not None}
-        unchecked = words.keys() - known.keys()
-        find_label = partial(_find_label, words=known, unchecked=unchecked)
-        remove_label = partial(_remove_label, words=known)
+        verdicts = {word: good for word, good in words.items() if good is not None}
+        unchecked = words.keys() - verdicts.keys()
+        find_label = partial(_find_label, words=verdicts, unchecked=unchecked)
+        remove_label = partial(_remove_label, words=verdicts)
         return LabelSource(find_label, advice, "its name", without_label=remove_label)
     message = f"Expected a regular expression for the label, got {pattern!r}"
     with instead(DataError, message, re.error):
