@@ -540,18 +540,18 @@ def _label_hint(column: str, cells: Counter[Any], options: LoadOptions) -> str:
     label_column = labels.LabelColumn(column, options.words, Counter())
     unknown = Counter[str]()
     unlabelled = Counter[str]()
-    known = set[int]()
+    meanings = set[int]()
     for cell, n in cells.items():
         try:
-            known.add(label_column.label_of(cell))
+            meanings.add(label_column.label_of(cell))
         except UnknownWordError as error:
             unknown[error.word] += n
         except UnlabelledError as error:
             unlabelled[error.word] += n
     if not 1 <= len(unknown) <= MAX_LABEL_WORDS:
         return f"label={column!r}"
-    label_map = label_map_of(unknown, known, unlabelled)
-    or_else = "" if known else " or the other way round"
+    label_map = label_map_of(unknown, meanings, unlabelled)
+    or_else = "" if meanings else " or the other way round"
     return f"label={column!r}, label_map={label_map!r}{or_else}"
 
 
