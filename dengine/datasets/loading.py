@@ -593,11 +593,11 @@ def _from_arrays(
             collector.label_forms = error.forms
             return 0
 
-    words = np.asarray(y)
     wanted = "a label for each trace, 1 (success) or 0 (failure)"
     with instead(DataError, f"Expected {wanted}", ValueError, TypeError):
+        words = np.asarray(y)
         labels = np.array([to_label(word) for word in words.tolist()])
-        X = np.asarray(X)
+        X = np.atleast_1d(X)
     collector.check_label_words()
     about["notes"] = tuple(f"{note}." for note in collector.notes)
     if collector.unlabelled and len(labels) == len(X):

@@ -84,6 +84,7 @@ def stream(
     return X, data.y, parts, due
 
 
+@pytest.mark.merge  # it is what notices that the program and the module in the file part
 def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as_its_own(
     start: Callable[..., Program],
     learned: Learned,
