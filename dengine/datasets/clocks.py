@@ -24,9 +24,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 EMPTY_CELLS = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # become NaN
+MILLISECONDS = ("ms", "msec", "millitm", "millisecond", "milliseconds")
 NO_CLOCK = "none"  # what the user states as the clock of recordings whose times are wrong
 MAX_GAP = 5.0  # median steps: a longer pause is no late message
 EVEN_TOLERANCE = 0.1  # steps: times that are less off even ones are read as even
+WRONG_RATE = 1.2  # times longer or shorter than by the clock: then the stated rate is wrong
 MAX_MISSING = 0.03  # of the rows of a recording whose samples are taken as even
 LATE_STEP = 1.5  # median steps: up to here a step is a usual one
 SLOWEST_STEP = 0.5  # seconds: a clock without a unit whose steps are longer counts milliseconds
@@ -105,9 +107,9 @@ def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
 def join_date_and_time(frame: pd.DataFrame) -> None:
     """Join a column of dates and one of times of day, in place, in a table of texts.
 
-    Both columns get date and time. A column of whole milliseconds, called ms, is added to times
-    without a fraction. The columns stay as they are if the time passes midnight but the date stays,
-    as that of the first row.
+    Both columns get date and time. A column of whole milliseconds, as of `MILLISECONDS`, is added
+    to times without a fraction, and gets the same. The columns stay as they are if the time passes
+    midnight but the date stays, as that of the first row.
     """
     import pandas as pd
 
@@ -124,9 +126,12 @@ def join_date_and_time(frame: pd.DataFrame) -> None:
     if ((hours.diff() <= -HALF_DAY) & (date == date.shift())).any():
         return
     names = [str(name).lower() for name in frame.columns]
-    if "ms" in names and not ends.iloc[:, times[0]].str.contains("[.,]").any():
-        time = time + "." + frame.iloc[:, names.index("ms")].str.zfill(3)
-    for place in (dates[0], times[0]):
+    milliseconds = [i for i, name in enumerate(names) if name in MILLISECONDS]
+    if milliseconds and not ends.iloc[:, times[0]].str.contains("[.,]").any():
+        time = time + "." + frame.iloc[:, milliseconds[0]].str.zfill(3)
+    else:
+        milliseconds = []
+    for place in (dates[0], times[0], *milliseconds[:1]):
         frame.isetitem(place, date + " " + time)
 
 
@@ -545,7 +550,7 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     return float(f"{rate:.4g}")
 
 
-def check_rows(clock: Clock, lines: pd.Index) -> None:
+def check_rows(clock: Clock, lines: pd.Index, time: str | None = None) -> None:
     """Raise UnreadableError if rows are missing or out of order by their clock.
 
     It holds where another rate is stated, too. A clock may be coarse, late for some rows, or start
@@ -556,6 +561,8 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
     clock : Clock
     lines : Index
         Line in the file of each time, for errors.
+    time : str, optional
+        The clock's column, if the user stated it.
 
     Raises
     ------
@@ -572,8 +579,9 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
         if not _is_counter_full(usual - steps[i], usual):
             wanted = f"a later time in column {clock.name} than that of the row before"
             actual = f"{-steps[i]:.3g} s earlier"
+            in_order = f"time={clock.name!r} puts rows in the order of their times, if all differ; "
             do = (
-                f"time={clock.name!r} puts rows in the order of their times, if all differ; "
+                f"{'' if time else in_order}"
                 f"time={NO_CLOCK!r} with a stated rate (rate_hz) leaves them as they are; "
                 "rows that are no samples, as zeros behind the last one, are to be deleted"
             )
@@ -583,6 +591,34 @@ def check_rows(clock: Clock, lines: pd.Index) -> None:
     missing = float(forward.sum()) - len(forward) * usual
     if len(gaps) and missing > (MAX_GAP - 1) * usual:
         raise _gap_error(usual, steps[gaps[0]], lines[rows[gaps[0] + 1]])
+
+
+def lost_rows_text(clock: Clock) -> str:
+    """Return whether a clock beside a stated rate shows lost rows, in words.
+
+    One without times, or in which half of the steps or more are 0, does not.
+    """
+    is_fine = (np.abs(np.diff(clock.seconds)) > 0).mean() > 0.5  # a step from or to NaN is not
+    shows = "shows" if is_fine else "is too coarse to show"
+    return f"column {clock.name} {shows} lost rows"
+
+
+def rate_contradiction(clock: Clock, rate_hz: float) -> str:
+    """Return a note that a stated rate contradicts a clock by more than a fifth, or "".
+
+    A coarse clock is right to one of its steps. One whose unit was assumed contradicts nothing.
+    """
+    steps = np.diff(clock.seconds[~np.isnan(clock.seconds)])
+    forward = steps[steps > 0]
+    if not len(forward) or clock.note:
+        return ""
+    span = float(forward.sum())
+    resolution = float(np.median(forward))
+    duration = len(clock.seconds) / rate_hz
+    is_near = span - resolution <= WRONG_RATE * duration
+    if is_near and duration <= WRONG_RATE * (span + resolution):
+        return ""
+    return f"Column {clock.name} contradicts the stated rate of {rate_hz:g} Hz: check it"
 
 
 def _gap_error(usual: float, gap: float, line: int) -> UnreadableError:

@@ -53,6 +53,7 @@ MEANING = {
 UNCHECKED = (*EMPTY_CELLS, *LISTS["unchecked"])
 # What a file manager adds to the name of a copy.
 COPY_SUFFIX = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)
+LEADING_ZEROS = re.compile(r"(?<=_)0+(?=\d)")
 FILE_SUFFIX = re.compile(r"\.[A-Za-z]\w{1,5}$")
 LAST_WORD = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # without a number
 LETTER = r"[^\W\d_]"
@@ -883,8 +884,11 @@ def labels_in_file(
             raise UnreadableError(message)
         return _label_of_row(row, label_column, where)
 
+    notes.update(_leading_zeros_note(source, [row for row in rows if n_names[row]]))
     files = ", ".join(row.file for row in rows[:3]) or "no files"
-    do = "call its columns file and label, and the files as they are"
+    has_files = column_among(header, LISTS["file_columns"]) is not None
+    do = "" if has_files else "call its columns file and label, and "
+    do = f"{do}write the files as they are, as {listed(names[:1])}"
     advice = f"{source} names {files}: {do}"
     listing = LabelSource(
         find, advice, source, faults, notes=notes, trust=listing_to_trust(source, column)
@@ -897,6 +901,22 @@ def labels_in_file(
         if name != column and name.lower() in LABEL_COLUMNS
     ]
     return labels_that_agree(listing, others, listing.trust)
+
+
+def _leading_zeros_note(source: str, rows: Sequence[_LabelRow]) -> dict[str, int]:
+    """Return a note, and how many times, on the rows of a file that leave leading zeros out.
+
+    It is empty without such rows.
+    """
+    without = [
+        row
+        for row in rows
+        if row.file.isdecimal() and row.file not in re.split(r"[\W_]+", row.words[0])
+    ]
+    if not without:
+        return {}
+    first = without[0]
+    return {f"{source} names {first.file}, read as {first.words[0]}, without zeros": len(without)}
 
 
 def _label_of_row(row: _LabelRow, column: LabelColumn, where: str) -> SourcedLabel:
@@ -975,7 +995,8 @@ def _read_label_rows(
         if any(_path_words(cell)[0] in files for cell in column)
     ]
     full_names = {} if with_names else {i: _names_with(x, names) for i, x in enumerate(columns)}
-    with_names = with_names or [i for i, name_of in full_names.items() if name_of]
+    n_named = max(map(len, full_names.values()), default=0)
+    with_names = with_names or [i for i, x in full_names.items() if len(x) == n_named > 0]
     with_labels = [
         i
         for i, column in enumerate(columns)
@@ -1016,7 +1037,8 @@ def _path_words(path: str) -> tuple[str, ...]:
 def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
     """Return for texts, for example serial numbers, the one file in whose name each stands.
 
-    It must stand there as one or more whole words, in upper or lower case; folders do not count. A
+    It must stand there as one or more whole words, in upper or lower case; folders do not count.
+    If it stands in none, but in one without leading zeros, which Excel removes, it is this one. A
     text that stands in no name is left out. The result is empty if a text stands in several names,
     or if the texts stand in no more than half as many files as there are texts.
     """
@@ -1027,6 +1049,7 @@ def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
 
     name_of = {}
     words_of_name = {name: words_of(PurePosixPath(name).name) for name in names}
+    bare_words = {name: LEADING_ZEROS.sub("", words) for name, words in words_of_name.items()}
     for text in texts:
         wanted = words_of(text)
         if wanted == "_":  # it has no words
@@ -1035,6 +1058,9 @@ def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
         if not matches and FILE_SUFFIX.search(text):  # of another file, as a bag
             wanted = words_of(FILE_SUFFIX.sub("", text.replace("\\", "/").rpartition("/")[2]))
             matches = [name for name, words in words_of_name.items() if wanted in words]
+        bare = [] if matches else [n for n, w in bare_words.items() if wanted in w]
+        if len(bare) == 1:
+            matches = bare
         if len(matches) > 1:
             return {}
         if matches:

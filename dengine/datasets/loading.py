@@ -62,6 +62,7 @@ from .tables import (
     read_folder,
     read_heads,
     read_tables,
+    without_trailing_nan,
 )
 from .text import SUFFIXES as TEXTS
 from .triggers import Trigger
@@ -75,6 +76,7 @@ SIMULATED = ("height_mm", "cycle", "conditions", "condition_names", "seed", "sce
 Files = Mapping[str, Path]
 TABLES = (*TEXTS, ".parquet", ".pq")
 RATES = ("fs", "f_s", "fs_hz", "rate", "samplerate", "sample_rate", "sampling_rate", "frequency")
+STEPS = ("dt", "delta_t", "timestep", "time_step")  # seconds
 MIN_PADDING = 5  # zeros at the end of a trace that are no measurement
 FORMS = ".npz, .csv, .tsv, .txt, .dat, .parquet or .mcap"
 
@@ -354,9 +356,42 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
             options = replace(options, channels=())
         about["channels"] = channels or names
         data = _from_arrays(X, arrays[label], options, name, label_column, **about)
-        data = refit(data, options, has_unit="unit" in arrays)
+        data = _refit_without_padding(data, options, has_unit="unit" in arrays)
     read = {label, *traces, options.part, *ARRAYS, *SIMULATED, *arrays}
     return replace(data, notes=(*data.notes, *_archive_notes(data, all_names, read)))
+
+
+def _refit_without_padding(data: Dataset, options: LoadOptions, *, has_unit: bool) -> Dataset:
+    """Return a data set as `refit` does, whose traces end before the NaN behind their last number.
+
+    If some do, a note says so, and all are brought to one length as recordings are; those that
+    cannot be are among its faults.
+    """
+    X: NDArray[np.float32] = as_traces(data.X)
+    is_nan = np.all(np.isnan(X), axis=1)
+    n_padded = int((is_nan[:, -1] & ~is_nan.all(axis=1)).sum())
+    if not n_padded:
+        return refit(data, options, has_unit=has_unit)
+    about = refit(data, replace(options, samples=None, fit=None), has_unit=has_unit)
+    collector = RecordingCollector(data.name, about.channels)
+    collector.notes[f"{n_padded} of {len(data)} traces end at their last number, before NaN"] = 1
+    traces = as_traces(about.X)
+    channel_units = tuple(split_unit(about.unit, traces.shape[1]))
+    parts = [None] * len(data) if data.part is None else map(str, data.part)
+    for i, (trace, label, part) in enumerate(zip(traces, data.y, parts, strict=True), start=1):
+        recording = Recording(
+            without_trailing_nan(trace),
+            about.rate_hz,
+            channel_units,
+            label=int(label),
+            source=f"trace {i}",
+            part=part,
+        )
+        collector.recordings.append(recording)
+    fitted = as_dataset(collector, replace(options, unit=about.unit))
+    reading = {**about.reading, "first": fitted.reading["first"]}
+    known = [note for note in fitted.notes if note != UNKNOWN_RATE]
+    return replace(fitted, notes=(*about.notes, *known), reading=reading)
 
 
 def _arrays_by_meaning(
@@ -386,6 +421,8 @@ def _arrays_by_meaning(
             result |= {"unit" if is_unit else "channels": x, key: x}
         elif x.size == 1 and key.lower() in RATES:
             result |= {"rate_hz": x.reshape(()), key: x}
+        elif x.size == 1 and key.lower() in STEPS and x.dtype.kind == "f" and 0 < x < 1:
+            result |= {"rate_hz": 1 / x.reshape(()), key: x}
         elif x.ndim == 1 and len(x) in lengths and is_time_column(key) and x.dtype.kind in "iuf":
             with suppress(UnreadableError):
                 clock = clock_of(pd.DataFrame({key: x}))

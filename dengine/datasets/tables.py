@@ -74,6 +74,7 @@ NUMBER_FIRST = re.compile(
 # Added to a long table; no file has these names.
 SECONDS_COLUMN = "\0seconds"
 RUN_COLUMN = "\0run"  # number of the rows of a part that stand together and in the order of time
+LIST_CELL = re.compile(r"[\[(]\s*[-+]?[\d.]+[\s,]")  # a list as text
 MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered ones
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 NEAR = 0.01  # of the largest number: numbers that differ by less are rounded in two ways
@@ -796,7 +797,9 @@ def _check_columns(frame: pd.DataFrame, source: str) -> None:
     """
     for name in frame.columns:
         is_single = (frame.columns == name).sum() == 1 and len(frame) > 0
-        if is_single and isinstance(frame[name].iloc[0], list | tuple | np.ndarray):
+        cell = frame[name].iloc[0] if is_single else None
+        is_text = isinstance(cell, str) and LIST_CELL.match(cell) is not None
+        if is_text or isinstance(cell, list | tuple | np.ndarray):
             wanted = f"a number or a text a cell in {source}"
             do = "give a trace a row, its samples a column each"
             do = f"{do}, or load_dataset((X, y)) with the lists as X"
@@ -864,7 +867,7 @@ def _add_wide_rows(
         clock = "" if table.rate_hz is None else "the first column, a column for each part"
         reading = label.reading._replace(numbers=table.numbers, clock=clock)
         return Recording(
-            _without_trailing_nan(trace),
+            without_trailing_nan(trace),
             table.rate_hz,
             reading=reading,
             label=label.label,
@@ -1351,7 +1354,7 @@ def choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str
     return chosen
 
 
-def _without_trailing_nan(trace: NDArray[np.float32]) -> NDArray[np.float32]:
+def without_trailing_nan(trace: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return a trace (C, T) without the last samples that are NaN in all channels.
 
     A trace of nothing but NaN is returned whole.

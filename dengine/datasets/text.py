@@ -33,7 +33,9 @@ from .clocks import (
     in_order_of_time,
     is_rising,
     join_date_and_time,
+    lost_rows_text,
     place_of_clock,
+    rate_contradiction,
     rate_of,
     resample_evenly,
     rising_columns,
@@ -46,7 +48,7 @@ from .numerals import is_numeral, write_as_python
 if TYPE_CHECKING:
     import pandas as pd
 
-SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".lvm")
 BESIDE = (".txt", ".json", ".ini", ".yaml", ".yml", ".meta", ".info", ".log")
 SMALL = 2**14  # bytes of a file that tells of a recording
 LARGEST = 128 * 2**20  # bytes of one text file
@@ -69,6 +71,9 @@ COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 # A cell of a row of units, beside the units that `units.parse` knows.
 UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")
+NUMBER_AND_UNIT = re.compile(
+    r"(?P<number>[-+−]?\d[\d.,]*([eE][-+]?\d+)?) *(?P<unit>[^\W\d][^\d:,;]*)"
+)
 # How a row of units states times of day: hh:mm:ss, HH:MM:SS.fff or mm:ss,0.
 TIME_FORMAT = re.compile(r"(h{1,2}:)?m{1,2}:s{1,2}([.,:](f+|s+|m+|z+|x+|0+))?", re.IGNORECASE)
 
@@ -88,7 +93,8 @@ class TextCells(NamedTuple):
     fields : dict of str to str
         What lines above the header and below the samples state, as `Result;OK` or `# Operator: A`.
     n_remarks : int
-        Number of the remarks that were left out below the header.
+        Number of the remarks that were left out below the header, or of all lines that were if
+        the user stated the columns.
     """
 
     header: list[str]
@@ -161,7 +167,9 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
     last = max(cells.rows.keys() - remarks, default=0)
     outside = [line for i, line in lines.items() if i < cells.line or i > last]
     kept = {i: row for i, row in cells.rows.items() if i not in remarks}
-    return cells._replace(rows=kept, fields=_fields_in(outside), n_remarks=len(remarks))
+    return cells._replace(
+        rows=kept, fields=_fields_in(outside), n_remarks=cells.n_remarks + len(remarks)
+    )
 
 
 def _is_horizontal(rows: Collection[Sequence[str]]) -> bool:
@@ -359,7 +367,8 @@ def _find_header(
     units_row = above[header + 1] if header + 1 < data else []
     if columns:
         data_rows = dict(zip(lines[data:], rows[data:], strict=True))
-        return TextCells(columns, 0, _pad_units(units_row, len(columns)), data_rows, delimiter, {})
+        column_units = _pad_units(units_row, len(columns))
+        return TextCells(columns, 0, column_units, data_rows, delimiter, {}, data)
     header, names, units_row = _names_in(above, header, units_row)
     names = _without_times(names, rows, lines[header] if lines else 0)
     first = max(data, 1)
@@ -541,7 +550,7 @@ def read_table(
     n = len(header)
     complete = {i: row[:n] for i, row in cells.rows.items() if len(row) >= n and not any(row[n:])}
     wrong = {
-        i: f"Expected {n} columns, got {len(row)}"
+        i: f"Expected {n} columns, got {len(row)}: {listed(row)}"
         for i, row in cells.rows.items()
         if i not in complete
     }
@@ -553,13 +562,17 @@ def read_table(
     mark = numbers = ""
     if not as_text:
         decimal = options.decimal or decimal
+        cell_units = _take_units_off(frame)
         mark, group, odd_cells = write_as_python(frame, cells.delimiter, decimal, options.thousands)
         wrong |= odd_cells
-        between = f"{cells.delimiter!r} between cells" if cells.delimiter else ""
-        other = "" if encoding == "utf-8-sig" else encoding
-        thousands = f"thousands mark {group!r}" if group else ""
-        marks = (f"decimal mark {mark!r}" if mark else "whole numbers", thousands, between, other)
-        numbers = ", ".join(filter(None, marks))
+        parts = (
+            f"decimal mark {mark!r}" if mark else "whole numbers",
+            f"thousands mark {group!r}" if group else "",
+            f"{cells.delimiter!r} between cells" if cells.delimiter else "",
+            "" if encoding == "utf-8-sig" else encoding,
+            _convert_cells(frame, cell_units, cells.units),
+        )
+        numbers = ", ".join(filter(None, parts))
         join_date_and_time(frame)
     faults = [Fault(path.name, i, message) for i, message in sorted(wrong.items())]
     frame = frame.drop(index=[i for i in wrong if i in complete])
@@ -575,6 +588,53 @@ def read_table(
         column_units[i] = unit
     about = (cells.fields | fields_beside(path), cells.n_remarks)
     return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
+
+
+def _take_units_off(frame: pd.DataFrame) -> dict[int, list[str]]:
+    """Remove the units in a table's cells, as of `56.5 N`, in place.
+
+    Only columns whose cells all have a unit of one dimension, or are empty, are changed. Returns
+    the unit of each cell, "" for an empty one, by the position of the column.
+    """
+    cell_units = dict[int, list[str]]()
+    for i in range(frame.shape[1]):
+        cells = frame.iloc[:, i].tolist()
+        if not any(map(NUMBER_AND_UNIT.fullmatch, cells[:1])):
+            continue
+        matches = [NUMBER_AND_UNIT.fullmatch(cell) for cell in cells]
+        column = [units.spelling(match["unit"]) if match else "" for match in matches]
+        parsed = [units.parse(unit) for unit in column if unit]
+        dimensions = {dimension for dimension, _ in filter(None, parsed)}
+        is_whole = all(match or not cell for match, cell in zip(matches, cells, strict=True))
+        if is_whole and len(dimensions) == 1 and all(parsed):
+            cell_units[i] = column
+            frame.isetitem(i, [match["number"] if match else "" for match in matches])
+    return cell_units
+
+
+def _convert_cells(
+    frame: pd.DataFrame, cell_units: Mapping[int, Sequence[str]], column_units: list[str]
+) -> str:
+    """Convert cells to one unit for each column, in place, and set that in `column_units`.
+
+    It is the only one of the column, or else the one without a prefix, as N for N and kN. Returns
+    what was done, "" for nothing.
+
+    cell_units : from `_take_units_off`.
+    """
+    texts = []
+    for i, cells in cell_units.items():
+        stated = list(dict.fromkeys(filter(None, cells)))
+        column_units[i] = stated[0]
+        if len(stated) > 1:
+            dimension, _ = units.parse(stated[0]) or ("", 1.0)
+            column_units[i] = dimension
+            factors = {unit: units.factor(unit, dimension) or 1.0 for unit in stated}
+            numbers, _ = floats(frame.iloc[:, i])
+            scales = [factors.get(unit, 1.0) for unit in cells]
+            frame.isetitem(i, (numbers * scales).astype(str))
+        texts.append(f"units {listed(stated)} in the cells of {frame.columns[i]}")
+    return ", ".join(texts)
 
 
 def _is_last_number_cut(cells: Sequence[str]) -> bool:
@@ -601,7 +661,10 @@ def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, s
             cell = str(cells[index])
             prefix = NUMBER_PREFIX.match(cell)  # always matches: it may be empty
             actual = excerpt(cell, prefix.end() if prefix else 0)
-            wrong.setdefault(index, f"Expected a number in column {name}, got {actual}")
+            message = f"Expected a number in column {name}, got {actual}"
+            if NUMBER_AND_UNIT.fullmatch(cell):
+                message = f"{message}; export plain numbers, without units"
+            wrong.setdefault(index, message)
     with np.errstate(over="ignore"):  # what overflows becomes an infinity, which the engine finds
         return values.astype(np.float32), wrong
 
@@ -800,7 +863,7 @@ def rows_to_trace(
         notes["Rows are put in the order of their times"] += 1
         trace = np.ascontiguousarray(trace[:, order])
         rows = rows.iloc[order]
-    check_rows(clock, rows.index)
+    check_rows(clock, rows.index, options.time)
     _check_repeated(rows, clock)
     return _trace_at_rate(trace, clock, rows.index, options, notes)
 
@@ -819,7 +882,9 @@ def _trace_at_rate(
     lines : line in the file of each sample.
     """
     if options.rate_hz is not None:
-        clock_text = f"none, the rate is stated; column {clock.name} shows lost rows"
+        clock_text = f"none, the rate is stated; {lost_rows_text(clock)}"
+        if contradiction := rate_contradiction(clock, options.rate_hz):
+            notes[contradiction] += 1
         return Recording(trace, reading=Reading(clock=clock_text))
     reading = Reading(clock=f"column {clock.name} ({clock.form})")
     rate = rate_of(clock, lines)

@@ -26,7 +26,8 @@ SLASHED = re.compile(
 ENDING = re.compile(r"(?P<name>.*[^_. -])[_. -]+(?P<unit>[A-Za-zµμ·]+)")  # FZ_kN
 # A line above a header that states a unit: # Force unit: kN, or Einheit Kraft;kN.
 UNIT_LINE = re.compile(
-    r"(?P<before>[\w -]*?)\b(?:units?|einheit(?:en)?|unité|unidad|unità)\b(?P<behind>[\w ]*)"
+    r"(?P<before>[\w -]*?)(?<![^\W_])(?:units?|einheit(?:en)?|unité|unidad|unità)(?![^\W_])"
+    r"(?P<behind>[\w ]*)"
     r"[:=;,\t]\s*[\"'\[(]*(?P<unit>[^\s\"';,\])]+)",
     re.IGNORECASE,
 )
@@ -65,15 +66,23 @@ def stated_in_preamble(text: str, header: Sequence[str], places: Sequence[int]) 
     """Return the unit that the text above a header states for each of some columns; "" for none.
 
     A line is of the columns that it names; one that names none is of the only column, or a unit of
-    force is of those with the name of a force. A line may list the units of all columns.
+    force is of those with the name of a force. A line may list the units of all columns, or those
+    of all but the clock in the first column, above which the line has its name, as LabVIEW writes.
 
     places : positions of the columns without a unit that are no clock.
     """
     names = [header[i] for i in places]
     result = [""] * len(names)
     for match in UNIT_LINE.finditer(text):
-        line = text[match.start("unit") :].partition("\n")[0]
+        is_cell = text[match.end("behind")] in ";,\t"  # the next cell may be empty
+        start = match.end("behind") + 1 if is_cell else match.start("unit")
+        line = text[start:].partition("\n")[0]
         items = [spelling(item.strip(" \"'[]()")) for item in re.split(r"[,;\t]", line)]
+        n_items = max((i for i, item in enumerate(items, start=1) if item), default=0)
+        is_behind_name = 0 not in places and seconds_in(items[0]) is None
+        are_units = sum(map(bool, items)) > 1 and all(parse(item) for item in filter(None, items))
+        if is_behind_name and are_units and n_items < len(header):
+            items = ["", *items[:n_items]] + [""] * (len(header) - n_items - 1)
         if len(items) == len(header) > 1:
             return [items[i] if parse(items[i]) else "" for i in places]
         unit = spelling(match["unit"])

@@ -21,7 +21,7 @@ DELIMITERS = {
     "blank": " ",
     "several blanks": "   ",
 }
-SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".lvm")
 
 # 1043.5 in a number format -> how it writes a number.
 NUMBERS: Mapping[str, Callable[[float], str]] = {

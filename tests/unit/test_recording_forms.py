@@ -792,7 +792,14 @@ def test_a_summary_below_samples_without_a_clock_is_no_sample(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    "above", [["X-Unit;mm", "Y-Unit;kN"], ["# Units: ms, mm, kN"], ["Einheit Y: kN"]]
+    "above",
+    [
+        ["X-Unit;mm", "Y-Unit;kN"],
+        ["# Units: ms, mm, kN"],
+        ["Einheit Y: kN"],
+        ["Channels\t2\t\t", "Y_Unit_Label\tmm\tkN\t"],
+        ["Units: mm, kN"],
+    ],
 )
 def test_units_above_the_header_are_those_of_the_columns_they_name(
     above: list[str], tmp_path: Path
@@ -803,6 +810,92 @@ def test_units_above_the_header_are_those_of_the_columns_they_name(
         write(tmp_path / f"{i}_OK.csv", ["Time [ms]", "X", "Y"], *cells, above=lines)
     data = load_dataset(tmp_path, channel="Y", rate_hz=250, unit="N")
     np.testing.assert_allclose(data.X, np.tile(VALUES, (3, 1)), rtol=1e-3, atol=0.06)
+
+
+def test_units_in_cells_are_read_and_converted(tmp_path: Path) -> None:
+    cells = [f"{v / 1000:.4f} kN" if abs(v) >= 1000 else f"{v:.1f} N" for v in VALUES]
+    write(tmp_path / "a_OK.csv", ["time", "FZ"], times(), cells)
+    write(tmp_path / "b_OK.csv", ["time", "FZ"], times(), [f"{v / 1000:.4f} kN" for v in VALUES])
+    write(tmp_path / "c_OK.csv", ["time", "FZ"], times(), [f"{v:.1f} N" for v in VALUES])
+    data = load_dataset(tmp_path)
+    np.testing.assert_allclose(data.X, np.tile(VALUES, (3, 1)), rtol=1e-5)
+    assert data.unit == "N"
+    assert "in the cells of FZ" in data.reading["numbers"]
+    write(tmp_path / "c_OK.csv", ["time", "FZ"], times(), ["5 parsecs", *texts()[1:]])
+    [fault] = load_dataset(tmp_path).faults
+    assert "got '5 parsecs'; export plain numbers, without units" in fault.message
+
+
+def test_lists_in_cells_of_a_text_file_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text('"",force,label\n0,"[1.5, 2.0, 3.1]",OK\n1,"[1.0, 2.0, 3.0]",NOK\n')
+    with pytest.raises(DataError, match="column force holds lists; give a trace a row"):
+        load_dataset(path, channel="force", label="label")
+
+
+def test_a_date_a_time_and_milliseconds_are_one_clock(tmp_path: Path) -> None:
+    clock = [4 * i + 990 for i in range(N)]
+    seconds = [f"06:00:{ms // 1000:02d}" for ms in clock]
+    header = ["Date", "Time", "Millitm", "F"]
+    write(
+        tmp_path / "a_OK.csv",
+        header,
+        ["03/01/2026"] * N,
+        seconds,
+        [str(ms % 1000) for ms in clock],
+        texts(),
+    )
+    for stated in ({}, {"time": "Millitm"}):
+        data = load_dataset(tmp_path, channel="F", **stated)
+        np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+        assert data.rate_hz == 250.0
+
+
+def test_lines_above_samples_without_a_header_are_counted(tmp_path: Path) -> None:
+    write(tmp_path / "a_OK.csv", ["0.0", "1.0"], times()[1:], texts()[1:], above=["ready, tare"])
+    data = load_dataset(tmp_path, columns="time,F")
+    assert data.X.shape[-1] == N
+    assert data.reading["rows"] == "1 left out"
+    with pytest.raises(DataError, match=r"Expected 1 columns, got 2: 0\.0, 1\.0"):
+        load_dataset(tmp_path, columns="F", channel="F")
+
+
+def test_nan_behind_the_last_number_ends_a_trace_of_an_archive(tmp_path: Path) -> None:
+    X = np.tile(VALUES, (6, 1))
+    X[0, 100:] = np.nan
+    X[1, 20:] = np.nan
+    np.savez(tmp_path / "a.npz", X=X, y=[1, 0, 1, 0, 1, 1], dt=0.004, part=np.arange(6) + 10)
+    data = load_dataset(tmp_path / "a.npz")
+    assert data.rate_hz == 250.0
+    assert np.isfinite(data.X).all()
+    assert (data.lengths.tolist(), data.y.tolist()) == ([100, N, N, N, N], [1, 1, 0, 1, 1])
+    assert [fault.source for fault in data.faults] == ["trace 2"]
+    assert data.part.tolist() == ["10", "12", "13", "14", "15"]
+    assert "2 of 6 traces end at their last number, before NaN." in data.notes
+    assert load_dataset(tmp_path / "a.npz", samples=90).X.shape == (5, 90)
+
+
+@pytest.mark.parametrize("form", ["coarse", "equal", "empty", "fine"])
+def test_a_clock_too_coarse_to_show_lost_rows_is_said_to_be(form: str, tmp_path: Path) -> None:
+    cells = {
+        "coarse": [f"06:00:{i // 50:02d}" for i in range(N)],
+        "equal": ["1.7723e9"] * N,
+        "empty": [""] * N,
+        "fine": times(),
+    }[form]
+    write(tmp_path / "a_OK.csv", ["time", "FZ"], cells, texts())
+    data = load_dataset(tmp_path, rate_hz=250 if form == "fine" else 50)
+    shows = "shows" if form == "fine" else "is too coarse to show"
+    assert f"column time {shows} lost rows" in data.reading["clock"]
+    assert not any("contradicts" in note for note in data.notes)
+
+
+def test_a_stated_rate_that_a_coarse_clock_contradicts_is_noted(tmp_path: Path) -> None:
+    cells = [f"06:00:{i // 20:02d}" for i in range(N)]
+    write(tmp_path / "a_OK.csv", ["time", "FZ"], cells, texts())
+    note = "Column time contradicts the stated rate of 500 Hz: check it."
+    assert note in load_dataset(tmp_path, rate_hz=500).notes
+    assert note not in load_dataset(tmp_path, rate_hz=20).notes
 
 
 def test_a_clock_that_is_wrong_is_left_out_by_name(tmp_path: Path) -> None:
@@ -884,3 +977,19 @@ def test_files_of_other_columns_are_told_how_to_name_their_label(tmp_path: Path)
     words = {"label": "Status", "label_map": "1=good,2=bad"}
     data = load_dataset(tmp_path, channel="M", unit="N", **words)
     np.testing.assert_allclose(data.X, np.tile(VALUES, (6, 1)), rtol=1e-3, atol=0.06)
+
+
+@pytest.mark.parametrize("column", ["N° série", "serial", "file"])
+def test_serial_numbers_without_leading_zeros_name_recordings(column: str, tmp_path: Path) -> None:
+    for i in range(95, 107):
+        write(tmp_path / "data" / f"P_{i:06d}.csv", ["time", "FZ"], times(), texts(VALUES + i))
+    rows = [f"{i},{'OK' if i % 2 else 'NOK'},{i % 2 + 1}" for i in range(95, 107)]
+    listing = tmp_path / "list.csv"
+    listing.write_text("\n".join([f"{column},Result,operator", *rows]))
+    data = load_dataset(tmp_path / "data", labels=listing)
+    assert data.y.tolist() == [i % 2 for i in range(95, 107)]
+    assert "list.csv names 95, read as p_000095, without zeros (12 times)." in data.notes
+    listing.write_text("\n".join([f"{column},Result", *(f"X{row}" for row in rows)]))
+    with pytest.raises(DataError) as error:
+        load_dataset(tmp_path / "data", labels=listing)
+    assert ("call its columns" in str(error.value)) == (column != "file")
