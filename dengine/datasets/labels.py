@@ -1039,8 +1039,8 @@ def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
 
     It must stand there as one or more whole words, in upper or lower case; folders do not count.
     If it stands in none, but in one without leading zeros, which Excel removes, it is this one. A
-    text that stands in no name is left out. The result is empty if a text stands in several names,
-    or if the texts stand in no more than half as many files as there are texts.
+    text that stands in no name, or in several, is left out. The result is empty if the texts stand
+    in no more than half as many files as there are texts.
     """
 
     def words_of(text: str) -> str:
@@ -1061,9 +1061,7 @@ def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
         bare = [] if matches else [n for n, w in bare_words.items() if wanted in w]
         if len(bare) == 1:
             matches = bare
-        if len(matches) > 1:
-            return {}
-        if matches:
+        if len(matches) == 1:
             name_of[text] = matches[0]
     return name_of if 2 * len(set(name_of.values())) > len(texts) else {}
 

@@ -337,7 +337,8 @@ def _find_header(
     A row is data if it has numbers in most of the columns that are numeric in the last 20 rows.
     What stands above the header is left out. If two lines stand above the data and the first can be
     the header, it is the header, and the second is a damaged row; a first line in which a name
-    occurs twice, as of groups of columns, cannot be. In a header of evenly rising times, as that of
+    occurs twice, as of groups of columns, cannot be, nor can one of fewer clocks and units, as
+    `Result;OK` or a title. In a header of evenly rising times, as that of
     a wide table, these are replaced by 0, 1, 2, ... Raises UnreadableError for
     numbers without a header if no `columns` are given; without rows the header is empty.
     """
@@ -358,7 +359,8 @@ def _find_header(
         group_names = list(filter(None, rows[0]))
         has_groups = len(set(group_names)) < len(group_names)
         has_groups |= len(group_names) < len(above[1]) > len({*above[1]}) and all(above[1])
-        if not (has_groups or is_remark or is_units[0]):
+        is_field = _n_measured(above[1]) > _n_measured(above[0])
+        if not (has_groups or is_remark or is_units[0] or is_field):
             header = data = 0
     if header > 1 and _have_a_column_each(above, len(rows[data])):
         header = data = 0
@@ -379,6 +381,11 @@ def _find_header(
         data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
     line = lines[header] if lines else 0
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter, {})
+
+
+def _n_measured(names: Sequence[str]) -> int:
+    """Return how many names of a row are those of clocks, or state a unit."""
+    return sum(is_time_column(name) or units.split(name)[1] != "" for name in names)
 
 
 def _names_in(
@@ -424,7 +431,7 @@ def _without_times(names: list[str], rows: list[list[str]], line: int) -> list[s
     if is_even and _are_even(names[i] for i in sorted(numbered)):
         numbers = itertools.count()
         return [str(next(numbers)) if i in numbered else name for i, name in enumerate(names)]
-    if 2 * len(numbered) > len(names):
+    if 2 * len(numbered) > sum(map(bool, names)):
         message = f"Expected a header, its first line is of numbers; {_columns_advice(rows)}"
         raise UnreadableError(message, line)
     return names
@@ -498,7 +505,9 @@ def _columns_advice(rows: list[list[str]]) -> str:
     first = [row[0].replace(",", ".") for row in rows[:200] if len(row) == len(names)]
     with suppress(ValueError):
         names[0] = "time" if is_rising(np.array(first, dtype=np.float64)) else "c0"
-    return f"write one above, or name its {len(names)} columns, columns={','.join(names)[:200]!r}"
+    if len(names) > SAMPLED_CELLS:
+        return "write one above, as FZ_0,FZ_1,... and label for a table with a row a part"
+    return f"write one above, or name its {len(names)} columns, columns={','.join(names)!r}"
 
 
 def read_table(
@@ -928,8 +937,11 @@ def column_place(name: str, header: Sequence[str], line: int = 1) -> int:
     if not places:
         raise UnreadableError(f"Expected a column {name}, got {columns}", line)
     if len(places) > 1:
-        names = (f"{word}_{i}" if word in header[:i] else word for i, word in enumerate(header))
-        do = f"name them anew, columns={','.join(names)!r}"
+        names = list(header)
+        for i in places:
+            plain, unit = units.split(header[i])
+            names[i] = f"{plain}_{i} [{unit}]" if unit else f"{plain}_{i}"
+        do = f"name them anew, columns={','.join(names)!r}, and the channel as there"
         message = f"Expected a column {name}, got it twice or more in {columns}; {do}"
         raise UnreadableError(message, line)
     return places[0]

@@ -646,12 +646,17 @@ def test_a_column_twice_is_one_line_that_says_what_to_do(tmp_path: Path) -> None
     )
     assert "--channel Y" in one_line("data", tmp_path / "1")
     advised = re.search(
-        r"name them anew, --columns (\S+?);", one_line("data", tmp_path / "1", "--channel", "X")
+        r"name them anew, --columns (\S+?),? and",
+        one_line("data", tmp_path / "1", "--channel", "X"),
     )[1]
     assert (
-        document("data", tmp_path / "1", "--channel", "X", "--columns", advised)["survey"]["traces"]
+        document("data", tmp_path / "1", "--channel", "X_3", "--columns", advised)["survey"][
+            "traces"
+        ]
         == 4
     )
+    refused = one_line("data", tmp_path / "1", "--channel", "X", "--columns", advised)
+    assert "Expected a column X, got" in refused
 
 
 def one_line(*words: object) -> str:
@@ -993,3 +998,50 @@ def test_serial_numbers_without_leading_zeros_name_recordings(column: str, tmp_p
     with pytest.raises(DataError) as error:
         load_dataset(tmp_path / "data", labels=listing)
     assert ("call its columns" in str(error.value)) == (column != "file")
+
+
+@pytest.mark.parametrize("line", ["Datum;02.03.2026", "Result;OK", "Table 1;"])
+def test_one_line_above_a_header_with_units_is_no_header(line: str, tmp_path: Path) -> None:
+    cells = [times(form="{:.3f}"), texts(VALUES / 1000, "{:.4f}")]
+    write(tmp_path / "a_OK.csv", ["Zeit [s]", "Kraft [kN]"], *cells, delimiter=";", above=[line])
+    data = load_dataset(tmp_path, channel="Kraft")
+    np.testing.assert_allclose(data.X[0], VALUES / 1000, atol=1e-4)
+    assert (data.unit, data.rate_hz) == ("kN", 250.0)
+
+
+def test_columns_of_one_name_are_named_apart_with_their_unit(tmp_path: Path) -> None:
+    write(tmp_path / "a_OK.csv", ["Time [s]", "F [kN]", "F [kN]"], times(), texts(), texts(-VALUES))
+    with pytest.raises(DataError) as error:
+        load_dataset(tmp_path, channel="F [kN]")
+    columns = re.search(r"columns='(.*?)'", str(error.value))[1]
+    assert columns == "Time [s],F_1 [kN],F_2 [kN]"
+    data = load_dataset(tmp_path, channel="F_2", columns=columns)
+    np.testing.assert_array_equal(data.X[0], -VALUES.astype(np.float32))
+    assert data.unit == "kN"
+
+
+def test_a_serial_number_of_two_recordings_leaves_the_others_their_labels(tmp_path: Path) -> None:
+    for name in ("A10", "A11", "A12", "A13_1", "A13_2"):
+        write(tmp_path / "data" / f"{name}_x.csv", ["time", "FZ"], times(), texts())
+    listing = tmp_path / "list.csv"
+    rows = ["A10,1,OK", "A11,2,NOK", "A12,3,OK", "A13,4,NOK", "A13,5,OK"]
+    listing.write_text("\n".join(["Seriennummer,Nr,Ergebnis", *rows]))
+    data = load_dataset(tmp_path / "data", labels=listing, label="Ergebnis")
+    assert data.y.tolist() == [1, 0, 1]
+    assert {f.source for f in data.faults} == {"A13_1_x.csv", "A13_2_x.csv", "list.csv"}
+
+
+def test_settings_beside_samples_without_a_header_ask_for_names(tmp_path: Path) -> None:
+    settings = ["Record Length", "Interval", "Trigger", *[""] * (N - 3)]
+    lines = [f"{a},,{t},{x}," for a, t, x in zip(settings, times(), texts(), strict=True)]
+    (tmp_path / "a_OK.csv").write_text("\n".join([lines[0].replace(",,", ",5e2,"), *lines[1:]]))
+    with pytest.raises(
+        DataError, match="its first line is of numbers; .* columns='c0,c1,c2,c3,c4'"
+    ):
+        load_dataset(tmp_path, channel="c3")
+
+
+def test_many_columns_without_a_header_are_not_listed(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "a.csv", np.tile(VALUES, (9, 1)), delimiter=",")
+    with pytest.raises(DataError, match=r"write one above, as FZ_0,FZ_1,\.\.\. and label"):
+        load_dataset(tmp_path / "a.csv")
