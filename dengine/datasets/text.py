@@ -722,9 +722,9 @@ def read_recording(
 def _of_one_signal(table: TextTable, channels: Sequence[str]) -> TextTable:
     """Return a table with a row for each value of each signal as that of one of them.
 
-    Such a table has a column of names, among them the channel, and one other column of numbers that
-    change and are no times. The latter gets the channel's name. Any other table, and that of
-    several channels, is returned as it is.
+    Such a table has a column of names, among them the channel, and one other that changes, holds
+    numbers in most rows, and is no clock. The latter gets the channel's name. Any other table, and
+    that of several channels, is returned as it is.
     """
     frame = table.frame
     if len(channels) != 1 or units.find_columns(channels[0], list(frame.columns)):
@@ -736,7 +736,9 @@ def _of_one_signal(table: TextTable, channels: Sequence[str]) -> TextTable:
     values = [
         name
         for name in rows
-        if not (is_time_column(name) or floats(rows[name])[1]) and len({*rows[name]}) > 1
+        if not is_time_column(name)
+        and 2 * len(floats(rows[name])[1]) < len(rows)
+        and len({*rows[name]}) > 1
     ]
     if len(values) != 1:
         return table

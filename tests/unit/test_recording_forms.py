@@ -1036,7 +1036,7 @@ def test_settings_beside_samples_without_a_header_ask_for_names(tmp_path: Path) 
     lines = [f"{a},,{t},{x}," for a, t, x in zip(settings, times(), texts(), strict=True)]
     (tmp_path / "a_OK.csv").write_text("\n".join([lines[0].replace(",,", ",5e2,"), *lines[1:]]))
     with pytest.raises(
-        DataError, match="its first line is of numbers; .* columns='c0,c1,c2,c3,c4'"
+        DataError, match=r"its first line is of numbers; .* columns='c0,c1,c2,c3,c4'"
     ):
         load_dataset(tmp_path, channel="c3")
 
@@ -1045,3 +1045,11 @@ def test_many_columns_without_a_header_are_not_listed(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "a.csv", np.tile(VALUES, (9, 1)), delimiter=",")
     with pytest.raises(DataError, match=r"write one above, as FZ_0,FZ_1,\.\.\. and label"):
         load_dataset(tmp_path / "a.csv")
+
+
+def test_a_word_among_the_values_of_a_signal_is_named(tmp_path: Path) -> None:
+    for name, last in (("a_OK", "I/O Timeout"), ("b_OK", "1.0")):
+        columns = [["F"] * N, times(), [*texts()[:-1], last], ["Good"] * N]
+        write(tmp_path / f"{name}.csv", ["Tag", "Timestamp", "Value", "Status"], *columns)
+    [fault] = load_dataset(tmp_path, channel="F").faults
+    assert "Expected a number in column F, got 'I/O Timeout'" in fault.message
