@@ -608,13 +608,16 @@ def _take_units_off(frame: pd.DataFrame) -> dict[int, list[str]]:
     cell_units = dict[int, list[str]]()
     for i in range(frame.shape[1]):
         cells = frame.iloc[:, i].tolist()
-        if not any(map(NUMBER_AND_UNIT.fullmatch, cells[:1])):
+        if not NUMBER_AND_UNIT.fullmatch(next(filter(None, cells), "")):
             continue
         matches = [NUMBER_AND_UNIT.fullmatch(cell) for cell in cells]
         column = [units.spelling(match["unit"]) if match else "" for match in matches]
         parsed = [units.parse(unit) for unit in column if unit]
         dimensions = {dimension for dimension, _ in filter(None, parsed)}
-        is_whole = all(match or not cell for match, cell in zip(matches, cells, strict=True))
+        # Without a blank it may be a part's number, as 0001A.
+        is_whole = all(
+            (match and " " in cell) or not cell for match, cell in zip(matches, cells, strict=True)
+        )
         if is_whole and len(dimensions) == 1 and all(parsed):
             cell_units[i] = column
             frame.isetitem(i, [match["number"] if match else "" for match in matches])

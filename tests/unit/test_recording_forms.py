@@ -826,9 +826,10 @@ def test_units_in_cells_are_read_and_converted(tmp_path: Path) -> None:
     np.testing.assert_allclose(data.X, np.tile(VALUES, (3, 1)), rtol=1e-5)
     assert data.unit == "N"
     assert "in the cells of FZ" in data.reading["numbers"]
-    write(tmp_path / "c_OK.csv", ["time", "FZ"], times(), ["5 parsecs", *texts()[1:]])
-    [fault] = load_dataset(tmp_path).faults
-    assert "got '5 parsecs'; export plain numbers, without units" in fault.message
+    for odd in ("5 parsecs", "5N"):
+        write(tmp_path / "c_OK.csv", ["time", "FZ"], times(), [odd] * N)
+        [fault] = load_dataset(tmp_path).faults
+        assert f"got '{odd}'; export plain numbers, without units" in fault.message
 
 
 def test_lists_in_cells_of_a_text_file_are_named(tmp_path: Path) -> None:
