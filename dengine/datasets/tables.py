@@ -844,7 +844,8 @@ def _add_wide_rows(
     traces = values.reshape(len(frame), len(columns), -1)
     collector.channels = tuple(filter(None, columns))
     _check_single_signal(frame, others, options)
-    if unread := [_describe_column(frame, name) for name in others if name not in all_columns]:
+    unread = [name for name in others if name and name not in all_columns]
+    if unread := [_describe_column(frame, name) for name in unread]:
         collector.notes[f"Not read: the columns {listed(unread)}"] = 1
     label_cells = [
         labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
@@ -1426,7 +1427,7 @@ def _sample_columns(names: list[str], options: LoadOptions) -> dict[str, list[st
     }
     if not channels:
         wanted = "samples in numbered columns, as FZ_0, FZ_1, ..."
-        raise DataError(f"Expected {wanted}, found {listed(names)}.")
+        raise DataError(f"Expected {wanted}, found {listed(filter(None, names))}.")
     for columns in channels.values():
         steps = np.diff([number for number, _ in columns])
         odd = np.flatnonzero(steps != np.median(steps))
