@@ -464,7 +464,7 @@ _UNIT = (
     "Unit of the samples; those that are in another one, kN for N, are converted.  "
     "[default: the header's, else N]"
 )
-_COLUMNS = "The names of the columns of text files without a header, as in time,fx,fz."
+_COLUMNS = "The names of the columns of text files without a header, as in time,fx,fz or c0..c99."
 _DECIMAL = "The decimal mark in text files, . or ,  [default: detected in each file]"
 _THOUSANDS = (
     "What groups thousands in text files, as the point in 1.043,5.  "

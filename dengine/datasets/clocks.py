@@ -54,6 +54,7 @@ STATED_UNIT = re.compile(
 )
 DAY_FIRST = re.compile(r"^(\d\d?)\.(\d\d?)\.(\d{4})")  # a German date
 SLASHED_DATE = re.compile(r"^(\d\d?)/(\d\d?)/(\d{4})")
+ANY_ORDER = "dates, day or month first"  # the form of a clock where nothing tells which it is
 TIME_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
 DATE_FORM = r"\d{4}-?\d\d-?\d\d|\d{4}/\d\d?/\d\d?|\d\d?[./]\d\d?[./]\d{2,4}"
 TIME_FORM = r"\d{1,2}:?\d\d(:?\d\d([.,]\d+)?)?\s*(Z|UTC|AM|PM|[+\-−]\d\d(:?\d\d)?)?"
@@ -351,9 +352,10 @@ def seconds_of(
             return _elapsed(column, times) * scale, wrong, note, unit
     seconds, missing = _parse_timestamps(column)
     form = "dates" if holds_dates(column) else "times of day"
-    parts = column.astype(str).str.strip().str.extract(SLASHED_DATE).astype(float)
-    if parts.notna().all(axis=None):
-        form = f"dates, {'day' if _is_day_first(parts) else 'month'} first"
+    text = column.astype(str).str.strip()
+    if text.str.match(SLASHED_DATE).all():
+        order = _date_order(text)
+        form = f"dates, {order} first" if order else ANY_ORDER
     return seconds, column.index[missing].tolist(), "", form
 
 
@@ -399,8 +401,7 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
     """Return seconds since the first time of a column, shape (n,), and which cells are no time.
 
     Times are ISO 8601, dates as 02.03.2026 or 3/2/2026 with or without a time, or times of day.
-    Of 3/2/2026 the first number is the month, unless one is beyond 12, or months go back from row
-    to row so, and do not if it is the day.
+    Of 3/2/2026 the first number is the month, unless `_date_order` tells that it is the day.
     """
     import pandas as pd
 
@@ -410,6 +411,7 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
         stamps = column
     else:
         text = column.astype(str).str.strip().str.upper()
+        is_day_first = _date_order(text) == "day"
         text = text.str.replace(",", ".").str.replace("−", "-")
         text = text.str.replace(r"\s*UTC$", "Z", regex=True).str.replace(r"\s+", " ", regex=True)
         if text.str.fullmatch(TIME_OF_DAY).mean() > 0.5:
@@ -419,8 +421,7 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
             text = text.str.replace(
                 DAY_FIRST, lambda m: f"{m[3]}-{m[2]:0>2}-{m[1]:0>2}", regex=True
             )
-            parts = text.str.extract(SLASHED_DATE).astype(float)
-            day, month = (1, 2) if _is_day_first(parts) else (2, 1)
+            day, month = (1, 2) if is_day_first else (2, 1)
             text = text.str.replace(
                 SLASHED_DATE, lambda m: f"{m[3]}-{m[month]:0>2}-{m[day]:0>2}", regex=True
             )
@@ -435,15 +436,22 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
     return (_over_midnight(elapsed) if stamps.dtype.kind == "m" else elapsed), missing
 
 
-def _is_day_first(parts: pd.DataFrame) -> bool:
-    """Return whether the first number of dates as 3/2/2026 is the day.
+def _date_order(text: pd.Series) -> str:
+    """Return what comes first in dates as 3/2/2026, "day" or "month"; "" if nothing tells it.
 
-    parts : the three numbers of each date.
+    A number beyond 12 is a day. Of two readings that one is right in which the dates do not go
+    back, or else that which spans fewer days. At last a decimal comma in the times tells the day.
     """
-    # Beyond 12 it is a day. Of two readings dates do not go back in the right one.
-    goes_back = [(372 * parts[2] + 31 * parts[m]).diff().min() < 0 for m in (0, 1)]
-    is_day_first = bool((parts[0] > 12).any()) or goes_back == [True, False]
-    return is_day_first and not (parts[1] > 12).any()
+    parts = text.str.extract(SLASHED_DATE).astype(float)
+    if (parts[[0, 1]] > 12).any(axis=None):
+        return "month" if (parts[1] > 12).any() else "day"
+    days = [372 * parts[2] + 31 * parts[month] + parts[1 - month] for month in (0, 1)]
+    goes_back = [reading.diff().min() < 0 for reading in days]
+    spans = [reading.max() - reading.min() for reading in days]
+    for month_first, day_first in (goes_back, spans):
+        if month_first != day_first:
+            return "day" if month_first > day_first else "month"
+    return "day" if text.str.contains(r":\d+,\d").any() else ""
 
 
 def _over_midnight(seconds: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -40,6 +40,8 @@ UNKNOWN_RATE = (
 )
 LABEL_FORMS = "as True/False, OK/NOK, pass/fail or 1/0"
 MEANINGS = ("bad", "good")  # of the labels 0 and 1
+# A range of numbered names, as c0..c498.
+NAME_RANGE = re.compile(r"(?P<name>[^\W\d]\w*?)(?P<first>\d{1,5})\.\.(?P=name)(?P<last>\d{1,5})")
 MAX_LABEL_WORDS = 12  # more different words are no labels
 expect_data = partial(expect, error=DataError)
 
@@ -329,9 +331,19 @@ class LoadOptions:
 
 
 def split_names(names: str | Sequence[str] | None) -> tuple[str, ...]:
-    """Return names one by one, of "FZ_Base,FX_Base" or of a list of them, without blanks."""
+    """Return names one by one, of "FZ_Base,FX_Base" or of a list of them, without blanks.
+
+    The range c0..c3 stands for c0, c1, c2 and c3.
+    """
     items = names.split(",") if isinstance(names, str) else names or ()
-    return tuple(name.strip() for name in items if name.strip())
+    result = list[str]()
+    for name in filter(None, map(str.strip, items)):
+        if match := NAME_RANGE.fullmatch(name):
+            numbers = range(int(match["first"]), int(match["last"]) + 1)
+            result += [f"{match['name']}{i}" for i in numbers]
+        else:
+            result.append(name)
+    return tuple(result)
 
 
 class Reading(NamedTuple):

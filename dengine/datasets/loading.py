@@ -156,7 +156,8 @@ def load_dataset(
         Meaning of other label words, "heil=good,Riss=bad". "1=good,0=bad" if names end in numbers
         that are labels. "0=" is the word of a part not checked yet, "=good" an empty cell.
     columns : str or sequence of str, optional
-        Names of the columns of text files without a header, or with another one: "time,fx,fz".
+        Names of the columns of text files without a header, or with another one: "time,fx,fz", or
+        "c0..c498,label" for many.
     decimal, thousands : str, optional
         Marks in the numbers of text files, "," or ".". None: the cells of each file prove them.
     encoding : str, optional

@@ -26,6 +26,7 @@ from ..files import read_errors
 from ..traces import is_time_column
 from . import labels, units
 from .clocks import (
+    ANY_ORDER,
     HEAD,
     MAX_GAP,
     clock_of,
@@ -995,7 +996,7 @@ def _from_long(
     others = [name for name in frame.columns if name not in (options.part, time, *label_columns)]
     check = partial(_check_labels, all_rows, label_source, collector.name)
     collector.channels = _channels_of_long(frame, others, options, check)
-    seconds, *_ = seconds_of(frame[time], time, column_units.get(time, ""))
+    seconds, form = _times_of_long(frame[time], column_units.get(time, ""), collector)
     rows_of_part = _rows_by_part(frame, seconds, options)
     no_stations = {options.part, time, *label_columns, *collector.channels}
     _check_single_station(rows_of_part, [name for name in others if name not in no_stations])
@@ -1011,14 +1012,30 @@ def _from_long(
         rows = rows.drop(columns=[SECONDS_COLUMN, RUN_COLUMN])
         units_row = [column_units.get(name, "") for name in rows.columns]
         timed = rows_to_trace(rows, places, replace(options, time=time), collector.notes, units_row)
-        channels = collector.channels
-        channel_units = (column_units.get(name) or units.split(name)[1] for name in channels)
-        reading = timed.reading._replace(numbers=first.numbers)
+        channel_units = (
+            column_units.get(name) or units.split(name)[1] for name in collector.channels
+        )
+        clock = timed.reading.clock.replace(ANY_ORDER, form)  # a part's rows may not tell it
+        reading = timed.reading._replace(numbers=first.numbers, clock=clock)
         return timed._replace(units=tuple(channel_units), start=start, reading=reading)
 
     labels.collect_recordings(rows_of_part, read, label_source, collector)
     collector.order_by_start(apart=True, has_dates=has_dates)
     return as_dataset(collector, options)
+
+
+def _times_of_long(
+    column: pd.Series, unit: str, collector: RecordingCollector
+) -> tuple[NDArray[np.float64], str]:
+    """Return the times of a long table in seconds, and their form as in `Clock`.
+
+    A note of the collector says so if dates may have the day or the month first.
+    """
+    seconds, _, _, form = seconds_of(column, str(column.name), unit)
+    if form == ANY_ORDER:
+        text = f"Column {column.name} has {form}: they are read month first"
+        collector.notes[f"{text}, which matters for the order of the parts alone"] = 1
+    return seconds, form
 
 
 def _channels_of_long(

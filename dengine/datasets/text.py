@@ -337,10 +337,9 @@ def _find_header(
     A row is data if it has numbers in most of the columns that are numeric in the last 20 rows.
     What stands above the header is left out. If two lines stand above the data and the first can be
     the header, it is the header, and the second is a damaged row; a first line in which a name
-    occurs twice, as of groups of columns, cannot be, nor can one of fewer clocks and units, as
-    `Result;OK` or a title. In a header of evenly rising times, as that of
-    a wide table, these are replaced by 0, 1, 2, ... Raises UnreadableError for
-    numbers without a header if no `columns` are given; without rows the header is empty.
+    occurs twice, as of groups of columns, or that states a field, cannot be. In a header of evenly
+    rising times, as that of a wide table, these are replaced by 0, 1, 2, ... Raises UnreadableError
+    for numbers without a header if no `columns` are given; without rows the header is empty.
     """
     lines = list(rows_by_line)
     rows = list(rows_by_line.values())
@@ -359,8 +358,7 @@ def _find_header(
         group_names = list(filter(None, rows[0]))
         has_groups = len(set(group_names)) < len(group_names)
         has_groups |= len(group_names) < len(above[1]) > len({*above[1]}) and all(above[1])
-        is_field = _n_measured(above[1]) > _n_measured(above[0])
-        if not (has_groups or is_remark or is_units[0] or is_field):
+        if not (has_groups or is_remark or is_units[0] or _is_field_above(*above)):
             header = data = 0
     if header > 1 and _have_a_column_each(above, len(rows[data])):
         header = data = 0
@@ -381,6 +379,19 @@ def _find_header(
         data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
     line = lines[header] if lines else 0
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter, {})
+
+
+def _is_field_above(first: list[str], second: list[str]) -> bool:
+    """Return whether the first of two lines is a title or a field, as `Result;OK`, above a header.
+
+    Then the second is of names alone, and has more clocks and units than the first, or this has a
+    value, or is but one cell.
+    """
+    words = _without_trailing_empty(first)
+    names = _without_trailing_empty(second)
+    is_field = len(words) == 1 or any(map(_is_value, words[1:]))
+    is_field |= _n_measured(names) > _n_measured(words)
+    return is_field and len(names) > 1 and not any(map(_is_value, names))
 
 
 def _n_measured(names: Sequence[str]) -> int:
@@ -501,13 +512,17 @@ def _pad_units(units_row: list[str], n: int) -> list[str]:
 
 def _columns_advice(rows: list[list[str]]) -> str:
     """Return advice, for an error, on how to name the columns of a file without a header."""
-    names = [f"c{i}" for i in range(len(rows[0]))]
-    first = [row[0].replace(",", ".") for row in rows[:200] if len(row) == len(names)]
+    n = len(rows[0])
+    complete = [row for row in rows[:200] if len(row) == n]
+    first = [row[0].replace(",", ".") for row in complete]
+    names = [f"c{i}" for i in range(n)]
+    if n > MIN_TIMES:  # as a wide table
+        is_labelled = {row[-1] for row in complete} == {"0", "1"}
+        names = [f"c0..c{n - 2}", "label"] if is_labelled else [f"c0..c{n - 1}"]
     with suppress(ValueError):
-        names[0] = "time" if is_rising(np.array(first, dtype=np.float64)) else "c0"
-    if len(names) > SAMPLED_CELLS:
-        return "write one above, as FZ_0,FZ_1,... and label for a table with a row a part"
-    return f"write one above, or name its {len(names)} columns, columns={','.join(names)!r}"
+        if is_rising(np.array(first, dtype=np.float64)):
+            names[0] = names[0].replace("c0..", "time,c1..") if n > MIN_TIMES else "time"
+    return f"write one above, or name its {n} columns, columns={','.join(names)!r}"
 
 
 def read_table(
@@ -943,10 +958,13 @@ def column_place(name: str, header: Sequence[str], line: int = 1) -> int:
         raise UnreadableError(f"Expected a column {name}, got {columns}", line)
     if len(places) > 1:
         names = list(header)
-        for i in places:
-            plain, unit = units.split(header[i])
-            names[i] = f"{plain}_{i} [{unit}]" if unit else f"{plain}_{i}"
-        do = f"name them anew, columns={','.join(names)!r}, and the channel as there"
-        message = f"Expected a column {name}, got it twice or more in {columns}; {do}"
+        do = "name it as it stands"
+        if len({header[i] for i in places}) < len(places):
+            for n, i in enumerate(places, start=1):
+                bare = units.split(names[i])[0]
+                names[i] = names[i].replace(bare, f"{bare}_{n}", 1)
+            do = f"name them anew, columns={','.join(names)!r}, and the channel"
+        choice = " or ".join(f"channel={names[i]!r}" for i in places)
+        message = f"Expected a column {name}, got it twice or more in {columns}; {do}, {choice}"
         raise UnreadableError(message, line)
     return places[0]

@@ -645,18 +645,44 @@ def test_a_column_twice_is_one_line_that_says_what_to_do(tmp_path: Path) -> None
         "data", tmp_path / "0", "--channel", "Y"
     )
     assert "--channel Y" in one_line("data", tmp_path / "1")
-    advised = re.search(
-        r"name them anew, --columns (\S+?),? and",
-        one_line("data", tmp_path / "1", "--channel", "X"),
-    )[1]
-    assert (
-        document("data", tmp_path / "1", "--channel", "X_3", "--columns", advised)["survey"][
-            "traces"
-        ]
-        == 4
+    error = one_line("data", tmp_path / "1", "--channel", "X")
+    assert "--columns Time,X_1,Y,X_2, and the channel, --channel X_1 or --channel X_2;" in error
+    advised = ("--columns", "Time,X_1,Y,X_2")
+    survey = document("data", tmp_path / "1", "--channel", "X_2", *advised)["survey"]
+    assert survey["traces"] == 4
+    assert "Expected a column X, got Time, X_1" in one_line(
+        "data", tmp_path / "1", "--channel", "X", *advised
     )
-    refused = one_line("data", tmp_path / "1", "--channel", "X", "--columns", advised)
-    assert "Expected a column X, got" in refused
+
+
+def test_a_column_twice_is_read_by_the_name_that_the_error_advises(tmp_path: Path) -> None:
+    """g26: the advice left the channel as it was, and the first sensor was read in silence."""
+    header = ["t [s]", "Force [N]", "Force [N]"]
+    write(tmp_path / "a_OK.csv", header, times(), texts(-VALUES), texts())
+    columns = "t [s],Force_1 [N],Force_2 [N]"
+    with pytest.raises(DataError, match=re.escape(f"columns='{columns}', and the channel")):
+        load_dataset(tmp_path, channel="Force")
+    data = load_dataset(tmp_path, columns=columns, channel="Force_2 [N]")
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    with pytest.raises(DataError, match="Expected a column Force"):
+        load_dataset(tmp_path, columns=columns, channel="Force")
+    header = ["t [s]", "Force [N]", "Force [kN]"]
+    write(tmp_path / "a_OK.csv", header, times(), texts(), texts(-VALUES))
+    with pytest.raises(DataError, match=r"channel='Force \[N\]' or channel='Force \[kN\]'"):
+        load_dataset(tmp_path, channel="Force")
+
+
+def test_a_matrix_without_a_header_is_read_by_the_range_that_the_error_advises(
+    tmp_path: Path,
+) -> None:
+    """g11: the advice named 500 columns, and was cut off in the middle."""
+    path = tmp_path / "m.csv"
+    path.write_text("\n".join(",".join([*texts(), str(i % 2)]) for i in range(4)))
+    with pytest.raises(DataError, match=rf"columns='c0\.\.c{N - 1},label'"):
+        load_dataset(path)
+    data = load_dataset(path, columns=f"c0..c{N - 1},label", rate_hz=500)
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    assert data.y.tolist() == [0, 1, 0, 1]
 
 
 def one_line(*words: object) -> str:
@@ -1051,15 +1077,47 @@ def test_settings_beside_samples_without_a_header_ask_for_names(tmp_path: Path) 
         load_dataset(tmp_path, channel="c3")
 
 
-def test_many_columns_without_a_header_are_not_listed(tmp_path: Path) -> None:
-    np.savetxt(tmp_path / "a.csv", np.tile(VALUES, (9, 1)), delimiter=",")
-    with pytest.raises(DataError, match=r"write one above, as FZ_0,FZ_1,\.\.\. and label"):
-        load_dataset(tmp_path / "a.csv")
-
-
 def test_a_word_among_the_values_of_a_signal_is_named(tmp_path: Path) -> None:
     for name, last in (("a_OK", "I/O Timeout"), ("b_OK", "1.0")):
         columns = [["F"] * N, times(), [*texts()[:-1], last], ["Good"] * N]
         write(tmp_path / f"{name}.csv", ["Tag", "Timestamp", "Value", "Status"], *columns)
     [fault] = load_dataset(tmp_path, channel="F").faults
     assert "Expected a number in column F, got 'I/O Timeout'" in fault.message
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["Datum;02.03.2026", "Ergebnis;IO", "Zeit;06:11:00", "Bauteil;Stecker 4711", "Table 1;;"],
+)
+def test_one_line_above_the_header_is_a_field(line: str, tmp_path: Path) -> None:
+    """g29, g31, g32: `Datum;02.03.2026` was taken as the header, in silence."""
+    header = ["Zeit [ms]", "Kraft [kN]"]
+    counts = [str(2 * i) for i in range(N)]
+    write(tmp_path / "a_OK.csv", header, counts, german(texts()), delimiter=";", above=[line])
+    data = load_dataset(tmp_path, label="_(OK|NOK)")
+    assert (data.channels, data.unit, data.rate_hz) == (("Kraft [kN]",), "kN", 500.0)
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("dates", "order", "expected"),
+    [
+        (["3/2/2026", "2/3/2026", "9/2/2026"], "day first", "132"),  # 3 weeks, not 7 months
+        (["2/3/2026", "3/2/2026", "2/9/2026"], "month first", "132"),
+        (["3/2/2026"] * 3, "day or month first", "123"),
+    ],
+)
+def test_all_rows_tell_whether_the_day_is_first(
+    dates: list[str], order: str, expected: str, tmp_path: Path
+) -> None:
+    """g22, g34: 12/02/2026 was read month first, also where that made days months."""
+    rows = [
+        f"{part},{date} 06:{part:02d}:00.{4 * i:03d},{value},OK"
+        for part, date in enumerate(dates, start=1)
+        for i, value in enumerate(texts())
+    ]
+    (tmp_path / "a.csv").write_text("\n".join(["part,time,FZ,label", *rows]))
+    data = load_dataset(tmp_path / "a.csv", time="time")
+    assert data.reading["clock"] == f"column time (dates, {order})"
+    assert "".join(data.source) == expected
+    assert any("read month first" in note for note in data.notes) == (order[:6] == "day or")
