@@ -391,8 +391,8 @@ def _refit_without_padding(data: Dataset, options: LoadOptions, *, has_unit: boo
         collector.recordings.append(recording)
     fitted = as_dataset(collector, replace(options, unit=about.unit))
     reading = {**about.reading, "first": fitted.reading["first"]}
-    known = [note for note in fitted.notes if note != UNKNOWN_RATE]
-    return replace(fitted, notes=(*about.notes, *known), reading=reading)
+    fitting_notes = [note for note in fitted.notes if note != UNKNOWN_RATE]
+    return replace(fitted, notes=(*about.notes, *fitting_notes), reading=reading)
 
 
 def _arrays_by_meaning(
