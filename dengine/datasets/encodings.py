@@ -6,6 +6,7 @@ one. `text.read_table` decodes each file by `decode`.
 """
 
 import re
+from collections.abc import Iterable
 from contextlib import suppress
 
 from ..errors import shortened
@@ -27,6 +28,8 @@ OTHERS = {
     "euc_jp": ("euc_jp", "[\u3041-\u30ff\u4e00-\u9fff]"),
     "cp1251": ("cp1251", "[А-яЁё]"),
 }
+# In which a text may have the names that a user states; Windows-1252 reads most of them, too.
+BY_NAME = ("cp1250", *OTHERS, "cp1253", "cp1254", "cp1257")
 FEW = 3  # encodings that an error proposes
 SHOWN = 24  # characters of a text
 
@@ -68,6 +71,27 @@ def decode(content: bytes, stated: str | None = None) -> tuple[str, str]:
     if advice := _advice(content):
         raise UnreadableError(f"Expected text in UTF-8 or {WESTERN}, got another encoding{advice}")
     return content.decode("latin-1"), "Latin-1"
+
+
+def missing_name(content: bytes, names: Iterable[str], stated: str | None = None) -> str:
+    """Return what to do, for an error, if a text has one of some names only in another encoding.
+
+    "" if it has not. Names in ASCII, and a text in UTF-8 or UTF-16, tell nothing.
+
+    content, stated : as for `decode`.
+    """
+    with suppress(UnreadableError):
+        text, encoding = decode(content, stated)
+        if encoding.lower().startswith("utf"):
+            return ""
+        names = [name for name in names if name.lower() not in text.lower()]
+    for name in names:
+        for encoding in () if name.isascii() else BY_NAME:
+            with suppress(UnicodeDecodeError):
+                if name.lower() in content.decode(encoding).lower():
+                    do = f"state its encoding, in which it is there, encoding={encoding!r}"
+                    return f"Expected the text {name!r}, found none; {do}"
+    return ""
 
 
 def _is_western(text: str) -> bool:

@@ -50,7 +50,7 @@ from .dataset import (
     as_dataset,
     label_map_of,
 )
-from .encodings import decode
+from .encodings import decode, missing_name
 from .numerals import UndecidedError
 from .text import SUFFIXES as TEXTS
 from .text import (
@@ -80,6 +80,7 @@ MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered 
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 NEAR = 0.01  # of the largest number: numbers that differ by less are rounded in two ways
 FEW_ROWS = 5  # a text file of as few tells of a recording, and is none
+HIDDEN = (".", "~$")  # begin the names of files that no user wrote, as Excel's locks
 TRIED = 20  # recordings, on which advice about a column is tried
 MIN_RUN = 8  # rows on average that stand together in a table that is in the order of its parts
 MAX_STATIONS = 12  # more different values in the rows of a part are no stations
@@ -108,7 +109,7 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     named = {
         labels.normalized(inner.as_posix()): path
         for inner, path in paths.items()
-        if path.resolve() != label_file and not any(word.startswith(".") for word in inner.parts)
+        if path.resolve() != label_file and not any(word.startswith(HIDDEN) for word in inner.parts)
     }
     if not named:
         entries = listed(sorted(path.name for path in folder.iterdir()))
@@ -161,7 +162,10 @@ def read_heads(named: Mapping[str, Path], options: LoadOptions) -> FolderHeads:
     paths = [path for path in named.values() if path.suffix.lower() in TEXTS]
     if not paths:
         return FolderHeads([], Counter(), {}, [])
-    _check_encoding(paths, options)
+    try:
+        _check_encoding(paths, options)
+    except DataError as error:
+        raise _with_label_error(error, partial(_check_words_in_names, named, options)) from error
     sample = [_first_rows(path, options) for path in paths[:: max(len(paths) // TRIED, 1)]]
     usual_header, _ = Counter(tuple(cells.header) for cells in sample).most_common(1)[0]
     first = next(cells for cells in sample if tuple(cells.header) == usual_header)
@@ -220,16 +224,32 @@ def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptio
 
 
 def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
-    """Raise DataError with advice if neither first, middle nor last file can be decoded."""
+    """Raise DataError with advice if neither first, middle nor last file can be decoded.
+
+    Also if some files have a name of the options, as of a channel, only in another encoding.
+    """
+    columns = (options.label, options.part, options.time)
+    names = [*options.channels, *options.words, *filter(None, columns)]
+    if not all(map(str.isascii, names)):
+        for path in paths[:: max(len(paths) // TRIED, 1)]:
+            with suppress(OSError):
+                if advice := missing_name(_first_lines(path), names, options.encoding):
+                    raise DataError(f"Cannot read {path}: {advice}.")
     error: UnreadableError | None = None
     for path in (paths[0], paths[len(paths) // 2], paths[-1]):
         try:
-            with suppress(OSError), path.open("rb") as file:
-                decode(file.read(2**18).rpartition(b"\n")[0], options.encoding)
+            with suppress(OSError):
+                decode(_first_lines(path), options.encoding)
             return
         except UnreadableError as caught:
             error = caught
     raise DataError(f"Cannot read {paths[0]}: {error}.")
+
+
+def _first_lines(path: Path) -> bytes:
+    """Return the complete lines among the first 256 KiB of a file. Raises OSError."""
+    with path.open("rb") as file:
+        return file.read(2**18).rpartition(b"\n")[0]
 
 
 def read_folder(
@@ -353,6 +373,16 @@ def _check_labels(places: Mapping[str, Any], source: labels.LabelSource, name: s
     """
     collector = RecordingCollector(name, ())
     labels.collect_recordings(places, _read_nothing, source, collector).check_label_words()
+
+
+def _check_words_in_names(named: Mapping[str, Path], options: LoadOptions) -> None:
+    """Raise DataError if the names of a folder's files have label words of unknown meaning."""
+    if options.labels is None:
+        collector = RecordingCollector("the files' names", ())
+        source = labels.labels_in_names(options.label, options.words)
+        with suppress(DataError):
+            labels.collect_recordings(named, _read_nothing, source, collector)
+        collector.check_label_words()
 
 
 def _with_label_error(error: DataError, check: Callable[[], object]) -> DataError:

@@ -1121,3 +1121,44 @@ def test_all_rows_tell_whether_the_day_is_first(
     assert data.reading["clock"] == f"column time (dates, {order})"
     assert "".join(data.source) == expected
     assert any("read month first" in note for note in data.notes) == (order[:6] == "day or")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "channel", "word"),
+    [("cp1250", "Siła", "Zły"), ("gb18030", "压力", "不合格"), ("cp932", "荷重", "不良")],
+)
+def test_a_name_that_another_encoding_has_proposes_it(
+    encoding: str, channel: str, word: str, tmp_path: Path
+) -> None:
+    """g16, g27: `Siła` was no column, for Windows-1252 makes it `Si³a`."""
+    for i in range(4):
+        cells = ["0.0", "1.5", word if i % 2 else "OK"], ["0.1", "2.5", word if i % 2 else "OK"]
+        rows = [["time", channel, "Result"], *cells]
+        (tmp_path / f"p_{i}.csv").write_bytes("\n".join(map(",".join, rows)).encode(encoding))
+    label_map = {word: "bad"}
+    for options in ({"channel": channel}, {"label_map": label_map}):
+        with pytest.raises(DataError, match=f"encoding='{encoding}'"):
+            load_dataset(tmp_path, **options)
+    data = load_dataset(tmp_path, channel=channel, label_map=label_map, encoding=encoding)
+    assert data.y.tolist() == [1, 0, 1, 0]
+
+
+def test_an_error_of_the_encoding_says_which_label_words_in_names_are_unknown(
+    tmp_path: Path,
+) -> None:
+    """g27: the label map was asked for only after the encoding was stated."""
+    for i in range(8):
+        folder = tmp_path / ("不合格" if i % 2 else "合格")
+        folder.mkdir(exist_ok=True)
+        rows = [["时间(ms)", "压力(N)"], ["0", "1.5"], ["2", "2.5"]]
+        (folder / f"压装{i}.csv").write_bytes("\n".join(map(",".join, rows)).encode("gb18030"))
+    with pytest.raises(DataError, match=r"encoding='gb18030'.*label_map='.*不合格=bad"):
+        load_dataset(tmp_path, channel="压力")
+
+
+def test_excels_lock_of_an_open_file_is_no_recording(tmp_path: Path) -> None:
+    """g17: ~$a_OK.csv was a recording that cannot be read, in letters that nobody wrote."""
+    write(tmp_path / "a_OK.csv", ["t [s]", "FZ"], times(), texts())
+    (tmp_path / "~$a_OK.csv").write_bytes(b"\x06Meier" + b" " * 49 + "Meier".encode("utf-16-le"))
+    data = load_dataset(tmp_path)
+    assert (len(data.X), data.faults) == (1, ())
