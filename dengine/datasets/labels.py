@@ -982,7 +982,8 @@ def _read_label_rows(
     except (OSError, UnreadableError) as error:
         raise DataError(f"Cannot read the labels in {path}: {error}.") from error
     header = list(table.frame.columns)
-    cells = dict(zip(table.frame.index, table.frame.to_numpy().tolist(), strict=True))
+    rows_by_line = zip(table.frame.index, table.frame.to_numpy().tolist(), strict=True)
+    cells = {line: row for line, row in rows_by_line if any(row)}
     faults = table.faults
     if header[0].lower().endswith(SUFFIXES):  # no header, but the first row
         cells = {1: header, **cells}

@@ -66,6 +66,7 @@ REMARK = re.compile(r"^\s*(#+|%+|//+|\*+|--+|;+)\s*")  # by which programs mark 
 FIELD_KEY = re.compile(r"[^\W\d][^\d:;=\\]{0,40}")
 FIELD_MARK = re.compile(r"\s*[:;=\t,|]\s*")  # the first of them stands before the value
 CELL_MARK = re.compile(r"[;,\t|]")
+ROW_COUNT = re.compile(r"\(\d+ [^\W\d].*\)")  # what a database's client writes below a table
 LABVIEW_END = "***End_of_Header***"
 COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
@@ -189,14 +190,15 @@ def _remarks(cells: TextCells) -> set[int]:
     """Return the lines of the data rows that are remarks of the program that wrote the file.
 
     These are the header again, rows with a comment mark and without numbers, rows that are but one
-    word, as `//END`, and narrower rows without digits in their first cell behind all others, as
-    `Result;OK`. In a file of one column there are none, except the header.
+    word, as `//END` or `(90 rows affected)`, and narrower rows without digits in their first cell
+    behind all others, as `Result;OK`. In a file of one column there are none, except the header.
     """
     remarks = set[int]()
     is_at_end = True
     for i, row in reversed(cells.rows.items()):
         words = list(filter(None, row))
         is_word = words == row[:1] and not any(map(str.isdigit, row[0]))
+        is_word |= words == row[:1] and ROW_COUNT.fullmatch(row[0]) is not None
         is_comment = REMARK.match(row[0]) is not None and not _numeric_columns(row)
         is_field = is_at_end and len(words) == 2 and len(words) < len(cells.header)
         is_field = is_field and FIELD_KEY.fullmatch(row[0]) is not None
@@ -572,7 +574,8 @@ def read_table(
     if not header:
         raise UnreadableError("Expected a header, the first line names no column", cells.line)
     n = len(header)
-    complete = {i: row[:n] for i, row in cells.rows.items() if len(row) >= n and not any(row[n:])}
+    rows = _pad_rows(cells.rows, n)
+    complete = {i: row[:n] for i, row in rows.items() if len(row) >= n and not any(row[n:])}
     wrong = {
         i: f"Expected {n} columns, got {len(row)}: {listed(row)}"
         for i, row in cells.rows.items()
@@ -612,6 +615,18 @@ def read_table(
         column_units[i] = unit
     about = (cells.fields | fields_beside(path), cells.n_remarks)
     return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
+
+
+def _pad_rows(rows: dict[int, list[str]], n: int) -> dict[int, list[str]]:
+    """Return rows of cells, with empty cells up to the n of the header where these are left out.
+
+    They are left out if all rows of the usual number of cells end in an empty one.
+    """
+    width, _ = Counter(map(len, rows.values())).most_common(1)[0] if rows else (n, 0)
+    if width >= n or any(row[-1] for row in rows.values() if len(row) == width):
+        return rows
+    padding = [""] * (n - width)
+    return {i: row + padding if len(row) == width else row for i, row in rows.items()}
 
 
 def _take_units_off(frame: pd.DataFrame) -> dict[int, list[str]]:

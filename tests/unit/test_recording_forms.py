@@ -1162,3 +1162,35 @@ def test_excels_lock_of_an_open_file_is_no_recording(tmp_path: Path) -> None:
     (tmp_path / "~$a_OK.csv").write_bytes(b"\x06Meier" + b" " * 49 + "Meier".encode("utf-16-le"))
     data = load_dataset(tmp_path)
     assert (len(data.X), data.faults) == (1, ())
+
+
+def test_rows_that_leave_out_their_last_empty_columns_are_padded(tmp_path: Path) -> None:
+    """g09: Rigol writes start and increment into its first row alone."""
+    rows = [f"{i},{value}," for i, value in enumerate(texts())]
+    lines = ["X,CH1,Start,Increment", "Sequence,Volt,-2.0e-01,2.0e-03", *rows]
+    (tmp_path / "a_OK.csv").write_text("\n".join(lines))
+    data = load_dataset(tmp_path, channel="CH1", rate_hz=500)
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+
+
+def test_what_a_database_writes_below_a_table_is_no_recording(tmp_path: Path) -> None:
+    """g14: `(9000 rows affected)` was counted as a recording that is left out."""
+    rows = [
+        f"{part},{0.01 * i:.2f},{value},OK" for part in (1, 2) for i, value in enumerate(texts())
+    ]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["part,time,FZ,label", *rows, "(9000 rows affected)"]))
+    data = load_dataset(path, time="time")
+    assert (len(data.X), data.faults) == (2, ())
+
+
+def test_blank_rows_of_a_list_are_no_recordings(tmp_path: Path) -> None:
+    """g24: `;;` above the sums of a list was called a recording without a name."""
+    for i in range(4):
+        write(tmp_path / "d" / f"p_{i}.csv", ["t [s]", "FZ"], times(), texts(VALUES + i))
+    listing = tmp_path / "list.csv"
+    rows = [f"p_{i}.csv;{'OK' if i % 2 else 'NOK'};" for i in range(4)]
+    listing.write_text("\n".join(["file;label;remark", *rows, ";;", ";;"]))
+    data = load_dataset(tmp_path / "d", labels=listing)
+    assert (len(data.X), data.faults) == (4, ())
+    assert not any("more than once" in note for note in data.notes)
