@@ -1076,10 +1076,12 @@ def _channels_of_long(
 ) -> tuple[str, ...]:
     """Return the channels of a long table, among those columns `names` that hold numbers.
 
-    If they must be named, DataError is raised, which also says what `check_labels` finds wrong.
+    A column without a name is none: R writes row numbers so. If they must be named, DataError is
+    raised, which also says what `check_labels` finds wrong.
     """
+    named = filter(None, names)
     try:
-        return choose_channels([name for name in names if not floats(frame[name])[1]], options)
+        return choose_channels([name for name in named if not floats(frame[name])[1]], options)
     except DataError as error:
         raise _with_label_error(error, check_labels) from error
 

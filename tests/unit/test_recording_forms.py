@@ -1194,3 +1194,15 @@ def test_blank_rows_of_a_list_are_no_recordings(tmp_path: Path) -> None:
     data = load_dataset(tmp_path / "d", labels=listing)
     assert (len(data.X), data.faults) == (4, ())
     assert not any("more than once" in note for note in data.notes)
+
+
+def test_a_column_without_a_name_is_no_channel_of_a_long_table(tmp_path: Path) -> None:
+    """g12: R's row numbers were offered as a channel without a name."""
+    rows = [
+        f"{N * part + i},{part},{0.01 * i:.2f},{value},OK"
+        for part in (1, 2)
+        for i, value in enumerate(texts())
+    ]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join([",part,time,force_N,label", *rows]))
+    assert load_dataset(path, time="time").channels == ("force_N",)
