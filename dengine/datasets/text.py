@@ -406,8 +406,9 @@ def _names_in(
 ) -> tuple[int, list[str], list[str]]:
     """Return the position of the header above the data, the names in it, and the units.
 
-    In rows of pairs, as TwinCAT Scope writes them, each name but the clock's stands behind a word.
-    A name that is there twice gets that of its group before it, if a row of groups stands above.
+    TwinCAT Scope writes two columns for each channel: the first, its clock, is named "Time" here.
+    Otherwise a name that is there twice gets that of its group before it, if a row of groups stands
+    above; a clock's name stays.
     """
     names = above[header] if above else []
     if pairs := [row for row in above if _are_pairs(row)]:

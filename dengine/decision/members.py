@@ -208,8 +208,9 @@ class MemberEvidence(nn.Module):
 
         `n_silent` accepted parts went on since the last label. They count as not wrong, and outside
         of the safe mode as not novel. `novel` says whether the trace of the part at hand was novel.
-        It counts outside of the safe mode, where it may start one, and in the safe mode for novel
-        traces, where the detector counts how long few have been novel.
+        Outside of the safe mode it steps the detector of novel traces, which may start a safe mode.
+        In a safe mode for novel traces the same detector counts how long few have been novel. In
+        any other safe mode `novel` has no effect.
         """
         self.step_detector(0, self.correct_step, n_silent)
         safe_mode = int(self.safe_mode.item())
