@@ -247,10 +247,11 @@ class Recipe:
     def to_toml(self) -> str:
         """Return the recipe as TOML, in which None is written as "none".
 
-        Defaults that belong to the reducer's class are written as values; the class is imported for
-        them. A reducer object is written as `module:Class` and its parameters. Where these are no
-        plain values, as in a pipeline, it is written as "object Class", and the object must be
-        handed in again.
+        `radius` and `retrain_every` are written as values also where the reducer's class gives
+        them; it is imported for that. Of a named reducer only the `params` given are written, not
+        its defaults. A reducer object is written as `module:Class` and its parameters. Where these
+        are no plain values, as in a pipeline, it is written as "object Class", and the object must
+        be handed in again.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain["reducer"], params = _name_and_params(self.reducer, self.params)

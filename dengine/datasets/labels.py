@@ -829,9 +829,10 @@ def labels_in_file(
     A row names a recording by its full path, by the end of it, or by a path with more leading
     folders. The suffix may be left out, and case is ignored. A file without a header, whose first
     line names a .csv, has files and labels in this order. A column of files that has another name
-    is found by the names of recordings in it. A recording may have several rows of one label. A
-    row that matches several recordings labels only one whose full path it gives; for the others
-    `find` raises UnreadableError.
+    is found by the names of recordings in it. A recording may have several rows of one label;
+    of rows with different paths that match it, only the one with its full path counts, or else the
+    longest path. A row that matches several recordings labels only one whose full path it gives;
+    for the others `find` raises UnreadableError.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""`load_dataset`, which reads recordings from whatever holds them, and the readers of arrays.
+"""`load_dataset`, which reads recordings from whatever holds them, and the readers of .npz files,
+stores and arrays in memory.
 
-It finds out what a source is and calls its reader: `tables`, `bags`, or for .npz files, stores and
-arrays in memory the functions below.
+It finds out what a source is and calls its reader: in `tables`, in `bags`, or below.
 """
 
 import os

@@ -97,8 +97,10 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     """Return the files of recordings in a folder and those inside it, by their path in it.
 
     They are the Parquet and .npz files if there are any, else the text files of the most frequent
-    suffix. `run_2.csv` comes before `run_10.csv`. Hidden files and the file of labels are left out.
-    Raises DataError if there is none.
+    suffix; several suffixes if they are equally frequent. A suffix whose first file has at most
+    `FEW_ROWS` rows, as notes beside a recording have, counts only if all suffixes are like that.
+    `run_2.csv` comes before `run_10.csv`. Hidden files and the file of labels are left out. Raises
+    DataError if there is none.
     """
     label_file = None if options.labels is None else Path(options.labels).resolve()
     paths = {

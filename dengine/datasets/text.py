@@ -1,4 +1,4 @@
-"""Text files of numbers in the dialects that people's tools write: .csv, .tsv, .txt and .dat.
+"""Text files of numbers in the dialects that people's tools write: .csv, .tsv, .txt, .dat, .lvm.
 
 `read_table` reads a file as a table of texts: it finds the delimiter, the header, the row of units
 and the number format. `read_recording` makes a trace of one file, and `rows_to_trace`

@@ -134,7 +134,10 @@ class Peers:
         self._asked = self._clock() if n_labels < MOST else -np.inf
 
     def take_over(self, version: ModelVersion) -> None:
-        """Let a peer's version answer, with every label since and this cell's own rule.
+        """Let a peer's version answer, with every label since.
+
+        Its rule is the one that this cell's model has now, as it is: nothing is rebuilt, and the
+        peer's rule is ignored.
 
         Where it cannot be restored, that is logged and the present version goes on answering. It is
         tried again with later news only if the store was the reason.
