@@ -761,7 +761,8 @@ def _of_one_signal(table: TextTable, channels: Sequence[str]) -> TextTable:
     that of several channels, is returned as it is.
     """
     frame = table.frame
-    if len(channels) != 1 or units.find_columns(channels[0], list(frame.columns)):
+    is_signal = len(channels) == 1 and frame.columns.is_unique
+    if not is_signal or units.find_columns(channels[0], list(frame.columns)):
         return table
     tags = [name for name in frame if (frame[name] == channels[0]).any()]
     if len(tags) != 1:

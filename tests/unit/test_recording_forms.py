@@ -1206,3 +1206,9 @@ def test_a_column_without_a_name_is_no_channel_of_a_long_table(tmp_path: Path) -
     path = tmp_path / "a.csv"
     path.write_text("\n".join([",part,time,force_N,label", *rows]))
     assert load_dataset(path, time="time").channels == ("force_N",)
+
+
+def test_a_channel_that_is_not_beside_columns_of_one_name_is_an_error(tmp_path: Path) -> None:
+    """g05: a clock for each channel, and a channel that is not there, ended in a traceback."""
+    write(tmp_path / "a_OK.csv", ["Time", "Fx", "Time", "Fz"], times(), texts(), times(), texts())
+    assert "Expected a column F, got Time, Fx" in one_line("data", tmp_path, "--channel", "F")
