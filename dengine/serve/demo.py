@@ -1,7 +1,7 @@
-"""`playing`: a cell without a robot, for `dengine serve --demo`.
+"""Plays recordings through the service in place of a robot, for `dengine serve --demo`: `playing`.
 
-It plays the bundled recordings through the service as a robot's program would: insert, ask for a
-decision, report the outcome.
+For each recorded part it does what a robot's program does: insert, ask for a decision, report the
+outcome.
 """
 
 import asyncio

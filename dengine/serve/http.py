@@ -512,9 +512,10 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
 
     It has the decision's trace, the band of good parts (None where there is none), up to `N_BADS`
     newest bad traces among the newest `N_LABELS` labels (none if their shape differs), and the
-    corrections of its label. Band and bad traces are rounded for a picture. Damaged rows are left
-    out, and an event records that. Raises UnknownDecisionError without a decision,
-    ReportConflictError if the part has several.
+    corrections of its label. Band and bad traces are rounded for a picture. Raises StoreError for
+    a damaged trace of the decision or of a neighbour; other damaged rows are left out, and an event
+    records that. Raises UnknownDecisionError without a decision, ReportConflictError if the part
+    has several.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
