@@ -424,11 +424,13 @@ def label_map_of(
     Parameters
     ----------
     words : Counter
+        How often each word occurs.
     labels : collection of int
-        Those that are known. Without any a dash, or an empty cell in most rows, may mean that there
-        is no fault: the map says so.
+        Those that are known.
     unlabelled : mapping of str to int
-        How often each word of an unchecked part is there.
+        How often each word occurs that marks a part as unchecked. Without known labels such a word
+        may mean that there is no fault. So a dash then counts as one of `words`, and so does an
+        empty cell if it is more frequent than all `words` together. Others are not used.
     """
     no_fault = {word: (unlabelled or {}).get(word, 0) for word in ("-", "") if not labels}
     if no_fault.get("", 0) <= words.total():
