@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import json
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -247,7 +248,11 @@ def fields_beside(path: Path) -> dict[str, str]:
             ]
         for other in others:
             if other.is_file() and other.stat().st_size < SMALL:
-                return _fields_in(decode(other.read_bytes())[0].splitlines())
+                text, _ = decode(other.read_bytes())
+                if other.suffix.lower() == ".json":  # a line for each field, however it was written
+                    with suppress(ValueError):
+                        text = json.dumps(json.loads(text), indent=1, ensure_ascii=False)
+                return _fields_in(text.splitlines())
     return {}
 
 

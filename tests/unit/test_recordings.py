@@ -2,6 +2,7 @@
 named and alone is lost.
 """
 
+import json
 import re
 import tempfile
 from collections.abc import Callable
@@ -1877,7 +1878,7 @@ def test_channels_of_one_name_are_told_apart_by_the_groups_above(
     np.testing.assert_array_equal(load_dataset(tmp_path, channel="Sensor B Fz").X, small.X)
 
 
-@pytest.mark.parametrize("form", ["in its folder", "of its name"])
+@pytest.mark.parametrize("form", ["in its folder", "of its name", "in one line"])
 def test_a_verdict_in_a_small_file_beside_the_recording_is_the_label(
     form: str, small: Dataset, tmp_path: Path
 ) -> None:
@@ -1886,7 +1887,9 @@ def test_a_verdict_in_a_small_file_beside_the_recording_is_the_label(
         write_csv(folder / f"SN{i:03}.csv", x)
         name = "result.txt" if form == "in its folder" else f"SN{i:03}.json"
         text = f"Operator: A\nResult: {word}\n"
-        text = text if name.endswith(".txt") else f'{{\n  "part": {i},\n  "verdict": "{word}"\n}}'
+        if name.endswith(".json"):
+            fields = {"part": i, "check": {"verdict": word, "by": "camera"}, "program": 7}
+            text = json.dumps(fields, indent=None if form == "in one line" else 2)
         (folder / name).write_text(text)
     data = load_dataset(tmp_path)
     np.testing.assert_array_equal(data.X, small.X)
