@@ -428,14 +428,12 @@ def label_map_of(
     labels : collection of int
         Those that are known.
     unlabelled : mapping of str to int
-        How often each word occurs that marks a part as unchecked. Without known labels such a word
-        may mean that there is no fault. So a dash then counts as one of `words`, and so does an
-        empty cell if it is more frequent than all `words` together. Others are not used.
+        How often each word occurs that marks a part as unchecked. Without known labels a dash, or
+        an empty cell, counts as one of `words` if it is more frequent than all of these together:
+        then it means that there is no fault. Others are not used.
     """
     no_fault = {word: (unlabelled or {}).get(word, 0) for word in ("-", "") if not labels}
-    if no_fault.get("", 0) <= words.total():
-        no_fault.pop("", None)
-    words = words + Counter(no_fault)
+    words = words + Counter({word: n for word, n in no_fault.items() if n > words.total()})
     ordered = [word for word, _ in words.most_common()]
     if len(set(labels)) == 1:
         bad = set(ordered) if 1 in labels else set()

@@ -1551,6 +1551,14 @@ def test_the_map_for_words_of_faults_has_the_dash_of_parts_without_one(tmp_path:
         load_dataset(tmp_path, label="Fault")
 
 
+def test_a_dash_less_frequent_than_the_words_is_no_word_of_the_map(tmp_path: Path) -> None:
+    for i, word in enumerate(["heil", "heil", "heil", "Riss", "-"]):
+        frame = pd.DataFrame({"FZ_Base": np.arange(30.0), "Fault": word})
+        frame.to_csv(tmp_path / f"{i}.csv", index=False)
+    with pytest.raises(DataError, match=r"label_map='heil=good,Riss=bad'"):
+        load_dataset(tmp_path, label="Fault")
+
+
 def test_rows_of_zeros_with_a_time_of_zero_behind_the_last_sample_are_left_out(
     tmp_path: Path,
 ) -> None:
