@@ -25,11 +25,11 @@ from training.make_recordings import write_plants, write_recordings
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """80 recordings as UR cells make them, three of them broken; beside them those of
+    """40 recordings as UR cells make them, three of them broken; beside them those of
     five plants.
     """
     path = tmp_path_factory.mktemp("recordings") / "cell_3"
-    write_recordings(path, 80, 3, 0)
+    write_recordings(path, 40, 3, 0)
     write_plants(path.parent, 60, 0)
     return path
 
@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_path: Path) -> None:
     result = well("data", folder, "--channel", "FZ_Base,FX_Base", "--out", tmp_path / "out")
     words = " ".join(result.stdout.replace("│", " ").split())
-    text = "traces 77|names FZ_Base, FX_Base|rates low 500,|Left out 3 of 80|Expected 13 columns, got 12"
+    text = "traces 37|names FZ_Base, FX_Base|rates low 500,|Left out 3 of 40|Expected 13 columns, got 12"
     assert [word for word in text.split("|") if word not in words] == []
     assert (tmp_path / "out" / "data.png").stat().st_size > 10_000
     played = well(
@@ -49,11 +49,11 @@ def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_
         "--reducer",
         "pca",
         "--cycles",
-        60,
+        30,
         "--repeats",
         1,
     )
-    assert played.stderr.count("Left out 3 of 80 recordings of cell_3:") == 1
+    assert played.stderr.count("Left out 3 of 40 recordings of cell_3:") == 1
 
 
 def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_length(
@@ -64,9 +64,9 @@ def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_l
         document("train", "--data", folder, "--store", store, "--reducer", "pca")["import"][
             "imported"
         ]
-        == 77
+        == 37
     )
-    assert document("train", "--data", folder, "--store", store)["import"]["repeated"] == 77
+    assert document("train", "--data", folder, "--store", store)["import"]["repeated"] == 37
     with DataEngine.open(store) as engine:
         assert (engine.trace.fit, engine.trace.columns) == ("pad", ("FZ_Base",))
         frames = [
@@ -428,7 +428,7 @@ def test_a_long_table_whose_times_are_not_named_is_told_to_name_them(
 def test_a_part_without_a_verdict_is_counted_as_unlabelled_and_left_out(
     empty: str, make_data, tmp_path: Path
 ) -> None:
-    data = make_data(30, samples=40)
+    data = make_data(15, samples=40)
     words = [("OK" if y else "NOK") if i % 3 == 0 else empty for i, y in enumerate(data.y.tolist())]
     table = pd.DataFrame(data.X.astype(float), columns=[f"FZ_{i}" for i in range(40)]).assign(
         verdict=words
@@ -446,7 +446,7 @@ def test_a_part_without_a_verdict_is_counted_as_unlabelled_and_left_out(
     (tmp_path / "labels.csv").write_text(
         "file,label\n" + "\n".join(f"run_{i}.csv,{word}" for i, word in enumerate(words))
     )
-    np.savez(tmp_path / "x.npz", X=data.X, y=np.array(words), part=np.arange(30))
+    np.savez(tmp_path / "x.npz", X=data.X, y=np.array(words), part=np.arange(15))
     sources = {
         "wide.csv": [],
         "long.csv": ["--part", "serial", "--time", "time"],
@@ -456,9 +456,9 @@ def test_a_part_without_a_verdict_is_counted_as_unlabelled_and_left_out(
     sources["plain"] = ["--labels", tmp_path / "labels.csv"]
     for source, options in sources.items():
         survey = document("data", tmp_path / source, *options)["survey"]
-        assert (survey["traces"], survey["unlabelled"], survey["faults"]) == (10, 20, []), source
+        assert (survey["traces"], survey["unlabelled"], survey["faults"]) == (5, 10, []), source
         assert survey["good"] == int(data.y[::3].sum())
-        assert "20 of 30" in well("data", tmp_path / source, *options).stdout
+        assert "10 of 15" in well("data", tmp_path / source, *options).stdout
     played = well(
         "replay",
         "--data",
@@ -466,12 +466,12 @@ def test_a_part_without_a_verdict_is_counted_as_unlabelled_and_left_out(
         "--reducer",
         "pca",
         "--cycles",
-        10,
+        5,
         "--repeats",
         1,
     )
     note = (
-        r"20 of 30 recordings of wide have no label yet( \('.*' 20 times\))?: they are left out\."
+        r"10 of 15 recordings of wide have no label yet( \('.*' 10 times\))?: they are left out\."
     )
     assert re.search(note, played.stderr)
 
