@@ -411,7 +411,7 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
         stamps = column
     else:
         text = column.astype(str).str.strip().str.upper()
-        is_day_first = _date_order(text) == "day"
+        as_written = text
         text = text.str.replace(",", ".").str.replace("−", "-")
         text = text.str.replace(r"\s*UTC$", "Z", regex=True).str.replace(r"\s+", " ", regex=True)
         if text.str.fullmatch(TIME_OF_DAY).mean() > 0.5:
@@ -421,7 +421,7 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
             text = text.str.replace(
                 DAY_FIRST, lambda m: f"{m[3]}-{m[2]:0>2}-{m[1]:0>2}", regex=True
             )
-            day, month = (1, 2) if is_day_first else (2, 1)
+            day, month = (1, 2) if _date_order(as_written) == "day" else (2, 1)
             text = text.str.replace(
                 SLASHED_DATE, lambda m: f"{m[3]}-{m[month]:0>2}-{m[day]:0>2}", regex=True
             )
@@ -602,9 +602,10 @@ def check_rows(clock: Clock, lines: pd.Index, time: str | None = None) -> None:
 
 
 def lost_rows_text(clock: Clock) -> str:
-    """Return whether a clock beside a stated rate shows lost rows, in words.
+    """Return a text for the reading: would a clock show it if rows were lost, or is it too coarse?
 
-    One without times, or in which half of the steps or more are 0, does not.
+    Whether rows are lost is not looked at here. A clock is too coarse if half of its steps or more
+    are 0; a step from or to an empty cell counts as one of 0. The clock has two rows or more.
     """
     is_fine = (np.abs(np.diff(clock.seconds)) > 0).mean() > 0.5  # a step from or to NaN is not
     shows = "shows" if is_fine else "is too coarse to show"
@@ -612,9 +613,10 @@ def lost_rows_text(clock: Clock) -> str:
 
 
 def rate_contradiction(clock: Clock, rate_hz: float) -> str:
-    """Return a note that a stated rate contradicts a clock by more than a fifth, or "".
+    """Return a note if the duration by a stated rate is not that by a clock, else "".
 
-    A coarse clock is right to one of its steps. One whose unit was assumed contradicts nothing.
+    It is not if one is more than 1.2 times the other, after the clock's span was allowed an error
+    of one median step. A clock whose unit was assumed contradicts nothing.
     """
     steps = np.diff(clock.seconds[~np.isnan(clock.seconds)])
     forward = steps[steps > 0]

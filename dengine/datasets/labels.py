@@ -40,7 +40,7 @@ from .dataset import (
     expect_data,
     label_map_of,
 )
-from .text import SUFFIXES, column_place, read_table
+from .text import SUFFIXES, column_place, fields_beside, read_table
 
 # The words of labels, and the names of their columns.
 LISTS = tomllib.loads((files("dengine") / "data" / "label_words.toml").read_text("utf-8"))
@@ -460,14 +460,16 @@ class LabelColumn:
 def read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
     """Read a file and return the cells of one of its columns as texts.
 
-    Without such a column it is the value of a line outside the table, as `Result;OK`. Raises
-    UnreadableError if the file or the column cannot be read.
+    Without such a column it is the value of a line outside the table, as `Result;OK`, or in a
+    small file beside it. Raises UnreadableError if the file or the column cannot be read.
     """
     # Without stated columns the label needs no number format.
     table = read_table(path, options, as_text=not options.columns)
     frame = table.frame
-    if column in table.fields and column not in frame:
-        return [table.fields[column]]
+    if column not in frame:
+        fields = {**table.fields, **fields_beside(path)}
+        if column in fields:
+            return [fields[column]]
     return list(map(str, frame.iloc[:, column_place(column, list(frame.columns))]))
 
 
@@ -633,9 +635,8 @@ def _find_label(name: str, words: LabelMap, unchecked: Collection[str] = ()) -> 
     """Return the label in a path.
 
     Raises NoLabelError if there is none, UnlabelledError if there is only a word of `UNCHECKED` or
-    of `unchecked`, the user's,
-    UnknownWordError if a word before it may be a not, as in ikke_ok, and UnreadableError if several
-    labels contradict each other.
+    of `unchecked`, the user's, UnknownWordError if a word before it may be a not, as in ikke_ok,
+    and UnreadableError if several labels contradict each other.
     """
     labels = _found_labels(name, words)
     deciding = [label for label in labels if label.decides]

@@ -398,10 +398,11 @@ def _refit_without_padding(data: Dataset, options: LoadOptions, *, has_unit: boo
 def _arrays_by_meaning(
     named: Files, arrays: Mapping[str, NDArray[Any]], label: str, options: LoadOptions
 ) -> dict[str, NDArray[Any]]:
-    """Return arrays that archives have under other names, by the names of `ARRAYS` and their own.
+    """Return arrays that archives have under unusual names, each by its usual and its own name.
 
-    They are `rate_hz`, as `fs` or of an array of times; `channels` and `unit`, arrays of texts that
-    are as long as the axis of the channels; and `X`, if the user names channels of it.
+    The usual names are those of `ARRAYS`: `rate_hz`, of a number such as fs or dt or from an array
+    of times; `channels` and `unit`, arrays of texts as long as the axis of the channels; and `X`,
+    if the user names channels of it. Empty without labels.
 
     arrays : those that are there by the usual names. label : the array of labels.
     """

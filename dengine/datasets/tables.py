@@ -622,9 +622,8 @@ def _first_rows(path: Path, options: LoadOptions) -> TextCells:
         lines = content.split(b"\n")[:100]
         start = len(b"\n".join(lines))
         end = file.seek(0, os.SEEK_END)
-        if (
-            start < end and b"\0" not in content[:400]
-        ):  # in UTF-16 a line may begin in mid-character
+        # In UTF-16 a line may begin in mid-character.
+        if start < end and b"\0" not in content[:400]:
             file.seek(max(start, end - 2**10))
             lines += file.read().split(b"\n")[1:]
         text, _ = decode(b"\n".join(lines), options.encoding)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -188,11 +189,12 @@ def _is_horizontal(rows: Collection[Sequence[str]]) -> bool:
 
 
 def _remarks(cells: TextCells) -> set[int]:
-    """Return the lines of the data rows that are remarks of the program that wrote the file.
+    """Return the line numbers of rows below the header that are no data.
 
-    These are the header again, rows with a comment mark and without numbers, rows that are but one
-    word, as `//END` or `(90 rows affected)`, and narrower rows without digits in their first cell
-    behind all others, as `Result;OK`. In a file of one column there are none, except the header.
+    Four kinds of rows are meant: the header again; rows that begin with a comment mark and have no
+    numbers; rows in which only the first cell is filled, with a word, as `//END` or `(90 rows
+    affected)`; and, behind all data, rows of a name and a value, as `Result;OK`, in a table of more
+    columns. In a table of one column only the first kind counts.
     """
     remarks = set[int]()
     is_at_end = True
@@ -211,10 +213,11 @@ def _remarks(cells: TextCells) -> set[int]:
 
 
 def _fields_in(lines: Iterable[str]) -> dict[str, str]:
-    """Return what lines outside the table state, by its name: the first of each name counts.
+    """Return the values that lines outside the table state, by name; of a name the first counts.
 
-    A line states it as `Result: OK`, `# Result = OK` or `Result;OK`, or a line of names stands
-    above one of as many values.
+    A line is read as name and value: `Result: OK`, `# Result = OK` or `Result;OK`. A value ends at
+    the next of these marks, so that of `Start: 12:30:05` is 12. If two lines in succession have as
+    many cells, those of the first are also read as names of those below them.
     """
     fields = dict[str, str]()
     above: list[str] = []
@@ -241,7 +244,8 @@ def fields_beside(path: Path) -> dict[str, str]:
     """
     others = [path.with_suffix(suffix) for suffix in BESIDE if suffix != path.suffix.lower()]
     with suppress(OSError, UnreadableError):
-        inside = list(itertools.islice(path.parent.iterdir(), 4))
+        with os.scandir(path.parent) as entries:  # not all: there may be thousands
+            inside = [Path(entry.path) for entry in itertools.islice(entries, 3)]
         if len(inside) == 2:
             others += [
                 other for other in inside if other.suffix.lower() in BESIDE and other != path
@@ -412,8 +416,8 @@ def _names_in(
     """Return the position of the header above the data, the names in it, and the units.
 
     TwinCAT Scope writes two columns for each channel: the first, its clock, is named "Time" here.
-    Otherwise a name that is there twice gets that of its group before it, if a row of groups stands
-    above; a clock's name stays.
+    In other files with a row of groups above the header, a name that occurs twice gets the name of
+    its group before it, except that of a clock.
     """
     names = above[header] if above else []
     if pairs := [row for row in above if _are_pairs(row)]:
@@ -619,7 +623,7 @@ def read_table(
     stated = units.stated_in_preamble(preamble, header, without)
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
-    about = (cells.fields | fields_beside(path), cells.n_remarks)
+    about = (cells.fields, cells.n_remarks)
     return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
 
 
@@ -638,8 +642,9 @@ def _pad_rows(rows: dict[int, list[str]], n: int) -> dict[int, list[str]]:
 def _take_units_off(frame: pd.DataFrame) -> dict[int, list[str]]:
     """Remove the units in a table's cells, as of `56.5 N`, in place.
 
-    Only columns whose cells all have a unit of one dimension, or are empty, are changed. Returns
-    the unit of each cell, "" for an empty one, by the position of the column.
+    Only columns are changed whose cells are all empty, or a number, a blank and a known unit, all
+    units of one dimension. Returns, by the position of the column, the unit of each cell in its
+    usual spelling, "" for an empty cell.
     """
     cell_units = dict[int, list[str]]()
     for i in range(frame.shape[1]):
@@ -665,8 +670,8 @@ def _convert_cells(
 ) -> str:
     """Convert cells to one unit for each column, in place, and set that in `column_units`.
 
-    It is the only one of the column, or else the one without a prefix, as N for N and kN. Returns
-    what was done, "" for nothing.
+    If the column has several units, the numbers are converted to the unit without a prefix: N for N
+    and kN. Returns a text for the reading that names the units, "" if no cell has one.
 
     cell_units : from `_take_units_off`.
     """
@@ -675,7 +680,7 @@ def _convert_cells(
         stated = list(dict.fromkeys(filter(None, cells)))
         column_units[i] = stated[0]
         if len(stated) > 1:
-            dimension, _ = units.parse(stated[0]) or ("", 1.0)
+            dimension, _ = units.parse(stated[0]) or ("", 1.0)  # each parses: it was taken off
             column_units[i] = dimension
             factors = {unit: units.factor(unit, dimension) or 1.0 for unit in stated}
             numbers, _ = floats(frame.iloc[:, i])

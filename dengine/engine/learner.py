@@ -124,7 +124,8 @@ class Learner:
     def precompute(self) -> None:
         """Start a thread that computes what the next retrain begins with; do not wait for it.
 
-        Nothing is started if one was, and no retrain has waited for it since. There must be labels.
+        The result is kept in the newest model. While an earlier one has not been waited for,
+        nothing is started. There must be labels.
         """
         if self._precomputed is not None:
             return

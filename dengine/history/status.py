@@ -355,7 +355,9 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     last_seq = retrains[-1].last_seq if retrains else 0
     accepted = [report.version for report in store.retrains() if report.accepted]
     since = int(settings.get("policy_since", 0))
-    in_force = tally if not since else store.tally(None, since, policy.label_within)
+    in_force = tally
+    if since:
+        in_force = store.tally(since_version=since, within=policy.label_within)
     return Status(
         cell=store.cell_id,
         product=store.product,

@@ -1543,19 +1543,20 @@ def test_a_listing_with_other_columns_is_one_error_that_says_what_each_needs(
         load_dataset(few, labels=tmp_path / "mes.csv")
 
 
-def test_the_map_for_words_of_faults_has_the_dash_of_parts_without_one(tmp_path: Path) -> None:
-    for i, word in enumerate(["-", "-", "-", "jammed", "tilted"]):
+@pytest.mark.parametrize(
+    ("words", "label_map"),
+    [
+        (["-", "-", "-", "jammed", "tilted"], "-=good,jammed=bad,tilted=bad"),
+        (["heil", "heil", "heil", "Riss", "-"], "heil=good,Riss=bad"),
+    ],
+)
+def test_a_suggested_label_map_has_a_dash_only_if_it_is_more_frequent_than_the_words(
+    words: list[str], label_map: str, tmp_path: Path
+) -> None:
+    for i, word in enumerate(words):
         frame = pd.DataFrame({"FZ_Base": np.arange(30.0), "Fault": word})
         frame.to_csv(tmp_path / f"{i}.csv", index=False)
-    with pytest.raises(DataError, match=r"label_map='-=good,jammed=bad,tilted=bad'"):
-        load_dataset(tmp_path, label="Fault")
-
-
-def test_a_dash_less_frequent_than_the_words_is_no_word_of_the_map(tmp_path: Path) -> None:
-    for i, word in enumerate(["heil", "heil", "heil", "Riss", "-"]):
-        frame = pd.DataFrame({"FZ_Base": np.arange(30.0), "Fault": word})
-        frame.to_csv(tmp_path / f"{i}.csv", index=False)
-    with pytest.raises(DataError, match=r"label_map='heil=good,Riss=bad'"):
+    with pytest.raises(DataError, match=f"label_map='{label_map}'"):
         load_dataset(tmp_path, label="Fault")
 
 
