@@ -14,6 +14,7 @@ cycles, and prints the totals.
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from common import POLICY, noisy, options, print_table, quantiles, wall_time
 from dengine import Dataset, Recipe, load_dataset, open_store
 
 BUDGET = 0.45  # seconds of a retrain
+PATIENCE = 60.0  # seconds for which a request is repeated
 
 
 @dataclass
@@ -36,6 +38,7 @@ class Stretch:
     page: list[float] = field(default_factory=list)
     actions: dict[str, int] = field(default_factory=lambda: {"accept": 0, "reject": 0, "verify": 0})
     line_stops: int = 0
+    repeated: int = 0  # requests that were sent again, because the disk did not answer in time
 
     def row(self, cycle: int, labels: int, memory: dict[str, int]) -> dict[str, Any]:
         """Return a row of the table: cycle is the last one, labels those acknowledged so far."""
@@ -47,6 +50,7 @@ class Stretch:
             "labels": labels,
             **self.actions,
             "line_stops": self.line_stops,
+            "repeated": self.repeated,
             "decide_p50_s": decide["p50_s"],
             "decide_p99_s": decide["p99_s"],
             "decide_worst_s": decide["worst_s"],
@@ -127,16 +131,32 @@ class Soak:
 
         Adds times and counts to `stretch`, and a reported label to `acknowledged`.
         """
-        seconds, decision = wall_time(self.web.decide, trace, part)
+        seconds, decision = wall_time(self._ask, stretch, self.web.decide, trace, part)
         stretch.decide.append(seconds)
         stretch.actions[decision["action"]] += 1
         is_line_stop = decision["action"] == "accept" and not good
         stretch.line_stops += is_line_stop
         if is_line_stop or decision["action"] == "verify":
-            seconds, _ = wall_time(self.web.report, decision["id"], good)
+            seconds, _ = wall_time(self._ask, stretch, self.web.report, decision["id"], good)
             stretch.report.append(seconds)
             self.acknowledged[decision["id"]] = good
         time.sleep(self.pace)
+
+    def _ask(
+        self, stretch: Stretch, request: Callable[..., dict[str, Any]], *arguments: Any
+    ) -> dict[str, Any]:
+        """Send a request until it is answered, as its error tells a robot, and return the answer.
+
+        After a minute of 503 (the disk did not answer in time) the error is raised.
+        """
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            try:
+                return request(*arguments)
+            except RuntimeError as error:
+                if ": 503 " not in str(error) or time.monotonic() > deadline:
+                    raise
+            stretch.repeated += 1
 
     def _read_page(self, stretch: Stretch) -> None:
         """Ask for what the page shows; raise RuntimeError unless it is answered."""
