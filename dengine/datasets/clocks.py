@@ -44,6 +44,25 @@ EPOCHS = (
     *((1.0, 0.0), (1e-3, 0.0), (1e-6, 0.0), (1e-9, 0.0)),
     *((1e-7, 11_644_473_600.0), (1e-7, 62_135_596_800.0)),
 )
+# What the sampling rate, or the time from sample to sample, is called outside the samples, without
+# blanks and marks.
+RATE_NAMES = (
+    *("fs", "fshz", "rate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency"),
+    *("abtastrate", "abtastfrequenz", "messrate", "messfrequenz", "datarate"),
+)
+STEP_NAMES = (
+    *("dt", "deltat", "timestep", "sampletime", "sampleinterval", "samplinginterval"),
+    *("samplingtime", "sampleperiod", "samplingperiod", "abtastzeit", "abtastintervall"),
+)
+# A line above a header that states one of these: Sample rate: 500 Hz, dt [ms];2, # fs = 500
+RATE_LINE = re.compile(
+    r"[#%\s\"']*(?P<name>[^\W\d][^\d:;=,|\[(]*?)\s*([\[(](?P<bracketed>\w+)[\])])?[\"']?"
+    r"\s*[:;=,\t|\s]\s*[\"']?(?P<number>\d+([.,]\d+)?(e-?\d+)?)"
+    r"[\s;,|\"'\[(]*(?P<unit>[a-zµμ]*)[\s;,|\"'\])]*",
+    re.IGNORECASE,
+)
+HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6}
+COUNTER_BITS = (16, 32)  # of the counters that start anew when they are full
 PLAUSIBLE_DATES = (946_684_800.0, 4_102_444_800.0)  # since 1970: the years 2000 to 2100
 LEAST_DATE = 1e16  # a larger count since a start would be of months, even in nanoseconds
 LARGEST_EXACT = 2.0**53  # float64 rounds larger whole numbers
@@ -349,7 +368,12 @@ def seconds_of(
         if 2 * len(wrong) < max(len(times), 1):
             scale, note = _seconds_per_count(times, name, unit)
             unit = next((u for u, s in units.SECONDS.items() if s == scale), f"{scale:g} s")
-            return _elapsed(column, times) * scale, wrong, note, unit
+            seconds = _elapsed(column, times) * scale
+            for period in (*(2.0**bits * scale for bits in COUNTER_BITS), DAY):
+                unwrapped = _unwrap(seconds, period)
+                if not (np.diff(unwrapped) < 0).any():  # else rows in any order
+                    return unwrapped, wrong, note, unit
+            return seconds, wrong, note, unit
     seconds, missing = _parse_timestamps(column)
     form = "dates" if holds_dates(column) else "times of day"
     text = column.astype(str).str.strip()
@@ -433,7 +457,7 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
     if not len(valid):
         return np.full(len(column), np.nan), missing
     elapsed = (stamps - valid.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
-    return (_over_midnight(elapsed) if stamps.dtype.kind == "m" else elapsed), missing
+    return (_unwrap(elapsed, DAY) if stamps.dtype.kind == "m" else elapsed), missing
 
 
 def _date_order(text: pd.Series) -> str:
@@ -454,16 +478,18 @@ def _date_order(text: pd.Series) -> str:
     return "day" if text.str.contains(r":\d+,\d").any() else ""
 
 
-def _over_midnight(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return times of day, shape (n,), as times that go on where a step is one over midnight.
+def _unwrap(seconds: NDArray[np.float64], period: float) -> NDArray[np.float64]:
+    """Return times, shape (n,), that go on where a clock starts anew after a period.
 
-    Such a step goes back by a day, but for at most five usual steps.
+    There a step goes back by the period, but for at most five usual steps. NaN stay, and a step
+    from or to one starts nothing anew.
     """
     steps = np.diff(seconds, prepend=seconds[:1])
     forward = steps[steps > 0]
     usual = float(np.median(forward)) if len(forward) else 0.0
-    is_over = (steps < 0) & (steps + DAY <= MAX_GAP * usual)
-    return seconds + DAY * np.cumsum(is_over)
+    ahead = steps + period
+    is_anew = (steps < 0) & (ahead > -usual / 2) & (ahead <= MAX_GAP * usual)
+    return seconds + period * np.cumsum(is_anew)
 
 
 def _seconds_per_count(times: NDArray[np.float64], name: str, unit: str) -> tuple[float, str]:
@@ -558,11 +584,28 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     return float(f"{rate:.4g}")
 
 
+def rate_in_preamble(text: str) -> float | None:
+    """Return the sampling rate in hertz that a line of the text above a header states.
+
+    It states a rate, which without a unit is in hertz, or the time from one sample to the next,
+    which must have a unit. None if no line does, or its rate is not plausible.
+    """
+    for match in filter(None, map(RATE_LINE.fullmatch, text.splitlines())):
+        name = re.sub(r"[\W_]", "", match["name"].lower())
+        number = float(match["number"].replace(",", "."))
+        unit = (match["bracketed"] or match["unit"]).lower()
+        rate = number * HERTZ.get(unit or "hz", 0.0) if name in RATE_NAMES else 0.0
+        step = number * (units.seconds_in(unit) or 0.0) if name in STEP_NAMES else 0.0
+        rate = 1.0 / step if step else rate
+        if RATES[0] <= rate <= RATES[1]:
+            return float(f"{rate:.4g}")
+    return None
+
+
 def check_rows(clock: Clock, lines: pd.Index, time: str | None = None) -> None:
     """Raise UnreadableError if rows are missing or out of order by their clock.
 
-    It holds where another rate is stated, too. A clock may be coarse, late for some rows, or start
-    anew where its counter is full.
+    It holds where another rate is stated, too. A clock may be coarse, or late for some rows.
 
     Parameters
     ----------
@@ -583,17 +626,18 @@ def check_rows(clock: Clock, lines: pd.Index, time: str | None = None) -> None:
     if len(forward) < 2:
         return
     usual = float(np.median(forward))
-    for i in np.flatnonzero(steps < -MAX_GAP * usual).tolist():
-        if not _is_counter_full(usual - steps[i], usual):
-            wanted = f"a later time in column {clock.name} than that of the row before"
-            actual = f"{-steps[i]:.3g} s earlier"
-            in_order = f"time={clock.name!r} puts rows in the order of their times, if all differ; "
-            do = (
-                f"{'' if time else in_order}"
-                f"time={NO_CLOCK!r} with a stated rate (rate_hz) leaves them as they are; "
-                "rows that are no samples, as zeros behind the last one, are to be deleted"
-            )
-            raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", lines[rows[i + 1]])
+    backwards = np.flatnonzero(steps < -MAX_GAP * usual)
+    if len(backwards):
+        i = int(backwards[0])
+        wanted = f"a later time in column {clock.name} than that of the row before"
+        actual = f"{-steps[i]:.3g} s earlier"
+        in_order = f"time={clock.name!r} puts rows in the order of their times, if all differ; "
+        do = (
+            f"{'' if time else in_order}"
+            f"time={NO_CLOCK!r} with a stated rate (rate_hz) leaves them as they are; "
+            "rows that are no samples, as zeros behind the last one, are to be deleted"
+        )
+        raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", lines[rows[i + 1]])
     gaps = np.flatnonzero(steps > MAX_GAP * usual)
     # After a late row others come sooner, so that none are missing.
     missing = float(forward.sum()) - len(forward) * usual
@@ -636,15 +680,6 @@ def _gap_error(usual: float, gap: float, line: int) -> UnreadableError:
     return UnreadableError(
         f"Expected a step of {usual:.3g} s in time, got a gap of {gap:.3g} s", line
     )
-
-
-def _is_counter_full(seconds: float, step: float) -> bool:
-    """Return whether a clock starts anew after this many seconds, within one and a half steps.
-
-    Such is a counter of 16 or 32 bits, and a time of day.
-    """
-    periods = [2.0**bits * unit for bits in (16, 32) for unit, _ in EPOCHS]
-    return any(abs(seconds - period) < 1.5 * step for period in (*periods, DAY))
 
 
 def in_order_of_time(

@@ -11,6 +11,7 @@ A column whose name means the bad outcome, as `failed` or `Ausschuss`, says bad 
 An empty label, and a word as pending or unknown, is that of a part that was not checked yet.
 """
 
+import itertools
 import os
 import re
 import tomllib
@@ -476,6 +477,9 @@ def read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
 def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOptions) -> LabelSource:
     """Return a source of labels in a column of each recording's file, in one row or in all.
 
+    If the label changes once from the first row to the last, as where a controller shows that of
+    the part before until the cycle ends, the last one counts, and a note says so.
+
     paths : the files of the recordings, by name.
     """
     notes = Counter[str]()
@@ -483,8 +487,17 @@ def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOption
     place = f"its column {column}"
 
     def find(name: str) -> SourcedLabel:
-        """Return the label that all cells of a recording's column mean."""
-        return label_column.find(read_cells(paths[name], column, options), place)
+        """Return the label that all cells of a recording's column mean, or the last one."""
+        cells = read_cells(paths[name], column, options)
+        try:
+            return label_column.find(cells, place)
+        except SeveralLabelsError as error:
+            words = [cell.strip() for cell in cells if cell.strip() in error.words]
+            if len(error.words) > 2 or len(list(itertools.groupby(words))) > 2:
+                raise
+            label = label_column.find(words[-1:], place)
+            notes[f"Column {column} changes once in a recording: there its last value counts"] += 1
+            return label
 
     advice = f"column {column} has none; name another column (label)"
     return LabelSource(find, advice, place, notes=notes)
@@ -999,6 +1012,12 @@ def _read_label_rows(
     ]
     full_names = {} if with_names else {i: _names_with(x, names) for i, x in enumerate(columns)}
     n_named = max(map(len, full_names.values()), default=0)
+    place, texts, names_of_pairs = _names_in_two_columns(cells, names if full_names else [])
+    if len(names_of_pairs) > n_named:
+        full_names = {place: names_of_pairs}
+        n_named = len(names_of_pairs)
+    else:
+        texts.clear()
     with_names = with_names or [i for i, x in full_names.items() if len(x) == n_named > 0]
     with_labels = [
         i
@@ -1016,7 +1035,7 @@ def _read_label_rows(
     rows: dict[tuple[str, ...], _LabelRow] = {}
     for line, values in cells.items():
         number = values[header.index(part)] if part in header else ""
-        file = values[of_file]
+        file = texts.get(line, values[of_file])
         words = _path_words(full_names.get(of_file, {}).get(file, file))
         row = rows.get(words, _LabelRow((), words, file, (), number or None))
         lines = (*row.lines, line)
@@ -1037,6 +1056,37 @@ def _path_words(path: str) -> tuple[str, ...]:
     return file.removesuffix(suffix), *reversed(words)
 
 
+def _names_in_two_columns(
+    cells: Mapping[int, Sequence[str]], names: Sequence[str]
+) -> tuple[int, dict[int, str], dict[str, str]]:
+    """Return how two columns of a listing name files together, as serial number and run.
+
+    The first has texts that stand in names, but repeat. Returns its position, the joined texts of
+    each line, and the file of each of these as `_names_with`, for the two that name most files.
+
+    cells : the rows by line.
+    """
+    best: tuple[int, dict[int, str], dict[str, str]] = (0, {}, {})
+    columns = list(zip(*cells.values(), strict=True))
+    words_of_names = [_words_between(PurePosixPath(name).name) for name in names]
+    for i, column in enumerate(columns):
+        texts = set(column) - {""}
+        n_in_names = sum(any(_words_between(t) in w for w in words_of_names) for t in texts)
+        if len(texts) == len(column) or 2 * n_in_names <= len(texts):
+            continue
+        for j in range(len(columns)):
+            pairs = {line: f"{row[i]}_{row[j]}" for line, row in cells.items()}
+            name_of = _names_with(list(dict.fromkeys(pairs.values())), names) if j != i else {}
+            if len(name_of) > len(best[2]):
+                best = (i, pairs, name_of)
+    return best
+
+
+def _words_between(text: str) -> str:
+    """Return the words of a text in lower case, each between underscores."""
+    return re.sub(r"[\W_]+", "_", f"_{normalized(text).lower()}_")
+
+
 def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
     """Return for texts, for example serial numbers, the one file in whose name each stands.
 
@@ -1045,21 +1095,16 @@ def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
     text that stands in no name, or in several, is left out. The result is empty if the texts stand
     in no more than half as many files as there are texts.
     """
-
-    def words_of(text: str) -> str:
-        """Return the words of a text in lower case, each between underscores."""
-        return re.sub(r"[\W_]+", "_", f"_{normalized(text).lower()}_")
-
     name_of = {}
-    words_of_name = {name: words_of(PurePosixPath(name).name) for name in names}
+    words_of_name = {name: _words_between(PurePosixPath(name).name) for name in names}
     bare_words = {name: LEADING_ZEROS.sub("", words) for name, words in words_of_name.items()}
     for text in texts:
-        wanted = words_of(text)
+        wanted = _words_between(text)
         if wanted == "_":  # it has no words
             continue
         matches = [name for name, words in words_of_name.items() if wanted in words]
         if not matches and FILE_SUFFIX.search(text):  # of another file, as a bag
-            wanted = words_of(FILE_SUFFIX.sub("", text.replace("\\", "/").rpartition("/")[2]))
+            wanted = _words_between(FILE_SUFFIX.sub("", text.replace("\\", "/").rpartition("/")[2]))
             matches = [name for name, words in words_of_name.items() if wanted in words]
         bare = [] if matches else [n for n, w in bare_words.items() if wanted in w]
         if len(bare) == 1:

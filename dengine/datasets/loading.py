@@ -26,7 +26,7 @@ from ..traces import as_trace, as_traces, is_time_column, spec_of
 from . import units
 from .archives import hold_one_each, read_archive_each
 from .bags import is_stream, read_bag
-from .clocks import clock_of, rate_of
+from .clocks import RATE_NAMES, STEP_NAMES, clock_of, rate_of
 from .dataset import (
     UNKNOWN_RATE,
     Dataset,
@@ -75,8 +75,6 @@ TEXT_FORMAT = ("columns", "decimal", "thousands", "encoding")
 SIMULATED = ("height_mm", "cycle", "conditions", "condition_names", "seed", "scenario", "simulated")
 Files = Mapping[str, Path]
 TABLES = (*TEXTS, ".parquet", ".pq")
-RATES = ("fs", "f_s", "fs_hz", "rate", "samplerate", "sample_rate", "sampling_rate", "frequency")
-STEPS = ("dt", "delta_t", "timestep", "time_step")  # seconds
 MIN_PADDING = 5  # zeros at the end of a trace that are no measurement
 FORMS = ".npz, .csv, .tsv, .txt, .dat, .parquet or .mcap"
 
@@ -421,10 +419,11 @@ def _arrays_by_meaning(
         if x.ndim == 1 and len(x) in lengths and x.dtype.kind in "US":
             is_unit = all(units.parse(units.spelling(text)) for text in map(str, x.tolist()))
             result |= {"unit" if is_unit else "channels": x, key: x}
-        elif x.size == 1 and key.lower() in RATES:
+        elif x.size == 1 and key.lower().replace("_", "") in (*RATE_NAMES, "frequency"):
             result |= {"rate_hz": x.reshape(()), key: x}
-        elif x.size == 1 and key.lower() in STEPS and x.dtype.kind == "f" and 0 < x < 1:
-            result |= {"rate_hz": 1 / x.reshape(()), key: x}
+        elif x.size == 1 and key.lower().replace("_", "") in STEP_NAMES:
+            if x.dtype.kind == "f" and 0 < x < 1:  # in seconds
+                result |= {"rate_hz": 1 / x.reshape(()), key: x}
         elif x.ndim == 1 and len(x) in lengths and is_time_column(key) and x.dtype.kind in "iuf":
             with suppress(UnreadableError):
                 clock = clock_of(pd.DataFrame({key: x}))

@@ -83,6 +83,7 @@ FEW_ROWS = 5  # a text file of as few tells of a recording, and is none
 HIDDEN = (".", "~$")  # begin the names of files that no user wrote, as Excel's locks
 TRIED = 20  # recordings, on which advice about a column is tried
 MIN_RUN = 8  # rows on average that stand together in a table that is in the order of its parts
+FEW_AGAIN = 0.2  # of the parts' numbers: if fewer come again, these are single faults
 MAX_STATIONS = 12  # more different values in the rows of a part are no stations
 # What a column is called that tells where a part was made.
 STATION = re.compile(
@@ -813,7 +814,8 @@ def _turned(table: TextTable, options: LoadOptions) -> TextTable:
         clock = clock_of(frame[is_sample].iloc[:, :1], first, table.units)
         rate = None if clock is None else rate_of(clock, times.index)
     wide = wide.set_axis(range(2, len(wide) + 2))
-    return table._replace(frame=wide, units=[], rate_hz=None if options.rate_hz else rate)
+    clock_text = "the first column, a column for each part"
+    return table._replace(frame=wide, units=[], rate_hz=rate, clock=clock_text)
 
 
 def _word_in_name(name: str, source: labels.LabelSource) -> str:
@@ -883,6 +885,7 @@ def _add_wide_rows(
         labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
     ]
     do = f"name the column to trust: label={label_column!r}"
+    rate = None if options.rate_hz else table.rate_hz
     parts = [""] * len(frame)
     if options.part in frame:
         parts = frame[options.part].astype(object).fillna("").tolist()
@@ -897,11 +900,11 @@ def _add_wide_rows(
             for column, word in zip(label_cells, words, strict=True)
         }
         label = labels.agreed_label(finders, do, collector.notes)
-        clock = "" if table.rate_hz is None else "the first column, a column for each part"
+        clock = "" if rate is None else table.clock
         reading = label.reading._replace(numbers=table.numbers, clock=clock)
         return Recording(
             without_trailing_nan(trace),
-            table.rate_hz,
+            rate,
             reading=reading,
             label=label.label,
             source=f"{source}, line {line}",
@@ -1090,12 +1093,37 @@ def _channels_of_long(
 def _rows_by_part(
     frame: pd.DataFrame, seconds: NDArray[np.float64], options: LoadOptions
 ) -> dict[str, pd.DataFrame]:
-    """Return the rows of each part of a long table, with columns of their times and runs."""
+    """Return the rows of each part of a long table, with columns of their times and runs.
+
+    Raises DataError if many numbers were given to several parts, one after the other.
+    """
     part = frame[options.part]
     is_new = (part != part.shift()).to_numpy() | np.r_[False, np.diff(seconds) < 0]
     with_seconds = frame.assign(**{SECONDS_COLUMN: seconds, RUN_COLUMN: np.cumsum(is_new)})
     groups = with_seconds.groupby(options.part, sort=False)
-    return {str(part): rows for part, rows in groups}
+    rows_of_part = {str(part): rows for part, rows in groups}
+    _check_numbers_once(rows_of_part)
+    return rows_of_part
+
+
+def _check_numbers_once(rows_of_part: Mapping[str, pd.DataFrame]) -> None:
+    """Raise DataError if many parts have a number that was given again, as that of each shift.
+
+    Such a part has rows in several runs, a long time apart, with other parts between them. One part
+    alone, or one of many, is a fault of its own.
+    """
+    again = []
+    for part, rows in rows_of_part.items():
+        starts = np.flatnonzero(rows[RUN_COLUMN].diff().to_numpy() > 1)
+        steps = np.abs(np.diff(rows[SECONDS_COLUMN].to_numpy()))
+        if len(starts) and steps[starts - 1].min() > len(rows) * np.median(steps):
+            again.append((part, rows.index[starts[0]]))
+    if len(again) < 2 or len(again) < FEW_AGAIN * len(rows_of_part):
+        return
+    part, line = again[0]
+    wanted = f"one recording for each part, {len(again)} of {len(rows_of_part)} numbers come again"
+    do = "make the parts' numbers unique, as day (or station) and number in one column"
+    raise DataError(f"Expected {wanted} later, as {part} in line {line}; {do}.")
 
 
 def _check_together(rows_of_part: Mapping[str, pd.DataFrame]) -> None:

@@ -38,6 +38,7 @@ from .clocks import (
     lost_rows_text,
     place_of_clock,
     rate_contradiction,
+    rate_in_preamble,
     rate_of,
     resample_evenly,
     rising_columns,
@@ -71,6 +72,11 @@ CELL_MARK = re.compile(r"[;,\t|]")
 ROW_COUNT = re.compile(r"\(\d+ [^\W\d].*\)")  # what a database's client writes below a table
 LABVIEW_END = "***End_of_Header***"
 COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
+RATE_ABOVE = "none, a line above the header states the rate"
+COUNTER_NAME = re.compile(
+    r"(sample|index|idx|no|nr|n|i|row|point|count|number|nummer|zeile|messpunkt|punkt)\w{0,3}\.?",
+    re.IGNORECASE,
+)
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 # A cell of a row of units, beside the units that `units.parse` knows.
 UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")
@@ -129,7 +135,9 @@ class TextTable(NamedTuple):
     n_remarks : int
         As in `TextCells`.
     rate_hz : float, optional
-        Of a wide table whose samples have times.
+        That a line above the header states, or of a wide table whose samples have times.
+    clock : str
+        What tells this rate, as in `Reading`.
     """
 
     frame: pd.DataFrame
@@ -141,6 +149,7 @@ class TextTable(NamedTuple):
     fields: Mapping[str, str] = {}
     n_remarks: int = 0
     rate_hz: float | None = None
+    clock: str = RATE_ABOVE
 
 
 def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
@@ -217,22 +226,22 @@ def _fields_in(lines: Iterable[str]) -> dict[str, str]:
 
     A line is read as name and value: `Result: OK`, `# Result = OK` or `Result;OK`. A value ends at
     the next of these marks, so that of `Start: 12:30:05` is 12. If two lines in succession have as
-    many cells, those of the first are also read as names of those below them.
+    many cells, those of the first are also read as names of those below them; if they are three or
+    more names, only so.
     """
+    texts = [REMARK.sub("", line.strip().strip("\"'")) for line in lines]
+    rows = [[cell.strip(" \"'") for cell in CELL_MARK.split(text)] for text in texts]
     fields = dict[str, str]()
-    above: list[str] = []
-    for line in lines:
-        plain = REMARK.sub("", line.strip().strip("\"'"))
-        cells = [cell.strip(" \"'") for cell in CELL_MARK.split(plain)]
-        name, *values = (cell.strip(" \"'") for cell in FIELD_MARK.split(plain))
+    for text, row, below in zip(texts, rows, [*rows, []][1:], strict=True):
+        is_above = 1 < len(row) == len(below)
+        are_names = is_above and len(row) > 2 and all(map(FIELD_KEY.fullmatch, row))
+        name, *values = (cell.strip(" \"'") for cell in FIELD_MARK.split(text))
         value = next(filter(None, values), "")
-        if FIELD_KEY.fullmatch(name) and value:
+        if FIELD_KEY.fullmatch(name) and value and not are_names:
             fields.setdefault(name, value)
-        if 1 < len(cells) == len(above):
-            for key, cell in zip(above, cells, strict=True):
-                if FIELD_KEY.fullmatch(key) and cell:
-                    fields.setdefault(key, cell)
-        above = cells
+        for key, cell in zip(row, below, strict=True) if is_above else ():
+            if FIELD_KEY.fullmatch(key) and cell:
+                fields.setdefault(key, cell)
     return fields
 
 
@@ -623,7 +632,7 @@ def read_table(
     stated = units.stated_in_preamble(preamble, header, without)
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
-    about = (cells.fields, cells.n_remarks)
+    about = (cells.fields, cells.n_remarks, rate_in_preamble(preamble))
     return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
 
 
@@ -748,7 +757,7 @@ def read_recording(
     header = list(frame.columns)
     rows = _without_unfilled(_without_summary(frame, options, notes), places, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
-    timed = rows_to_trace(rows, places, options, notes, table.units)
+    timed = rows_to_trace(rows, places, options, notes, table.units, table.rate_hz)
     n_out = len(frame) - len(rows) + table.n_remarks
     left_out = (
         f"header in line {table.line}" if table.line > 1 else "",
@@ -871,6 +880,7 @@ def rows_to_trace(
     options: LoadOptions,
     notes: Counter[str],
     units_row: Sequence[str] = (),
+    rate_hz: float | None = None,
 ) -> Recording:
     """Convert the rows of a table, one for each sample, to a trace with its rate.
 
@@ -886,13 +896,15 @@ def rows_to_trace(
         Counts what users should know; it is added to.
     units_row : sequence of str
         Unit of each column, if there is a row of units.
+    rate_hz : float, optional
+        Rate that the file states above the rows, for rows without a clock.
 
     Returns
     -------
     Recording
         In the order of the times, where these can be trusted; see `clocks.in_order_of_time`. An
-        empty cell is NaN, which the engine finds. The rate is None if one is stated, or no clock is
-        known; there are no units.
+        empty cell is NaN, which the engine finds. The rate is None if the user states one, or
+        nothing tells it; there are no units.
 
     Raises
     ------
@@ -911,6 +923,8 @@ def rows_to_trace(
             raise
         return Recording(trace)  # a stated rate needs no clock
     if clock is None:
+        if options.rate_hz is None and rate_hz is not None:
+            return Recording(trace, rate_hz, reading=Reading(clock=RATE_ABOVE))
         if options.rate_hz is None:
             _offer_clock(rows, places, notes)
         return Recording(trace)
@@ -967,8 +981,16 @@ def _check_repeated(rows: pd.DataFrame, clock: Clock) -> None:
 
 
 def _offer_clock(rows: pd.DataFrame, places: Sequence[int], notes: Counter[str]) -> None:
-    """Add a note if a column that is no channel rises steadily: it may be the clock."""
+    """Add a note if a column that is no channel rises steadily: it may be the clock.
+
+    One that has the name of a counter of samples and rises by 1 is none.
+    """
     names = [str(rows.columns[i]) for i in rising_columns(rows) if i not in places]
+    names = [
+        name
+        for name in names
+        if COUNTER_NAME.fullmatch(name) is None or (np.diff(floats(rows[name])[0]) != 1).any()
+    ]
     for name in names[:1]:
         rises = f"column {name} rises steadily: time={name!r} if it is one"
         notes[f"No clock is known; {rises}"] += 1

@@ -1072,7 +1072,7 @@ def test_a_part_that_was_made_twice_at_other_times_is_not_joined(
         long_table(small, lambda i, late=late: 10.0 * i + late).assign(station=number)
         for number, late in enumerate((0.0, 1000.0), start=1)
     ]
-    with pytest.raises(DataError, match=r"1, line .*: Expected a step of 0.004 s in time, got a g"):
+    with pytest.raises(DataError, match="24 of 24 numbers come again later, as 1 in line 1201"):
         load_dataset(pd.concat(stations), time="time", channel="FZ", rate_hz=rate_hz)
 
 
@@ -1651,7 +1651,7 @@ def test_annotations_repeated_headers_and_end_marks_are_no_rows(
     assert not data.unlabelled
 
 
-def test_a_word_of_a_part_that_is_not_checked_yet_is_stated_and_proposed(
+def test_a_register_that_is_0_until_the_part_is_checked_counts_at_its_end(
     small: Dataset, tmp_path: Path
 ) -> None:
     for i, (x, y) in enumerate(zip(small.X, small.y, strict=True)):
@@ -1660,10 +1660,9 @@ def test_a_word_of_a_part_that_is_not_checked_yet_is_stated_and_proposed(
         (tmp_path / f"{i:03}.csv").write_text(text)
     with pytest.raises(DataError) as error:
         load_dataset(tmp_path, channel="FZ", label="register")
-    label_map = re.search(r"label_map='([^']*,0=)'", str(error.value))
+    label_map = re.search(r"label_map='(1=good,2=bad)'", str(error.value))
     assert label_map is not None, error.value
-    swapped = "1=good,2=bad,0="
-    data = load_dataset(tmp_path, channel="FZ", label="register", label_map=swapped)
+    data = load_dataset(tmp_path, channel="FZ", label="register", label_map=label_map[1])
     np.testing.assert_array_equal(data.y, small.y)
     (tmp_path / "025_waits.csv").write_text("time_ms,FZ,verdict\n" + "2,1,\n" * 5)
     assert parse_label_map({"0": None, "ok": 1}) == {"0": None, "ok": True}
@@ -1950,3 +1949,117 @@ def test_a_verdict_in_a_comment_with_a_semicolon_is_found(small: Dataset, tmp_pa
     data = load_dataset(tmp_path, channel="Fz")
     np.testing.assert_array_equal(data.X, small.X)
     np.testing.assert_array_equal(data.y, small.y)
+
+
+def test_a_counter_of_16_bits_that_starts_anew_is_a_clock(small: Dataset, tmp_path: Path) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        first = 65_500 if i == 3 else 100 * i
+        rows = [[str((first + 2 * k) % 65_536), str(v)] for k, v in enumerate(x)]
+        write_rows(tmp_path / f"{i:03}_{word}.csv", [["tick_ms", "rForce"], *rows])
+    data = load_dataset(tmp_path, channel="rForce", time="tick_ms")
+    np.testing.assert_array_equal(data.X, small.X)
+    assert data.rate_hz == 500.0
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Sample rate: 500 Hz",
+        "# fs = 500",
+        "Sampling interval;0,002;s",
+        "Abtastrate [kHz];0,5",
+        "dt\t2 ms",
+    ],
+)
+def test_a_line_above_the_header_tells_the_rate_of_samples_without_a_clock(
+    line: str, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = "\n".join(f"{k};{v}".replace(".", ",") for k, v in enumerate(x))
+        text = f"Machine: 4\n{line}\n\nSample;Force [N]\n{rows}\n"
+        (tmp_path / f"{i:03}_{word}.csv").write_text(text)
+    data = load_dataset(tmp_path, channel="Force")
+    np.testing.assert_allclose(data.X, small.X, rtol=1e-6)
+    assert data.rate_hz == 500.0
+    assert data.reading["clock"] == "none, a line above the header states the rate"
+    assert load_dataset(tmp_path, channel="Force", rate_hz=250.0).rate_hz == 250.0
+
+
+@pytest.mark.parametrize("line", ["dt: 2", "Rate: 3 parts/min", "Sample rate: fast"])
+def test_a_line_that_states_no_rate_leaves_it_unknown(
+    line: str, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = "\n".join(f"{k};{v}" for k, v in enumerate(x))
+        text = f"Machine: 4\n{line}\n\nSample;Force [N]\n{rows}\n"
+        (tmp_path / f"{i:03}_{word}.csv").write_text(text)
+    data = load_dataset(tmp_path, channel="Force")
+    assert data.rate_hz is None
+    assert not any("time='Sample'" in note for note in data.notes)  # it counts samples
+
+
+@pytest.mark.parametrize("n_again", [2, 6])
+def test_a_listing_by_serial_number_and_run_finds_the_file_of_each_run(
+    n_again: int, small: Dataset, tmp_path: Path
+) -> None:
+    """Some parts, or all, were measured twice."""
+    rows = []
+    for i, (x, word) in enumerate(zip(small.X[:12], words(small), strict=False)):
+        n_parts = 12 - n_again
+        serial, run = (4700 + i, 1) if i < n_parts else (4700 + i - n_parts, 2)
+        write_csv(tmp_path / f"SN{serial}_{run}.csv", x)
+        rows.append([f"SN{serial}", str(run), word, "14.03.2026"])
+    listing = write_rows(tmp_path.parent / "runs.csv", [["serial", "run", "result", "date"], *rows])
+    data = load_dataset(tmp_path, labels=listing)
+    assert not data.faults
+    assert len(data) == 12
+    by_name = sorted(range(12), key=lambda i: (rows[i][0], rows[i][1]))
+    np.testing.assert_array_equal(data.y, small.y[:12][by_name])
+    np.testing.assert_array_equal(data.X, small.X[:12][by_name])
+
+
+def test_numbers_of_parts_that_start_anew_each_day_are_refused_with_advice(
+    small: Dataset, tmp_path: Path
+) -> None:
+    times = pd.date_range("2026-03-14 06:00", periods=50, freq="2ms")
+    frames = [
+        pd.DataFrame(
+            {"time": times + pd.Timedelta(hours=24 * (i // 6), seconds=30 * (i % 6))}
+        ).assign(part=i % 6 + 1, day=14 + i // 6, force=x, verdict=word)
+        for i, (x, word) in enumerate(zip(small.X[:12], words(small), strict=False))
+    ]
+    frame = pd.concat(frames)
+    path = tmp_path / "week.csv"
+    frame.to_csv(path, index=False)
+    with pytest.raises(DataError, match="6 of 6 numbers come again later, as 1 in line 302"):
+        load_dataset(path, time="time", label="verdict", channel="force")
+    day_and_number = frame["day"].astype(str) + "_" + frame["part"].astype(str)
+    frame.assign(part=day_and_number).to_csv(path, index=False)
+    data = load_dataset(path, time="time", label="verdict", channel="force")
+    np.testing.assert_array_equal(data.X, small.X[:12])
+
+
+def test_names_above_values_are_read_as_such(small: Dataset, tmp_path: Path) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = "\n".join(f"{k};{v};0" for k, v in enumerate(x))
+        text = f"Result;Operator;Tool\n{word};Anna;T1\n\ntime [ms];Force [N];Way [mm]\n{rows}\n"
+        (tmp_path / f"{i:03}.csv").write_text(text)
+    data = load_dataset(tmp_path, channel="Force", label="Result")
+    np.testing.assert_array_equal(data.y, small.y)
+
+
+def test_a_result_that_is_that_of_the_part_before_until_the_end_counts_at_the_end(
+    small: Dataset, tmp_path: Path
+) -> None:
+    before = "OK"
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = [[f"{2 * k}", f"{v}", word if k > 45 else before] for k, v in enumerate(x)]
+        write_rows(tmp_path / f"{i:03}.csv", [["time [ms]", "FZ", "result"], *rows])
+        before = word
+    data = load_dataset(tmp_path, channel="FZ")
+    np.testing.assert_array_equal(data.y, small.y)
+    assert not data.faults
+    assert any("there its last value counts" in note for note in data.notes)
+    rows = [[f"{2 * k}", f"{v}", "OK" if k % 2 else "NOK"] for k, v in enumerate(small.X[0])]
+    write_rows(tmp_path / "999.csv", [["time [ms]", "FZ", "result"], *rows])
+    assert "Expected one label" in load_dataset(tmp_path, channel="FZ").faults[0].message
