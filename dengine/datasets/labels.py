@@ -52,8 +52,10 @@ MEANING = {
     **dict.fromkeys((*BAD, "no", "0"), False),
 }
 UNCHECKED = (*EMPTY_CELLS, *LISTS["unchecked"])
-# What a file manager adds to the name of a copy.
-COPY_SUFFIX = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)
+# What a file manager adds to the name of a copy, before or behind it.
+COPY_MARK = re.compile(
+    r"^(copy of|kopie von|copie de) |([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE
+)
 LEADING_ZEROS = re.compile(r"(?<=_)0+(?=\d)")
 FILE_SUFFIX = re.compile(r"\.[A-Za-z]\w{1,5}$")
 LAST_WORD = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # without a number
@@ -714,7 +716,7 @@ def _components(name: str) -> list[tuple[str, int]]:
     """
     *folders, file = name.split("/")
     starts = [sum(len(folder) + 1 for folder in folders[:i]) for i in range(len(folders))]
-    file_stem = COPY_SUFFIX.sub("", PurePosixPath(file).stem)
+    file_stem = COPY_MARK.sub("", PurePosixPath(file).stem)
     nearest_first = reversed(list(zip(folders, starts, strict=True)))
     return [(file_stem, len(name) - len(file)), *nearest_first]
 

@@ -331,7 +331,7 @@ def _leave_out_copies(collector: RecordingCollector) -> None:
     reasons = {}
     for i, recording in enumerate(collector.recordings):
         path = PurePosixPath(recording.source)
-        original = str(path.with_stem(labels.COPY_SUFFIX.sub("", path.stem) or path.stem))
+        original = str(path.with_stem(labels.COPY_MARK.sub("", path.stem) or path.stem))
         is_other = original != recording.source and original in traces
         if is_other and np.array_equal(traces[original], recording.trace, equal_nan=True):
             reasons[i] = f"Expected each recording once, it is a copy of {original}"

@@ -1904,10 +1904,11 @@ def test_a_verdict_in_a_small_file_beside_the_recording_is_the_label(
     np.testing.assert_array_equal(data.y, small.y)
 
 
-def test_a_copy_of_a_file_manager_counts_once(few: Path) -> None:
+@pytest.mark.parametrize("form", ["{} - Copy", "{} (2)", "Kopie von {}", "Copy of {}"])
+def test_a_copy_of_a_file_manager_counts_once(form: str, few: Path) -> None:
     n = len(load_dataset(few))
     first = min(few.iterdir())
-    first.with_stem(f"{first.stem} - Copy").write_bytes(first.read_bytes())
+    first.with_stem(form.format(first.stem)).write_bytes(first.read_bytes())
     data = load_dataset(few)
     assert len(data) == n
     assert "it is a copy of" in data.faults[0].message
