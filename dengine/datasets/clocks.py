@@ -44,8 +44,8 @@ EPOCHS = (
     *((1.0, 0.0), (1e-3, 0.0), (1e-6, 0.0), (1e-9, 0.0)),
     *((1e-7, 11_644_473_600.0), (1e-7, 62_135_596_800.0)),
 )
-# What the sampling rate, or the time from sample to sample, is called outside the samples, without
-# blanks and marks.
+# What the sampling rate, or the time from sample to sample, is called above a header or as an array
+# of an archive, in lower case, without blanks and marks.
 RATE_NAMES = (
     *("fs", "fshz", "rate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency"),
     *("abtastrate", "abtastfrequenz", "messrate", "messfrequenz", "datarate"),
@@ -368,12 +368,7 @@ def seconds_of(
         if 2 * len(wrong) < max(len(times), 1):
             scale, note = _seconds_per_count(times, name, unit)
             unit = next((u for u, s in units.SECONDS.items() if s == scale), f"{scale:g} s")
-            seconds = _elapsed(column, times) * scale
-            for period in (*(2.0**bits * scale for bits in COUNTER_BITS), DAY):
-                unwrapped = _unwrap(seconds, period)
-                if not (np.diff(unwrapped) < 0).any():  # else rows in any order
-                    return unwrapped, wrong, note, unit
-            return seconds, wrong, note, unit
+            return _continue_counter(_elapsed(column, times) * scale, scale), wrong, note, unit
     seconds, missing = _parse_timestamps(column)
     form = "dates" if holds_dates(column) else "times of day"
     text = column.astype(str).str.strip()
@@ -478,11 +473,26 @@ def _date_order(text: pd.Series) -> str:
     return "day" if text.str.contains(r":\d+,\d").any() else ""
 
 
-def _unwrap(seconds: NDArray[np.float64], period: float) -> NDArray[np.float64]:
-    """Return times, shape (n,), that go on where a clock starts anew after a period.
+def _continue_counter(seconds: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    """Return the times, shape (n,), of a clock that may count from 0 again within a recording.
 
-    There a step goes back by the period, but for at most five usual steps. NaN stay, and a step
-    from or to one starts nothing anew.
+    It does so after 2**16 or 2**32 counts, or a day; there the times go on. They are returned
+    unchanged if they would still go back anywhere, as rows in any order do.
+
+    scale : seconds in one count.
+    """
+    for period in (*(2.0**bits * scale for bits in COUNTER_BITS), DAY):
+        unwrapped = _unwrap(seconds, period)
+        if not (np.diff(unwrapped) < 0).any():
+            return unwrapped
+    return seconds
+
+
+def _unwrap(seconds: NDArray[np.float64], period: float) -> NDArray[np.float64]:
+    """Return times, shape (n,), with a period added from each row on at which the clock wraps.
+
+    It wraps where a step goes back, and the step and the period together are a step of at most five
+    usual ones forwards (half of one backwards). Steps from and to NaN do not count.
     """
     steps = np.diff(seconds, prepend=seconds[:1])
     forward = steps[steps > 0]

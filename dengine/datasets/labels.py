@@ -52,10 +52,9 @@ MEANING = {
     **dict.fromkeys((*BAD, "no", "0"), False),
 }
 UNCHECKED = (*EMPTY_CELLS, *LISTS["unchecked"])
-# What a file manager adds to the name of a copy, before or behind it.
-COPY_MARK = re.compile(
-    r"^(copy of|kopie von|copie de) |([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE
-)
+# What a file manager adds to the name of a copy, behind it or before it.
+COPY_SUFFIX = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)
+COPY_PREFIX = re.compile(r"^(copy of|kopie von|copie de) ", re.IGNORECASE)
 LEADING_ZEROS = re.compile(r"(?<=_)0+(?=\d)")
 FILE_SUFFIX = re.compile(r"\.[A-Za-z]\w{1,5}$")
 LAST_WORD = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # without a number
@@ -716,7 +715,7 @@ def _components(name: str) -> list[tuple[str, int]]:
     """
     *folders, file = name.split("/")
     starts = [sum(len(folder) + 1 for folder in folders[:i]) for i in range(len(folders))]
-    file_stem = COPY_MARK.sub("", PurePosixPath(file).stem)
+    file_stem = COPY_SUFFIX.sub("", PurePosixPath(file).stem)
     nearest_first = reversed(list(zip(folders, starts, strict=True)))
     return [(file_stem, len(name) - len(file)), *nearest_first]
 
@@ -1014,12 +1013,11 @@ def _read_label_rows(
     ]
     full_names = {} if with_names else {i: _names_with(x, names) for i, x in enumerate(columns)}
     n_named = max(map(len, full_names.values()), default=0)
-    place, texts, names_of_pairs = _names_in_two_columns(cells, names if full_names else [])
-    if len(names_of_pairs) > n_named:
-        full_names = {place: names_of_pairs}
-        n_named = len(names_of_pairs)
-    else:
-        texts.clear()
+    among = names if full_names else ()
+    place, texts, names_of_texts = _names_in_two_columns(cells, among, more_than=n_named)
+    if texts:
+        full_names = {place: names_of_texts}
+        n_named = len(names_of_texts)
     with_names = with_names or [i for i, x in full_names.items() if len(x) == n_named > 0]
     with_labels = [
         i
@@ -1059,14 +1057,16 @@ def _path_words(path: str) -> tuple[str, ...]:
 
 
 def _names_in_two_columns(
-    cells: Mapping[int, Sequence[str]], names: Sequence[str]
+    cells: Mapping[int, Sequence[str]], names: Sequence[str], *, more_than: int
 ) -> tuple[int, dict[int, str], dict[str, str]]:
-    """Return how two columns of a listing name files together, as serial number and run.
+    """Find two columns of a listing that name files together, as serial number and run.
 
-    The first has texts that stand in names, but repeat. Returns its position, the joined texts of
-    each line, and the file of each of these as `_names_with`, for the two that name most files.
+    The texts of the first column repeat, and more than half of them stand in names of files. It is
+    joined with each other column, as `4700_1`; the two by which `_names_with` finds most files are
+    taken. Returns the position of the first column, the joined text of each line, and the file of
+    each such text; (0, {}, {}) if no two columns name more than `more_than` texts.
 
-    cells : the rows by line.
+    cells : the cells of each row, by its line. names : the files.
     """
     best: tuple[int, dict[int, str], dict[str, str]] = (0, {}, {})
     columns = list(zip(*cells.values(), strict=True))
@@ -1079,7 +1079,7 @@ def _names_in_two_columns(
         for j in range(len(columns)):
             pairs = {line: f"{row[i]}_{row[j]}" for line, row in cells.items()}
             name_of = _names_with(list(dict.fromkeys(pairs.values())), names) if j != i else {}
-            if len(name_of) > len(best[2]):
+            if len(name_of) > max(more_than, len(best[2])):
                 best = (i, pairs, name_of)
     return best
 

@@ -138,7 +138,8 @@ def load_dataset(
         What happens to traces of another length, as in `TraceSpec`. None: strict for recordings of
         one length; cut if all have the `samples` stated; else pad to the median length.
     rate_hz : float, optional
-        Sampling rate, instead of what timestamps tell. Without either the rate is unknown.
+        Sampling rate, instead of that by timestamps or of a line above the header. Without any of
+        these the rate is unknown.
     trigger : Trigger or str, optional
         When an insertion begins in one long recording, see `as_trigger`. Its channels are FX ...
         MZ, by default FZ; `label` is the topic that gives labels, and a file of `labels` names
@@ -416,14 +417,14 @@ def _arrays_by_meaning(
     lengths = set(stored[traces[0]].shape) - {n} if traces else set()
     result = dict[str, NDArray[Any]]()
     for key, x in stored.items():
+        bare = key.lower().replace("_", "")
         if x.ndim == 1 and len(x) in lengths and x.dtype.kind in "US":
             is_unit = all(units.parse(units.spelling(text)) for text in map(str, x.tolist()))
             result |= {"unit" if is_unit else "channels": x, key: x}
-        elif x.size == 1 and key.lower().replace("_", "") in (*RATE_NAMES, "frequency"):
+        elif x.size == 1 and bare in (*RATE_NAMES, "frequency"):
             result |= {"rate_hz": x.reshape(()), key: x}
-        elif x.size == 1 and key.lower().replace("_", "") in STEP_NAMES:
-            if x.dtype.kind == "f" and 0 < x < 1:  # in seconds
-                result |= {"rate_hz": 1 / x.reshape(()), key: x}
+        elif x.size == 1 and bare in STEP_NAMES and x.dtype.kind == "f" and 0 < x < 1:  # seconds
+            result |= {"rate_hz": 1 / x.reshape(()), key: x}
         elif x.ndim == 1 and len(x) in lengths and is_time_column(key) and x.dtype.kind in "iuf":
             with suppress(UnreadableError):
                 clock = clock_of(pd.DataFrame({key: x}))

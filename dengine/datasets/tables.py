@@ -323,15 +323,16 @@ def read_folder(
 
 
 def _leave_out_copies(collector: RecordingCollector) -> None:
-    """Make faults of the recordings that a file manager has copied, as `5_ok - Copy.csv`.
+    """Make faults of copies by a file manager, as `5_ok - Copy.csv` and `Copy of 5_ok.csv`.
 
-    The samples are those of the file without what it adds to a name.
+    A copy has the samples of the recording whose name is the same without what was added.
     """
     traces = {recording.source: recording.trace for recording in collector.recordings}
     reasons = {}
     for i, recording in enumerate(collector.recordings):
         path = PurePosixPath(recording.source)
-        original = str(path.with_stem(labels.COPY_MARK.sub("", path.stem) or path.stem))
+        stem = labels.COPY_PREFIX.sub("", labels.COPY_SUFFIX.sub("", path.stem))
+        original = str(path.with_stem(stem or path.stem))
         is_other = original != recording.source and original in traces
         if is_other and np.array_equal(traces[original], recording.trace, equal_nan=True):
             reasons[i] = f"Expected each recording once, it is a copy of {original}"

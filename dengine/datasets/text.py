@@ -981,19 +981,19 @@ def _check_repeated(rows: pd.DataFrame, clock: Clock) -> None:
 
 
 def _offer_clock(rows: pd.DataFrame, places: Sequence[int], notes: Counter[str]) -> None:
-    """Add a note if a column that is no channel rises steadily: it may be the clock.
+    """Add a note on the first column, other than a channel, that rises steadily: it may be the
+    clock.
 
-    One that has the name of a counter of samples and rises by 1 is none.
+    A column that has the name of a counter of samples, as `Index`, and rises by 1 is passed over.
     """
-    names = [str(rows.columns[i]) for i in rising_columns(rows) if i not in places]
-    names = [
-        name
-        for name in names
-        if COUNTER_NAME.fullmatch(name) is None or (np.diff(floats(rows[name])[0]) != 1).any()
-    ]
-    for name in names[:1]:
-        rises = f"column {name} rises steadily: time={name!r} if it is one"
-        notes[f"No clock is known; {rises}"] += 1
+    for i in rising_columns(rows):
+        name = str(rows.columns[i])
+        is_counter = COUNTER_NAME.fullmatch(name) is not None
+        is_counter = is_counter and bool((np.diff(floats(rows.iloc[:, i])[0]) == 1).all())
+        if i not in places and not is_counter:
+            rises = f"column {name} rises steadily: time={name!r} if it is one"
+            notes[f"No clock is known; {rises}"] += 1
+            return
 
 
 def column_place(name: str, header: Sequence[str], line: int = 1) -> int:

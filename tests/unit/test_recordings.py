@@ -1651,6 +1651,22 @@ def test_annotations_repeated_headers_and_end_marks_are_no_rows(
     assert not data.unlabelled
 
 
+def test_the_word_of_a_part_that_is_not_checked_yet_is_proposed_for_a_long_table(
+    small: Dataset,
+) -> None:
+    frame = long_table(small, lambda i: 10.0 * i)
+    is_end = frame.groupby("part").cumcount() > 45
+    codes = frame.pop("label").map({"OK": 1, "NOK": 2})
+    frame["register"] = codes.where(is_end, 0)
+    options = {"time": "time", "channel": "FZ", "label": "register"}
+    with pytest.raises(DataError) as error:
+        load_dataset(frame, **options)
+    label_map = re.search(r"label_map='([^']*,0=)'", str(error.value))
+    assert label_map is not None, error.value
+    data = load_dataset(frame, **options, label_map="1=good,2=bad,0=")
+    np.testing.assert_array_equal(data.y, small.y)
+
+
 def test_a_register_that_is_0_until_the_part_is_checked_counts_at_its_end(
     small: Dataset, tmp_path: Path
 ) -> None:
@@ -1662,8 +1678,9 @@ def test_a_register_that_is_0_until_the_part_is_checked_counts_at_its_end(
         load_dataset(tmp_path, channel="FZ", label="register")
     label_map = re.search(r"label_map='(1=good,2=bad)'", str(error.value))
     assert label_map is not None, error.value
-    data = load_dataset(tmp_path, channel="FZ", label="register", label_map=label_map[1])
-    np.testing.assert_array_equal(data.y, small.y)
+    for stated in (label_map[1], "1=good,2=bad,0="):
+        data = load_dataset(tmp_path, channel="FZ", label="register", label_map=stated)
+        np.testing.assert_array_equal(data.y, small.y)
     (tmp_path / "025_waits.csv").write_text("time_ms,FZ,verdict\n" + "2,1,\n" * 5)
     assert parse_label_map({"0": None, "ok": 1}) == {"0": None, "ok": True}
 
@@ -1912,6 +1929,16 @@ def test_a_copy_of_a_file_manager_counts_once(form: str, few: Path) -> None:
     data = load_dataset(few)
     assert len(data) == n
     assert "it is a copy of" in data.faults[0].message
+
+
+def test_labels_behind_the_numbers_of_files_that_are_named_as_copies_leave_their_order(
+    small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        write_csv(tmp_path / f"Copy of part_{i}_{word}.csv", x)
+    data = load_dataset(tmp_path)
+    np.testing.assert_array_equal(data.X, small.X)
+    assert data.ordered
 
 
 def test_a_signal_in_rows_of_a_file_is_chosen_by_its_name(small: Dataset, tmp_path: Path) -> None:
