@@ -131,23 +131,29 @@ class Soak:
 
         Adds times and counts to `stretch`, and a reported label to `acknowledged`.
         """
-        seconds, decision = wall_time(self._ask, stretch, self.web.decide, trace, part)
+        seconds, decision = wall_time(
+            self._send_until_answered, stretch, self.web.decide, trace, part
+        )
         stretch.decide.append(seconds)
         stretch.actions[decision["action"]] += 1
         is_line_stop = decision["action"] == "accept" and not good
         stretch.line_stops += is_line_stop
         if is_line_stop or decision["action"] == "verify":
-            seconds, _ = wall_time(self._ask, stretch, self.web.report, decision["id"], good)
+            seconds, _ = wall_time(
+                self._send_until_answered, stretch, self.web.report, decision["id"], good
+            )
             stretch.report.append(seconds)
             self.acknowledged[decision["id"]] = good
         time.sleep(self.pace)
 
-    def _ask(
+    def _send_until_answered(
         self, stretch: Stretch, request: Callable[..., dict[str, Any]], *arguments: Any
     ) -> dict[str, Any]:
-        """Send a request until it is answered, as its error tells a robot, and return the answer.
+        """Send a request, again at once while the status is 503, and return the answer.
 
-        After a minute of 503 (the disk did not answer in time) the error is raised.
+        503 means that the store is busy, or that the disk did not answer in time. Each repetition
+        is counted in `stretch.repeated`. Raises RuntimeError for any other status, and for 503
+        after a minute.
         """
         deadline = time.monotonic() + PATIENCE
         while True:

@@ -491,8 +491,8 @@ def _continue_counter(seconds: NDArray[np.float64], scale: float) -> NDArray[np.
 def _unwrap(seconds: NDArray[np.float64], period: float) -> NDArray[np.float64]:
     """Return times, shape (n,), with a period added from each row on at which the clock wraps.
 
-    It wraps where a step goes back, and the step and the period together are a step of at most five
-    usual ones forwards (half of one backwards). Steps from and to NaN do not count.
+    It wraps where a step is negative, but step + period lies between -1/2 and 5 median forward
+    steps. No wrap is found at a NaN; the rows behind it keep the periods that were added before.
     """
     steps = np.diff(seconds, prepend=seconds[:1])
     forward = steps[steps > 0]
@@ -597,8 +597,9 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
 def rate_in_preamble(text: str) -> float | None:
     """Return the sampling rate in hertz that a line of the text above a header states.
 
-    It states a rate, which without a unit is in hertz, or the time from one sample to the next,
-    which must have a unit. None if no line does, or its rate is not plausible.
+    The line is a name in `RATE_NAMES` with a number, in hertz if it has no unit (`fs = 500`), or a
+    name in `STEP_NAMES` with a number and its unit (`dt [ms];2`). Lines whose rate is not from 1 Hz
+    to 1 MHz are passed over. The rate is rounded to four digits; None if no line states one.
     """
     for match in filter(None, map(RATE_LINE.fullmatch, text.splitlines())):
         name = re.sub(r"[\W_]", "", match["name"].lower())
@@ -615,7 +616,9 @@ def rate_in_preamble(text: str) -> float | None:
 def check_rows(clock: Clock, lines: pd.Index, time: str | None = None) -> None:
     """Raise UnreadableError if rows are missing or out of order by their clock.
 
-    It holds where another rate is stated, too. A clock may be coarse, or late for some rows.
+    The check is made also if the user states another rate. It allows a coarse clock, and rows that
+    come late if the next ones come the sooner. Rows without a time are passed over, and a clock
+    with fewer than two steps forwards is not checked.
 
     Parameters
     ----------
@@ -623,12 +626,13 @@ def check_rows(clock: Clock, lines: pd.Index, time: str | None = None) -> None:
     lines : Index
         Line in the file of each time, for errors.
     time : str, optional
-        The clock's column, if the user stated it.
+        The clock's column, if the user stated it; it changes only what the error advises.
 
     Raises
     ------
     UnreadableError
-        If the clock goes back, or rows are missing in a gap, by more than five usual steps.
+        If the clock goes back by more than five median forward steps. Also if a step is longer than
+        five, and more than four steps are missing in the whole recording.
     """
     rows = np.flatnonzero(~np.isnan(clock.seconds))
     steps = np.diff(clock.seconds[rows])

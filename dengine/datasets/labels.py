@@ -476,10 +476,11 @@ def read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
 
 
 def labels_in_column(paths: Mapping[str, Path], column: str, options: LoadOptions) -> LabelSource:
-    """Return a source of labels in a column of each recording's file, in one row or in all.
+    """Return a source of labels in a column of each recording's file; empty cells do not count.
 
-    If the label changes once from the first row to the last, as where a controller shows that of
-    the part before until the cycle ends, the last one counts, and a note says so.
+    If the label changes once from the first row to the last, the last one counts, and a note of the
+    source says so: controllers show the result of the last part until the next one is checked. More
+    changes are a SeveralLabelsError. A file is read when its label is asked for.
 
     paths : the files of the recordings, by name.
     """
@@ -1064,7 +1065,7 @@ def _names_in_two_columns(
     The texts of the first column repeat, and more than half of them stand in names of files. It is
     joined with each other column, as `4700_1`; the two by which `_names_with` finds most files are
     taken. Returns the position of the first column, the joined text of each line, and the file of
-    each such text; (0, {}, {}) if no two columns name more than `more_than` texts.
+    each such text; (0, {}, {}) if no two columns name more than `more_than` files.
 
     cells : the cells of each row, by its line. names : the files.
     """
@@ -1085,7 +1086,10 @@ def _names_in_two_columns(
 
 
 def _words_between(text: str) -> str:
-    """Return the words of a text in lower case, each between underscores."""
+    """Return the words of a text in lower case, between underscores: `_sn_4700_` for `SN-4700`.
+
+    It is `_` for a text without words.
+    """
     return re.sub(r"[\W_]+", "_", f"_{normalized(text).lower()}_")
 
 

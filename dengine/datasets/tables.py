@@ -1094,9 +1094,11 @@ def _channels_of_long(
 def _rows_by_part(
     frame: pd.DataFrame, seconds: NDArray[np.float64], options: LoadOptions
 ) -> dict[str, pd.DataFrame]:
-    """Return the rows of each part of a long table, with columns of their times and runs.
+    """Return the rows of each part of a long table, by its number, in order of first appearance.
 
-    Raises DataError if many numbers were given to several parts, one after the other.
+    The rows have two more columns: `SECONDS_COLUMN`, their times, and `RUN_COLUMN`, the number of
+    the run that they are in. A run ends where the next row is of another part or earlier. Raises
+    DataError if many parts' numbers were used again later.
     """
     part = frame[options.part]
     is_new = (part != part.shift()).to_numpy() | np.r_[False, np.diff(seconds) < 0]
@@ -1108,10 +1110,11 @@ def _rows_by_part(
 
 
 def _check_numbers_once(rows_of_part: Mapping[str, pd.DataFrame]) -> None:
-    """Raise DataError if many parts have a number that was given again, as that of each shift.
+    """Raise DataError if many parts' numbers were used again, as where each shift counts from 1.
 
-    Such a part has rows in several runs, a long time apart, with other parts between them. One part
-    alone, or one of many, is a fault of its own.
+    Many are two or more, and at least a fifth of all (`FEW_AGAIN`); fewer are not looked at here. A
+    number was used again if its rows stand in several runs, other parts between them, and each
+    pause is longer than all of its rows would take at their median step.
     """
     again = []
     for part, rows in rows_of_part.items():

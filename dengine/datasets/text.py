@@ -224,10 +224,13 @@ def _remarks(cells: TextCells) -> set[int]:
 def _fields_in(lines: Iterable[str]) -> dict[str, str]:
     """Return the values that lines outside the table state, by name; of a name the first counts.
 
-    A line is read as name and value: `Result: OK`, `# Result = OK` or `Result;OK`. A value ends at
-    the next of these marks, so that of `Start: 12:30:05` is 12. If two lines in succession have as
-    many cells, those of the first are also read as names of those below them; if they are three or
-    more names, only so.
+    A line is read as name and value: `Result: OK`, `# Result = OK` or `Result;OK`. The marks
+    between them are `: ; = , |` and tab. A value ends at the next mark: it is 12 in
+    `Start: 12:30:05`, and 3 in `Force: 3,5`. A name has no digits and at most 41 characters; empty
+    values are passed over.
+
+    If the next line has as many cells (between `; , |` or tabs), each cell is also read as the name
+    of the cell below it. A line of three or more names is read in this way alone.
     """
     texts = [REMARK.sub("", line.strip().strip("\"'")) for line in lines]
     rows = [[cell.strip(" \"'") for cell in CELL_MARK.split(text)] for text in texts]
@@ -984,7 +987,10 @@ def _offer_clock(rows: pd.DataFrame, places: Sequence[int], notes: Counter[str])
     """Add a note on the first column, other than a channel, that rises steadily: it may be the
     clock.
 
-    A column that has the name of a counter of samples, as `Index`, and rises by 1 is passed over.
+    The first 200 rows tell whether it rises. A column that has the name of a counter of samples, as
+    `Index`, and rises by 1 in all rows is passed over.
+
+    places : positions of the channels.
     """
     for i in rising_columns(rows):
         name = str(rows.columns[i])
