@@ -8,6 +8,7 @@ training or of the executor stops the cell.
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass, field, replace
@@ -24,9 +25,11 @@ from ..store.records import LabelledTraces
 
 log = logging.getLogger("dengine")
 HUNG = 60.0  # seconds after which work in the executor is given up
-# Share of the budget after which no step begins; a model that lacks a few steps decides a little
-# less often.
+# Share of the budget after which no step begins. It is smaller, down to the second, where the work
+# after the steps takes longer. A model that lacks a few steps decides a little less often.
 STEPS = 0.7
+FEWEST_STEPS = 0.3
+N_REMEMBERED = 20  # trainings; the next one reserves what the slowest of them took after its steps
 LATE = "ended by the clock, before its last step"
 
 Clock = Callable[[], float]
@@ -172,10 +175,20 @@ class Limits:
         Seconds of wall time.
     max_steps : int or None
         Optimiser steps.
+    reserve : float
+        Seconds of the budget that are kept for the last step and the work after it.
     """
 
     budget: float | None = None
     max_steps: int | None = None
+    reserve: float = 0.0
+
+    def deadline(self, begin: float) -> float | None:
+        """Return when no step may begin any more, for a training that begins at `begin`."""
+        if self.budget is None:
+            return None
+        seconds = min(STEPS * self.budget, self.budget - self.reserve)
+        return begin + max(FEWEST_STEPS * self.budget, seconds)
 
 
 @dataclass(frozen=True)
@@ -192,6 +205,8 @@ class Trained:
         Optimiser steps that were done.
     seconds : float
         Duration of the training.
+    last_seconds : float
+        Duration of its last step and of all work after that; 0 for a training without steps.
     begin : float
         When work on the retrain began, by the retrainer's clock.
     seq : array of int64, shape (n,)
@@ -202,6 +217,7 @@ class Trained:
     reason: str
     n_steps: int = 0
     seconds: float = 0.0
+    last_seconds: float = 0.0
     begin: float = 0.0
     seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
@@ -239,6 +255,11 @@ class Retrainer:
         self.future: Future[Trained] | None = None
         self._began = 0.0  # when the training in the executor began, by `time.monotonic`
         self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
+        self._last_seconds = deque([0.0], N_REMEMBERED)  # of the newest trainings
+
+    def _limits(self) -> Limits:
+        """Return the limits of the next training, with the reserve that the last ones needed."""
+        return replace(self.limits, reserve=max(self._last_seconds))
 
     def train(self, current: EngineModel, begin: float) -> Trained:
         """Train a successor of the current model in this thread, and return the outcome.
@@ -247,7 +268,8 @@ class Retrainer:
         failure is an outcome without a model.
         """
         data = self.window.snapshot()
-        trained = train_candidate(current.successor(), data, self.limits, self.clock)
+        trained = train_candidate(current.successor(), data, self._limits(), self.clock)
+        self._last_seconds.append(trained.last_seconds)
         return replace(trained, begin=begin)
 
     def start(self, current: EngineModel) -> bool:
@@ -262,7 +284,7 @@ class Retrainer:
         data = self.window.snapshot()
         if not self._began:
             log.info("the first retrain begins, on %d labels", len(data.seq))
-        arguments = (current.successor(), data, self.limits, self.clock)
+        arguments = (current.successor(), data, self._limits(), self.clock)
         try:
             self.future = self.executor.submit(train_candidate, *arguments)
         except (
@@ -293,6 +315,7 @@ class Retrainer:
             trained = future.result(timeout=max(0.0, min(wait, left)))
         except Exception as error:  # the failure is recorded, and the old version goes on answering
             trained = Trained(None, self._give_up(future, error), seq=self._seq)
+        self._last_seconds.append(trained.last_seconds)
         return replace(trained, begin=self.clock() - trained.seconds)
 
     def _give_up(self, future: Future[Trained], error: Exception) -> str:
@@ -326,8 +349,7 @@ def train_candidate(
     """
     torch.set_num_threads(1)  # it holds for the present thread only
     begin = clock()
-    deadline = None if limits.budget is None else begin + STEPS * limits.budget
-    stop = StopRule(deadline, limits.max_steps, clock)
+    stop = StopRule(limits.deadline(begin), limits.max_steps, clock)
     model: EngineModel | None = None
     n_steps = 0
     try:
@@ -346,7 +368,9 @@ def train_candidate(
         reason = f"dropped: {error}"
     except Exception as error:  # no exception inside a model reaches the cell
         reason = _dropped(error)
-    return Trained(model, reason, n_steps, clock() - begin, seq=data.seq)
+    end = clock()
+    last_seconds = 0.0 if stop.last_step is None else end - stop.last_step
+    return Trained(model, reason, n_steps, end - begin, last_seconds, seq=data.seq)
 
 
 def _dropped(error: Exception) -> str:

@@ -62,12 +62,15 @@ class StopRule:
         Returns the present time in seconds.
     late : bool
         Whether the deadline, and not the number of steps, ended the fit.
+    last_step : float or None
+        When the last step began, of a fit with a deadline; None before the first.
     """
 
     deadline: float | None = None
     max_steps: int | None = None
     clock: Callable[[], float] = time.perf_counter
     late: bool = False
+    last_step: float | None = None
 
     def exhausted(self, step: int, min_steps: int = 0) -> bool:
         """Return whether step number `step`, counted from 0, may not begin any more.
@@ -78,9 +81,12 @@ class StopRule:
         """
         if self.max_steps is not None and step >= self.max_steps:
             return True
-        self.late = (
-            self.deadline is not None and self.clock() >= self.deadline and step >= min_steps
-        )
+        if self.deadline is None:
+            return False
+        now = self.clock()
+        self.late = now >= self.deadline and step >= min_steps
+        if not self.late:
+            self.last_step = now
         return self.late
 
 

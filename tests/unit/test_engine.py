@@ -17,6 +17,7 @@ from sklearn.decomposition import PCA
 
 from dengine import (
     Action,
+    ConvReducer,
     DataEngine,
     Dataset,
     Reason,
@@ -33,7 +34,7 @@ from dengine.engine.engine import core_of
 from dengine.errors import ReportError, SettingError, StoreError
 from dengine.folds import COIN_BITS, audit_salt, content_hash, toss
 from dengine.store import SqlStore
-from tests.support.driving import RECIPE, Counting, evidence, make
+from tests.support.driving import RECIPE, Counting, evidence, learn, make
 from tests.support.driving import drive as play
 
 AUDITING = RECIPE.with_policy(audit_rate=0.3)
@@ -315,6 +316,31 @@ def test_a_dropped_candidate_leaves_the_old_version_answering(data: Dataset) -> 
     assert "PCA needs more than 500 traces" in report.reason
     assert evidence(engine.decide(good(data))) == before
     assert [r.accepted for r in engine.store.retrains()][-1] is False
+
+
+class Slowing(ConvReducer):
+    """Takes, by a clock of its own, 0.02 s for a step and 0.2 s for what comes after the steps."""
+
+    now = 0.0
+
+    def train_step(self, *arguments: Any) -> float:
+        Slowing.now += 0.02
+        return super().train_step(*arguments)
+
+    def estimate_statistics(self, x: torch.Tensor) -> None:
+        Slowing.now += 0.2
+        super().estimate_statistics(x)
+
+
+def test_a_retrain_leaves_the_time_that_the_last_one_needed_after_its_steps(data: Dataset) -> None:
+    recipe = Recipe(Slowing(folds=2), retrain_every=1000, budget=0.45)
+    engine = DataEngine(recipe=recipe, clock=lambda: Slowing.now)
+    learn(engine, data, range(40))
+    first, second = engine.retrain(), engine.retrain()
+    assert first.seconds > 0.45
+    assert second.seconds <= 0.45
+    assert second.n_steps == first.n_steps - 4
+    assert "ended by the clock" in second.reason
 
 
 def test_retrains_that_are_dropped_three_times_in_a_row_are_an_alarm_until_one_is_accepted(
