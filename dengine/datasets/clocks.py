@@ -57,8 +57,8 @@ STEP_NAMES = (
 # A line above a header that states one of these: Sample rate: 500 Hz, dt [ms];2, # fs = 500
 RATE_LINE = re.compile(
     r"[#%\s\"']*(?P<name>[^\W\d][^\d:;=,|\[(]*?)\s*([\[(](?P<bracketed>\w+)[\])])?[\"']?"
-    r"\s*[:;=,\t|\s]\s*[\"']?(?P<number>\d+([.,]\d+)?(e-?\d+)?)"
-    r"[\s;,|\"'\[(]*(?P<unit>[a-zµμ]*)[\s;,|\"'\])]*",
+    r"\s*[:;=,\t|\s]\s*[\"']?(?P<number>\d+([.,]\d+)?(e[+-]?\d+)?)"
+    r"([;,|\t]+\s*(?P=number))*[\s;,|\"'\[(]*(?P<unit>[a-zµμ]*)[\s;,|\"'\])]*",
     re.IGNORECASE,
 )
 HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6}

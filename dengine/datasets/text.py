@@ -169,12 +169,13 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
         del lines[min(lines)]
     try:
         delimiter = stated[1] if stated else _find_delimiter(list(lines.values()))
-        rows = {i: _split_line(line, delimiter) for i, line in lines.items()}
+        split = {i: _split_line(line, delimiter) for i, line in lines.items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
+    rows = {i: row for i, row in split.items() if any(row)}
     if _is_horizontal(rows.values()):
         rows = dict(enumerate(map(list, zip(*rows.values(), strict=True)), start=1))
-    cells = _find_header(rows, delimiter, list(columns))
+    cells = _find_header(_names_and_units_of_keys(rows), delimiter, list(columns))
     remarks = _remarks(cells)
     last = max(cells.rows.keys() - remarks, default=0)
     outside = [line for i, line in lines.items() if i < cells.line or i > last]
@@ -195,6 +196,23 @@ def _is_horizontal(rows: Collection[Sequence[str]]) -> bool:
     is_named = all(row[0] and not _numeric_columns(row[:1]) for row in rows)
     is_number = all(len(_numeric_columns(row)) == min(n) - 1 for row in rows)
     return is_named and is_number and is_time_column(next(iter(rows))[0])
+
+
+def _names_and_units_of_keys(rows: dict[int, list[str]]) -> dict[int, list[str]]:
+    """Return the rows of a text without those of keys above samples, but for the names and units.
+
+    So Yokogawa's recorders write: a key such as "TraceName", "VUnit" or "Date" and its value for
+    each channel stand above samples that leave the column of the keys empty. Other rows are
+    returned as they are.
+    """
+    keys = {row[0].lower(): i for i, row in reversed(rows.items()) if row[0]}
+    has_samples = rows and not any(row[0] for row in list(rows.values())[-SAMPLED_LINES:])
+    names = max((i for key, i in keys.items() if key.endswith("name")), default=0)
+    if not (has_samples and names) or any(map(_is_value, keys)):
+        return rows
+    units_line = min((i for key, i in keys.items() if key.endswith("unit")), default=names)
+    kept = {i: row for i, row in rows.items() if not row[0]}
+    return {i: ["", *rows[i][1:]] for i in (names, units_line)} | kept
 
 
 def _remarks(cells: TextCells) -> set[int]:
@@ -369,7 +387,11 @@ def _find_header(
     last_rows = (rows if columns else rows[1:])[-20:]
     usual = Counter(map(_numeric_columns, last_rows)).most_common(1)
     numeric = usual[0][0] if usual else frozenset()
-    is_data = (2 * len(_numeric_columns(row) & numeric) > len(numeric) for row in rows)
+    width = max(map(len, last_rows), default=0)
+    is_data = (
+        2 * len(_numeric_columns(row) & numeric) > len(numeric) and len(row) <= width
+        for row in rows
+    )
     data = next((k for k, is_row_data in enumerate(is_data) if is_row_data), 0)
     above = [_without_comment_mark(row, delimiter) for row in rows[: max(data, 1)]]
     is_units = [any(row) and all(map(_is_unit, row)) for row in above]
@@ -635,7 +657,8 @@ def read_table(
     stated = units.stated_in_preamble(preamble, header, without)
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
-    about = (cells.fields, cells.n_remarks, rate_in_preamble(preamble))
+    head = "\n".join(text.splitlines()[: min(cells.rows, default=1) - 1])
+    about = (cells.fields, cells.n_remarks, rate_in_preamble(head))
     return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
 
 

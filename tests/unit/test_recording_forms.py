@@ -730,13 +730,43 @@ WRITERS: dict[str, Callable[[Path], object]] = {
         delimiter="\t",
         above=["LabVIEW Measurement", "***End***"],
     ),
+    "maXYmos": lambda path: write(
+        path,
+        ["Time", "X(ABSOLUTE)", "Y"],
+        ["s", *german(times())],
+        ["mm", *["40,2"] * N],
+        ["N", *german(texts())],
+        delimiter=";",
+        above=[
+            "Index;Result information;Process values;Channel-X;Channel-Y;Measuring curve",
+            "Line;6;18;27;33;40",
+            "Result information;\nTotal result;OK\n",
+            "Process values;\nYMAX;2,6;kN\n",
+            f"Measuring curve;\nNumber of measuring points;{N}\n",
+        ],
+    ),
+    "ScopeCorder": lambda path: path.write_text(
+        "\n".join(
+            [
+                '"Model Name",DL850E',
+                '"TraceName",CH1_LOAD',
+                f'"BlockSize",{N}',
+                '"VUnit",N',
+                '"SampleRate",2.500000E+02',
+                '"HUnit",s',
+                '"Time",13:08:21.4418',
+                ",",
+                *(f",{cell}" for cell in texts()),
+            ]
+        )
+    ),
 }
 
 
 @pytest.mark.parametrize("tool", WRITERS)
 def test_files_of_tools_are_read_as_they_come(tool: str, tmp_path: Path) -> None:
     WRITERS[tool](tmp_path / "a_OK.csv")
-    data = load_dataset(tmp_path)
+    data = load_dataset(tmp_path, channel="Y" if tool == "maXYmos" else None)
     np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
     assert data.rate_hz == 250.0
 
