@@ -54,9 +54,10 @@ def names_of(kind: str) -> tuple[str, ...]:
     Parameters
     ----------
     kind : str
-        guarantee, interval, stops, recipe, baseline, method (recipes and baselines), fit, label,
-        action or reason.
+        guarantee, interval, stops, recipe, baseline, method (recipes and baselines), fit (of live
+        traces), form (of recordings), label, action or reason.
     """
+    from ..datasets.dataset import PAD_ALL
     from ..decision.intervals import INTERVALS
     from ..decision.policy import RULES, Stops
     from ..experiments.baselines import BASELINES
@@ -72,6 +73,7 @@ def names_of(kind: str) -> tuple[str, ...]:
         "baseline": BASELINES,
         "method": [*RECIPES, *BASELINES],
         "fit": FITS,
+        "form": (*FITS, PAD_ALL),
         "label": LABELS,
         "action": [action.value for action in Action],
         "reason": [reason.value for reason in Reason],
@@ -503,6 +505,7 @@ TRACE = {
     "fit": click.option("--fit", type=NameChoice("fit"), help=_FIT),
 }
 DATA = TRACE | {
+    "fit": click.option("--fit", type=NameChoice("form"), help=_FIT),
     "label": click.option("--label", metavar="PATTERN", help=_LABEL),
     "labels": click.option("--labels", metavar="FILE", help=_LABELS),
     "label_map": click.option("--label-map", metavar="WORDS", help=_LABEL_MAP),

@@ -43,6 +43,7 @@ MEANINGS = ("bad", "good")  # of the labels 0 and 1
 # A range of numbered names, as c0..c498.
 NAME_RANGE = re.compile(r"(?P<name>[^\W\d]\w*?)(?P<first>\d{1,5})\.\.(?P=name)(?P<last>\d{1,5})")
 MAX_LABEL_WORDS = 12  # more different words are no labels
+PAD_ALL = "pad-all"  # as "pad", for recordings of any length
 expect_data = partial(expect, error=DataError)
 
 
@@ -315,7 +316,8 @@ class LoadOptions:
     encoding: str | None = None
 
     def __post_init__(self) -> None:
-        expect_data(self.fit in (None, *FITS), f"fit to be one of {', '.join(FITS)}", self.fit)
+        fits = (*FITS, PAD_ALL)
+        expect_data(self.fit in (None, *fits), f"fit to be one of {', '.join(fits)}", self.fit)
         expect_data(self.rate_hz is None or self.rate_hz > 0, "a rate above 0 Hz", self.rate_hz)
         expect_data(self.samples is None or self.samples >= 1, "1 or more samples", self.samples)
         for names in (self.channels, self.columns):
@@ -614,8 +616,9 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     """Make one data set of the recordings that were collected.
 
     They are converted to one unit and one length. A recording at another rate than most is a fault,
-    or with `fit="resample"` is interpolated at the rate of the others. The collector is changed:
-    what does not fit moves to its faults.
+    or with `fit="resample"` is interpolated at the rate of the others. One of a length that cannot
+    be fitted is a fault, unless `fit="pad-all"`; notes say how many are bad. The collector is
+    changed: what does not fit moves to its faults.
 
     Raises
     ------
@@ -630,12 +633,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     lengths = np.array([r.trace.shape[1] for r in collector.recordings], dtype=np.int64)
     fit, samples = choose_fit(lengths, options.fit, options.samples)
     stretch = samples / float(np.median(lengths)) if fit == "resample" else 1.0
-    reasons = {
-        i: f"Expected {_fit_text(samples, fit)}, got {length}"
-        for i, length in enumerate(lengths.tolist())
-        if not can_fit_length(length, samples, FITS.index(fit))
-    }
-    collector.leave_out(reasons)
+    _fit_odd_lengths(collector, samples, fit, keeps_all=options.fit == PAD_ALL)
     recordings = collector.recordings
     _note_scales(collector)
     if fit == "resample" and lengths.max() - lengths.min() > RATE_TOLERANCE * samples:
@@ -685,6 +683,36 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         lengths=np.array(lengths_read, dtype=np.int64),
         rates=rates if np.isfinite(rates).any() else None,
     )
+
+
+def _fit_odd_lengths(
+    collector: RecordingCollector, samples: int, fit: str, *, keeps_all: bool
+) -> None:
+    """Make faults of the recordings whose length cannot be fitted, or with `keeps_all` fit them.
+
+    A shorter one then repeats its last sample, a longer one is cut. Notes say how many there are,
+    and if most of those left out are bad.
+    """
+    recordings = collector.recordings
+    lengths = [recording.trace.shape[1] for recording in recordings]
+    odd = [i for i, n in enumerate(lengths) if not can_fit_length(n, samples, FITS.index(fit))]
+    if keeps_all:
+        for i in odd:
+            positions = np.arange(samples).clip(max=lengths[i] - 1)
+            length = recordings[i].length or lengths[i]
+            trace = recordings[i].trace[:, positions]
+            recordings[i] = recordings[i]._replace(trace=trace, length=length)
+        if n_short := sum(lengths[i] < samples for i in odd):
+            text = f"{n_short} shorter than half of {samples} samples repeat their last one"
+            collector.notes[f"{text}; a live trace as short is verified"] = 1
+        return
+    n_bad = sum(recordings[i].label == 0 for i in odd)
+    if 2 * n_bad > len(odd):
+        text = f"{n_bad} of {len(odd)} recordings that are left out for their length are bad"
+        collector.notes[f"{text}: fit={PAD_ALL!r} keeps them"] = 1
+    wanted = f"Expected {_fit_text(samples, fit)}"
+    do = f"fit={PAD_ALL!r} keeps it"
+    collector.leave_out({i: f"{wanted}, got {lengths[i]}; {do}" for i in odd})
 
 
 def _note_scales(collector: RecordingCollector) -> None:
@@ -873,7 +901,7 @@ def choose_fit(lengths: NDArray[np.int64], fit: str | None, samples: int | None)
     ----------
     lengths : array of int64, shape (n,)
     fit : str or None
-        In `FITS`, if the user stated it.
+        In `FITS`, or `PAD_ALL`, which is returned as "pad", if the user stated it.
     samples : int or None
         The length of all, if the user stated it.
 
@@ -895,6 +923,7 @@ def choose_fit(lengths: NDArray[np.int64], fit: str | None, samples: int | None)
     low = int(lengths.min())
     high = int(lengths.max())
     median = int(np.median(lengths))
+    fit = "pad" if fit == PAD_ALL else fit
     if fit is None:
         if low == high and samples in (None, low):
             fit = "strict"

@@ -39,7 +39,7 @@ from ..store.opening import LONG_WAIT, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
-from .loading import TABLES
+from .loading import holds_table
 
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
@@ -60,7 +60,7 @@ def stored_form(store: "StoreLike", source: Any) -> dict[str, Any]:
     if not isinstance(source, str | os.PathLike):
         return {}
     path = Path(source)
-    if not (path.is_dir() or path.suffix.lower() in TABLES):
+    if not (path.is_dir() or (path.is_file() and holds_table(path))):
         return {}
     try:
         with opening(store, must_exist=True) as opened:

@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 
 from ..errors import DataError, instead, listed
 from .clocks import EMPTY_CELLS
+from .containers import PACKED
 from .dataset import (
     MAX_LABEL_WORDS,
     MEANINGS,
@@ -1002,10 +1003,11 @@ def _read_label_rows(
     rows_by_line = zip(table.frame.index, table.frame.to_numpy().tolist(), strict=True)
     cells = {line: row for line, row in rows_by_line if any(row)}
     faults = table.faults
-    if header[0].lower().endswith(SUFFIXES):  # no header, but the first row
+    files = {_path_words(name)[0] for name in names}
+    # No header, but the first row.
+    if header[0].lower().endswith(SUFFIXES) or _path_words(header[0])[0] in files:
         cells = {1: header, **cells}
         header = ["file", "label", *header[2:]]
-    files = {_path_words(name)[0] for name in names}
     columns = [list(dict.fromkeys(column)) for column in zip(*cells.values(), strict=True)]
     with_names = [
         i
@@ -1026,7 +1028,7 @@ def _read_label_rows(
         if LabelColumn(header[i], options.words, Counter()).has_labels(column)
     ]
     most = min(MAX_LABEL_WORDS, len(cells) / 2)
-    with_words = [i for i, column in enumerate(columns) if 2 <= len(column) <= most]
+    with_words = {i: column for i, column in enumerate(columns) if 2 <= len(column) <= most}
     found_in = (with_names, with_labels, with_words)
     of_file, of_label = _label_file_columns(header, path, *found_in, options.label)
     part = options.part
@@ -1052,7 +1054,7 @@ def _path_words(path: str) -> tuple[str, ...]:
     """
     words = normalized(path).lower().replace("\\", "/").split("/")
     words = [word for word in words if word not in ("", ".")] or [""]
-    file = words.pop()
+    file = words.pop().removesuffix(PACKED)
     suffix = next((suffix for suffix in (*SUFFIXES, ".npz") if file.endswith(suffix)), "")
     return file.removesuffix(suffix), *reversed(words)
 
@@ -1131,7 +1133,7 @@ def _label_file_columns(
     path: str | os.PathLike[str],
     with_names: Sequence[int],
     with_labels: Sequence[int],
-    with_words: Sequence[int],
+    with_words: Mapping[int, Sequence[str]],
     column: str | None = None,
 ) -> tuple[int, int]:
     """Return the positions of the column of files and of the column of labels.
@@ -1143,7 +1145,7 @@ def _label_file_columns(
     found.
 
     with_names, with_labels : the columns in which recordings are named, and those of labels alone.
-    with_words : those of a few words, whose meaning may be asked for.
+    with_words : the words of those that have few, whose meaning may be asked for.
     column : the one of labels, if the user stated it.
     """
     of_file = column_among(header, LISTS["file_columns"])
@@ -1164,14 +1166,51 @@ def _label_file_columns(
             of_label = others[0]
     if of_file is None or of_label is None:
         do = "name that of labels (label)"
-        if with_words:
-            do = f"name that of labels, label={header[with_words[0]]!r}"
+        if choice := {header[i]: words for i, words in with_words.items() if i != of_file}:
+            do = f"name that of labels, {propose_columns(choice)}"
         if of_file is None:
             do = f"call that of files' names file, and {do}"
         raise DataError(
             f"Expected columns file and label in {path}, got {', '.join(header)}; {do}."
         )
     return of_file, of_label
+
+
+def columns_with_labels(
+    cells: Mapping[str, Iterable[Any]], words: LabelMap = NO_WORDS
+) -> list[str]:
+    """Return the columns in which a cell is a label, or all if none has one.
+
+    cells : the words of each column, by its name.
+    """
+
+    def is_label(column: LabelColumn, cell: Any) -> bool:
+        """Return whether a cell is the label of a part that was checked."""
+        with suppress(UnlabelledError, UnknownWordError):
+            return column.label_of(cell) in (0, 1)
+        return False
+
+    all_columns = {name: LabelColumn(name, words, Counter()) for name in cells}
+    known = [
+        name
+        for name, column in all_columns.items()
+        if any(is_label(column, cell) for cell in cells[name])
+    ]
+    return known or list(cells)
+
+
+def propose_columns(cells: Mapping[str, Iterable[Any]], words: LabelMap = NO_WORDS) -> str:
+    """Return the options, for an error, that name a column of labels: `label='Decision'`.
+
+    Of several that may be it, each has its first words behind it.
+
+    cells : as in `columns_with_labels`.
+    """
+    names = columns_with_labels(cells, words)
+    if len(names) == 1:
+        return f"label={names[0]!r}"
+    firsts = {name: listed(itertools.islice(cells[name], 3)) for name in names}
+    return " or ".join(f"label={name!r} ({first})" for name, first in firsts.items())
 
 
 def collect_recordings(

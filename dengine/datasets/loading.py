@@ -27,6 +27,7 @@ from . import units
 from .archives import hold_one_each, read_archive_each
 from .bags import is_stream, read_bag
 from .clocks import RATE_NAMES, STEP_NAMES, clock_of, rate_of
+from .containers import HEAD, NPZ, PARQUET, binary_kind, is_text, suffix_of
 from .dataset import (
     UNKNOWN_RATE,
     Dataset,
@@ -74,7 +75,7 @@ TEXT_FORMAT = ("columns", "decimal", "thousands", "encoding")
 # What `dengine simulate` writes beside them, for `experiments`.
 SIMULATED = ("height_mm", "cycle", "conditions", "condition_names", "seed", "scenario", "simulated")
 Files = Mapping[str, Path]
-TABLES = (*TEXTS, ".parquet", ".pq")
+TABLES = (*TEXTS, *PARQUET)
 MIN_PADDING = 5  # zeros at the end of a trace that are no measurement
 FORMS = ".npz, .csv, .tsv, .txt, .dat, .parquet or .mcap"
 
@@ -134,9 +135,11 @@ def load_dataset(
     labels : path, optional
         For a folder, a CSV file with a column of file names and one of labels; for a long table, of
         parts and labels; for an .npz file, of labels with a row for each trace.
-    fit : {"strict", "cut", "pad", "resample"}, optional
-        What happens to traces of another length, as in `TraceSpec`. None: strict for recordings of
-        one length; cut if all have the `samples` stated; else pad to the median length.
+    fit : {"strict", "cut", "pad", "resample", "pad-all"}, optional
+        What happens to traces of another length, as in `TraceSpec`; "pad-all" also pads recordings
+        shorter than half, which the others leave out, and cuts those longer than twice. None:
+        strict for recordings of one length; cut if all have the `samples` stated; else pad to the
+        median length.
     rate_hz : float, optional
         Sampling rate, instead of that by timestamps or of a line above the header. Without any of
         these the rate is unknown.
@@ -266,13 +269,29 @@ def _find_file_reader(
         raise DataError(f"Expected {wanted}, or a folder of CSV files, got {path}.")
     if path.is_file() and is_database(path):
         return (), partial(_read_store, path, name, options)
-    if any(file.suffix.lower() in TABLES for file in named.values()):
+    if any(map(holds_table, named.values())):
         read = partial(read_tables, named, name, options)
         return ("label", "labels", "time", *TEXT_FORMAT), read
-    if path.is_dir() or path.suffix.lower() == ".npz" or zipfile.is_zipfile(path):
+    if path.is_dir() or path.suffix.lower() == NPZ or _is_archive(path):
         read_npz = read_archive_each if hold_one_each(named, options) else _read_npz
         return ("label", "labels", "time"), partial(read_npz, named, name, options)
-    raise DataError(f"Expected a file {FORMS}, got {path}; save it as one of these.")
+    with path.open("rb") as file:
+        kind = binary_kind(file.read(HEAD))
+    raise DataError(f"Expected a text file, or one {FORMS}, got {path}, {kind}.")
+
+
+def holds_table(path: Path) -> bool:
+    """Return whether a file is read as a table: by its suffix, or because it is a text."""
+    return suffix_of(path) in TABLES or (path.suffix.lower() != NPZ and is_text(path))
+
+
+def _is_archive(path: Path) -> bool:
+    """Return whether a file is a zip archive that has arrays of NumPy in it."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with suppress(zipfile.BadZipFile, OSError), zipfile.ZipFile(path) as archive:
+        return any(name.endswith(".npy") for name in archive.namelist())
+    return False
 
 
 def _read_store(path: Path, name: str, options: LoadOptions) -> Dataset:

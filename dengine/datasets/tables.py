@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -22,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
-from ..files import read_errors
 from ..traces import is_time_column
 from . import labels, units
 from .clocks import (
@@ -36,6 +36,16 @@ from .clocks import (
     place_of_clock,
     rate_of,
     seconds_of,
+)
+from .containers import (
+    JSON,
+    NPZ,
+    PACKED,
+    PARQUET,
+    binary_kind,
+    number_rows,
+    open_text,
+    suffix_of,
 )
 from .dataset import (
     MAX_LABEL_WORDS,
@@ -51,7 +61,7 @@ from .dataset import (
     label_map_of,
 )
 from .encodings import decode, missing_name
-from .numerals import UndecidedError
+from .numerals import UndecidedError, is_numeral
 from .text import SUFFIXES as TEXTS
 from .text import (
     TextCells,
@@ -91,7 +101,8 @@ STATION = re.compile(
     r"|spindle|spindel|nest|cavity|tool|head|lane",
     re.IGNORECASE,
 )
-SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
+NO_TEXTS = (*PARQUET, NPZ)
+SUFFIXES = (*TEXTS, *NO_TEXTS)
 
 
 def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
@@ -100,37 +111,69 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     They are the Parquet and .npz files if there are any, else the text files of the most frequent
     suffix; several suffixes if they are equally frequent. A suffix whose first file has at most
     `FEW_ROWS` rows, as notes beside a recording have, counts only if all suffixes are like that.
-    `run_2.csv` comes before `run_10.csv`. Hidden files and the file of labels are left out. Raises
-    DataError if there is none.
+    One that is not in `SUFFIXES` counts if it is more frequent and its first file is a table of
+    numbers. `run_2.csv` comes before `run_10.csv`. Hidden files and the file of labels are left
+    out; names are those without .gz. Raises DataError if there is none.
     """
     label_file = None if options.labels is None else Path(options.labels).resolve()
     paths = {
         path.relative_to(folder): path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in SUFFIXES and (path.is_file() or path.is_symlink())
+        for path in sorted(folder.rglob("*"), reverse=True)  # x.csv replaces x.csv.gz
+        if path.is_file() or path.is_symlink()
     }
     named = {
-        labels.normalized(inner.as_posix()): path
+        labels.normalized(inner.as_posix()).removesuffix(PACKED): path
         for inner, path in paths.items()
         if path.resolve() != label_file and not any(word.startswith(HIDDEN) for word in inner.parts)
     }
-    if not named:
-        entries = listed(sorted(path.name for path in folder.iterdir()))
-        forms = f"CSV files, one an insertion, or tables ({', '.join(SUFFIXES)})"
-        actual = f"none among {entries}; save them as such" if entries else "none"
-        raise DataError(f"Expected {forms}, in the folder {folder}, found {actual}.")
-    # CSV files beside other files are lists of labels.
-    others = [name for name, path in named.items() if path.suffix.lower() not in TEXTS]
-    counts = Counter(path.suffix.lower() for path in named.values())
-    if len(counts) > 1:  # files of a few lines beside each recording tell of it
-        firsts = {path.suffix.lower(): path for path in reversed(named.values())}
-        tables = [
-            s for s, path in firsts.items() if len(_first_rows(path, options).rows) > FEW_ROWS
+    counts = Counter(map(suffix_of, named.values()))
+    firsts = {suffix_of(path): path for path in named.values()}
+    chosen = [suffix for suffix in NO_TEXTS if suffix in counts]  # beside these, CSV lists labels
+    if not chosen:
+        usual = [suffix for suffix in counts if suffix in SUFFIXES]
+        heads = {suffix: _first_rows(firsts[suffix], options) for suffix in counts}
+        # Files of a few lines beside each recording tell of it.
+        tables = [suffix for suffix in usual if len(heads[suffix].rows) > FEW_ROWS]
+        most = max((counts[suffix] for suffix in tables or usual), default=0)
+        unusual = [
+            suffix
+            for suffix in counts
+            if suffix not in (*SUFFIXES, *JSON)
+            and counts[suffix] >= most + bool(tables)
+            and _is_of_numbers(heads[suffix])
         ]
-        counts = Counter({suffix: counts[suffix] for suffix in tables or counts})
-    most = max(counts.values())
-    texts = [name for name, path in named.items() if counts[path.suffix.lower()] == most]
-    return {name: named[name] for name in sorted(others or texts, key=natural_key)}
+        chosen = [suffix for suffix in tables or usual if counts[suffix] == most]
+        if unusual:
+            chosen = [max(unusual, key=counts.__getitem__)]
+    if not chosen:
+        raise DataError(_no_recordings(folder, firsts))
+    names = [name for name, path in named.items() if suffix_of(path) in chosen]
+    return {name: named[name] for name in sorted(names, key=natural_key)}
+
+
+def _no_recordings(folder: Path, firsts: Mapping[str, Path]) -> str:
+    """Return the message of an error: a folder has no files that are read; what its files are.
+
+    firsts : the first file of each suffix.
+    """
+    entries = listed(sorted(path.name for path in folder.iterdir()))
+    forms = f"CSV files, one an insertion, or tables ({', '.join(SUFFIXES)})"
+    actual = f"none among {entries}; save them as such" if entries else "none"
+    kinds = []
+    for path in firsts.values():
+        with suppress(OSError), path.open("rb") as file:
+            kinds += [f"{path.name} is {kind}" for kind in [binary_kind(file.read(2**12))] if kind]
+    details = "".join(f". {kind}" for kind in kinds[:3])
+    return f"Expected {forms}, in the folder {folder}, found {actual}{details}."
+
+
+def _is_of_numbers(head: TextCells) -> bool:
+    """Return whether the head of a text is a table: most of its rows have numbers, and as many
+    cells as the header.
+    """
+    rows = [row for row in head.rows.values() if len(row) == len(head.header)]
+    n_numbers = sum(any(map(is_numeral, row)) for row in rows)
+    return len(head.rows) > FEW_ROWS and 2 * n_numbers > len(head.rows)
 
 
 class FolderHeads(NamedTuple):
@@ -162,7 +205,7 @@ def read_heads(named: Mapping[str, Path], options: LoadOptions) -> FolderHeads:
 
     Raises DataError if the files cannot be decoded by `options.encoding`.
     """
-    paths = [path for path in named.values() if path.suffix.lower() in TEXTS]
+    paths = [path for path in named.values() if suffix_of(path) not in NO_TEXTS]
     if not paths:
         return FolderHeads([], Counter(), {}, [])
     try:
@@ -201,7 +244,7 @@ def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptio
     later. Raises DataError if the first file cannot be read.
     """
     path = next(iter(named.values()))
-    if path.suffix.lower() not in TEXTS:
+    if suffix_of(path) in NO_TEXTS:
         return True
     header = heads.header
     if options.time is not None and options.part in header:
@@ -251,7 +294,7 @@ def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
 
 def _first_lines(path: Path) -> bytes:
     """Return the complete lines among the first 256 KiB of a file. Raises OSError."""
-    with path.open("rb") as file:
+    with open_text(path) as file:
         return file.read(2**18).rpartition(b"\n")[0]
 
 
@@ -560,12 +603,25 @@ def _label_advice(
     ]
     if not likely:
         return None
-    column = min(likely, key=lambda column: len(set(counts_by_column[column]) - {0, 1, ""}))
-    cells = Counter[str]()
+    cells = {column: Counter[str]() for column in likely}
     for path in sample.values():
-        with suppress(UnreadableError, OSError):
-            cells.update(set(labels.read_cells(path, column, options)))
-    return f"if column {column} tells them, name it: {_label_hint(column, cells, options)}"
+        for column in likely:
+            with suppress(UnreadableError, OSError):
+                cells[column].update(set(labels.read_cells(path, column, options)))
+    return f"if a column tells them, name it: {_label_hints(cells, options)}"
+
+
+def _label_hints(cells: Mapping[str, Counter[Any]], options: LoadOptions) -> str:
+    """Return the options, for an error, that name a column of labels among several.
+
+    If only one has labels, they also say what its other words mean.
+
+    cells : how often each word is in each column.
+    """
+    names = labels.columns_with_labels(cells, options.words)
+    if len(names) == 1:
+        return _label_hint(names[0], cells[names[0]], options)
+    return labels.propose_columns(cells, options.words)
 
 
 def _label_hint(column: str, cells: Counter[Any], options: LoadOptions) -> str:
@@ -604,11 +660,17 @@ def _common_decimal_mark(paths: Sequence[Path], options: LoadOptions) -> str | N
 
 
 def _unread_files_note(folder: Path, named: Mapping[str, Path], options: LoadOptions) -> list[str]:
-    """Return a note on the text files with another suffix than the recordings, or no note."""
-    suffix = next(iter(named.values())).suffix.lower()
+    """Return a note on the tables and text files of another suffix than the recordings, or none."""
+    suffix = suffix_of(next(iter(named.values())))
     label_file = None if options.labels is None else Path(options.labels).resolve()
-    paths = (path for path in folder.rglob("*") if path.suffix.lower() in TEXTS and path.is_file())
-    others = (path for path in paths if path.suffix.lower() != suffix)
+    paths = [path for path in folder.rglob("*") if path.is_file() and suffix_of(path) != suffix]
+    firsts = {suffix_of(path): path for path in paths}
+    tables = {
+        other
+        for other, path in firsts.items()
+        if other in TEXTS or (other not in JSON and _is_of_numbers(_first_rows(path, options)))
+    }
+    others = (path for path in paths if suffix_of(path) in tables)
     unread = sorted(path.name for path in others if path.resolve() != label_file)
     return [f"Not read, for most files are {suffix}: {listed(unread)}"] if unread else []
 
@@ -619,7 +681,7 @@ def _first_rows(path: Path, options: LoadOptions) -> TextCells:
     Behind 100 lines the numbers of lines are wrong, and the last row may be cut off. The header is
     empty if they cannot be read: the error comes when the whole file is read.
     """
-    with suppress(UnreadableError, OSError), path.open("rb") as file:
+    with suppress(UnreadableError, OSError, EOFError, zlib.error), open_text(path) as file:
         content = file.read(2**18)
         lines = content.split(b"\n")[:100]
         start = len(b"\n".join(lines))
@@ -686,10 +748,9 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
     tables: dict[str, TextTable] = {}
     for source, path in named.items():
         try:
-            is_text = path.suffix.lower() in TEXTS
-            table = read_table(path, options) if is_text else _read_parquet(path)
+            table = read_table(path, options)
         except UnreadableError as error:
-            fault = Fault(path.name, error.line, str(error))
+            fault = Fault(path.name, error.line, str(error).rstrip("."))
             raise DataError(f"Cannot read {path}: {fault}.") from error
         if table.frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
@@ -708,29 +769,13 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
     return _from_tables(tables, options, collector)
 
 
-def _read_parquet(path: Path) -> TextTable:
-    """Return a Parquet file as a table whose rows count from 1.
-
-    Raises DataError if it cannot be read or is damaged, or pyarrow is not installed.
-    """
-    import pandas as pd
-
-    with read_errors(path, "a Parquet file", "pyarrow", "files"):
-        return TextTable(_number_rows(pd.read_parquet(path)), [], 0, [], "")
-
-
-def _number_rows(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table whose columns have texts as names and whose rows count from 1."""
-    return frame.set_axis(list(map(str, frame.columns)), axis=1).set_axis(range(1, len(frame) + 1))
-
-
 def from_frame(frame: pd.DataFrame, options: LoadOptions) -> Dataset:
     """Make a data set of a DataFrame, a wide or a long table; its rows count from 1 in faults.
 
     Raises DataError if a column holds lists or occurs twice, or columns that are needed are missing
     or not named.
     """
-    table = TextTable(_number_rows(frame), [], 0, [], "")
+    table = TextTable(number_rows(frame), [], 0, [], "")
     return _from_tables({"row": table}, options, RecordingCollector("data", ()))
 
 
@@ -1348,7 +1393,10 @@ def _long_table_advice(frame: pd.DataFrame, options: LoadOptions, label_file: st
         hints.append(f"time={time!r}" if time else "the column of times (time)")
     if not (options.label or options.labels):
         is_other = {name: name.lower() not in labels.LABEL_COLUMNS for name in few}
-        label = min(few, key=lambda name: (is_other[name], changes[name]), default=part)
+        cells = {name: frame[name].astype(str).unique().tolist() for name in few}
+        known = labels.columns_with_labels(cells, options.words)
+        likeliness = {name: (is_other[name], name not in known, changes[name]) for name in few}
+        label = min(few, key=likeliness.__getitem__, default=part)
         if label != part:
             hints.append(_label_hint(label, Counter(frame[label].astype(str)), options))
         else:
@@ -1470,12 +1518,11 @@ def _label_column(frame: pd.DataFrame, options: LoadOptions) -> str:
     if options.time is None and not numbered and has_clock:
         do = "as in one recording; give a folder of such CSV files"
         raise DataError(f"Expected a row an insertion, got {listed(others)}, {do}.")
-    counts = {name: frame[name].nunique() for name in others}
-    likely = [name for name, n in counts.items() if 2 <= n <= MAX_LABEL_WORDS]
+    cells = {name: Counter(frame[name].astype(str)) for name in others}
+    likely = {name: n for name, n in cells.items() if 2 <= frame[name].nunique() <= MAX_LABEL_WORDS}
     do = "add one that is called so"
     if likely:
-        column = min(likely, key=counts.__getitem__)
-        do = f"name it: {_label_hint(column, Counter(frame[column].astype(str)), options)}"
+        do = f"name it: {_label_hints(likely, options)}"
     columns = listed(others or frame.columns)
     raise DataError(f"Expected a column of labels, y or label, found {columns}; {do}.")
 

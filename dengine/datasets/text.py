@@ -12,6 +12,7 @@ import itertools
 import json
 import os
 import re
+import zlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import excerpt, listed
+from ..errors import excerpt, instead, listed
 from ..traces import is_time_column
 from . import units
 from .clocks import (
@@ -44,6 +45,7 @@ from .clocks import (
     rising_columns,
     start_of,
 )
+from .containers import as_texts, open_text, read_frame
 from .dataset import Fault, LoadOptions, Reading, Recording, UnreadableError
 from .encodings import decode
 from .numerals import is_numeral, write_as_python
@@ -580,6 +582,8 @@ def read_table(
 ) -> TextTable:
     """Read a text file as a table of texts, in which numbers are written as Python writes them.
 
+    A Parquet or JSON file is read as the table that it holds.
+
     Parameters
     ----------
     path : Path
@@ -589,7 +593,7 @@ def read_table(
         Decimal mark, as of the other files of a folder, that is taken if the user stated none.
         None: as the cells prove.
     as_text : bool, default False
-        Whether numbers stay texts as they are written.
+        Whether numbers stay texts as they are written; those of Parquet and JSON become texts.
 
     Returns
     -------
@@ -600,17 +604,25 @@ def read_table(
     Raises
     ------
     UnreadableError
-        If the file is empty or too large, cannot be decoded, has no header, or its number format is
-        undecided.
+        If the file is empty or too large, is no text or cannot be decoded, has no header, or its
+        number format is undecided.
+    DataError
+        If a Parquet or JSON file cannot be read as a table.
     """
     import pandas as pd
 
-    size = path.stat().st_size
-    if size > LARGEST:
+    if (stored := read_frame(path)) is not None:
+        return TextTable(as_texts(stored) if as_text else stored, [], 0, [], "")
+    with (
+        instead(UnreadableError, "Cannot unpack it", EOFError, zlib.error),
+        open_text(path) as file,
+    ):
+        content = file.read(LARGEST + 1)
+    if len(content) > LARGEST:
         wanted = f"at most {LARGEST // 2**20} MB"
         do = "split it, or write Parquet"
-        raise UnreadableError(f"Expected {wanted}, got {size // 2**20} MB; {do}")
-    text, encoding = decode(path.read_bytes(), options.encoding)
+        raise UnreadableError(f"Expected {wanted}, got {path.stat().st_size // 2**20} MB; {do}")
+    text, encoding = decode(content, options.encoding)
     cells = split_cells(text, options.columns)
     if not cells.header:
         raise UnreadableError("Expected a header and rows, it is empty")

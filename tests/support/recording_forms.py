@@ -320,7 +320,7 @@ def in_code(words: Mapping[str, object] | tuple[str, ...]) -> str:
 def tables() -> dict[str, str]:
     """The page's lists by their names, in Markdown."""
     rows = {
-        "Files": in_code(SUFFIXES),
+        "Files": f"{in_code(SUFFIXES)}, other text that most files are, all also as `.gz`",
         "Between cells": ", ".join(DELIMITERS),
         "1043.5 is written as": in_code(NUMBERS),
         "A clock in seconds is called": in_code(CLOCK_NAMES),

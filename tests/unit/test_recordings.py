@@ -822,13 +822,6 @@ REFUSED: dict[str, tuple[Callable[[Dataset, Path], Any], str]] = {
         "labelled traces in data, got .2 that have no label yet",
     ),
     "an empty folder": (lambda data, tmp: tmp, "Expected CSV files, one an insertion"),
-    **{
-        kind: (
-            lambda data, tmp, kind=kind: written_text(tmp / f"data.{kind}"),
-            r"a file \.npz, \.csv, .*\.parquet or \.mcap",
-        )
-        for kind in ("xlsx", "npy")
-    },
 }
 
 
@@ -2091,3 +2084,72 @@ def test_a_result_that_is_that_of_the_part_before_until_the_end_counts_at_the_en
     rows = [[f"{2 * k}", f"{v}", "OK" if k % 2 else "NOK"] for k, v in enumerate(small.X[0])]
     write_rows(tmp_path / "999.csv", [["time [ms]", "FZ", "result"], *rows])
     assert "Expected one label" in load_dataset(tmp_path, channel="FZ").faults[0].message
+
+
+TELL_LABELS = {  # the columns of a listing beside the files' names -> what the error proposes
+    "one has labels": ({"Inspector": ["Anna", "Bob"], "Decision": ["OK", "rework"]}, "Decision"),
+    "two have labels": (
+        {"Inspector": ["Anna", "Bob"], "Visual": ["NOK", "OK"], "Height": ["OK", "NOK"]},
+        "Visual (NOK, OK) or --label Height (OK, NOK)",
+    ),
+    "none has labels": (
+        {"Inspector": ["Anna", "Bob"], "Decision": ["heil", "Riss"]},
+        "Inspector (Anna, Bob) or --label Decision (heil, Riss)",
+    ),
+}
+
+
+@pytest.mark.parametrize("form", TELL_LABELS)
+def test_the_error_proposes_the_column_whose_words_are_labels_or_shows_all(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    columns, proposal = TELL_LABELS[form]
+    cells = {name: [words[i % 2] for i in range(24)] for name, words in columns.items()}
+    for i, trace in enumerate(small.X):
+        write_csv(tmp_path / "cell" / f"part_{i}.csv", trace)
+    files = {"file": [f"part_{i}.csv" for i in range(24)]}
+    pd.DataFrame({**files, **cells}).to_csv(tmp_path / "l.csv", index=False)
+    wide(small).drop(columns="label").assign(**cells).to_csv(tmp_path / "wide.csv", index=False)
+    for source, listing in ((tmp_path / "cell", tmp_path / "l.csv"), (tmp_path / "wide.csv", None)):
+        with pytest.raises(DataError) as caught:
+            load_dataset(source, labels=listing)
+        assert f"--label {proposal}" in as_options(str(caught.value))
+
+
+@pytest.mark.parametrize(
+    ("good", "bad"), [("合格", "不合格"), ("良品", "不良"), ("합격", "불합격")]
+)
+def test_verdicts_of_east_asian_listings_are_labels(
+    good: str, bad: str, small: Dataset, tmp_path: Path
+) -> None:
+    for i, trace in enumerate(small.X):
+        write_csv(tmp_path / "cell" / f"part_{i}.csv", trace)
+    rows = [
+        f"part_{i}.csv,{'田中' if i % 2 else '鈴木'},{good if y else bad}"
+        for i, y in enumerate(small.y)
+    ]
+    (tmp_path / "l.csv").write_text("\n".join(["ファイル,検査者,判定", *rows]), "utf-8")
+    data = load_dataset(tmp_path / "cell", labels=tmp_path / "l.csv")
+    np.testing.assert_array_equal(data.y, small.y)
+
+
+def test_short_recordings_of_stopped_parts_are_kept_if_the_user_says_so(
+    small: Dataset, tmp_path: Path
+) -> None:
+    for i, trace in enumerate(small.X[:12]):
+        write_csv(tmp_path / f"part_{i}_OK.csv", trace)
+    write_csv(tmp_path / "stop_1_NOK.csv", small.X[0][:20])
+    write_csv(tmp_path / "stop_2_NOK.csv", small.X[1][:12])
+    write_csv(tmp_path / "long_OK.csv", np.tile(small.X[0], 3))
+    data = load_dataset(tmp_path)
+    text = "2 of 3 recordings that are left out for their length are bad: --fit pad-all keeps them."
+    assert text in [as_options(note) for note in data.notes]
+    assert len(data) == 12
+    assert all("--fit pad-all keeps it" in as_options(fault.message) for fault in data.faults)
+    kept = load_dataset(tmp_path, fit="pad-all")
+    assert (len(kept), kept.faults, kept.fit, kept.spec.fit) == (15, (), "pad", "pad")
+    assert "2 shorter than half of 50 samples repeat their last one" in kept.notes[0]
+    np.testing.assert_array_equal(kept.X[-2], np.r_[small.X[0][:20], np.full(30, small.X[0][19])])
+    assert sorted(kept.lengths.tolist()) == [12, 20, *[50] * 12, 150]
+    survey = document("data", tmp_path, "--fit", "pad-all")["survey"]
+    assert (survey["good"], survey["bad"]) == (13, 2)

@@ -1,0 +1,138 @@
+"""A file is read by what it holds: text of any suffix, packed text, Parquet and JSON; what is none
+of these is refused by its kind.
+"""
+
+import gzip
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dengine import load_dataset
+from dengine.errors import DataError
+
+N = 12
+WORDS = ["OK" if i % 3 else "NOK" for i in range(N)]
+LABELS = [int(word == "OK") for word in WORDS]
+LISTING = pd.DataFrame(
+    {"file": [f"rec_{i:03d}.csv" for i in range(N)], "verdict": WORDS, "serial": range(N)}
+)
+ROWS = json.loads(LISTING.to_json(orient="records"))
+
+
+def write_recordings(folder: Path, suffix: str = ".csv", *, with_labels: bool = True) -> Path:
+    folder.mkdir()
+    for i, word in enumerate(WORDS):
+        name = f"rec_{i:03d}_{word}{suffix}" if with_labels else f"rec_{i:03d}{suffix}"
+        rows = [f"{k / 500:.3f}\t{np.sin(k + i):.3f}" for k in range(30)]
+        text = "\n".join(["time\tFZ", *rows, ""]).encode()
+        (folder / name).write_bytes(gzip.compress(text) if suffix.endswith(".gz") else text)
+    return folder
+
+
+LISTINGS: dict[str, Callable[[Path], object]] = {
+    "l.parquet": LISTING.to_parquet,
+    "index.parquet": LISTING.set_index("file").to_parquet,
+    "l.json": lambda path: LISTING.to_json(path, orient="records"),
+    "l.jsonl": lambda path: LISTING.to_json(path, orient="records", lines=True),
+    "named.json": lambda path: path.write_text(
+        json.dumps(dict(zip(LISTING.file, WORDS, strict=True)))
+    ),
+    "inside.json": lambda path: path.write_text(json.dumps({"cell": 3, "parts": ROWS})),
+    "l.csv.gz": lambda path: LISTING.to_csv(path, index=False),
+    "numbers.parquet": lambda path: LISTING.assign(
+        file=np.arange(float(N)), verdict=np.array(LABELS, dtype=bool)
+    ).to_parquet(path),
+}
+
+
+@pytest.mark.parametrize("name", LISTINGS)
+def test_a_listing_is_read_from_every_table_that_recordings_are_read_from(
+    name: str, tmp_path: Path
+) -> None:
+    LISTINGS[name](tmp_path / name)
+    folder = write_recordings(tmp_path / "cell", with_labels=False)
+    data = load_dataset(folder, labels=tmp_path / name)
+    assert (data.y.tolist(), data.faults) == (LABELS, ())
+    assert data.reading["labels"].startswith(name)
+
+
+def write_workbook(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("xl/workbook.xml", "<workbook/>")
+
+
+REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
+    "l.xlsx": (write_workbook, "a workbook or a zip archive; save the sheet as CSV"),
+    "l.feather": (LISTING.to_feather, "an Arrow file .Feather.; save it as Parquet or CSV"),
+    "l.csv": (LISTING.to_parquet, "a Parquet file; name it .parquet"),
+    "l.bin": (lambda path: path.write_bytes(bytes(range(256)) * 20), "a binary file of an unknown"),
+    "l.npy": (
+        lambda path: np.save(path, np.zeros((3, 4))),
+        "a single NumPy array; save it as .npz",
+    ),
+    "l.h5": (lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(99)), "an HDF5 file; save"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_file_that_is_no_table_is_refused_by_its_kind_in_one_line(
+    name: str, tmp_path: Path
+) -> None:
+    write, kind = REFUSED[name]
+    write(tmp_path / name)
+    folder = write_recordings(tmp_path / "cell", with_labels=False)
+    for source, options in ((folder, {"labels": tmp_path / name}), (tmp_path / name, {})):
+        with pytest.raises(DataError, match=kind) as caught:
+            load_dataset(source, **options)
+        assert str(caught.value).isprintable()
+
+
+SUFFIXES = (".asc", ".log", ".prn", ".trc", ".CSV.gz", ".txt.gz", "")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_text_is_read_whatever_its_suffix_where_most_files_have_it(
+    suffix: str, tmp_path: Path
+) -> None:
+    folder = write_recordings(tmp_path / "cell", suffix)
+    for i in range(N):  # what an editor leaves beside each of them
+        (folder / f"rec_{i}.json").write_text("[\n1.0,\n2.0,\n3.0,\n4.0,\n5.0,\n6.0,\n7.0\n]")
+    (folder / "readme.dat").write_text("of cell 3")
+    data = load_dataset(folder)
+    assert (data.y.tolist(), data.rate_hz, data.faults) == (LABELS, 500.0, ())
+    assert any("readme.dat" in note for note in data.notes)
+    wide = pd.DataFrame(data.X, columns=[f"FZ_{i}" for i in range(30)]).assign(label=WORDS)
+    how = "gzip" if suffix.endswith(".gz") else None
+    wide.to_csv(tmp_path / f"wide{suffix}", index=False, sep="\t", compression=how)
+    named = load_dataset(tmp_path / f"wide{suffix}")
+    np.testing.assert_array_equal(named.X, data.X)
+
+
+def test_tables_of_a_rarer_suffix_are_named_in_a_note(tmp_path: Path) -> None:
+    folder = write_recordings(tmp_path / "cell")
+    (folder / "late_OK.asc").write_bytes((folder / "rec_001_OK.csv").read_bytes())
+    data = load_dataset(folder)
+    assert len(data) == N
+    assert data.notes == ("Not read, for most files are .csv: late_OK.asc.",)
+
+
+def test_a_packed_file_that_is_cut_off_is_a_fault_and_the_others_are_read(tmp_path: Path) -> None:
+    folder = write_recordings(tmp_path / "cell", ".csv.gz")
+    cut = folder / "rec_001_OK.csv.gz"
+    cut.write_bytes(cut.read_bytes()[:60])
+    data = load_dataset(folder)
+    assert len(data) == N - 1
+    assert data.faults[0].source == "rec_001_OK.csv"
+    assert "Cannot unpack it" in data.faults[0].message
+
+
+def test_a_folder_of_binary_files_is_refused_by_their_kind(tmp_path: Path) -> None:
+    for name in ("a_OK.tdms", "b_NOK.tdms"):
+        (tmp_path / name).write_bytes(b"TDSm" + bytes(200))
+    with pytest.raises(DataError, match=r"a_OK\.tdms is a TDMS file; export it as text"):
+        load_dataset(tmp_path)
