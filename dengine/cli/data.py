@@ -55,6 +55,8 @@ def data(source: DataChoice, out: Out | None) -> None:
     rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in", "duplicates_in"))
     if not survey.rate_hz:
         rows.append(("rate", "unknown"))
+    if not survey.unit:
+        rows.append(("unit", "unknown"))
     parts: list[Any] = [table_of_rows(survey.name, rows), *map(as_options, dataset.notes)]
     if survey.not_finite_in:
         files = listed(survey.not_finite_in)

@@ -54,6 +54,8 @@ STEP_NAMES = (
     *("dt", "deltat", "timestep", "sampletime", "sampleinterval", "samplinginterval"),
     *("samplingtime", "sampleperiod", "samplingperiod", "abtastzeit", "abtastintervall"),
 )
+UNSURE_RATES = ("rate", "datarate")  # of samples only in hertz
+FREQUENCIES = ("frequency", "frequenz", "freq")  # of samples, or of something else
 # A line above a header that states one of these: Sample rate: 500 Hz, dt [ms];2, # fs = 500
 RATE_LINE = re.compile(
     r"[#%\s\"']*(?P<name>[^\W\d][^\d:;=,|\[(]*?)\s*([\[(](?P<bracketed>\w+)[\])])?[\"']?"
@@ -594,23 +596,30 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     return float(f"{rate:.4g}")
 
 
-def rate_in_preamble(text: str) -> float | None:
-    """Return the sampling rate in hertz that a line of the text above a header states.
+def rate_in_preamble(text: str) -> tuple[float | None, str]:
+    """Return the sampling rate in hertz that a line of the text above a header states, and a note.
 
     The line is a name in `RATE_NAMES` with a number, in hertz if it has no unit (`fs = 500`), or a
     name in `STEP_NAMES` with a number and its unit (`dt [ms];2`). Lines whose rate is not from 1 Hz
-    to 1 MHz are passed over. The rate is rounded to four digits; None if no line states one.
+    to 1 MHz are passed over. The rate is rounded to four digits; None if no line states one. Then
+    the note offers a line that may state it, as `Rate: 5` or `Frequency: 500 Hz`; "" for none.
     """
+    offer = ""
     for match in filter(None, map(RATE_LINE.fullmatch, text.splitlines())):
         name = re.sub(r"[\W_]", "", match["name"].lower())
         number = float(match["number"].replace(",", "."))
         unit = (match["bracketed"] or match["unit"]).lower()
-        rate = number * HERTZ.get(unit or "hz", 0.0) if name in RATE_NAMES else 0.0
+        names = (*RATE_NAMES, *FREQUENCIES)
+        rate = number * HERTZ.get(unit or "hz", 0.0) if name in names else 0.0
         step = number * (units.seconds_in(unit) or 0.0) if name in STEP_NAMES else 0.0
         rate = 1.0 / step if step else rate
-        if RATES[0] <= rate <= RATES[1]:
-            return float(f"{rate:.4g}")
-    return None
+        is_unsure = name in FREQUENCIES or (name in UNSURE_RATES and not unit)
+        if RATES[0] <= rate <= RATES[1] and not is_unsure:
+            return float(f"{rate:.4g}"), ""
+        if is_unsure or (name in STEP_NAMES and not unit):
+            do = f"rate_hz={rate:.4g}" if rate else "state it, rate_hz=..."
+            offer = f"A line says {match[0].strip()!r}: if that is of the samples, {do}"
+    return None, offer
 
 
 def check_rows(clock: Clock, lines: pd.Index, time: str | None = None) -> None:

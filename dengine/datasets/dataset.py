@@ -116,7 +116,7 @@ class Dataset:
     rate_hz : float, optional
         Sampling rate in hertz. None: unknown.
     unit : str, default "N"
-        Unit of the samples, one for all channels or "kN, mm", one for each.
+        Unit of the samples, one for all channels or "kN, mm", one for each; "" if it is unknown.
     cause : array of str, shape (n,), optional
         Why a part failed.
     part : array of str, shape (n,), optional
@@ -183,13 +183,13 @@ class Dataset:
         """The `TraceSpec` of live traces of the same shape, for `DataEngine(trace=data.spec)`.
 
         If the rate is unknown, it is the default of `TraceSpec`: state `rate_hz` before times
-        matter.
+        matter. An unknown unit is called "units".
         """
         n_channels = 1 if self.X.ndim == 2 else self.X.shape[1]
         spec = TraceSpec(
             self.X.shape[-1],
             channels=n_channels,
-            unit=self.unit,
+            unit=", ".join(unit.strip() or "units" for unit in self.unit.split(",")),
             fit=self.fit,
             columns=self.channels,
         )
@@ -884,14 +884,11 @@ def _resample(
 
 
 def guess_unit(channels: Sequence[str]) -> str:
-    """Return "N·m", "N" or "mixed units" for channels, by their names; for people.
-
-    Names that begin with mx, mux or tx (or y, z) are torques, all others are forces.
+    """Return the unit of channels by `units.guess`, for people: one for all, or "N, N·m"; "" if
+    it is unknown, as without names.
     """
-    is_torque = {re.match(r"(mu?|t)[xyz](_|$)", name.lower()) is not None for name in channels}
-    if is_torque == {True, False}:
-        return "mixed units"
-    return "N·m" if True in is_torque else "N"
+    guesses = [units.guess(name) for name in channels] or [""]
+    return guesses[0] if len(set(guesses)) == 1 else ", ".join(guesses)
 
 
 def choose_fit(lengths: NDArray[np.int64], fit: str | None, samples: int | None) -> tuple[str, int]:
@@ -968,7 +965,8 @@ def refit(data: Dataset, options: LoadOptions, *, has_unit: bool = True) -> Data
     if options.channels and data.X.ndim == 3:
         data = _select_channels(data, options.channels)
     if options.unit is not None:
-        data = _convert_unit(data, options.unit) if has_unit else replace(data, unit=options.unit)
+        is_known = has_unit and data.unit != ""
+        data = _convert_unit(data, options.unit) if is_known else replace(data, unit=options.unit)
     if options.fit is None or options.fit == data.fit == "strict":
         return data if options.samples is None else data.cut(options.samples)
     length = data.X.shape[-1]

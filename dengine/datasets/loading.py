@@ -367,9 +367,8 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         if "unit" in arrays:
             stored_unit = arrays["unit"]
             about["unit"] = ", ".join(map(str, np.atleast_1d(stored_unit).tolist()))
-        elif names and X.ndim == 3:
-            guesses = [guess_unit((channel,)) for channel in names]
-            about["unit"] = guesses[0] if len(set(guesses)) == 1 else ", ".join(guesses)
+        else:
+            about["unit"] = guess_unit(names or channels)
         if len(channels) == 1 and X.ndim == 3:  # it is the name of an array of several channels
             channels = ()
             options = replace(options, channels=())
@@ -670,7 +669,7 @@ def _from_arrays(
         X = X[is_labelled]
         labels = labels[is_labelled]
         words = words[is_labelled]
-    data = make_dataset(X, labels, name=name, **about)
+    data = make_dataset(X, labels, name=name, **{"unit": "", **about})
     clock = "none, an array tells the rate" if data.rate_hz and not options.rate_hz else ""
     place = f"{'column' if options.labels else 'array'} {label}"
     readings = [Reading(place, str(word), clock) for word in words.tolist()]

@@ -932,6 +932,8 @@ def _add_wide_rows(
     ]
     do = f"name the column to trust: label={label_column!r}"
     rate = None if options.rate_hz else table.rate_hz
+    if table.offer and not options.rate_hz:
+        collector.notes[table.offer] = 1
     parts = [""] * len(frame)
     if options.part in frame:
         parts = frame[options.part].astype(object).fillna("").tolist()

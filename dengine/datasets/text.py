@@ -76,7 +76,8 @@ LABVIEW_END = "***End_of_Header***"
 COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
 RATE_ABOVE = "none, a line above the header states the rate"
 COUNTER_NAME = re.compile(
-    r"(sample|index|idx|no|nr|n|i|row|point|count|number|nummer|zeile|messpunkt|punkt)\w{0,3}\.?",
+    r"(sample|index|idx|no|nr|n|i|row|point|count|number|nummer|zeile|messpunkt|punkt)"
+    r"([se]|er|[ _-]?(no|nr|id|idx|number|\d{1,3}))?\.?",
     re.IGNORECASE,
 )
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
@@ -138,8 +139,10 @@ class TextTable(NamedTuple):
         As in `TextCells`.
     rate_hz : float, optional
         That a line above the header states, or of a wide table whose samples have times.
+    offer : str
+        A note on a line above the header that may state the rate; "" for none.
     clock : str
-        What tells this rate, as in `Reading`.
+        What tells the rate, as in `Reading`.
     """
 
     frame: pd.DataFrame
@@ -151,6 +154,7 @@ class TextTable(NamedTuple):
     fields: Mapping[str, str] = {}
     n_remarks: int = 0
     rate_hz: float | None = None
+    offer: str = ""
     clock: str = RATE_ABOVE
 
 
@@ -438,7 +442,8 @@ def _is_field_above(first: list[str], second: list[str]) -> bool:
     names = _without_trailing_empty(second)
     is_field = len(words) == 1 or any(map(_is_value, words[1:]))
     is_field |= _n_measured(names) > _n_measured(words)
-    return is_field and len(names) > 1 and not any(map(_is_value, names))
+    has_mark = len(words) == 1 and len(FIELD_MARK.split(words[0])) > 1
+    return is_field and (len(names) > 1 or has_mark) and not any(map(_is_value, names))
 
 
 def _n_measured(names: Sequence[str]) -> int:
@@ -670,7 +675,7 @@ def read_table(
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
     head = "\n".join(text.splitlines()[: min(cells.rows, default=1) - 1])
-    about = (cells.fields, cells.n_remarks, rate_in_preamble(head))
+    about = (cells.fields, cells.n_remarks, *rate_in_preamble(head))
     return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
 
 
@@ -796,6 +801,8 @@ def read_recording(
     rows = _without_unfilled(_without_summary(frame, options, notes), places, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
     timed = rows_to_trace(rows, places, options, notes, table.units, table.rate_hz)
+    if table.offer and not (timed.reading.clock or options.rate_hz):
+        notes[table.offer] += 1
     n_out = len(frame) - len(rows) + table.n_remarks
     left_out = (
         f"header in line {table.line}" if table.line > 1 else "",

@@ -32,6 +32,9 @@ UNIT_LINE = re.compile(
     re.IGNORECASE,
 )
 FORCE_NAME = re.compile(r"f[xyz]?([_ ].*)?|.*(force|kraft|last|load).*", re.IGNORECASE)
+# Of a torque whose unit nobody knows, and of one that robots and sensors give in N·m: MuZ_Base.
+TORQUE_NAME = re.compile(r"m[d]?([_ ].*)?|.*(torque|moment|couple|torsion).*", re.IGNORECASE)
+TORQUE_AXIS = re.compile(r"(mu?|t)[xyz](_.*)?", re.IGNORECASE)
 COMMENT_MARK = re.compile(r"^\s*[#%]+\s*")  # by which other programs know a comment
 
 
@@ -98,6 +101,17 @@ def stated_in_preamble(text: str, header: Sequence[str], places: Sequence[int]) 
         for i in chosen:
             result[i] = unit
     return result
+
+
+def guess(channel: str) -> str:
+    """Return "N" or "N·m" for a channel whose name says that it is a force or a robot's torque.
+
+    "" for any other, as `Torque`, which is often in N·cm.
+    """
+    if TORQUE_AXIS.fullmatch(channel):
+        return "N·m"
+    is_force = FORCE_NAME.fullmatch(channel) and not TORQUE_NAME.fullmatch(channel)
+    return "N" if is_force else ""
 
 
 def factor(unit: str, other: str) -> float | None:

@@ -1178,11 +1178,11 @@ def test_an_error_of_the_encoding_says_which_label_words_in_names_are_unknown(
 ) -> None:
     """g27: the label map was asked for only after the encoding was stated."""
     for i in range(8):
-        folder = tmp_path / ("不合格" if i % 2 else "合格")
+        folder = tmp_path / ("不正常" if i % 2 else "正常")
         folder.mkdir(exist_ok=True)
         rows = [["时间(ms)", "压力(N)"], ["0", "1.5"], ["2", "2.5"]]
         (folder / f"压装{i}.csv").write_bytes("\n".join(map(",".join, rows)).encode("gb18030"))
-    with pytest.raises(DataError, match=r"encoding='gb18030'.*label_map='.*不合格=bad"):
+    with pytest.raises(DataError, match=r"encoding='gb18030'.*label_map='.*不正常=bad"):
         load_dataset(tmp_path, channel="压力")
 
 

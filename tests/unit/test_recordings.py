@@ -294,7 +294,7 @@ AMBIGUOUS = {  # the name of a column that means no outcome -> its cells
     "crack": ["yes", "no", "no"],
     "leak": [True, False, False],
     "pass_fail": [1, 0, 0],
-    "不良": [1.0, 0.0, 0.0],
+    "割れ": [1.0, 0.0, 0.0],
 }
 
 
@@ -597,7 +597,7 @@ def test_unasked_lengths_that_differ_are_padded_and_never_resampled(
 ) -> None:
     assert load_dataset(uneven).fit == "pad"
     short = load_dataset(uneven, samples=60)
-    assert (short.spec, short.X.shape) == (TraceSpec(60, fit="cut"), (15, 60))
+    assert (short.spec, short.X.shape) == (TraceSpec(60, fit="cut", unit="units"), (15, 60))
     with pytest.raises(
         DataError,
         match=r"Expected recordings of one length, got 9\d to 110 samples; choose fit='pad'",
@@ -764,11 +764,6 @@ def test_a_row_whose_last_cells_are_empty_is_a_shorter_trace(
             data.X,
             load_dataset(([x[:n] for x, n in zip(small.X, lengths, strict=True)], small.y)).X,
         )
-
-
-def written_text(path: Path) -> Path:
-    path.write_text("FZ_0,FZ_1,label")
-    return path
 
 
 REFUSED: dict[str, tuple[Callable[[Dataset, Path], Any], str]] = {
@@ -1136,10 +1131,10 @@ def test_an_archive_says_what_of_it_is_not_read_and_that_its_rate_is_unknown(
 
 
 ENCODINGS = {  # header and labels in other scripts, and the encoding
-    "cp932": ("時間(ms),荷重(N),判定", "合格", "不合格"),
-    "gb18030": ("时间(ms),力(N),结果", "合格", "不合格"),
-    "big5": ("時間(ms),力(N),結果", "合格", "不合格"),
-    "cp949": ("시간(ms),힘(N),판정", "합격", "불합격"),
+    "cp932": ("時間(ms),荷重(N),判定", "正常", "不正常"),
+    "gb18030": ("时间(ms),力(N),结果", "正常", "不正常"),
+    "big5": ("時間(ms),力(N),結果", "正常", "不正常"),
+    "cp949": ("시간(ms),힘(N),판정", "정상", "비정상"),
     "cp1251": ("Время(ms),Сила(N),Результат", "годен", "брак"),
 }
 
@@ -1295,7 +1290,7 @@ def test_a_folder_of_archives_one_for_each_part_is_read(
     X = small.X[:6]
     np.testing.assert_array_equal(data.X, np.stack([X, -X], axis=1) if form == "channels" else X)
     assert (data.y.tolist(), data.rate_hz, data.faults) == (small.y[:6].tolist(), 250.0, ())
-    assert data.unit == ("kN" if form == "one row" else "N")
+    assert data.unit == {"one row": "kN", "channels": ""}.get(form, "N")
 
 
 def test_an_archive_of_a_part_that_contradicts_its_name_is_a_fault(
@@ -2153,3 +2148,90 @@ def test_short_recordings_of_stopped_parts_are_kept_if_the_user_says_so(
     assert sorted(kept.lengths.tolist()) == [12, 20, *[50] * 12, 150]
     survey = document("data", tmp_path, "--fit", "pad-all")["survey"]
     assert (survey["good"], survey["bad"]) == (13, 2)
+
+
+def write_below(line: str, folder: Path, columns: str = "FX,FZ", step: int = 0) -> Path:
+    """Two recordings of 60 samples below a line; the first of two columns rises by `step`."""
+    folder.mkdir()
+    for name in ("a_OK.csv", "b_NOK.csv"):
+        rows = [f"{i * step},{np.sin(i):.3f}"[-6 if columns == "FZ" else 0 :] for i in range(60)]
+        rows = [row.strip(",") for row in rows]
+        (folder / name).write_text("\n".join([*filter(None, [line]), columns, *rows, ""]))
+    return folder
+
+
+RATES_ABOVE = {
+    **dict.fromkeys(("Sample rate: 500", "fs;500", "Rate: 500 Hz", "Abtastrate [kHz];0.5"), 500.0),
+    **dict.fromkeys(("Rate: 5", "Data rate: 115200", "Frequency: 50 Hz", "dt: 2", "rate = 2,5")),
+}
+
+
+@pytest.mark.parametrize("line", RATES_ABOVE)
+def test_a_line_states_the_rate_only_if_it_is_that_of_samples_else_it_is_offered(
+    line: str, tmp_path: Path
+) -> None:
+    folder = write_below(line, tmp_path / "cell")
+    data = load_dataset(folder, channel="FZ")
+    assert data.rate_hz == RATES_ABOVE[line]
+    offers = [as_options(note) for note in data.notes if f"A line says {line!r}" in note]
+    assert [("--rate-hz" in offer) for offer in offers] == ([True] if data.rate_hz is None else [])
+    lone = write_below(line, tmp_path / "lone", columns="FZ")
+    assert (load_dataset(lone).channels, load_dataset(lone).rate_hz) == (("FZ",), data.rate_hz)
+    stated = load_dataset(folder, channel="FZ", rate_hz=100.0)
+    assert not any("A line says" in note for note in stated.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_offered"),
+    [
+        ("i_ms", True),
+        ("n_us", True),
+        ("no_s", True),
+        ("Index", False),
+        ("sample_no", False),
+        ("Samples", False),
+        ("Nr.", False),
+        ("i2", False),
+        ("idx", False),
+        ("Counter", False),
+    ],
+)
+def test_a_column_that_counts_in_a_unit_of_time_is_offered_as_the_clock(
+    name: str, is_offered: bool, tmp_path: Path
+) -> None:
+    data = load_dataset(write_below("", tmp_path / "cell", f"{name},FZ", step=1), channel="FZ")
+    assert any(f"time={name!r}" in note for note in data.notes) is is_offered
+
+
+UNITS_BY_NAME = {
+    **dict.fromkeys(("Torque", "Drehmoment", "Md", "load_torque", "Moment_1", "Weg"), ""),
+    **dict.fromkeys(("FZ_Base", "force", "Kraft"), "N"),
+    **dict.fromkeys(("Mz", "MuX_Base"), "N·m"),
+}
+
+
+@pytest.mark.parametrize("name", UNITS_BY_NAME)
+def test_a_unit_that_nothing_states_is_unknown_unless_the_name_is_that_of_a_force(
+    name: str, small: Dataset, tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "a.npz", **{name: small.X, "y": small.y})
+    wide(small).rename(columns=lambda old: old.replace("FZ_", f"{name}_")).to_parquet(
+        tmp_path / "a.parquet"
+    )
+    unit = UNITS_BY_NAME[name]
+    for source in (tmp_path / "a.npz", tmp_path / "a.parquet"):
+        data = load_dataset(source, channel=name)
+        assert (data.unit, data.spec.unit) == (unit, unit or "units")
+        ends = f"{data.X[0, 0]:.6g} to {data.X[0, -1]:.6g} {unit}".strip()
+        assert f"{ends} in 50 samples" in data.reading["first"]
+        assert ("unit unknown" in line_of("data", source, "--channel", name)) is (unit == "")
+        assert load_dataset(source, channel=name, unit="N·cm").unit == "N·cm"
+
+
+def test_of_two_channels_each_has_its_own_unit_or_none(small: Dataset, tmp_path: Path) -> None:
+    X = np.stack([small.X, small.X], axis=1)
+    np.savez(tmp_path / "a.npz", X=X, y=small.y, channels=np.array(["FZ", "Torque"]))
+    data = load_dataset(tmp_path / "a.npz")
+    assert data.spec.unit == ("N", "units")
+    assert load_dataset(tmp_path / "a.npz", channel="Torque").spec.unit == "units"
+    assert load_dataset(tmp_path / "a.npz", unit="N, Nm").spec.unit == ("N", "Nm")
