@@ -55,17 +55,17 @@ def suffix_of(path: Path) -> str:
 def binary_kind(head: bytes) -> str:
     """Return what a file is that is no text and what to do, by its first bytes; "" for a text.
 
-    Zeros in every second byte are those of UTF-16.
+    Zeros in every second byte alone are those of UTF-16, and those at the end of a buffer's.
     """
     for first, (kind, do) in KINDS.items():
         if head.startswith(first):
             return f"{kind}; {do}"
-    n_zeros = max(head[::2].count(0), head[1::2].count(0))
-    has_zeros = b"\0" in head and head[:2] not in (b"\xff\xfe", b"\xfe\xff")
+    head = head.rstrip(b"\0")
+    fewer, more = sorted((head[::2].count(0), head[1::2].count(0)))
+    is_wide = head[:2] in (b"\xff\xfe", b"\xfe\xff") or (5 * more > len(head) > 50 * fewer)
     n_control = len(head) - len(head.translate(None, CONTROL))
-    if n_control > MOST_CONTROL * len(head) or (has_zeros and n_zeros < len(head) / 5):
-        return "a binary file of an unknown kind; export it as text"
-    return ""
+    is_text = is_wide or (n_control <= MOST_CONTROL * len(head) and b"\0" not in head)
+    return "" if is_text else "a binary file of an unknown kind; export it as text"
 
 
 def open_text(path: Path) -> IO[bytes]:

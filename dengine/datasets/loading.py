@@ -340,14 +340,15 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
     """
     label = label_column = options.label or "y"
     arrays, all_names = _read_archives(named, options)
+    stored, _ = _read_archives(named, options, every=True)
     if options.labels is not None:
         label = "y"
-        keys = _keys_of_traces(_read_archives(named, options, every=True)[0])
+        keys = _keys_of_traces(stored)
         label_words, label_column = read_ordered_labels(options.labels, options, keys)
         if label in arrays and options.label is None:
             _check_same_labels(arrays[label], label_words, label_column, options)
         arrays[label] = np.array(label_words)
-    arrays |= _arrays_by_meaning(named, arrays, label, options)
+    arrays |= _arrays_by_meaning(named, stored, arrays, label, options)
     channels = () if "X" in arrays else options.channels
     traces = channels or ("X",)
     if not {label, *traces} <= set(arrays):
@@ -413,7 +414,11 @@ def _refit_without_padding(data: Dataset, options: LoadOptions, *, has_unit: boo
 
 
 def _arrays_by_meaning(
-    named: Files, arrays: Mapping[str, NDArray[Any]], label: str, options: LoadOptions
+    named: Files,
+    stored: Mapping[str, NDArray[Any]],
+    arrays: Mapping[str, NDArray[Any]],
+    label: str,
+    options: LoadOptions,
 ) -> dict[str, NDArray[Any]]:
     """Return arrays that archives have under unusual names, each by its usual and its own name.
 
@@ -421,13 +426,12 @@ def _arrays_by_meaning(
     of times; `channels` and `unit`, arrays of texts as long as the axis of the channels; and `X`,
     if the user names channels of it. Empty without labels.
 
-    arrays : those that are there by the usual names. label : the array of labels.
+    stored : all arrays. arrays : those that are there by the usual names. label : that of labels.
     """
     import pandas as pd
 
     if label not in arrays:
         return {}
-    stored, _ = _read_archives(named, options, every=True)
     n = len(arrays[label])
     blocks = [key for key, x in stored.items() if x.ndim == 3]
     blocks = [key for key in ("X", *options.channels) if key in blocks] or blocks

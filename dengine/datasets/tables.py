@@ -212,16 +212,17 @@ def read_heads(named: Mapping[str, Path], options: LoadOptions) -> FolderHeads:
         _check_encoding(paths, options)
     except DataError as error:
         raise _with_label_error(error, partial(_check_words_in_names, named, options)) from error
-    sample = [_first_rows(path, options) for path in paths[:: max(len(paths) // TRIED, 1)]]
-    usual_header, _ = Counter(tuple(cells.header) for cells in sample).most_common(1)[0]
-    first = next(cells for cells in sample if tuple(cells.header) == usual_header)
+    step = max(len(paths) // TRIED, 1)
+    sample = {path: _first_rows(path, options) for path in paths[::step]}
+    usual_header, _ = Counter(tuple(cells.header) for cells in sample.values()).most_common(1)[0]
+    first = next(cells for cells in sample.values() if tuple(cells.header) == usual_header)
     heads = FolderHeads(first.header, Counter(), {}, list(first.fields))
     usual = _usual_label_columns(heads.label_places)
     for name in heads.label_places:
         if name not in usual and labels.is_verdict(name, _cells_of(first, name), options.words):
             heads.verdicts[name] = set()
     for path in paths:
-        cells = _first_rows(path, options)
+        cells = sample.get(path) or _first_rows(path, options)
         rows = list(cells.rows.values())
         heads.channel_choices[_columns_without_clock(cells.header, rows, options)] += 1
         for name in [name for name in heads.verdicts if {name} & {*cells.header, *cells.fields}]:
