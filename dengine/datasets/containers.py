@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
 
+from ..errors import instead
 from ..files import read_errors
 from .dataset import UnreadableError
 
@@ -41,6 +42,7 @@ KINDS = {
     b"%PDF": ("a PDF", "export the table as CSV"),
     b"PAR1": ("a Parquet file", "name it .parquet"),
 }
+LARGEST = 128 * 2**20  # bytes of one text file
 HEAD = 4096  # bytes that tell what a file is
 CONTROL = bytes({*range(1, 32)} - {*b"\t\n\v\f\r\x1a\x1b"})  # no text has many of these
 MOST_CONTROL = 0.02  # of the bytes of a text
@@ -87,6 +89,22 @@ def open_text(path: Path) -> IO[bytes]:
     return opened
 
 
+def read_content(path: Path) -> bytes:
+    """Return the bytes of a text file as `open_text` gives them.
+
+    Raises UnreadableError, also for more than 128 MB and a packed file that is damaged.
+    """
+    with (
+        instead(UnreadableError, "Cannot unpack it", EOFError, zlib.error),
+        open_text(path) as file,
+    ):
+        content = file.read(LARGEST + 1)
+    if len(content) > LARGEST:
+        wanted = f"at most {LARGEST // 2**20} MB"
+        raise UnreadableError(f"Expected {wanted}, got more; split it, or write Parquet")
+    return content
+
+
 def is_text(path: Path) -> bool:
     """Return whether a file can be read and is a text."""
     with suppress(OSError, EOFError, zlib.error, UnreadableError), open_text(path):
@@ -113,6 +131,8 @@ def read_frame(path: Path, content: bytes = b"") -> pd.DataFrame | None:
     elif suffix_of(path) in JSON:
         with read_errors(path, "a list of JSON objects"):
             frame = pd.DataFrame(_json_rows((content or path.read_bytes()).decode("utf-8-sig")))
+    if frame is not None and frame.empty:
+        raise UnreadableError("Expected columns and rows, it is empty")
     return None if frame is None else number_rows(frame)
 
 
@@ -130,7 +150,7 @@ def _json_rows(text: str) -> list[dict[str, Any]]:
             for name, value in rows.items()
         ]
         rows = lists[0] if len(lists) == 1 else named
-    if not rows or not all(isinstance(row, dict) for row in rows):
+    if not rows or not all(isinstance(row, dict) and row for row in rows):
         raise ValueError("it is none")
     return list(rows)
 

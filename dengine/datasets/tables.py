@@ -89,6 +89,7 @@ LIST_CELL = re.compile(r"[\[(]\s*[-+]?[\d.]+[\s,]")  # a list as text
 MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered ones
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 NEAR = 0.01  # of the largest number: numbers that differ by less are rounded in two ways
+FEW_LISTINGS = 5  # text files for each archive, as lists of its labels
 FEW_ROWS = 5  # a text file of as few tells of a recording, and is none
 HIDDEN = (".", "~$")  # begin the names of files that no user wrote, as Excel's locks
 TRIED = 20  # recordings, on which advice about a column is tried
@@ -108,12 +109,13 @@ SUFFIXES = (*TEXTS, *NO_TEXTS)
 def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     """Return the files of recordings in a folder and those inside it, by their path in it.
 
-    They are the Parquet and .npz files if there are any, else the text files of the most frequent
-    suffix; several suffixes if they are equally frequent. A suffix whose first file has at most
-    `FEW_ROWS` rows, as notes beside a recording have, counts only if all suffixes are like that.
-    One that is not in `SUFFIXES` counts if it is more frequent and its first file is a table of
-    numbers. `run_2.csv` comes before `run_10.csv`. Hidden files and the file of labels are left
-    out; names are those without .gz. Raises DataError if there is none.
+    They are the Parquet and .npz files, unless there are more than five times as many text files,
+    else the text files of the most frequent suffix; several suffixes if they are equally frequent.
+    A suffix whose first file has at most `FEW_ROWS` rows, as notes beside a recording have, counts
+    only if all suffixes are like that. One that is not in `SUFFIXES` counts if it is more frequent
+    and its first file is a table of numbers. `run_2.csv` comes before `run_10.csv`. Hidden files
+    and the file of labels are left out; names are those without .gz. Raises DataError if there is
+    none.
     """
     label_file = None if options.labels is None else Path(options.labels).resolve()
     paths = {
@@ -128,9 +130,11 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     }
     counts = Counter(map(suffix_of, named.values()))
     firsts = {suffix_of(path): path for path in named.values()}
-    chosen = [suffix for suffix in NO_TEXTS if suffix in counts]  # beside these, CSV lists labels
+    # Beside these, CSV files list labels, or one of these lists those of many CSV files.
+    most = max(counts[suffix] for suffix in TEXTS)
+    chosen = [suffix for suffix in NO_TEXTS if most <= FEW_LISTINGS * counts[suffix] > 0]
     if not chosen:
-        usual = [suffix for suffix in counts if suffix in SUFFIXES]
+        usual = [suffix for suffix in counts if suffix in TEXTS]
         heads = {suffix: _first_rows(firsts[suffix], options) for suffix in counts}
         # Files of a few lines beside each recording tell of it.
         tables = [suffix for suffix in usual if len(heads[suffix].rows) > FEW_ROWS]
@@ -561,10 +565,13 @@ def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOpt
     recordings. None if there is none.
     """
     stems = {path.stem.lower() for path in named.values()}
-    for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in TEXTS):
+    forms = (*TEXTS, *PARQUET, *JSON)
+    for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in forms):
         cells = _first_rows(path, LoadOptions())
         last_row = cells.rows[max(cells.rows)] if cells.rows else cells.header
         words = {word.lower().removesuffix(path.suffix) for word in last_row}
+        if path.suffix.lower() not in TEXTS:  # whose rows are no lines
+            words = stems - {path.stem.lower()} if path.stem.lower() not in stems else set()
         if words.isdisjoint(stems - {path.stem.lower()}):
             continue
         with suppress(DataError):
@@ -669,7 +676,7 @@ def _unread_files_note(folder: Path, named: Mapping[str, Path], options: LoadOpt
     tables = {
         other
         for other, path in firsts.items()
-        if other in TEXTS or (other not in JSON and _is_of_numbers(_first_rows(path, options)))
+        if other in SUFFIXES or (other not in JSON and _is_of_numbers(_first_rows(path, options)))
     }
     others = (path for path in paths if suffix_of(path) in tables)
     unread = sorted(path.name for path in others if path.resolve() != label_file)

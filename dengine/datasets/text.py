@@ -12,7 +12,6 @@ import itertools
 import json
 import os
 import re
-import zlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -22,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import excerpt, instead, listed
+from ..errors import excerpt, listed
 from ..traces import is_time_column
 from . import units
 from .clocks import (
@@ -45,7 +44,7 @@ from .clocks import (
     rising_columns,
     start_of,
 )
-from .containers import as_texts, open_text, read_frame
+from .containers import as_texts, read_content, read_frame
 from .dataset import Fault, LoadOptions, Reading, Recording, UnreadableError
 from .encodings import decode
 from .numerals import is_numeral, write_as_python
@@ -56,7 +55,6 @@ if TYPE_CHECKING:
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".lvm")
 BESIDE = (".txt", ".json", ".ini", ".yaml", ".yml", ".meta", ".info", ".log")
 SMALL = 2**14  # bytes of a file that tells of a recording
-LARGEST = 128 * 2**20  # bytes of one text file
 NUMBER_PREFIX = re.compile(r"\s*[+-]?\d*\.?\d*(?:(?<=\d)[eE][+-]?\d+)?")  # of a damaged number
 # Of equally good ones the first is taken. " ": any blanks; "": one column.
 DELIMITERS = ("\t", ";", "|", ",", " ", "")
@@ -618,16 +616,7 @@ def read_table(
 
     if (stored := read_frame(path)) is not None:
         return TextTable(as_texts(stored) if as_text else stored, [], 0, [], "")
-    with (
-        instead(UnreadableError, "Cannot unpack it", EOFError, zlib.error),
-        open_text(path) as file,
-    ):
-        content = file.read(LARGEST + 1)
-    if len(content) > LARGEST:
-        wanted = f"at most {LARGEST // 2**20} MB"
-        do = "split it, or write Parquet"
-        raise UnreadableError(f"Expected {wanted}, got {path.stat().st_size // 2**20} MB; {do}")
-    text, encoding = decode(content, options.encoding)
+    text, encoding = decode(read_content(path), options.encoding)
     cells = split_cells(text, options.columns)
     if not cells.header:
         raise UnreadableError("Expected a header and rows, it is empty")

@@ -146,3 +146,15 @@ def test_a_text_of_wide_characters_is_no_binary_file(encoding: str, tmp_path: Pa
         (tmp_path / name).write_bytes(content)
     data = load_dataset(tmp_path, channel="Сила", time="Время", encoding="cp1251")
     assert (len(data), data.faults) == (2, ())
+
+
+@pytest.mark.parametrize("name", ["labels.parquet", "labels.json"])
+def test_a_listing_in_the_folder_is_no_recording_and_the_error_says_to_give_it(
+    name: str, tmp_path: Path
+) -> None:
+    folder = write_recordings(tmp_path / "cell", with_labels=False)
+    LISTINGS[f"l{Path(name).suffix}"](folder / name)
+    with pytest.raises(DataError, match=f"{name} names files: give it, labels=") as caught:
+        load_dataset(folder)
+    path = str(caught.value).partition("labels='")[2].partition("'")[0]
+    assert load_dataset(folder, labels=path).y.tolist() == LABELS
