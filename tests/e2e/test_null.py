@@ -56,7 +56,7 @@ def test_labels_of_noise_yield_next_to_nothing_certain(
     name: str, make_data, proof_repeats: int
 ) -> None:
     recipe = RECIPES[name].with_policy(alpha=0.1, lower_bound=0.9)
-    recipe = recipe.with_settings(retrain_every=30)
+    recipe = recipe.with_settings(retrain_every=60)
     played = [
         replay(noise_labels(make_data, seed), recipe, seed=seed) for seed in range(proof_repeats)
     ]

@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import multiprocessing
 import os
 import re
 import signal
@@ -133,9 +134,11 @@ def test_it_ends_with_whoever_made_it_also_at_work(
 def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retrains_in_line(
     data: Dataset,
 ) -> None:
+    others = set(multiprocessing.active_children())
     with RetrainingProcess() as process:
         engine = DataEngine(recipe=replace(CONV, reducer="pca", params={}), executor=process)
-        os.kill(process.submit(os.getpid).result(300), signal.SIGKILL)
+        (killed,) = set(multiprocessing.active_children()) - others
+        os.kill(killed.pid, signal.SIGKILL)  # at once: to be ready takes it seconds
         with pytest.raises(BrokenExecutor):
             process.submit(os.getpid).result(300)
         learn_and_settle(engine, data)

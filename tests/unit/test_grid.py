@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joblib import parallel_config
 from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
@@ -128,8 +129,15 @@ def test_a_baseline_without_its_library_is_refused_before_anything_is_played(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_grid_is_the_same_in_other_processes(data: Dataset) -> None:
-    first, two = (run_grid(data, [RECIPE, "always"], **GRID, n_jobs=workers) for workers in (1, 2))
+# Processes import torch for seconds; `compare` on docs/howto/own_reducer.md starts some, too.
+@pytest.mark.parametrize(
+    "backend", ["threading", pytest.param("loky", marks=pytest.mark.merge, id="processes")]
+)
+def test_a_grid_is_the_same_on_other_backends(backend: str, data: Dataset) -> None:
+    with parallel_config(backend=backend):
+        first, two = (
+            run_grid(data, [RECIPE, "always"], **GRID, n_jobs=workers) for workers in (1, 2)
+        )
     assert first.drop(columns=TIMED).equals(two.drop(columns=TIMED))
 
 

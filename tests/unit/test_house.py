@@ -2,7 +2,6 @@
 
 import ast
 import re
-import subprocess
 import sys
 from collections.abc import Iterable
 from functools import cache
@@ -137,24 +136,6 @@ def test_tests_go_through_public_faces() -> None:
         for result in private.findall(file.read_text("utf-8"))
     }
     assert not result, f"say it by a public face, or leave it out: {', '.join(sorted(result))}"
-
-
-LOOK = """
-import sys
-import numpy as np
-from dengine import DataEngine, Recipe
-engine = DataEngine(recipe=Recipe("pca"))
-engine.decide(np.random.default_rng(0).normal(size=100))
-print(*sorted({name.partition(".")[0] for name in sys.modules}))
-"""
-HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "onnxruntime", "umap"}
-
-
-def test_an_engine_with_pca_in_memory_loads_nothing_heavy() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", LOOK], cwd=REPO, capture_output=True, text=True, check=True
-    )
-    assert HEAVY & set(done.stdout.split()) == set(), "import it in the function that uses it"
 
 
 def test_the_readme_shows_where_things_are() -> None:

@@ -209,9 +209,10 @@ def test_one_byte_changed_in_any_column_of_any_table_is_found(
     written: Path, tmp_path: Path
 ) -> None:
     rng, tried, missed = random.Random(0), 0, []
-    for table, column in changed_columns(written) * 3:
+    for table, column in changed_columns(written) * 2:
         file = Path(shutil.copy(written, tmp_path / "changed.db"))
         connection = sqlite3.connect(file)
+        connection.execute("PRAGMA synchronous = OFF")
         rows = connection.execute(
             f'SELECT rowid, "{column}" FROM {table} WHERE "{column}" IS NOT NULL'
         ).fetchall()
@@ -227,7 +228,7 @@ def test_one_byte_changed_in_any_column_of_any_table_is_found(
                 tried += 1
                 missed += [] if found_wrong(file) else [(table, column, value, new)]
         connection.close()
-    assert (missed, tried > 180) == ([], True)
+    assert (missed, tried > 120) == ([], True)
 
 
 @pytest.mark.parametrize("table", TABLES)

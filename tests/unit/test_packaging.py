@@ -88,19 +88,44 @@ def test_the_wheel_has_dengine_whole_and_no_other_top_level_name(wheel: Path, re
     assert f"dengine-{dengine.__version__}.dist-info/licenses/LICENSE" in names
 
 
-def test_the_wheel_works_where_there_is_no_checkout(
-    wheel: Path, repo: Path, tmp_path: Path
-) -> None:
-    target = tmp_path / "site"
+HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "onnxruntime", "umap"}
+USE = """
+import sys
+sys.path[:0] = [{target!r}, {dependencies!r}]  # no .pth files
+import dengine, numpy as np
+from dengine import DataEngine, Recipe, load_dataset, replay
+print(dengine.__file__)
+DataEngine(recipe=Recipe("pca")).decide(np.random.default_rng(0).normal(size=100))
+print(*{{name.partition(".")[0] for name in sys.modules}})
+data = load_dataset("insertion")
+print(len(data), data.X.shape[1])
+print(len(replay(data, "pca", cycles=60).action))
+"""
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("installed") / "site"
+
+
+@pytest.fixture(scope="module")
+def used(wheel: Path, target: Path) -> list[str]:
+    """The lines that `USE` prints of the installed wheel: one process for several claims."""
     zipfile.ZipFile(wheel).extractall(target)  # what installing a pure wheel with --target does
-    code = (
-        f"import sys; sys.path[:0] = [{str(target)!r}, {sysconfig.get_path('purelib')!r}]\n"  # dependencies, no .pth files
-        "import dengine; print(dengine.__file__)\n"
-        "from dengine import Recipe, load_dataset, replay\n"
-        "data = load_dataset('insertion'); print(len(data), data.X.shape[1])\n"
-        "print(len(replay(data, 'pca', cycles=60).action))"
-    )
-    where, size, played = fresh(code, "-I", "-S", cwd=tmp_path).splitlines()
+    code = USE.format(target=str(target), dependencies=sysconfig.get_path("purelib"))
+    return fresh(code, "-I", "-S", cwd=target.parent).splitlines()
+
+
+def test_the_wheel_works_where_there_is_no_checkout(
+    used: list[str], target: Path, repo: Path
+) -> None:
+    where, _, size, played = used
     assert Path(where).is_relative_to(target)
     assert not Path(where).is_relative_to(repo)
     assert (size, played) == ("1503 1000", "60")
+
+
+def test_an_engine_with_pca_in_memory_loads_nothing_heavy(used: list[str]) -> None:
+    loaded = {*used[1].split()}
+    assert {"dengine", "torch"} <= loaded
+    assert HEAVY & loaded == set(), "import it in the function that uses it"
