@@ -73,14 +73,40 @@ STEADY = 0.9  # of the steps of a steady column are within half of their median
 STATED_UNIT = re.compile(
     r"[\[({</]\s*(?P<n>\d*[.,]?\d+)?\s*(?P<unit>[a-zµμ]+)\s*[\])}>]?\s*$|\bin (?P<such>[a-zµμ]+)$"
 )
-DAY_FIRST = re.compile(r"^(\d\d?)\.(\d\d?)\.(\d{4})")  # a German date
+# The beginnings of the months' names in English, German, French, Italian and Spanish.
+MONTHS = (
+    *(
+        "jan gen ene",
+        "feb fév fev",
+        "mar mär mae mrz",
+        "apr avr abr",
+        "may mai mag",
+        "jun juin giu",
+    ),
+    *("jul juil lug", "aug aoû aou ago", "sep set", "oct okt ott", "nov", "dec dez dic déc"),
+)
+MONTH = f"(?:{'|'.join(' '.join(MONTHS).split())})[^\\W\\d_]{{0,6}}\\.?"
+# Dates as 11.03.2024 or 11.03.24, 11-Mar-24 or 11. März 2024, and Mar 11, 2024.
+DAY_FIRST = tuple(
+    re.compile(form, re.IGNORECASE)
+    for form in (
+        r"^(?P<day>\d\d?)\.(?P<month>\d\d?)\.(?P<year>\d{4}|\d\d(?!\d))",
+        rf"^(?P<day>\d\d?)[-./ ]+(?P<month>{MONTH})[-./, ]+(?P<year>\d{{4}}|\d\d(?!\d))",
+        rf"^(?P<month>{MONTH}) (?P<day>\d\d?)[.,]? (?P<year>\d{{4}})",
+    )
+)
 SLASHED_DATE = re.compile(r"^(\d\d?)/(\d\d?)/(\d{4})")
 ANY_ORDER = "dates, day or month first"  # the form of a clock where nothing tells which it is
 TIME_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
-DATE_FORM = r"\d{4}-?\d\d-?\d\d|\d{4}/\d\d?/\d\d?|\d\d?[./]\d\d?[./]\d{2,4}"
+WORD_DATE = (
+    rf"\d\d?[-./ ]+(?i:{MONTH})[-./, ]+(?:\d\d){{1,2}}|(?i:{MONTH}) \d\d?[.,]? \d{{4}}"  # 11-Mar-24
+)
+DATE_FORM = rf"\d{{4}}-?\d\d-?\d\d|\d{{4}}/\d\d?/\d\d?|\d\d?[./]\d\d?[./]\d{{2,4}}|{WORD_DATE}"
 TIME_FORM = r"\d{1,2}:?\d\d(:?\d\d([.,]\d+)?)?\s*(Z|UTC|AM|PM|[+\-−]\d\d(:?\d\d)?)?"
 # Two columns of which one is the date of the other's time of day.
-DATE = re.compile(r"(19|20)\d\d([-/.]?)[01]?\d\2[0-3]?\d|[0-3]?\d[./-][01]?\d[./-](19|20)?\d\d")
+DATE = re.compile(
+    r"(19|20)\d\d([-/.]?)[01]?\d\2[0-3]?\d|[0-3]?\d[./-][01]?\d[./-](19|20)?\d\d|" + WORD_DATE
+)
 DAY_TIME = re.compile(r"\d{1,2}:\d\d:\d\d(?P<fraction>[.,]\d+)?( ?[AaPp][Mm])?")
 TIMESTAMP = re.compile(
     rf"({DATE_FORM})([T ]\s*{TIME_FORM})?|\d{{1,2}}:\d\d(:\d\d)?([.,]\d+)?", re.IGNORECASE
@@ -98,12 +124,15 @@ class Clock(NamedTuple):
         What was assumed and users should know; "" where name and unit say it all.
     form : str
         Its unit or form in words, as "ms" or "dates".
+    is_continued : bool
+        Whether it counts from 0 again, and its times go on there.
     """
 
     name: str
     seconds: NDArray[np.float64]
     note: str
     form: str
+    is_continued: bool = False
 
 
 def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
@@ -307,7 +336,8 @@ def clock_of(
         raise UnreadableError(f"Expected {wanted}, got {actual}; {do}", wrong[0])
     if time is None and not is_time_column(name):
         form = f"{form}, column {place + 1} by its values"
-    return Clock(name, seconds, note, form)
+    goes_back = bool((np.diff(floats(column)[0]) < 0).any())
+    return Clock(name, seconds, note, form, goes_back and not (np.diff(seconds) < 0).any())
 
 
 def _join_seconds(frame: pd.DataFrame, name: str) -> NDArray[np.float64] | None:
@@ -421,8 +451,8 @@ def start_of(column: pd.Series) -> float | None:
 def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return seconds since the first time of a column, shape (n,), and which cells are no time.
 
-    Times are ISO 8601, dates as 02.03.2026 or 3/2/2026 with or without a time, or times of day.
-    Of 3/2/2026 the first number is the month, unless `_date_order` tells that it is the day.
+    Times are ISO 8601, dates as 02.03.2026, 2-Mar-26 or 3/2/2026 with or without a time, or times
+    of day. Of 3/2/2026 the first number is the month, unless `_date_order` says that it is the day.
     """
     import pandas as pd
 
@@ -439,9 +469,8 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
             text = text.where(text.str.count(":") > 1, "00:" + text)
             stamps = pd.to_timedelta(text, errors="coerce")
         else:
-            text = text.str.replace(
-                DAY_FIRST, lambda m: f"{m[3]}-{m[2]:0>2}-{m[1]:0>2}", regex=True
-            )
+            for date_form in DAY_FIRST:
+                text = text.str.replace(date_form, _iso_date, regex=True)
             day, month = (1, 2) if _date_order(as_written) == "day" else (2, 1)
             text = text.str.replace(
                 SLASHED_DATE, lambda m: f"{m[3]}-{m[month]:0>2}-{m[day]:0>2}", regex=True
@@ -455,6 +484,15 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
         return np.full(len(column), np.nan), missing
     elapsed = (stamps - valid.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
     return (_unwrap(elapsed, DAY) if stamps.dtype.kind == "m" else elapsed), missing
+
+
+def _iso_date(match: re.Match[str]) -> str:
+    """Return a date as 2024-03-11; a year of two digits is one since 2000."""
+    word = match["month"].lower()
+    months = {begin: n for n, begins in enumerate(MONTHS, start=1) for begin in begins.split()}
+    month = next((n for begin, n in months.items() if word.startswith(begin)), word)
+    century = "20" if len(match["year"]) == 2 else ""
+    return f"{century}{match['year']}-{month:0>2}-{match['day']:0>2}"
 
 
 def _date_order(text: pd.Series) -> str:

@@ -130,7 +130,8 @@ def read_frame(path: Path, content: bytes = b"") -> pd.DataFrame | None:
             frame = frame.reset_index()
     elif suffix_of(path) in JSON:
         with read_errors(path, "a list of JSON objects"):
-            frame = pd.DataFrame(_json_rows((content or path.read_bytes()).decode("utf-8-sig")))
+            rows = _json_rows((content or path.read_bytes()).decode("utf-8-sig"))
+            frame = pd.json_normalize(rows)
     if frame is not None and frame.empty:
         raise UnreadableError("Expected columns and rows, it is empty")
     return None if frame is None else number_rows(frame)

@@ -27,7 +27,7 @@ from . import units
 from .archives import hold_one_each, read_archive_each
 from .bags import is_stream, read_bag
 from .clocks import RATE_NAMES, STEP_NAMES, clock_of, rate_of
-from .containers import HEAD, NPZ, PARQUET, binary_kind, is_text, suffix_of
+from .containers import HEAD, JSON, NPZ, PARQUET, binary_kind, is_text, suffix_of
 from .dataset import (
     UNKNOWN_RATE,
     Dataset,
@@ -75,9 +75,9 @@ TEXT_FORMAT = ("columns", "decimal", "thousands", "encoding")
 # What `dengine simulate` writes beside them, for `experiments`.
 SIMULATED = ("height_mm", "cycle", "conditions", "condition_names", "seed", "scenario", "simulated")
 Files = Mapping[str, Path]
-TABLES = (*TEXTS, *PARQUET)
+TABLES = (*TEXTS, *JSON, *PARQUET)
 MIN_PADDING = 5  # zeros at the end of a trace that are no measurement
-FORMS = ".npz, .csv, .tsv, .txt, .dat, .parquet or .mcap"
+FORMS = ".npz, .csv, .tsv, .txt, .dat, .json, .jsonl, .parquet or .mcap"
 
 
 def load_dataset(

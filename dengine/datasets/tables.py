@@ -29,6 +29,7 @@ from .clocks import (
     ANY_ORDER,
     HEAD,
     MAX_GAP,
+    NO_CLOCK,
     clock_of,
     floats,
     holds_dates,
@@ -47,6 +48,7 @@ from .containers import (
     open_text,
     suffix_of,
 )
+from .curves import expand_curves
 from .dataset import (
     MAX_LABEL_WORDS,
     Dataset,
@@ -66,7 +68,9 @@ from .text import SUFFIXES as TEXTS
 from .text import (
     TextCells,
     TextTable,
+    cut_note,
     fields_beside,
+    is_mostly_numbers,
     parse_numbers,
     read_recording,
     read_table,
@@ -84,6 +88,7 @@ NUMBER_FIRST = re.compile(
 )  # s000_fz
 # Added to a long table; no file has these names.
 SECONDS_COLUMN = "\0seconds"
+ROW_COLUMN = "\0row"  # number of the row, in place of the times that the user does not trust
 RUN_COLUMN = "\0run"  # number of the rows of a part that stand together and in the order of time
 LIST_CELL = re.compile(r"[\[(]\s*[-+]?[\d.]+[\s,]")  # a list as text
 MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered ones
@@ -764,6 +769,7 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
             raise DataError(f"Expected rows that can be read in {path}, found none.")
         collector.faults += [replace(fault, source=source) for fault in table.faults]
         tables[source] = table
+        collector.notes.update(table.notes)
         others = (str(other) for other in path.parent.glob("*.csv") if other not in named.values())
         collector.label_file = next(others, collector.label_file)
     first = next(iter(tables))
@@ -797,6 +803,7 @@ def _from_tables(
 
     tables : by the names of their files, or "row" for a DataFrame; the index is the line.
     """
+    tables, options = _with_samples_in_columns(tables, options, collector)
     turned = {source: _turned(table, options) for source, table in tables.items()}
     if any(table is not tables[source] for source, table in turned.items()):
         tables = turned
@@ -813,6 +820,10 @@ def _from_tables(
                 do = f"; if a file is one recording, name its label's column: label={constant[0]!r}"
             raise DataError(f"Expected {wanted}, only one of them has {differing}{do}.")
     if options.time is not None or options.labels is not None:
+        cut_lines = {(source, table.cut_line) for source, table in tables.items()}
+        cut = [fault for fault in collector.faults if (fault.source, fault.line) in cut_lines]
+        collector.faults = [fault for fault in collector.faults if fault not in cut]
+        collector.notes.update(map(cut_note, cut))
         frame, is_repeated = _concatenate_long(frames, options)
         return _from_long(frame, is_repeated, options, collector, first, tables[first])
     if advice := _long_table_advice(frames[first], options, collector.label_file):
@@ -822,6 +833,34 @@ def _from_tables(
     for source, table in tables.items():
         _add_wide_rows(table, options, collector, source)
     return as_dataset(collector, options)
+
+
+def _with_samples_in_columns(
+    tables: Mapping[str, TextTable], options: LoadOptions, collector: RecordingCollector
+) -> tuple[Mapping[str, TextTable], LoadOptions]:
+    """Return tables with a column for each sample where a cell holds a curve, and their options.
+
+    Raises DataError if the clocks of the curves contradict them or each other.
+    """
+    result = dict[str, TextTable]()
+    for source, table in tables.items():
+        try:
+            frame, rate, name, unread = expand_curves(table.frame, options)
+        except UnreadableError as error:
+            raise DataError(f"Cannot read {Fault(source, error.line, str(error))}.") from error
+        if frame is table.frame:
+            return tables, options
+        if options.labels is not None:
+            wanted = f"a column of labels beside the curves in the cells of {source}"
+            raise DataError(f"Expected {wanted}, got a file of labels; join it to the table.")
+        if unread:
+            collector.notes[f"Not read: the columns {listed(unread)}"] = 1
+        if rate is not None:
+            clock = f"column {name}, in which each cell has all times"
+            table = table._replace(rate_hz=rate, clock=clock)
+        numbers = table.numbers.replace("whole numbers", "curves in cells")
+        result[source] = table._replace(frame=frame, units=[], numbers=numbers)
+    return result, replace(options, time=None)
 
 
 def _turned(table: TextTable, options: LoadOptions) -> TextTable:
@@ -928,7 +967,7 @@ def _add_wide_rows(
     others = [name for name in frame.columns if name not in (*label_columns, options.part)]
     columns = _sample_columns(others, options)
     all_columns = [name for names in columns.values() for name in names]
-    values, wrong = parse_numbers(frame[all_columns])
+    values, wrong, _ = parse_numbers(frame[all_columns])
     traces = values.reshape(len(frame), len(columns), -1)
     collector.channels = tuple(filter(None, columns))
     _check_single_signal(frame, others, options)
@@ -938,6 +977,8 @@ def _add_wide_rows(
     label_cells = [
         labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
     ]
+    unit_of = dict(zip(frame.columns, table.units, strict=False))
+    channel_units = tuple(_unit_of_columns(*item, unit_of) for item in columns.items())
     do = f"name the column to trust: label={label_column!r}"
     rate = None if options.rate_hz else table.rate_hz
     if table.offer and not options.rate_hz:
@@ -961,6 +1002,7 @@ def _add_wide_rows(
         return Recording(
             without_trailing_nan(trace),
             rate,
+            channel_units,
             reading=reading,
             label=label.label,
             source=f"{source}, line {line}",
@@ -970,6 +1012,19 @@ def _add_wide_rows(
     words = zip(*(frame[name].tolist() for name in label_columns), strict=True)
     for row in zip(frame.index, traces, words, parts, strict=True):
         collector.add(source, partial(read, *row), row[0])
+
+
+def _unit_of_columns(channel: str, names: Sequence[str], unit_of: Mapping[str, str]) -> str:
+    """Return the unit of a wide table's channel, by its columns or its name; "" without one.
+
+    Raises DataError if its columns have several.
+    """
+    first_column = {unit_of.get(name, ""): name for name in reversed(names)}
+    if len(first_column) > 1:
+        actual = ", ".join(f"{name} in {unit or 'none'}" for unit, name in first_column.items())
+        do = "export the table in one unit"
+        raise DataError(f"Expected one unit of the columns of {channel}, got {actual}; {do}.")
+    return next(iter(first_column)) or units.split(channel)[1]
 
 
 def _describe_column(frame: pd.DataFrame, name: str) -> str:
@@ -991,7 +1046,7 @@ def _check_single_signal(frame: pd.DataFrame, names: Sequence[str], options: Loa
         return
     for name in names:
         texts = frame[name].nunique()
-        if not 2 <= texts <= MAX_STATIONS or not floats(frame[name])[1]:
+        if not 2 <= texts <= MAX_STATIONS or is_mostly_numbers(frame[name]):
             continue
         counts = frame.groupby(options.part)[name].agg(["nunique", "size"])
         if (counts == texts).all(axis=None):
@@ -1067,13 +1122,9 @@ def _from_long(
     first : the first of the tables that `frame` is of, for the units of columns.
     """
     column_units = dict(zip(first.frame.columns, first.units, strict=False))
-    time = _time_column(frame, options)
-    for name in (options.part, time):
-        if name not in frame:
-            wanted = f"a row a sample in {source}, with columns of parts (part) and times (time)"
-            names = _long_table_advice(frame, options, collector.label_file)
-            advice = f"; name {names}" if names else ""
-            raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
+    frame, time = _with_times(frame, options, collector.label_file, source)
+    if time != ROW_COLUMN:
+        options = replace(options, time=time)
     label = None if options.labels is not None else _label_column(frame, options)
     label_columns = [*([label] if label else []), *_compared_columns(frame, label, options)]
     all_rows = {str(part): rows for part, rows in frame.groupby(options.part, sort=False)}
@@ -1099,9 +1150,9 @@ def _from_long(
         """Return the rows of a part as a trace, in the order of their times."""
         rows = rows.sort_values(SECONDS_COLUMN, kind="stable")
         start = float(rows[SECONDS_COLUMN].iloc[0])
-        rows = rows.drop(columns=[SECONDS_COLUMN, RUN_COLUMN])
+        rows = rows.drop(columns=[SECONDS_COLUMN, RUN_COLUMN, ROW_COLUMN], errors="ignore")
         units_row = [column_units.get(name, "") for name in rows.columns]
-        timed = rows_to_trace(rows, places, replace(options, time=time), collector.notes, units_row)
+        timed = rows_to_trace(rows, places, options, collector.notes, units_row)
         channel_units = (
             column_units.get(name) or units.split(name)[1] for name in collector.channels
         )
@@ -1112,6 +1163,25 @@ def _from_long(
     labels.collect_recordings(rows_of_part, read, label_source, collector)
     collector.order_by_start(apart=True, has_dates=has_dates)
     return as_dataset(collector, options)
+
+
+def _with_times(
+    frame: pd.DataFrame, options: LoadOptions, label_file: str, source: str
+) -> tuple[pd.DataFrame, str]:
+    """Return a long table and its column of times; the numbers of its rows if the user trusts none.
+
+    Raises DataError if the column of parts or of times is not found.
+    """
+    time = _time_column(frame, options)
+    if time == NO_CLOCK and time not in frame:
+        time = ROW_COLUMN
+        frame = frame.assign(**{time: np.arange(len(frame))})
+    if options.part not in frame or time not in frame:
+        wanted = f"a row a sample in {source}, with columns of parts (part) and times (time)"
+        names = _long_table_advice(frame, options, label_file)
+        advice = f"; name {names}" if names else ""
+        raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
+    return frame, time
 
 
 def _times_of_long(
@@ -1141,7 +1211,7 @@ def _channels_of_long(
     """
     named = filter(None, names)
     try:
-        return choose_channels([name for name in named if not floats(frame[name])[1]], options)
+        return choose_channels([name for name in named if is_mostly_numbers(frame[name])], options)
     except DataError as error:
         raise _with_label_error(error, check_labels) from error
 
@@ -1342,7 +1412,7 @@ def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -
     if not frame.duplicated(keys[:2]).any():
         return frame
     others = [name for name in frame if name not in keys]
-    texts = [name for name in others if floats(frame[name])[1]]
+    texts = [name for name in others if not is_mostly_numbers(frame[name])]
     tags = [
         name
         for name in texts
@@ -1350,18 +1420,20 @@ def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -
     ]
     if not tags:
         return frame
-    tag = tags[0]
-    # A column that is constant for each signal, as InfluxDB's number of its table, has no samples.
-    is_constant = frame.groupby(tag)[others].nunique().max() <= 1
-    values = [name for name in others if name not in texts and not is_constant[name]]
+    channels = set(options.channels)
+    tag = next((name for name in tags if channels <= {*frame[name]}), tags[0])
+    signals = frame[tag].unique().tolist()
+    is_named = bool(channels) and channels <= set(signals)
+    rows = frame[frame[tag].isin(channels)] if is_named else frame
+    # A column that is constant in each curve, as InfluxDB's number of its table, has no samples.
+    is_constant = rows.groupby([tag, keys[0]])[others].nunique().max() <= 1
+    values = [name for name in others if not is_constant[name] and is_mostly_numbers(rows[name])]
     if len(values) != 1:
         return frame
-    signals = frame[tag].unique().tolist()
-    if not options.channels or not set(options.channels) <= set(signals):
+    if not is_named:
         have = f"{listed(signals)}, as column {tag} calls them"
         wanted = f"the channel to be named, as in channel={signals[0]!r}"
         raise DataError(f"Expected {wanted}; there are {have}.")
-    rows = frame[frame[tag].isin(options.channels)]
     # pivot_table would average.
     wide = rows.pivot(index=keys, columns=tag, values=values[0])  # noqa: PD010
     # A pivot sorts S10 before S9: restore the order of the parts.
@@ -1420,7 +1492,9 @@ def _long_table_advice(frame: pd.DataFrame, options: LoadOptions, label_file: st
 
 def _channel_hint(names: Sequence[str], frame: pd.DataFrame, options: LoadOptions) -> list[str]:
     """Return a hint to name the channel, in a list, if several columns may be it; else none."""
-    numeric = [name for name in names if not floats(frame[name])[1]]
+    numeric = [name for name in filter(None, names) if is_mostly_numbers(frame[name])]
+    if "_field" in frame:  # InfluxDB's, of the signals
+        numeric = list(map(str, frame["_field"].unique()))
     if options.channels or FORCE in numeric or len(numeric) < 2:
         return []
     return [f"channel={_likely_channel(numeric)!r}"]

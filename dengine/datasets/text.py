@@ -26,7 +26,9 @@ from ..traces import is_time_column
 from . import units
 from .clocks import (
     EMPTY_CELLS,
+    MAX_MISSING,
     TIMESTAMP,
+    WORD_DATE,
     Clock,
     check_even,
     check_rows,
@@ -45,6 +47,7 @@ from .clocks import (
     start_of,
 )
 from .containers import as_texts, read_content, read_frame
+from .curves import IN_LINE, UNQUOTED, write_curves
 from .dataset import Fault, LoadOptions, Reading, Recording, UnreadableError
 from .encodings import decode
 from .numerals import is_numeral, write_as_python
@@ -71,6 +74,7 @@ FIELD_MARK = re.compile(r"\s*[:;=\t,|]\s*")  # the first of them stands before t
 CELL_MARK = re.compile(r"[;,\t|]")
 ROW_COUNT = re.compile(r"\(\d+ [^\W\d].*\)")  # what a database's client writes below a table
 LABVIEW_END = "***End_of_Header***"
+INFLUX_COLUMNS = {"result", "table"}  # in the header of each of InfluxDB's tables
 COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
 RATE_ABOVE = "none, a line above the header states the rate"
 COUNTER_NAME = re.compile(
@@ -78,12 +82,18 @@ COUNTER_NAME = re.compile(
     r"([se]|er|[ _-]?(no|nr|id|idx|number|\d{1,3}))?\.?",
     re.IGNORECASE,
 )
+# In it no delimiter is looked for.
+ONE_CELL = re.compile(rf"{IN_LINE}|(?:{WORD_DATE})(?: +\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?)?")
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 # A cell of a row of units, beside the units that `units.parse` knows.
 UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")
 NUMBER_AND_UNIT = re.compile(
     r"(?P<number>[-+−]?\d[\d.,]*([eE][-+]?\d+)?) *(?P<unit>[^\W\d][^\d:,;]*)"
 )
+# What stands where there is no number, as Bad Input, #N/A or C's 1.#QNAN: it has no digit, or a
+# word before its first one, but for a code in brackets. A damaged number, as 12x5, is none.
+STATUS = re.compile(r"\s*(?:\D+|\D*[^\W\d]{2}.*|\[-?\d+\] *[^\W\d]{2}.*|-?1\.#[A-Z]+)")
+MOST = 0.8  # of a column's cells are numbers: the others are lost samples
 # How a row of units states times of day: hh:mm:ss, HH:MM:SS.fff or mm:ss,0.
 TIME_FORMAT = re.compile(r"(h{1,2}:)?m{1,2}:s{1,2}([.,:](f+|s+|m+|z+|x+|0+))?", re.IGNORECASE)
 
@@ -141,6 +151,10 @@ class TextTable(NamedTuple):
         A note on a line above the header that may state the rate; "" for none.
     clock : str
         What tells the rate, as in `Reading`.
+    notes : tuple of str
+        What users should know, as of units that were converted.
+    cut_line : int
+        Line of the last row if it is cut off, which is among the faults; 0 for none.
     """
 
     frame: pd.DataFrame
@@ -154,6 +168,8 @@ class TextTable(NamedTuple):
     rate_hz: float | None = None
     offer: str = ""
     clock: str = RATE_ABOVE
+    notes: tuple[str, ...] = ()
+    cut_line: int = 0
 
 
 def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
@@ -168,6 +184,9 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
     lines = {i: line for i, line in enumerate(text.splitlines(), start=1) if line.strip()}
     end = max((i for i, line in lines.items() if line.startswith(LABVIEW_END)), default=0)
     lines = {i: line for i, line in lines.items() if i > end}
+    lines = {
+        i: UNQUOTED.sub(r'"\g<0>"', line) if "[" in line else line for i, line in lines.items()
+    }
     stated = DELIMITER_LINE.fullmatch(next(iter(lines.values()), "").strip())
     if stated:
         del lines[min(lines)]
@@ -176,7 +195,7 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
         split = {i: _split_line(line, delimiter) for i, line in lines.items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
-    rows = {i: row for i, row in split.items() if any(row)}
+    rows = _under_one_header({i: row for i, row in split.items() if any(row)})
     if _is_horizontal(rows.values()):
         rows = dict(enumerate(map(list, zip(*rows.values(), strict=True)), start=1))
     cells = _find_header(_names_and_units_of_keys(rows), delimiter, list(columns))
@@ -187,6 +206,25 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
     return cells._replace(
         rows=kept, fields=_fields_in(outside), n_remarks=cells.n_remarks + len(remarks)
     )
+
+
+def _under_one_header(rows: dict[int, list[str]]) -> dict[int, list[str]]:
+    """Return the rows of InfluxDB's tables, one below the other, with the columns of all of them.
+
+    Each has a header with the columns result and table. Other rows, and those of tables with equal
+    headers, are returned as they are.
+    """
+    headers = [row for row in rows.values() if {*row} >= INFLUX_COLUMNS]
+    names = list(dict.fromkeys(name for header in headers for name in header))
+    if all(header == names for header in headers):
+        return rows
+    united = dict[int, list[str]]()
+    header = headers[0]
+    for i, row in rows.items():
+        header = row if row in headers else header
+        cells = dict(zip(header, row, strict=False))
+        united[i] = names if row is header else [cells.get(name, "") for name in names]
+    return united
 
 
 def _is_horizontal(rows: Collection[Sequence[str]]) -> bool:
@@ -315,8 +353,11 @@ def _find_delimiter(lines: Sequence[str]) -> str:
     and a header with as many. Without such cells it is the first that splits most lines, of tab,
     semicolon, bar and comma; "," if none does.
     """
-    sample = [units.COMMENT_MARK.sub("", line) for line in lines[-SAMPLED_LINES:]]
-    top = [units.COMMENT_MARK.sub("", line) for line in lines[:-1][:100]]
+    plain = [units.COMMENT_MARK.sub("", ONE_CELL.sub("0", line)) for line in lines[:100]]
+    top = plain[: len(lines) - 1]
+    sample = [
+        units.COMMENT_MARK.sub("", ONE_CELL.sub("0", line)) for line in lines[-SAMPLED_LINES:]
+    ]
 
     def score(delimiter: str) -> float:
         """Return how well a delimiter splits the lines, from 0 to 1."""
@@ -329,7 +370,7 @@ def _find_delimiter(lines: Sequence[str]) -> str:
         # The rows of data alone may end in a delimiter.
         n_names = width if rows[0][-1:] != [""] else width - 1
         cells = [cell for row in rows if len(row) == width for cell in row[:SAMPLED_CELLS]]
-        n_values = sum(map(_is_value, cells))
+        n_values = sum(_is_value(cell) or _has_unit(cell) for cell in cells)
         headers = (_without_trailing_empty(_split_line(line, delimiter)) for line in top)
         has_header = any(
             2 * sum(map(_is_value, row[:SAMPLED_CELLS])) <= min(len(row), SAMPLED_CELLS)
@@ -352,6 +393,12 @@ def _find_delimiter(lines: Sequence[str]) -> str:
 def _ends_in_comment(names: Sequence[str]) -> bool:
     """Return whether the last name of a header is that of a column of comments."""
     return bool(names) and names[-1].lower() in COMMENT_COLUMNS
+
+
+def _has_unit(cell: str) -> bool:
+    """Return whether a cell is a number with a known unit, as 56.5 N."""
+    match = NUMBER_AND_UNIT.fullmatch(cell)
+    return match is not None and units.parse(match["unit"]) is not None
 
 
 def _is_value(cell: str) -> bool:
@@ -631,41 +678,52 @@ def read_table(
         for i, row in cells.rows.items()
         if i not in complete
     }
-    if text[-1:] != "\n" and _is_last_number_cut([row[-1] for row in complete.values()]):
-        wrong[max(complete)] = "Expected as many decimals as above, the last number is cut off"
+    cut_line = _find_cut_row(text, cells, complete, wrong)
     frame = pd.DataFrame(
         list(complete.values()), index=list(complete), columns=header, dtype=object
     )
     mark = numbers = ""
+    notes: tuple[str, ...] = ()
     if not as_text:
         decimal = options.decimal or decimal
-        cell_units = _take_units_off(frame)
+        write_curves(frame)
+        cell_units = _take_units_off(frame, options)
         mark, group, odd_cells = write_as_python(frame, cells.delimiter, decimal, options.thousands)
         wrong |= odd_cells
+        units_text, notes = _convert_cells(frame, cell_units, cells.units)
         parts = (
             f"decimal mark {mark!r}" if mark else "whole numbers",
             f"thousands mark {group!r}" if group else "",
             f"{cells.delimiter!r} between cells" if cells.delimiter else "",
             "" if encoding == "utf-8-sig" else encoding,
-            _convert_cells(frame, cell_units, cells.units),
+            units_text,
         )
         numbers = ", ".join(filter(None, parts))
         join_date_and_time(frame)
     faults = [Fault(path.name, i, message) for i, message in sorted(wrong.items())]
     frame = frame.drop(index=[i for i in wrong if i in complete])
     column_units = cells.units[:n]
+    _add_stated_units(column_units, header, _lines_above(text, cells.line))
+    rate_and_offer = rate_in_preamble(_lines_above(text, min(cells.rows, default=1)))
+    about = (cells.fields, cells.n_remarks, *rate_and_offer, RATE_ABOVE, notes)
+    return TextTable(*(frame, faults, cells.line, column_units, mark, numbers, *about), cut_line)
+
+
+def _lines_above(text: str, line: int) -> str:
+    """Return the lines of a text above a line, from 1; "" for line 0."""
+    return "\n".join(text.splitlines()[: max(line - 1, 0)])
+
+
+def _add_stated_units(column_units: list[str], header: Sequence[str], preamble: str) -> None:
+    """Set the units that the text above a header states, in place, for columns without one."""
     without = [
         i
         for i, name in enumerate(header)
         if not (column_units[i] or units.split(name)[1] or is_time_column(name))
     ]
-    preamble = "\n".join(text.splitlines()[: max(cells.line - 1, 0)])
     stated = units.stated_in_preamble(preamble, header, without)
     for i, unit in zip(without, stated, strict=True):
         column_units[i] = unit
-    head = "\n".join(text.splitlines()[: min(cells.rows, default=1) - 1])
-    about = (cells.fields, cells.n_remarks, *rate_in_preamble(head))
-    return TextTable(frame, faults, cells.line, column_units, mark, numbers, *about)
 
 
 def _pad_rows(rows: dict[int, list[str]], n: int) -> dict[int, list[str]]:
@@ -680,44 +738,73 @@ def _pad_rows(rows: dict[int, list[str]], n: int) -> dict[int, list[str]]:
     return {i: row + padding if len(row) == width else row for i, row in rows.items()}
 
 
-def _take_units_off(frame: pd.DataFrame) -> dict[int, list[str]]:
+def _take_units_off(frame: pd.DataFrame, options: LoadOptions) -> dict[int, list[str]]:
     """Remove the units in a table's cells, as of `56.5 N`, in place.
 
-    Only columns are changed whose cells are all empty, or a number, a blank and a known unit, all
-    units of one dimension. Returns, by the position of the column, the unit of each cell in its
-    usual spelling, "" for an empty cell.
+    A column is changed if 80 % of its filled cells are a number with a known unit. A unit that no
+    blank parts from the number counts only in a column with decimals: 0001A is a part's number.
+    Returns, by the position of the column, the unit of each cell in its usual spelling, "" for one
+    without. Raises UnreadableError, with the line, if the units of a column are of several
+    dimensions, or a fifth of the numbers has a unit and others have none. The columns of parts and
+    labels, and those that are not among the stated channels, are then left as they are.
     """
     cell_units = dict[int, list[str]]()
-    for i in range(frame.shape[1]):
+    for i, name in enumerate(frame.columns):
         cells = frame.iloc[:, i].tolist()
-        if not NUMBER_AND_UNIT.fullmatch(next(filter(None, cells), "")):
+        sample = cells[:: max(1, len(cells) // SAMPLED_CELLS)]
+        if not any(map(NUMBER_AND_UNIT.fullmatch, sample)):
             continue
         matches = [NUMBER_AND_UNIT.fullmatch(cell) for cell in cells]
-        column = [units.spelling(match["unit"]) if match else "" for match in matches]
-        parsed = [units.parse(unit) for unit in column if unit]
-        dimensions = {dimension for dimension, _ in filter(None, parsed)}
-        # Without a blank it may be a part's number, as 0001A.
-        is_whole = all(
-            (match and " " in cell) or not cell for match, cell in zip(matches, cells, strict=True)
+        column = [units.spelling(match["unit"].strip()) if match else "" for match in matches]
+        column = [unit if units.parse(unit) else "" for unit in column]
+        has_decimals = any(
+            unit and set(".,") & {*cell} for unit, cell in zip(column, cells, strict=True)
         )
-        if is_whole and len(dimensions) == 1 and all(parsed):
-            cell_units[i] = column
-            frame.isetitem(i, [match["number"] if match else "" for match in matches])
+        if not has_decimals:
+            column = [unit if " " in cell else "" for unit, cell in zip(column, cells, strict=True)]
+        n_filled = sum(map(bool, cells))
+        is_bare = [not unit and is_numeral(cell) for unit, cell in zip(column, cells, strict=True)]
+        n_units = sum(map(bool, column))
+        if n_units < (1 - MOST) * n_filled or n_units + sum(is_bare) < MOST * n_filled:
+            continue
+        lines = dict(zip(reversed(column), reversed(frame.index), strict=True))  # the first of each
+        lines.pop("", None)
+        stated = sorted(lines, key=lines.__getitem__)
+        dimensions = {parsed[0] for parsed in map(units.parse, stated) if parsed}
+        if len(dimensions) > 1 or any(is_bare):
+            is_channel = not options.channels or units.find_columns(name, options.channels)
+            if name in (options.part, options.label) or not is_channel:
+                continue
+            other = next((u for u in stated if units.factor(u, stated[0]) is None), "no unit")
+            line = lines.get(other) or frame.index[is_bare.index(True)]
+            first = f"{stated[0]} in line {lines[stated[0]]}"
+            wanted = f"units of one quantity in the cells of {name}, got {other}, and {first}"
+            do = "export the column in one unit, or name another channel (channel)"
+            raise UnreadableError(f"Expected {wanted}; {do}", int(line))
+        cell_units[i] = column
+        numbers = [
+            match["number"] if unit and match else cell
+            for match, unit, cell in zip(matches, column, cells, strict=True)
+        ]
+        frame.isetitem(i, numbers)
     return cell_units
 
 
 def _convert_cells(
     frame: pd.DataFrame, cell_units: Mapping[int, Sequence[str]], column_units: list[str]
-) -> str:
+) -> tuple[str, tuple[str, ...]]:
     """Convert cells to one unit for each column, in place, and set that in `column_units`.
 
     If the column has several units, the numbers are converted to the unit without a prefix: N for N
-    and kN. Returns a text for the reading that names the units, "" if no cell has one.
+    and kN. Returns a text for the reading that names the units, "" if no cell has one, and a note
+    on each column that was converted.
 
     cell_units : from `_take_units_off`.
     """
     texts = []
+    notes = []
     for i, cells in cell_units.items():
+        name = frame.columns[i]
         stated = list(dict.fromkeys(filter(None, cells)))
         column_units[i] = stated[0]
         if len(stated) > 1:
@@ -725,29 +812,70 @@ def _convert_cells(
             column_units[i] = dimension
             factors = {unit: units.factor(unit, dimension) or 1.0 for unit in stated}
             numbers, _ = floats(frame.iloc[:, i])
-            scales = [factors.get(unit, 1.0) for unit in cells]
-            frame.isetitem(i, (numbers * scales).astype(str))
-        texts.append(f"units {listed(stated)} in the cells of {frame.columns[i]}")
-    return ", ".join(texts)
+            scaled = [
+                str(number * factors[unit]) if unit else cell
+                for number, unit, cell in zip(numbers, cells, frame.iloc[:, i], strict=True)
+            ]
+            frame.isetitem(i, scaled)
+            notes.append(
+                f"Column {name} has {listed(stated)} in its cells: all are {dimension} now"
+            )
+        texts.append(f"units {listed(stated)} in the cells of {name}")
+    return ", ".join(texts), tuple(notes)
 
 
-def _is_last_number_cut(cells: Sequence[str]) -> bool:
-    """Return whether the last of a column's cells has fewer decimals than all others, as many each.
+def _find_cut_row(
+    text: str, cells: TextCells, complete: Mapping[int, Sequence[str]], wrong: dict[int, str]
+) -> int:
+    """Return the line of the last row if it is cut off, by its cells or its last cell; else 0.
 
-    False for fewer than three cells.
+    complete : rows with all cells. wrong : what is wrong in others, to which the last may be added.
     """
+    last = max(cells.rows, default=0)
+    if text[-1:] != "\n" and last in complete and _is_last_cell_cut(list(complete.values())):
+        wrong[last] = "Expected a last cell as those above, it is cut off"
+    is_cut = last in wrong and len(cells.rows[last]) <= len(cells.header) and len(complete) > 1
+    return last if is_cut else 0
+
+
+def _is_last_cell_cut(rows: Sequence[Sequence[str]]) -> bool:
+    """Return whether the last cell of rows is but the beginning of the word above it, or has fewer
+    decimals than all above, as many each.
+
+    False for fewer than three rows.
+    """
+    cells = [row[-1] for row in rows]
+    if len(cells) > 2 and not any(map(str.isdigit, cells[-2])) and cells[-1] not in cells[:-1]:
+        return cells[-2].startswith(cells[-1])
     decimals = [len(cell.replace(",", ".").partition(".")[2]) for cell in cells]
     return len(decimals) > 2 and len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
 
 
-def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
+def is_mostly_numbers(cells: pd.Series) -> bool:
+    """Return whether at least 80 % of a column's filled cells are numbers, or all are empty."""
+    numbers, wrong = floats(cells)
+    n_numbers = int((~np.isnan(numbers)).sum())
+    return not wrong or n_numbers >= MOST * (n_numbers + len(wrong))
+
+
+def parse_numbers(
+    frame: pd.DataFrame,
+) -> tuple[NDArray[np.float32], dict[int, str], dict[int, str]]:
     """Convert a table to numbers.
 
-    Returns an array of float32, shape (n, columns), in which empty cells and those that are no
-    numbers are NaN, and a message for the index of each row that has a cell that is no number.
+    Returns
+    -------
+    values : array of float32, shape (n, columns)
+        Empty cells and those that are no numbers are NaN.
+    wrong : dict of int to str
+        A message for the index of each row that has a cell that is no number.
+    lost : dict of int to str
+        The cell of those rows in which all such cells are a `STATUS`.
     """
     values = np.empty(frame.shape)
     wrong = dict[int, str]()
+    lost = dict[int, str]()
+    damaged = set[int]()
     for i, name in enumerate(frame.columns):
         cells = frame.iloc[:, i]
         values[:, i], odd = floats(cells)
@@ -759,8 +887,13 @@ def parse_numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, s
             if NUMBER_AND_UNIT.fullmatch(cell):
                 message = f"{message}; export plain numbers, without units"
             wrong.setdefault(index, message)
+            if STATUS.fullmatch(cell):
+                lost.setdefault(index, cell.strip())
+            else:
+                damaged.add(index)
     with np.errstate(over="ignore"):  # what overflows becomes an infinity, which the engine finds
-        return values.astype(np.float32), wrong
+        numbers = values.astype(np.float32)
+    return numbers, wrong, {i: cell for i, cell in lost.items() if i not in damaged}
 
 
 def read_recording(
@@ -779,14 +912,17 @@ def read_recording(
     table = _of_one_signal(read_table(path, options, decimal), channels)
     header = list(table.frame.columns)
     places = [column_place(name, header, table.line) for name in channels]
-    if table.faults:
-        raise UnreadableError(table.faults[0].message, table.faults[0].line)
+    for fault in table.faults:
+        if fault.line != table.cut_line:
+            raise UnreadableError(fault.message, fault.line)
+        notes[cut_note(fault)] += 1
     if table.frame.empty:
         raise UnreadableError("Expected samples below the header, found none", table.line)
     frame, kept = _beside_their_clock(table.frame, places)
     places = [kept.index(place) for place in places]
     table = table._replace(frame=frame, units=[table.units[i] for i in kept])
     header = list(frame.columns)
+    notes.update(table.notes)
     rows = _without_unfilled(_without_summary(frame, options, notes), places, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
     timed = rows_to_trace(rows, places, options, notes, table.units, table.rate_hz)
@@ -804,6 +940,11 @@ def read_recording(
         place = place_of_clock(rows, options.time)
         start = None if place is None else start_of(rows.iloc[:, place])
     return timed._replace(units=channel_units, start=start, reading=reading)
+
+
+def cut_note(fault: Fault) -> str:
+    """Return the note on a file whose last row is cut off and left out."""
+    return f"The last row is cut off, and left out: {fault.source}, line {fault.line}"
 
 
 def _of_one_signal(table: TextTable, channels: Sequence[str]) -> TextTable:
@@ -946,9 +1087,7 @@ def rows_to_trace(
         For a cell that is no number, for rows that are missing or out of order, and, unless a rate
         is stated, for a clock that cannot be read or is not even enough.
     """
-    values, wrong = parse_numbers(rows.iloc[:, places])
-    if wrong:
-        raise UnreadableError(wrong[min(wrong)], min(wrong))
+    rows, values = _measured(rows, places, options, notes)
     trace = np.ascontiguousarray(values.T)
     try:
         clock = clock_of(rows, options.time, units_row)
@@ -962,6 +1101,8 @@ def rows_to_trace(
         if options.rate_hz is None:
             _offer_clock(rows, places, notes)
         return Recording(trace)
+    if clock.is_continued:
+        notes[f"The clock {clock.name} counts from 0 again: its times go on there"] += 1
     order, clock = in_order_of_time(rows, clock, options.time)
     if (order != np.arange(len(rows))).any():
         notes["Rows are put in the order of their times"] += 1
@@ -970,6 +1111,33 @@ def rows_to_trace(
     check_rows(clock, rows.index, options.time)
     _check_repeated(rows, clock)
     return _trace_at_rate(trace, clock, rows.index, options, notes)
+
+
+def _measured(
+    rows: pd.DataFrame, places: Sequence[int], options: LoadOptions, notes: Counter[str]
+) -> tuple[pd.DataFrame, NDArray[np.float32]]:
+    """Return the rows of a recording and their samples (T, C), with a note on lost samples.
+
+    A text in place of a number is a lost sample; with `fit="resample"` its row is left out. Raises
+    UnreadableError for a damaged number, and if too many samples are lost.
+    """
+    values, wrong, lost = parse_numbers(rows.iloc[:, places])
+    is_few = len(lost) <= MAX_MISSING * len(rows) + 1 < len(rows)
+    if damaged := wrong.keys() - (lost.keys() if is_few else {}):
+        line = min(damaged)
+        count = f", and {len(lost)} of {len(rows)} rows are such" if line in lost else ""
+        raise UnreadableError(f"{wrong[line]}{count}", line)
+    do = "NaN; fit='resample' interpolates them"
+    if lost and options.fit == "resample":
+        do = "interpolated"
+        is_measured = ~(rows.index.isin(list(lost)) & np.isnan(values).any(axis=1))
+        rows = rows[is_measured]
+        values = values[is_measured]
+    for cell in lost.values():
+        notes[
+            f"Samples are lost where a text is in place of a number, {cell!r}: they are {do}"
+        ] += 1
+    return rows, values
 
 
 def _trace_at_rate(

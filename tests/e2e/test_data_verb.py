@@ -37,7 +37,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_path: Path) -> None:
     result = well("data", folder, "--channel", "FZ_Base,FX_Base", "--out", tmp_path / "out")
     words = " ".join(result.stdout.replace("│", " ").split())
-    text = "traces 37|names FZ_Base, FX_Base|rates low 500,|Left out 3 of 40|Expected 13 columns, got 12"
+    text = (
+        "traces 38|names FZ_Base, FX_Base|rates low 500,|Left out 2 of 40|The last row is cut off"
+    )
     assert [word for word in text.split("|") if word not in words] == []
     assert (tmp_path / "out" / "data.png").stat().st_size > 10_000
     played = well(
@@ -53,7 +55,7 @@ def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_
         "--repeats",
         1,
     )
-    assert played.stderr.count("Left out 3 of 40 recordings of cell_3:") == 1
+    assert played.stderr.count("Left out 2 of 40 recordings of cell_3:") == 1
 
 
 def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_length(
@@ -64,9 +66,9 @@ def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_l
         document("train", "--data", folder, "--store", store, "--reducer", "pca")["import"][
             "imported"
         ]
-        == 37
+        == 38
     )
-    assert document("train", "--data", folder, "--store", store)["import"]["repeated"] == 37
+    assert document("train", "--data", folder, "--store", store)["import"]["repeated"] == 38
     with DataEngine.open(store) as engine:
         assert (engine.trace.fit, engine.trace.columns) == ("pad", ("FZ_Base",))
         frames = [

@@ -694,7 +694,7 @@ def one_line(*words: object) -> str:
     return result.stderr
 
 
-def test_lists_in_cells_are_one_line_that_says_what_to_do(tmp_path: Path) -> None:
+def test_short_lists_in_cells_are_one_line_that_says_what_to_do(tmp_path: Path) -> None:
     pd.DataFrame({"force": [[1.0, 2.0], [2.0, 3.0]], "label": [1, 0]}).to_parquet(
         tmp_path / "a.parquet"
     )
@@ -1107,12 +1107,13 @@ def test_settings_beside_samples_without_a_header_ask_for_names(tmp_path: Path) 
         load_dataset(tmp_path, channel="c3")
 
 
-def test_a_word_among_the_values_of_a_signal_is_named(tmp_path: Path) -> None:
+def test_a_word_among_the_values_of_a_signal_is_a_lost_sample(tmp_path: Path) -> None:
     for name, last in (("a_OK", "I/O Timeout"), ("b_OK", "1.0")):
         columns = [["F"] * N, times(), [*texts()[:-1], last], ["Good"] * N]
         write(tmp_path / f"{name}.csv", ["Tag", "Timestamp", "Value", "Status"], *columns)
-    [fault] = load_dataset(tmp_path, channel="F").faults
-    assert "Expected a number in column F, got 'I/O Timeout'" in fault.message
+    data = load_dataset(tmp_path, channel="F")
+    assert np.flatnonzero(np.isnan(data.X)).tolist() == [N - 1]
+    assert "'I/O Timeout': they are NaN" in data.notes[0]
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ BROKEN: dict[str, tuple[list[str], int, str]] = {
         8,
         "Expected a number in column FZ_Base, got '12N'",
     ),
-    "short_row_True.csv": ([*ROWS[:-1], "17.0"], 41, "Expected 2 columns, got 1"),
+    "short_row_True.csv": ([*ROWS[:-2], "17.0", ROWS[-1]], 40, "Expected 2 columns, got 1"),
     "long_row_True.csv": ([*ROWS[:5], ROWS[5] + ",1", *ROWS[6:]], 6, "Expected 2 columns, got 3"),
     "header_False.csv": (ROWS[:1], 1, "Expected samples below the header, found none"),
     "back_True.csv": (
@@ -1370,13 +1370,29 @@ def test_a_summary_above_the_samples_is_no_sample_also_with_a_stated_rate(
     np.testing.assert_array_equal(stated.X, small.X[:4])
 
 
-def test_a_number_that_is_cut_off_at_the_end_of_a_file_is_a_fault(tmp_path: Path) -> None:
-    for i, end in enumerate(("30.62\n", "3", "30.62")):
+def test_a_row_that_is_cut_off_at_the_end_of_a_file_is_left_out_with_a_note(tmp_path: Path) -> None:
+    for i, end in enumerate(("30.62\n", "3", "30.62", None)):
         rows = [f"{0.004 * k:.3f},{30 + 0.01 * k:.2f}" for k in range(50)]
-        text = "\n".join(["time,FZ", *rows, f"0.200,{end}"])
+        text = "\n".join(["time,FZ", *rows, "0.2" if end is None else f"0.200,{end}"])
         (tmp_path / f"{i}_OK.csv").write_text(text)
     data = load_dataset(tmp_path)
-    assert [(f.source, f.line) for f in data.faults] == [("1_OK.csv", 52)]
+    assert (data.faults, data.lengths.tolist()) == ((), [51, 50, 51, 50])
+    for name in ("1_OK.csv", "3_OK.csv"):
+        assert f"The last row is cut off, and left out: {name}, line 52." in data.notes
+
+
+@pytest.mark.parametrize("end", ["", ";12", ";12.5;O", "\n"])
+def test_the_last_row_of_a_long_table_that_is_cut_off_is_left_out_with_a_note(
+    end: str, small: Dataset, tmp_path: Path
+) -> None:
+    rows = long_rows(small, lambda v, i, k: f"{v}")
+    path = write_rows(tmp_path / "long.csv", rows[:-1])
+    with path.open("a") as file:
+        file.write(f"\nP23;{0.49}{end}")
+    data = load_dataset(path, **LONG)
+    np.testing.assert_array_equal(data.X[:, :49], small.X[:, :49])
+    assert (data.faults, data.lengths[-1]) == ((), 49)
+    assert "The last row is cut off, and left out: long.csv, line 1201." in data.notes
 
 
 def test_columns_of_a_listing_that_contradict_each_other_are_faults(few: Path) -> None:
@@ -1975,6 +1991,7 @@ def test_a_counter_of_16_bits_that_starts_anew_is_a_clock(small: Dataset, tmp_pa
     data = load_dataset(tmp_path, channel="rForce", time="tick_ms")
     np.testing.assert_array_equal(data.X, small.X)
     assert data.rate_hz == 500.0
+    assert "The clock tick_ms counts from 0 again: its times go on there." in data.notes
 
 
 @pytest.mark.parametrize(
@@ -2079,6 +2096,227 @@ def test_a_result_that_is_that_of_the_part_before_until_the_end_counts_at_the_en
     rows = [[f"{2 * k}", f"{v}", "OK" if k % 2 else "NOK"] for k, v in enumerate(small.X[0])]
     write_rows(tmp_path / "999.csv", [["time [ms]", "FZ", "result"], *rows])
     assert "Expected one label" in load_dataset(tmp_path, channel="FZ").faults[0].message
+
+
+def long_rows(data: Dataset, cell: Callable[[float, int, int], str]) -> list[list[str]]:
+    """A row for each sample; `cell` writes it by its value, its part and its number."""
+    rows = [["part", "time", "Kraft", "label"]]
+    for i, (x, word) in enumerate(zip(data.X, words(data), strict=True)):
+        rows += [[f"P{i}", f"{k / 100}", cell(v, i, k), word] for k, v in enumerate(x.tolist())]
+    return rows
+
+
+LONG = {"part": "part", "time": "time"}
+
+
+@pytest.mark.parametrize("blank", ["", " "])
+def test_units_in_the_cells_of_a_long_table_are_converted_and_noted(
+    blank: str, small: Dataset, tmp_path: Path
+) -> None:
+    path = tmp_path / "long.csv"
+    write_rows(path, long_rows(small, lambda v, i, k: f"{v}{blank}N"))
+    data = load_dataset(path, **LONG)
+    np.testing.assert_array_equal(data.X, small.X)
+    assert (data.unit, data.notes) == ("N", ())
+    write_rows(
+        path, long_rows(small, lambda v, i, k: f"{v}{blank}N" if i % 3 else f"{v / 1e3}{blank}kN")
+    )
+    data = load_dataset(path, **LONG)
+    np.testing.assert_allclose(data.X, small.X, rtol=1e-5)
+    assert data.notes == ("Column Kraft has kN, N in its cells: all are N now.",)
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ("{} Nm", "line 52: .*cells of Kraft, got Nm, and N in line 2"),
+        ("{} kp", "line 52: .*cells of Kraft, got kp, and N in line 2"),
+        ("{}", "line 52: .*cells of Kraft, got no unit, and N in line 2"),
+    ],
+)
+def test_units_of_several_quantities_in_the_cells_are_refused_with_both_lines(
+    other: str, message: str, small: Dataset, tmp_path: Path
+) -> None:
+    path = tmp_path / "long.csv"
+    write_rows(path, long_rows(small, lambda v, i, k: other.format(v) if i % 2 else f"{v} N"))
+    with pytest.raises(DataError, match=message):
+        load_dataset(path, **LONG)
+
+
+@pytest.mark.parametrize(
+    "status", ["Bad Input", "I/O Timeout", "#N/A", "-", "[-11059] No Data", "1.#QNAN"]
+)
+def test_a_status_in_place_of_a_number_is_a_lost_sample_that_is_noted(
+    status: str, small: Dataset, tmp_path: Path
+) -> None:
+    path = tmp_path / "long.csv"
+    rows = long_rows(
+        small, lambda v, i, k: status if (i, k) == (3, 7) or (i == 5 and k > 20) else str(v)
+    )
+    write_rows(path, rows)
+    data = load_dataset(path, **LONG)
+    assert [fault.source for fault in data.faults] == ["P5"]
+    assert "29 of 50 rows" in data.faults[0].message
+    expected = np.delete(small.X, 5, axis=0)
+    expected[3, 7] = np.nan
+    np.testing.assert_array_equal(data.X, expected)
+    assert any(repr(status) in note and "they are NaN" in note for note in data.notes)
+    evenly = load_dataset(path, **LONG, fit="resample").X
+    np.testing.assert_allclose(evenly[3, 7], (small.X[3, 6] + small.X[3, 8]) / 2, rtol=1e-3)
+
+
+def test_a_damaged_number_is_no_status(small: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "long.csv"
+    write_rows(path, long_rows(small, lambda v, i, k: "1x2.5" if (i, k) == (3, 7) else str(v)))
+    assert [fault.source for fault in load_dataset(path, **LONG).faults] == ["P3"]
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "%d-%b-%y %H:%M:%S.%f",
+        "%d-%b-%Y %H:%M:%S.%f",
+        "%b %d %Y %H:%M:%S.%f",
+        "%d-Mär-%y %H:%M:%S.%f",
+        "%d.%m.%y %H:%M:%S.%f",
+    ],
+)
+def test_dates_of_historians_are_times(form: str, small: Dataset, tmp_path: Path) -> None:
+    rows = long_rows(small, lambda v, i, k: str(v))
+    start = pd.Timestamp("2026-03-11 23:59:00")
+    for i, row in enumerate(rows[1:]):  # the parts are backwards in the file
+        part, k = divmod(i, 50)
+        time = start + pd.Timedelta(seconds=30 * (23 - part) + k / 100)
+        row[1] = time.strftime(form.replace("%d-Mär", f"{time.day}-Mär"))
+    data = load_dataset(write_rows(tmp_path / "long.csv", rows), **LONG)
+    np.testing.assert_array_equal(data.X, small.X[::-1])
+    assert (data.rate_hz, data.ordered) == (100.0, True)
+
+
+def test_a_long_table_whose_times_cannot_be_read_is_read_without_them(
+    small: Dataset, tmp_path: Path
+) -> None:
+    rows = long_rows(small, lambda v, i, k: str(v))
+    for row in rows[1:]:
+        row[1] = f"tick {row[1]}"
+    path = write_rows(tmp_path / "long.csv", rows)
+    with pytest.raises(DataError, match="time='none' and a stated rate"):
+        load_dataset(path, **LONG)
+    data = load_dataset(path, part="part", time="none", rate_hz=100)
+    np.testing.assert_array_equal(data.X, small.X)
+    assert data.notes == ()
+
+
+@pytest.mark.parametrize("is_annotated", [True, False])
+@pytest.mark.parametrize("n_first", [24, 10])
+def test_tables_of_influxdb_are_one_long_table_of_their_signals(
+    is_annotated: bool, n_first: int, small: Dataset, tmp_path: Path
+) -> None:
+    """Behind `n_first` parts a table with another order of columns and one column more begins."""
+    lines: list[str] = []
+    names = ["_time", "_value", "_field", "_measurement", "serial", "verdict"]
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        if i in (0, n_first):
+            header = names if i == 0 else [*names[:4], "verdict", "serial", "line"]
+            notes = [f"#{name}" + "," * (len(header) + 4) for name in ("group", "datatype")]
+            header_line = ",".join(["", "result", "table", "_start", "_stop", *header])
+            lines += ["", *(notes if is_annotated else []), header_line]
+        for table, field in enumerate(("force", "way", "state")):
+            for k, v in enumerate(x.tolist()):
+                value = {"force": f"{v}", "way": f"{k / 10}", "state": "RUN"}[field]
+                time = pd.Timestamp("2026-03-11T06:00:00Z") + pd.Timedelta(seconds=9 * i + k / 100)
+                cells = dict(zip(names, [time.isoformat(), value, field, "press"], strict=False))
+                cells |= {"serial": f"P{i}", "verdict": word, "line": "L2"}
+                row = [cells[name] for name in header]
+                span = ["2026-03-11T00:00:00Z", "2026-03-12T00:00:00Z"]
+                lines.append(",".join(["", "", str(3 * i + table), *span, *row]))
+    path = tmp_path / "influx.csv"
+    path.write_text("\r\n".join(lines[1:]) + "\r\n")
+    options = {"part": "serial", "label": "verdict"}
+    with pytest.raises(DataError, match="time='_time', channel='force'"):
+        load_dataset(path, **options)
+    data = load_dataset(path, **options, time="_time", channel="force")
+    np.testing.assert_array_equal(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
+    assert (data.rate_hz, data.faults) == (100.0, ())
+
+
+CURVES: dict[str, tuple[str, Callable[[list[str]], str]]] = {
+    "JSON in quotes": (",", lambda items: f'"[{", ".join(items)}]"'),
+    "JSON without quotes": (",", lambda items: f"[{','.join(items)}]"),
+    "PostgreSQL": (";", lambda items: f"{{{','.join(items)}}}"),
+    "semicolons": (",", lambda items: f'"{";".join(items)}"'),
+    "semicolons without quotes": (",", lambda items: ";".join(items)),
+    "blanks": ("\t", lambda items: " ".join(items)),
+    "decimal commas": (";", lambda items: " ".join(items).replace(".", ",")),
+    "bars": (";", lambda items: "|".join(items).replace(".", ",")),
+}
+
+
+@pytest.mark.parametrize("form", CURVES)
+def test_a_curve_in_one_cell_of_a_text_is_a_trace(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    delimiter, write = CURVES[form]
+    rows = [["serial", "Kraft [kN]", "verdict"]]
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows.append([f"{100 + i}", write([f"{v:.9f}" for v in x]), word])
+    path = tmp_path / "curves.csv"
+    path.write_text("\n".join(map(delimiter.join, rows)) + "\n")
+    data = load_dataset(path, part="serial")
+    np.testing.assert_allclose(data.X, small.X, atol=1e-7)
+    np.testing.assert_array_equal(data.y, small.y)
+    assert (data.unit, data.faults) == ("kN", ())
+    assert data.part is not None
+    assert data.part[0] == "100"
+
+
+@pytest.mark.parametrize("form", ["parquet", "json", "jsonl", "frame"])
+def test_lists_in_cells_are_traces_with_the_rate_of_the_times_beside_them(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    """One part has a shorter curve, one none, and one an item that is no number."""
+    rows = [
+        {"serial": f"P{i}", "t": [k / 100 for k in range(50)], "force": x.tolist(), "verdict": word}
+        for i, (x, word) in enumerate(zip(small.X, words(small), strict=True))
+    ]
+    rows[2] |= {"t": rows[2]["t"][:45], "force": rows[2]["force"][:45]}
+    rows[3] |= {"t": None, "force": None}
+    path = tmp_path / f"curves.{form}"
+    source: Any = path
+    if form == "json":
+        path.write_text(json.dumps(rows))
+    elif form == "jsonl":
+        path.write_text("\n".join(map(json.dumps, rows)))
+    elif form == "parquet":
+        pd.DataFrame(rows).to_parquet(path)
+    else:
+        source = pd.DataFrame(rows)
+    data = load_dataset(source, part="serial")
+    np.testing.assert_array_equal(data.X[3:], small.X[4:])
+    assert (data.rate_hz, data.lengths[2]) == (100.0, 45)
+    assert [(fault.line, fault.message[-12:]) for fault in data.faults] == [(4, "'no samples'")]
+    with pytest.raises(DataError, match="got a file of labels; join it to the table"):
+        load_dataset(source, part="serial", labels="listing.csv")
+    rows[5]["t"] = [k / 50 for k in range(50)]
+    with pytest.raises(DataError, match=r"line 6: Expected times in column t at 100 Hz.*got 50 Hz"):
+        load_dataset(pd.DataFrame(rows), part="serial")
+
+
+def test_a_wide_table_whose_cells_have_several_units_is_refused_or_converted(
+    small: Dataset, tmp_path: Path
+) -> None:
+    texts = wide(small).astype(str)
+    samples = texts.columns[:50]
+    texts[samples] = texts[samples] + " N"
+    texts.to_csv(tmp_path / "wide.csv", index=False)
+    data = load_dataset(tmp_path / "wide.csv")
+    np.testing.assert_array_equal(data.X, small.X)
+    assert data.unit == "N"
+    texts["FZ_7"] = texts["FZ_7"].str.replace("N", "kN")
+    texts.to_csv(tmp_path / "wide.csv", index=False)
+    with pytest.raises(DataError, match=r"one unit of the columns of FZ, got .*FZ_7 in kN"):
+        load_dataset(tmp_path / "wide.csv")
 
 
 TELL_LABELS = {  # the columns of a listing beside the files' names -> what the error proposes

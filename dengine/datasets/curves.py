@@ -1,0 +1,181 @@
+"""Curves in single cells of a table: a row for each part, and all of its samples in one cell.
+
+Databases and test benches write such cells: a list as Parquet and JSON have it, or a text as
+`[0.1, 0.2, 0.3]`, `0.1;0.2;0.3` or `0,1 0,2 0,3`. `expand_curves` makes a wide table of them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..traces import is_time_column
+from . import units
+from .clocks import clock_of, rate_of
+from .dataset import LoadOptions, UnreadableError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MIN_SAMPLES = 8  # of a curve; a list of fewer numbers is of something else
+SAME_RATE = 0.03  # by which the rates of curves may differ
+NUMBER = r"(?:[-+−]?\.?\d[\d.eE+\-−]*|nan|null|NaN|None)"
+ITEMS = rf"{NUMBER}(?:(?:\s*[,;|]\s*|\s+){NUMBER}){{{MIN_SAMPLES - 1},}}"
+BRACKETED = rf"[\[({{]\s*{ITEMS}\s*[\])}}]"
+CURVE = re.compile(rf"\s*(?:{BRACKETED}|{ITEMS}[;|,]?)\s*")
+UNQUOTED = re.compile(rf'(?<!")\[\s*{ITEMS}\s*\](?!")')  # its commas would be delimiters
+# A curve in a line of text: in quotes or brackets, or between delimiters of another kind.
+BETWEEN = "|".join(
+    rf"(?:^|(?<={mark})){NUMBER}(?:[{others}]{NUMBER}){{{MIN_SAMPLES - 1},}}(?={mark})"
+    rf"|(?<={mark}){NUMBER}(?:[{others}]{NUMBER}){{{MIN_SAMPLES - 1},}}$"
+    for mark, others in ((";", ", |"), (",", "; |"), ("\t", ",; |"), (r"\|", ",; "))
+)
+IN_LINE = rf'"\s*(?:{BRACKETED}|{ITEMS}[;|,]?)\s*"|{BRACKETED}|{BETWEEN}'
+
+
+def split_curve(cell: Any) -> list[Any] | NDArray[Any] | None:
+    """Return the samples in a cell, those of a text as texts with a decimal point.
+
+    None if the cell is neither a list of plain items nor a text of eight numbers or more.
+    """
+    if isinstance(cell, list | tuple | np.ndarray):
+        is_flat = len(cell) > 0 and not isinstance(cell[0], list | tuple | np.ndarray | dict)
+        return list(cell) if is_flat else None
+    if not isinstance(cell, str) or CURVE.fullmatch(cell) is None:
+        return None
+    text = cell.strip(" \t[](){};|,")
+    if re.search(r"[;|\t]", text):
+        items = re.split(r"\s*[;|\t]\s*", text)
+    elif re.search(r",\s", text) or not re.search(r"\s", text):
+        items = re.split(r"\s*,\s*", text)
+    else:
+        items = text.split()
+    if not any("." in item for item in items):
+        items = [item.replace(",", ".") for item in items]
+    return [item.replace("−", "-") for item in items]
+
+
+def write_curves(frame: pd.DataFrame) -> None:
+    """Write the curves of a table of texts as `[0.1, 0.2]`, in place, as no number is written."""
+    for i in range(frame.shape[1]):
+        cells = frame.iloc[:, i].tolist()
+        if split_curve(next(filter(None, cells), "")) is not None:
+            curves = map(split_curve, cells)
+            texts = [
+                cell if curve is None else f"[{', '.join(curve)}]"
+                for cell, curve in zip(cells, curves, strict=True)
+            ]
+            frame.isetitem(i, texts)
+
+
+def expand_curves(
+    frame: pd.DataFrame, options: LoadOptions
+) -> tuple[pd.DataFrame, float | None, str, list[str]]:
+    """Return a table with a numbered column for each sample of its curves, FZ_0, FZ_1, ...
+
+    Only the stated channels are expanded, if all of them are curves. A shorter curve is filled with
+    NaN; a cell without numbers becomes a text, which is a fault when it is read.
+
+    Returns
+    -------
+    frame : DataFrame
+        The same object if no column has curves of eight samples or more.
+    rate_hz : float or None
+        By a column of curves that are clocks; None without one.
+    clock : str
+        The name of that column; "" without one.
+    unread : list of str
+        Columns of curves that were left out.
+
+    Raises
+    ------
+    UnreadableError
+        If the clocks of curves differ by more than 3 %, or have not as many times as samples.
+    """
+    import pandas as pd
+
+    curves = {
+        str(name): [split_curve(cell) for cell in frame[name]]
+        for name in frame.columns[~frame.columns.duplicated(keep=False)]
+        if split_curve(next((c for c in frame[name] if not _is_empty(c)), None)) is not None
+    }
+    clocks = [name for name in curves if name == options.time or is_time_column(name)]
+    longest = {name: max(len(c) for c in cells if c is not None) for name, cells in curves.items()}
+    channels = [name for name, n in longest.items() if name not in clocks and n >= MIN_SAMPLES]
+    if not channels:
+        return frame, None, "", []
+    stated = [units.find_columns(name, channels) for name in options.channels]
+    if stated and all(stated):
+        channels = [channels[places[0]] for places in stated]
+    blocks = [frame.drop(columns=list(curves))]
+    for name in channels:
+        block = np.full((len(frame), longest[name]), np.nan)
+        odd = dict[tuple[int, int], str]()
+        for i, curve in enumerate(curves[name]):
+            samples, wrong = _numbers(curve)
+            block[i, : len(samples)] = samples
+            odd |= {(i, k): cell for k, cell in wrong.items()}
+        columns = [f"{name}_{k}" for k in range(longest[name])]
+        wide = pd.DataFrame(block, index=frame.index, columns=columns)
+        for (i, k), cell in odd.items():
+            wide[columns[k]] = wide[columns[k]].astype(object)
+            wide.iloc[i, k] = cell
+        blocks.append(wide)
+    rate = None
+    if clocks and options.rate_hz is None:
+        rate = _rate_of_curves(frame.index, curves[clocks[0]], curves[channels[0]], clocks[0])
+    unread = [name for name in curves if name not in (*channels, *clocks[:1])]
+    return pd.concat(blocks, axis=1), rate, clocks[0] if rate else "", unread
+
+
+def _is_empty(cell: Any) -> bool:
+    """Return whether a cell of a table is empty, or no text and no list."""
+    return cell == "" if isinstance(cell, str) else not hasattr(cell, "__len__")
+
+
+def _numbers(curve: Sequence[Any] | NDArray[Any] | None) -> tuple[list[float], dict[int, str]]:
+    """Return the samples of a curve, NaN for null, and each item that is no number by its place."""
+    wrong = dict[int, str]()
+    samples = list[float]()
+    for k, item in enumerate(["no samples"] if curve is None or not len(curve) else curve):
+        try:
+            samples.append(np.nan if item in (None, "null", "None") else float(item))
+        except (TypeError, ValueError):
+            samples.append(np.nan)
+            wrong[k] = str(item)
+    return samples, wrong
+
+
+def _rate_of_curves(
+    lines: pd.Index, clocks: Sequence[Any], curves: Sequence[Any], name: str
+) -> float | None:
+    """Return the median rate by the clocks of curves; None if none can be read.
+
+    Raises UnreadableError, with the line, for a clock whose rate differs by more than 3 %, or that
+    has not as many times as samples.
+    """
+    import pandas as pd
+
+    rates = dict[int, float]()
+    for line, times, curve in zip(lines, clocks, curves, strict=True):
+        if times is None or curve is None:
+            continue
+        if len(times) != len(curve):
+            wanted = f"as many times in column {name} as samples"
+            raise UnreadableError(f"Expected {wanted}, got {len(times)} and {len(curve)}", line)
+        clock = clock_of(pd.DataFrame({name: times}), name)
+        if clock is not None:
+            rates[line] = rate_of(clock, pd.RangeIndex(len(times)))
+    if not rates:
+        return None
+    usual = float(np.median(list(rates.values())))
+    for line, rate in rates.items():
+        if abs(rate - usual) > SAME_RATE * usual:
+            wanted = f"times in column {name} at {usual:g} Hz, as in most rows"
+            do = "state rate_hz=... if the times are wrong"
+            raise UnreadableError(f"Expected {wanted}, got {rate:g} Hz; {do}", line)
+    return usual
