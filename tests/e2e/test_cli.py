@@ -2,7 +2,6 @@
 
 import os
 import re
-import shlex
 import shutil
 import signal
 import sqlite3
@@ -15,14 +14,14 @@ import click
 import numpy as np
 import pytest
 
-from dengine import DataEngine, TraceSpec, load_dataset
+from dengine import DataEngine, load_dataset
 from dengine.cli import main
 from dengine.cli.output import INTERRUPTED
 from dengine.datasets import importing
 from dengine.datasets.importing import import_labelled
 from dengine.experiments.baselines import BASELINES
 from dengine.store import SqlStore
-from tests.support.command_line import dengine, document, line_of, succeed, well
+from tests.support.command_line import dengine, document, example_of, line_of, succeed, well
 from tests.support.driving import easy_parts
 from tests.support.exports import cell_journal
 
@@ -30,9 +29,9 @@ POLICY = ["--alpha", "0.2", "--lower-bound", "0.8"]
 KNOWN = [*POLICY, "--guarantee", "pooled", "--stops", "all"]
 VERBS = sorted(main.commands)
 LESS = {  # so that an example takes seconds; its own options are all read
-    "compare": "--repeats 1 --cycles 150",
+    "compare": "--repeats 1 --cycles 60",
     "costs": "--alphas 0.5 --lower-bounds 0.8 --cycles 100 --n-jobs 1",
-    "replay": "--repeats 1 --cycles 150",
+    "replay": "--repeats 1 --cycles 60",
     "run": "--cycles 6",
     "simulate": "--n 4",
     "train": "--data small.npz",
@@ -96,12 +95,6 @@ def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy() -> None:
     }
 
 
-def example_of(verb: str) -> list[str]:
-    lines = succeed(verb, "--help").rstrip().splitlines()
-    assert lines[-2].strip() == "Example:"
-    return shlex.split(lines[-1])
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What examples name: a trained engine.db of the bundled set, and cell.csv, a journal of two of
@@ -118,39 +111,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_example_of_serve_listens_and_ends_when_it_is_told_to(tmp_path: Path) -> None:
-    pytest.importorskip("uvicorn")
-    form = [
-        "--samples",
-        "40",
-        "--rate-hz",
-        "100",
-        "--unit",
-        "Nm",
-        "--channels",
-        "MZ,FZ",
-        "--fit",
-        "pad",
-    ]
-    started = [
-        sys.executable,
-        "-m",
-        *example_of("serve"),
-        "--port",
-        "0",
-        *form,
-    ]  # of two, the last counts
-    with subprocess.Popen(
-        started, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as process:
-        shown = process.stdout.readline()
-        process.terminate()
-        assert process.wait(120) == 0
-    assert "is served at http://127.0.0.1:" in shown
-    with DataEngine.open(tmp_path / "cell.db") as engine:
-        assert engine.trace == TraceSpec(40, 100.0, 2, "Nm", fit="pad", columns=("MZ", "FZ"))
-
-
+# The example of serve is what `tests.support.serving.started` types.
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "serve"])
 def test_every_help_ends_in_a_command_that_works(
     verb: str, folder: Path, tmp_path: Path, monkeypatch, make_data

@@ -143,11 +143,17 @@ def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fi
 
 
 @pytest.mark.parametrize(
-    ("guarantee", "stops"),
-    [("local", "some"), ("local", "all"), ("pooled", "some"), ("pooled", "all"), ("cost", "all")],
+    ("guarantee", "stops", "n"),
+    [
+        ("local", "some", 900),
+        ("local", "all", 900),
+        ("pooled", "some", 1500),
+        ("pooled", "all", 900),
+        ("cost", "all", 1500),
+    ],
 )
 def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
-    make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any
+    make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any, n: int
 ) -> None:
     settings = recipe(
         audit_rate=0.1,
@@ -161,11 +167,11 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
     )
     rng, happened, modes, saved = np.random.default_rng(7), Counter[str](), set(), False
     with engine:
-        for x, y, part in a_stream(make_data, 500, 1):
+        for x, y, part in a_stream(make_data, n // 3, 1):
             engine.report(engine.decide(x, part).id, y)
         engine.retrain()
         exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
-        for i, (x, y, part) in enumerate(a_stream(make_data, 1500, 2)):
+        for i, (x, y, part) in enumerate(a_stream(make_data, n, 2)):
             decision, result = engine.decide(x, part), exported.decide(x, part)
             assert row(result) == row(decision)
             if decision.embedding is not None:
@@ -190,7 +196,7 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
             assert exported.safe_mode == engine.safe_mode
             modes.add(engine.safe_mode)
             if (
-                i > 600 and not saved and decision.action is Action.ACCEPT and not heard
+                i > 0.4 * n and not saved and decision.action is Action.ACCEPT and not heard
             ):  # one that waits
                 exported, saved = load_exported(exported.save(tmp_path / "later.ts")), True
         model = engine.model

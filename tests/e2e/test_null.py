@@ -29,12 +29,12 @@ BY_CHANCE = (
 )
 
 
-def noise_labels(make_data, seed: int) -> Dataset:
+def noise_labels(make_data, seed: int, cycles: int = CYCLES) -> Dataset:
     """Traces of two shapes, as real ones; labels, 80 % successes, that have nothing to do with
     them.
     """
-    data = make_data(CYCLES, samples=100, seed=seed, noise=2.0)
-    labels = np.random.default_rng(seed + 10_000).random(CYCLES) < 0.8
+    data = make_data(cycles, samples=100, seed=seed, noise=2.0)
+    labels = np.random.default_rng(seed + 10_000).random(cycles) < 0.8
     return Dataset(data.X, labels.astype(np.int8), name="noise labels")
 
 
@@ -56,11 +56,13 @@ def test_labels_of_noise_yield_next_to_nothing_certain(
     name: str, make_data, proof_repeats: int
 ) -> None:
     recipe = RECIPES[name].with_policy(alpha=0.1, lower_bound=0.9)
-    recipe = recipe.with_settings(retrain_every=60)
+    recipe = recipe.with_settings(retrain_every=30)
+    cycles = CYCLES // 2  # what conv's steps cost grows with them
     played = [
-        replay(noise_labels(make_data, seed), recipe, seed=seed) for seed in range(proof_repeats)
+        replay(noise_labels(make_data, seed, cycles), recipe, seed=seed)
+        for seed in range(proof_repeats)
     ]
-    assert np.mean([certain(p) for p in played]) <= BY_CHANCE
+    assert np.mean([certain(p) for p in played]) <= BY_CHANCE / 2
 
 
 class SeesEverything(LabelFree):

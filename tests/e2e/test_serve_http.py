@@ -5,6 +5,7 @@ it remembers.
 import asyncio
 import json
 import re
+import shlex
 import socket
 import ssl
 import threading
@@ -798,16 +799,15 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
         ssl.create_default_context(cafile=str(tmp_path / "cert.pem")),
         {"authorization": f"Bearer {TOKEN}"},
     )
-    with started(tmp_path, "--reducer", "pca", *words) as process:
+    form = shlex.split("--samples 40 --rate-hz 100 --unit Nm --channels MZ,FZ --fit pad")
+    with started(tmp_path, "--reducer", "pca", *words, *form) as process:
         how: dict[str, Any] = {"verify": trusted, "timeout": 60, "trust_env": False}
         with httpx.Client(base_url=f"https://localhost:{process.port}", **how) as client:
             assert client.get("/healthz").json()["status"] == "ok"
             must_be_problem(client.get("/status"), 401)
             client.headers.update(output)
-            assert (
-                client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()["action"]
-                == "verify"
-            )
+            body = {"trace": stream.X[:2, :40].tolist(), "request": "order-0"}
+            assert client.post("/decide", json=body).json()["action"] == "verify"
             assert client.get("/status").json()["shadow"] is True
             for store, at, text in (
                 ("cell.db", "0", "cell.db"),
@@ -820,6 +820,7 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
     )
     assert TOKEN not in process.output
     with DataEngine.open(tmp_path / "cell.db") as engine:
+        assert engine.trace == TraceSpec(40, 100.0, 2, "Nm", fit="pad", columns=("MZ", "FZ"))
         assert engine.find("order-0").decision.action == "verify"
 
 

@@ -1,6 +1,7 @@
 """Runs the `dengine` command in this process, for tests of verbs."""
 
 import json
+import shlex
 from tempfile import gettempdir
 
 from click.testing import CliRunner, Result
@@ -46,3 +47,10 @@ def document(*words: object) -> dict:
     result = well(*words, "--json")
     assert result.stderr == ""
     return json.loads(result.stdout)
+
+
+def example_of(verb: str) -> list[str]:
+    """Return the words of the command in which the help of a verb ends."""
+    lines = succeed(verb, "--help").rstrip().splitlines()
+    assert lines[-2].strip() == "Example:"
+    return shlex.split(lines[-1])

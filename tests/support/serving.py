@@ -23,6 +23,7 @@ import pytest
 from dengine import DataEngine, Recipe
 from dengine.errors import DataError
 from dengine.serve.service import CellService
+from tests.support.command_line import example_of
 from tests.support.driving import RECIPE
 
 REPO = Path(__file__).resolve().parents[2]
@@ -105,20 +106,10 @@ class Process:
 def started(
     folder: Path, *words: str, wait: bool = True, python_path: str = str(REPO)
 ) -> Iterator[Process]:
-    """`dengine serve` and words, as they are typed in a folder. wait : until it says where it
-    listens.
+    """The example of `dengine serve --help` at a free port, and words, as they are typed in a
+    folder. wait : until it says where it listens.
     """
-    command = [
-        sys.executable,
-        "-m",
-        "dengine",
-        "serve",
-        "--store",
-        "cell.db",
-        "--port",
-        "0",
-        *words,
-    ]
+    command = [sys.executable, "-m", *example_of("serve"), "--port", "0", *words]
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     environment = os.environ | {"PYTHONPATH": python_path}
     process = subprocess.Popen(

@@ -315,7 +315,7 @@ def test_in_random_histories_with_overdue_checks_a_reopened_engine_is_the_one_th
     stream: Dataset, tmp_path: Path, policy: Policy
 ) -> None:
     history = RandomHistory(policy, tmp_path, stream.X[:20], seed=1)
-    for x, success in zip(stream.X[:220], stream.y.tolist(), strict=False):
+    for x, success in zip(stream.X[:160], stream.y.tolist(), strict=False):
         history.play(x, success == 1)
     assert history.compared > 0
     history.engine.close()

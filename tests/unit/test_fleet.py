@@ -126,7 +126,7 @@ def test_one_retrain_serves_all(
     recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray
 ) -> None:
     cells = [fleet.engine(name, recipe=recipe) for name in "abc"]
-    for i in range(150):
+    for i in range(90):
         learn(cells[i % 3], parts, [i])
     for engine in cells:
         core_of(engine).process_retrains()
