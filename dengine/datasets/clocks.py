@@ -167,8 +167,10 @@ def join_date_and_time(frame: pd.DataFrame) -> None:
     if len(frame) < 2:
         return
     ends = frame.iloc[[0, -1]].astype(str)
-    dates = [i for i in range(frame.shape[1]) if ends.iloc[:, i].str.fullmatch(DATE).all()]
-    times = [i for i in range(frame.shape[1]) if ends.iloc[:, i].str.fullmatch(DAY_TIME).all()]
+    first, last = ends.to_numpy().astype(str)  # pandas would parse each expression for each column
+    cells = list(enumerate(zip(first, last, strict=True)))
+    dates = [i for i, pair in cells if all(re.fullmatch(DATE, cell) for cell in pair)]
+    times = [i for i, pair in cells if all(re.fullmatch(DAY_TIME, cell) for cell in pair)]
     if len(dates) != 1 or len(times) != 1:
         return
     date = frame.iloc[:, dates[0]]

@@ -104,7 +104,7 @@ def test_folds_are_balanced(folds: int, step: float) -> None:
 
 @pytest.mark.parametrize("rate", [0.02, 0.25, 0.5])
 def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate: float) -> None:
-    h = content_hash(noise(20_000, 20))
+    h = content_hash(noise(8_000, 20))
     coin, fold = audited(h, rate, seed=3), fold_of(h, 2)
     assert stats.binomtest(int(coin.sum()), len(h), rate).pvalue > 1e-4
     assert (
@@ -116,7 +116,7 @@ def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate: float) -> None
 
 
 def test_engines_of_different_seeds_audit_different_traces() -> None:
-    h = content_hash(noise(20_000, 20))
+    h = content_hash(noise(8_000, 20))
     first, other = audited(h, 0.5, seed=1), audited(h, 0.5, seed=2)
     assert stats.binomtest(int((first == other).sum()), len(h), 0.5).pvalue > 1e-4
     np.testing.assert_array_equal(first, audited(h, 0.5, seed=1))

@@ -254,13 +254,13 @@ def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever
 ) -> None:
     rng, mean = np.random.default_rng(1), []
     for rate in (1.0 - lower_bound, 2.0 - 2.0 * lower_bound):
-        n, rules = 0, [WatchedRule(alpha, lower_bound) for _ in range(40)]
+        n, rules = 0, [WatchedRule(alpha, lower_bound) for _ in range(20)]
         for rule in rules:
             while rule.safe_mode() == 0:
                 rule.evidence.count_outcome(0, 0.95, bool(rng.random() < rate), 0, 1.0)
                 n += 1
         mean.append(n / len(rules))
-    assert mean[0] > 0.7 * FALSE_ALARMS / alpha  # of 40; exactly, it is beyond that
+    assert mean[0] > 0.7 * FALSE_ALARMS / alpha  # of 20; exactly, it is beyond that
     assert mean[1] < soon
 
 
