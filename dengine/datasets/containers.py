@@ -115,8 +115,9 @@ def is_text(path: Path) -> bool:
 def read_frame(path: Path, content: bytes = b"") -> pd.DataFrame | None:
     """Read a Parquet or JSON file as a table; its rows count from 1. None for another suffix.
 
-    JSON is a list of objects, an object on each line, one list in an object, or an object that
-    gives each name a label or an object. An index that has a name is a column of the table.
+    JSON is a list of objects, an object on each line, one list of objects in an object, an object
+    with lists of numbers, which is a single row, or an object that gives each name a label or an
+    object. An index that has a name is a column of the table.
 
     content : of the file, if it was read. Raises DataError for a file that is none of these.
     """
@@ -145,7 +146,12 @@ def _json_rows(text: str) -> list[dict[str, Any]]:
     if rows is None:
         rows = [json.loads(line) for line in text.splitlines() if line.strip()]
     if isinstance(rows, dict):
+        items = [value[0] for value in rows.values() if isinstance(value, list) and value]
+        if any(isinstance(item, int | float) for item in items):
+            return [rows]
         lists = [value for value in rows.values() if isinstance(value, list)]
+        if lists and any(isinstance(value, str) for value in rows.values()):
+            raise ValueError("it is one part, whose lists are of objects; write a table of them")
         named = [
             {"file": name, **(value if isinstance(value, dict) else {"label": value})}
             for name, value in rows.items()

@@ -111,7 +111,8 @@ def expand_curves(
     stated = [units.find_columns(name, channels) for name in options.channels]
     if stated and all(stated):
         channels = [channels[places[0]] for places in stated]
-    blocks = [frame.drop(columns=list(curves))]
+    lists = [str(name) for name, cells in frame.items() if any(map(_is_list, cells))]
+    blocks = [frame.drop(columns=[*curves, *lists])]
     for name in channels:
         block = np.full((len(frame), longest[name]), np.nan)
         odd = dict[tuple[int, int], str]()
@@ -128,13 +129,18 @@ def expand_curves(
     rate = None
     if clocks and options.rate_hz is None:
         rate = _rate_of_curves(frame.index, curves[clocks[0]], curves[channels[0]], clocks[0])
-    unread = [name for name in curves if name not in (*channels, *clocks[:1])]
+    unread = [name for name in {**curves, **dict.fromkeys(lists)} if name not in (*channels, *clocks[:1])]
     return pd.concat(blocks, axis=1), rate, clocks[0] if rate else "", unread
 
 
 def _is_empty(cell: Any) -> bool:
     """Return whether a cell of a table is empty, or no text and no list."""
-    return cell == "" if isinstance(cell, str) else not hasattr(cell, "__len__")
+    return cell == "" if isinstance(cell, str) else not _is_list(cell)
+
+
+def _is_list(cell: Any) -> bool:
+    """Return whether a cell of a table is a list, but no text."""
+    return hasattr(cell, "__len__") and not isinstance(cell, str)
 
 
 def _numbers(curve: Sequence[Any] | NDArray[Any] | None) -> tuple[list[float], dict[int, str]]:

@@ -108,7 +108,7 @@ STATION = re.compile(
     re.IGNORECASE,
 )
 NO_TEXTS = (*PARQUET, NPZ)
-SUFFIXES = (*TEXTS, *NO_TEXTS)
+SUFFIXES = (*TEXTS, *NO_TEXTS, *JSON)
 
 
 def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
@@ -147,13 +147,16 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
         unusual = [
             suffix
             for suffix in counts
-            if suffix not in (*SUFFIXES, *JSON)
+            if suffix not in SUFFIXES
             and counts[suffix] >= most + bool(tables)
             and _is_of_numbers(heads[suffix])
         ]
         chosen = [suffix for suffix in tables or usual if counts[suffix] == most]
         if unusual:
             chosen = [max(unusual, key=counts.__getitem__)]
+    n_json = max(counts[suffix] for suffix in JSON)
+    if not chosen or n_json > sum(counts[suffix] for suffix in chosen):  # else they tell of these
+        chosen = [suffix for suffix in JSON if counts[suffix] == n_json > 0]
     if not chosen:
         raise DataError(_no_recordings(folder, firsts))
     names = [name for name, path in named.items() if suffix_of(path) in chosen]
@@ -214,7 +217,7 @@ def read_heads(named: Mapping[str, Path], options: LoadOptions) -> FolderHeads:
 
     Raises DataError if the files cannot be decoded by `options.encoding`.
     """
-    paths = [path for path in named.values() if suffix_of(path) not in NO_TEXTS]
+    paths = [path for path in named.values() if suffix_of(path) not in (*NO_TEXTS, *JSON)]
     if not paths:
         return FolderHeads([], Counter(), {}, [])
     try:
@@ -254,7 +257,7 @@ def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptio
     later. Raises DataError if the first file cannot be read.
     """
     path = next(iter(named.values()))
-    if suffix_of(path) in NO_TEXTS:
+    if suffix_of(path) in (*NO_TEXTS, *JSON):
         return True
     header = heads.header
     if options.time is not None and options.part in header:

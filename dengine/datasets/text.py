@@ -584,7 +584,10 @@ def _true_header(
 
 def _are_even(cells: Iterable[str]) -> bool:
     """Return whether numbers as texts rise by steps that are equal to 1 %."""
-    numbers = [float(cell.replace(",", ".")) for cell in cells]
+    try:
+        numbers = [float(cell.replace(",", ".")) for cell in cells]
+    except ValueError:  # as 1.234,5, which is no time
+        return False
     steps = np.diff(numbers)
     return bool(steps[0] > 0) and bool(np.ptp(steps) < 0.01 * steps[0])
 
