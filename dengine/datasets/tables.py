@@ -107,6 +107,9 @@ STATION = re.compile(
     r"|spindle|spindel|nest|cavity|tool|head|lane",
     re.IGNORECASE,
 )
+# A folder that states the value of a column for the tables in it, as Spark and Hive name it.
+PARTITION = re.compile(r"([^/=]+)=([^/]*)/")
+NO_PARTITION = "__HIVE_DEFAULT_PARTITION__"
 NO_TEXTS = (*PARQUET, NPZ)
 SUFFIXES = (*TEXTS, *NO_TEXTS, *JSON)
 
@@ -770,6 +773,9 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
             raise DataError(f"Cannot read {path}: {fault}.") from error
         if table.frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
+        for key, value in PARTITION.findall(source):
+            if key not in table.frame:
+                table.frame[key] = "" if value == NO_PARTITION else value
         collector.faults += [replace(fault, source=source) for fault in table.faults]
         tables[source] = table
         collector.notes.update(table.notes)
@@ -876,7 +882,8 @@ def _turned(table: TextTable, options: LoadOptions) -> TextTable:
     import pandas as pd
 
     frame = table.frame
-    if not frame.columns.is_unique or frame.shape[1] <= MIN_NUMBERED or options.part in frame:
+    has_parts = options.part in frame.columns[1:]
+    if not frame.columns.is_unique or frame.shape[1] <= MIN_NUMBERED or has_parts:
         return table
     first = str(frame.columns[0])
     numbers = frame.apply(pd.to_numeric, errors="coerce")
@@ -915,10 +922,10 @@ def _turned(table: TextTable, options: LoadOptions) -> TextTable:
 
 
 def _word_in_name(name: str, source: labels.LabelSource) -> str:
-    """Return the word that is the label in a name, or "" if it has none."""
+    """Return the word that is the label in a name, else its last word, or "" if this is a number."""
     with suppress(UnreadableError):
         return source.find(name).word
-    return ""
+    return re.split(r"[\s_]", name)[-1].strip("0123456789")
 
 
 def _check_columns(frame: pd.DataFrame, source: str) -> None:
@@ -1412,7 +1419,9 @@ def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -
 
     keys : columns of parts, times and, if there is one, labels.
     """
-    if not frame.duplicated(keys[:2]).any():
+    channels = set(options.channels)
+    has_several = frame.duplicated(keys[:2]).any()
+    if not (has_several or channels):
         return frame
     others = [name for name in frame if name not in keys]
     texts = [name for name in others if not is_mostly_numbers(frame[name])]
@@ -1421,10 +1430,10 @@ def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -
         for name in texts
         if not STATION.fullmatch(name) and not frame.duplicated([*keys[:2], name]).any()
     ]
-    if not tags:
+    default = tags[0] if tags and has_several else None
+    tag = next((name for name in tags if channels and channels <= {*frame[name]}), default)
+    if tag is None:
         return frame
-    channels = set(options.channels)
-    tag = next((name for name in tags if channels <= {*frame[name]}), tags[0])
     signals = frame[tag].unique().tolist()
     is_named = bool(channels) and channels <= set(signals)
     rows = frame[frame[tag].isin(channels)] if is_named else frame

@@ -456,8 +456,10 @@ def _find_header(
         has_groups |= len(group_names) < len(above[1]) > len({*above[1]}) and all(above[1])
         if not (has_groups or is_remark or is_units[0] or _is_field_above(*above)):
             header = data = 0
-    if header > 1 and _have_a_column_each(above, len(rows[data])):
-        header = data = 0
+    if header > 1:
+        titles = _titles_above_columns(above, len(rows[data]))
+        if titles is not None:
+            header = data = titles
     if not columns and above and _numeric_columns(above[header]):
         header, data = _true_header(above, is_units, header, data)
     units_row = above[header + 1] if header + 1 < data else []
@@ -554,13 +556,17 @@ def _are_pairs(row: Sequence[str]) -> bool:
     return len(row) > 2 and len(row) % 2 == 0 and row[0] != "" and len({*row[::2]}) == 1
 
 
-def _have_a_column_each(above: Sequence[Sequence[str]], n: int) -> bool:
-    """Return whether rows above data of n columns tell something of each of many columns.
+def _titles_above_columns(above: Sequence[Sequence[str]], n: int) -> int | None:
+    """Return how many rows of titles stand above those that tell something of each of n columns.
 
-    So they do in a table with a column for each part. The first must tell the columns apart.
+    Such rows, two or more, stand above the data in a table with a column for each part. The first
+    must tell the columns apart. None for any other table.
     """
-    is_full = all(all(row[1:]) and len(row) == n for row in above)
-    return is_full and n > MIN_TIMES and len({*above[0]}) == n
+    is_full = [all(row[1:]) and len(row) == n for row in above]
+    titles = max((i for i, is_row_full in enumerate(is_full, 1) if not is_row_full), default=0)
+    if n <= MIN_TIMES or titles > len(above) - 2 or len({*above[titles]}) < n:
+        return None
+    return titles
 
 
 def _true_header(
