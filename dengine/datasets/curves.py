@@ -129,7 +129,9 @@ def expand_curves(
     rate = None
     if clocks and options.rate_hz is None:
         rate = _rate_of_curves(frame.index, curves[clocks[0]], curves[channels[0]], clocks[0])
-    unread = [name for name in {**curves, **dict.fromkeys(lists)} if name not in (*channels, *clocks[:1])]
+    unread = [
+        name for name in {**curves, **dict.fromkeys(lists)} if name not in (*channels, *clocks[:1])
+    ]
     return pd.concat(blocks, axis=1), rate, clocks[0] if rate else "", unread
 
 

@@ -54,6 +54,7 @@ from .dataset import (
     Dataset,
     Fault,
     LoadOptions,
+    Reading,
     Recording,
     RecordingCollector,
     UnknownWordError,
@@ -828,6 +829,9 @@ def _from_tables(
             if constant:
                 do = f"; if a file is one recording, name its label's column: label={constant[0]!r}"
             raise DataError(f"Expected {wanted}, only one of them has {differing}{do}.")
+    is_wide = options.time is None and _largest_channel(frames[first]) >= MIN_NUMBERED
+    if options.labels is not None and is_wide:
+        return _join_listing(tables, options, collector)
     if options.time is not None or options.labels is not None:
         cut_lines = {(source, table.cut_line) for source, table in tables.items()}
         cut = [fault for fault in collector.faults if (fault.source, fault.line) in cut_lines]
@@ -840,7 +844,39 @@ def _from_tables(
         actual = f"a row a sample: {columns}"
         raise DataError(f"Expected a row an insertion, got {actual}; a long table needs {advice}.")
     for source, table in tables.items():
-        _add_wide_rows(table, options, collector, source)
+        for line, _, read in _wide_rows(table, options, collector, source):
+            collector.add(source, read, line)
+    return as_dataset(collector, options)
+
+
+def _largest_channel(frame: pd.DataFrame) -> int:
+    """Return the number of columns of the channel that has most numbered columns; 0 for none."""
+    return max(map(len, _numbered_columns(frame.columns).values()), default=0)
+
+
+def _join_listing(
+    tables: Mapping[str, TextTable], options: LoadOptions, collector: RecordingCollector
+) -> Dataset:
+    """Make a data set of wide tables whose labels are in a file, by the numbers of parts.
+
+    Raises DataError if a table has no column of these, or two rows have one number.
+    """
+    read_of_part = dict[str, Callable[[], Recording]]()
+    for source, table in tables.items():
+        if options.part not in table.frame:
+            samples = max(_numbered_columns(table.frame.columns).values(), key=len)
+            others = table.frame.drop(columns=[name for _, name in samples])
+            likely = next((name for name in others if others[name].is_unique), "Serial")
+            wanted = f"the column of parts that the file of labels names, as in part={likely!r}"
+            raise DataError(f"Expected {wanted}, found {listed(others.columns)}.")
+        for _, part, read in _wide_rows(table, options, collector, source):
+            if part in read_of_part:
+                wanted = f"one row for each part, as {options.labels} lists them"
+                raise DataError(f"Expected {wanted}, got {part} twice.")
+            read_of_part[part] = read
+    listed_by = replace(options, part="part")
+    listing = labels.labels_in_file(str(options.labels), list(read_of_part), listed_by)
+    labels.collect_recordings(read_of_part, lambda read: read(), listing, collector)
     return as_dataset(collector, options)
 
 
@@ -904,7 +940,8 @@ def _turned(table: TextTable, options: LoadOptions) -> TextTable:
     if not (has_names or rows):  # words whose meaning the error asks for
         few = min(MAX_LABEL_WORDS, len(about) / 2)
         rows = [name for name in unique if 2 <= unique[name].nunique() <= few]
-    if not (has_names or rows or options.label in about):
+    has_listing = options.labels is not None
+    if not (has_names or rows or has_listing or options.label in about):
         return table
     samples = frame[is_sample].iloc[:, 1:].T.set_axis(list(map(str, range(len(times)))), axis=1)
     wide = pd.concat([about, samples], axis=1).assign(**{options.part: frame.columns[1:]})
@@ -922,7 +959,7 @@ def _turned(table: TextTable, options: LoadOptions) -> TextTable:
 
 
 def _word_in_name(name: str, source: labels.LabelSource) -> str:
-    """Return the word that is the label in a name, else its last word, or "" if this is a number."""
+    """Return the word that is the label in a name, else its last word; "" if that is a number."""
     with suppress(UnreadableError):
         return source.find(name).word
     return re.split(r"[\s_]", name)[-1].strip("0123456789")
@@ -958,22 +995,24 @@ def _column_forms(frame: pd.DataFrame) -> set[str]:
     return {channel_of.get(name, name) for name in frame.columns}
 
 
-def _add_wide_rows(
+def _wide_rows(
     table: TextTable, options: LoadOptions, collector: RecordingCollector, source: str
-) -> None:
-    """Add each row of a wide table to a collector as a recording, and set its channels.
+) -> list[tuple[int, str, Callable[[], Recording]]]:
+    """Return line, part and a reader of each row of a wide table; set the collector's channels.
 
     An empty cell before others is NaN, which the engine finds. A row whose last cells are empty is
-    a shorter trace. A row with text among its samples, an unknown label, or labels that contradict
-    each other is a fault; one without a label yet is only counted. Raises DataError if the columns
-    of labels, parts or samples are not found, and if each part has several rows, one per signal.
+    a shorter trace. The reader raises UnreadableError for a row with text among its samples, with
+    an unknown label, or with labels that contradict each other, and UnlabelledError for one without
+    a label yet; no label is read if the options name a file of them. Raises DataError if the
+    columns of labels, parts or samples are not found, and if each part has several rows, one per
+    signal.
     """
     frame = table.frame
-    label_column = _label_column(frame, options)
-    label_columns = [label_column, *_compared_columns(frame, label_column, options)]
-    if options.part != "part" and options.part not in frame:
-        wanted = f"a column {options.part} of parts' numbers"
-        raise DataError(f"Expected {wanted}, found {listed(frame.columns)}.")
+    label_columns = list[str]()
+    if options.labels is None:
+        label_column = _label_column(frame, options)
+        label_columns = [label_column, *_compared_columns(frame, label_column, options)]
+    parts = _parts_of_rows(frame, options)
     others = [name for name in frame.columns if name not in (*label_columns, options.part)]
     columns = _sample_columns(others, options)
     all_columns = [name for names in columns.values() for name in names]
@@ -989,39 +1028,51 @@ def _add_wide_rows(
     ]
     unit_of = dict(zip(frame.columns, table.units, strict=False))
     channel_units = tuple(_unit_of_columns(*item, unit_of) for item in columns.items())
-    do = f"name the column to trust: label={label_column!r}"
     rate = None if options.rate_hz else table.rate_hz
+    clock = "" if rate is None else table.clock
     if table.offer and not options.rate_hz:
         collector.notes[table.offer] = 1
-    parts = [""] * len(frame)
-    if options.part in frame:
-        parts = frame[options.part].astype(object).fillna("").tolist()
 
-    def read(line: int, trace: NDArray[np.float32], words: Sequence[Any], part: Any) -> Recording:
+    def read(line: int, trace: NDArray[np.float32], words: Sequence[Any], part: str) -> Recording:
         """Return a row as a recording; raise UnreadableError for a bad cell or label."""
         if line in wrong:
             raise UnreadableError(wrong[line])
-        number = str(part).removesuffix(".0").strip() or None
+        recording = Recording(
+            without_trailing_nan(trace),
+            rate,
+            channel_units,
+            reading=Reading(numbers=table.numbers, clock=clock),
+            source=f"{source}, line {line}",
+            part=part or None,
+        )
+        if not words:
+            return recording
         finders = {
             f"column {column.name}": partial(column.find, [word])
             for column, word in zip(label_cells, words, strict=True)
         }
+        do = f"name the column to trust: label={label_columns[0]!r}"
         label = labels.agreed_label(finders, do, collector.notes)
-        clock = "" if rate is None else table.clock
         reading = label.reading._replace(numbers=table.numbers, clock=clock)
-        return Recording(
-            without_trailing_nan(trace),
-            rate,
-            channel_units,
-            reading=reading,
-            label=label.label,
-            source=f"{source}, line {line}",
-            part=number,
-        )
+        return recording._replace(label=label.label, reading=reading)
 
-    words = zip(*(frame[name].tolist() for name in label_columns), strict=True)
-    for row in zip(frame.index, traces, words, parts, strict=True):
-        collector.add(source, partial(read, *row), row[0])
+    words = frame[label_columns].to_numpy(dtype=object).tolist()
+    rows = zip(frame.index, traces, words, parts, strict=True)
+    return [(row[0], row[3], partial(read, *row)) for row in rows]
+
+
+def _parts_of_rows(frame: pd.DataFrame, options: LoadOptions) -> list[str]:
+    """Return the part's number of each row of a wide table, "" without one.
+
+    Raises DataError if the column of parts that the user stated is not there.
+    """
+    if options.part in frame:
+        cells = frame[options.part].astype(object).fillna("")
+        return [str(cell).removesuffix(".0").strip() for cell in cells]
+    if options.part != "part":
+        wanted = f"a column {options.part} of parts' numbers"
+        raise DataError(f"Expected {wanted}, found {listed(frame.columns)}.")
+    return [""] * len(frame)
 
 
 def _unit_of_columns(channel: str, names: Sequence[str], unit_of: Mapping[str, str]) -> str:
