@@ -47,11 +47,29 @@ EPOCHS = (
 # What the sampling rate, or the time from sample to sample, is called above a header or as an array
 # of an archive, in lower case, without blanks and marks.
 RATE_NAMES = (
-    *("fs", "fshz", "rate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency"),
+    *(
+        "fs",
+        "fshz",
+        "sampleratehz",
+        "samplingratehz",
+        "rate",
+        "samplerate",
+        "samplingrate",
+        "samplefrequency",
+        "samplingfrequency",
+    ),
     *("abtastrate", "abtastfrequenz", "messrate", "messfrequenz", "datarate"),
 )
 STEP_NAMES = (
-    *("dt", "deltat", "timestep", "sampletime", "sampleinterval", "samplinginterval"),
+    *(
+        "dt",
+        "deltat",
+        "timestep",
+        "timestampstep",
+        "sampletime",
+        "sampleinterval",
+        "samplinginterval",
+    ),
     *("samplingtime", "sampleperiod", "samplingperiod", "abtastzeit", "abtastintervall"),
 )
 UNSURE_RATES = ("rate", "datarate")  # of samples only in hertz

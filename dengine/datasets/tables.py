@@ -35,6 +35,7 @@ from .clocks import (
     holds_dates,
     is_rising,
     place_of_clock,
+    rate_in_preamble,
     rate_of,
     seconds_of,
 )
@@ -108,6 +109,7 @@ STATION = re.compile(
     r"|spindle|spindel|nest|cavity|tool|head|lane",
     re.IGNORECASE,
 )
+UNIT_COLUMN = re.compile(r"(.*\W)?\w*(units?|einheit|uom)", re.IGNORECASE)
 # A folder that states the value of a column for the tables in it, as Spark and Hive name it.
 PARTITION = re.compile(r"([^/=]+)=([^/]*)/")
 NO_PARTITION = "__HIVE_DEFAULT_PARTITION__"
@@ -1021,6 +1023,8 @@ def _wide_rows(
     collector.channels = tuple(filter(None, columns))
     _check_single_signal(frame, others, options)
     unread = [name for name in others if name and name not in all_columns]
+    stated = _stated_in_rows(frame[unread], table)
+    unread = [name for name in unread if name not in stated.columns]
     if unread := [_describe_column(frame, name) for name in unread]:
         collector.notes[f"Not read: the columns {listed(unread)}"] = 1
     label_cells = [
@@ -1028,8 +1032,6 @@ def _wide_rows(
     ]
     unit_of = dict(zip(frame.columns, table.units, strict=False))
     channel_units = tuple(_unit_of_columns(*item, unit_of) for item in columns.items())
-    rate = None if options.rate_hz else table.rate_hz
-    clock = "" if rate is None else table.clock
     if table.offer and not options.rate_hz:
         collector.notes[table.offer] = 1
 
@@ -1037,11 +1039,13 @@ def _wide_rows(
         """Return a row as a recording; raise UnreadableError for a bad cell or label."""
         if line in wrong:
             raise UnreadableError(wrong[line])
+        rate = None if options.rate_hz else stated.rate_of.get(line)
+        is_stated = len(columns) == 1 and line in stated.unit_of
         recording = Recording(
             without_trailing_nan(trace),
             rate,
-            channel_units,
-            reading=Reading(numbers=table.numbers, clock=clock),
+            (stated.unit_of[line],) if is_stated else channel_units,
+            reading=Reading(numbers=table.numbers, clock="" if rate is None else stated.clock),
             source=f"{source}, line {line}",
             part=part or None,
         )
@@ -1053,12 +1057,91 @@ def _wide_rows(
         }
         do = f"name the column to trust: label={label_columns[0]!r}"
         label = labels.agreed_label(finders, do, collector.notes)
-        reading = label.reading._replace(numbers=table.numbers, clock=clock)
+        reading = recording.reading
+        reading = label.reading._replace(numbers=reading.numbers, clock=reading.clock)
         return recording._replace(label=label.label, reading=reading)
 
     words = frame[label_columns].to_numpy(dtype=object).tolist()
     rows = zip(frame.index, traces, words, parts, strict=True)
     return [(row[0], row[3], partial(read, *row)) for row in rows]
+
+
+class StatedByRow(NamedTuple):
+    """What columns of a wide table state of its rows.
+
+    unit_of, rate_of : dict
+        Unit and sampling rate in hertz, by the line of the row.
+    clock : str
+        What tells the rates, as in `Reading`.
+    columns : list of str
+        The columns that were read for this.
+    """
+
+    unit_of: dict[int, str]
+    rate_of: dict[int, float]
+    clock: str
+    columns: list[str]
+
+
+def _unit_columns(frame: pd.DataFrame) -> dict[str, dict[int, str]]:
+    """Return the column that states units, with the unit of each line that it is filled in.
+
+    The result is empty if no column does, and if several do, for these are of several signals.
+    """
+    result = {
+        str(name): cells[cells.notna() & (cells != "")].astype(str).to_dict()
+        for name, cells in frame.items()
+        if UNIT_COLUMN.fullmatch(str(name))
+    }
+    result = {
+        name: cells
+        for name, cells in result.items()
+        if cells and all(map(units.parse, cells.values()))
+    }
+    return result if len(result) == 1 else {}
+
+
+def _single_units(
+    stated_units: Mapping[str, Mapping[int, str]], lines: Iterable[int]
+) -> tuple[str, ...]:
+    """Return the unit that `_unit_columns` has for these lines, alone; empty if it has none.
+
+    Raises UnreadableError if it has several.
+    """
+    for name, unit_of in stated_units.items():
+        unit = tuple(dict.fromkeys(unit_of[line] for line in lines if line in unit_of))
+        if len(unit) > 1:
+            actual = f"{listed(unit)} in column {name}"
+            raise UnreadableError(f"Expected one unit of a recording, got {actual}")
+        return unit
+    return ()
+
+
+def _stated_in_rows(frame: pd.DataFrame, table: TextTable) -> StatedByRow:
+    """Return the units and rates that columns of a table state, as `torqueUnit` or `fs`.
+
+    A column counts if each of its cells that is not empty states one. If the table has a rate, it
+    is that of all rows.
+    """
+    filled = {str(name): cells[cells.notna() & (cells != "")] for name, cells in frame.items()}
+    in_units = _unit_columns(frame)
+    unit_of = next(iter(in_units.values()), {})
+    if table.rate_hz is not None:
+        rate_of = dict.fromkeys(table.frame.index, table.rate_hz)
+        return StatedByRow(unit_of, rate_of, table.clock, list(in_units))
+    for name, cells in filled.items():
+        rates = {line: _stated_rate(name, cell) for line, cell in cells.items()}
+        rate_of = {line: rate for line, rate in rates.items() if rate is not None}
+        if len(rate_of) == len(cells) > 0:
+            clock = f"none, column {name} states the rate"
+            return StatedByRow(unit_of, rate_of, clock, [name, *in_units])
+    return StatedByRow(unit_of, {}, "", list(in_units))
+
+
+def _stated_rate(name: str, cell: object) -> float | None:
+    """Return the rate in hertz that a cell of a column states, as 500 of `Sample Rate (Hz)`."""
+    quantity, unit = units.split(name.rpartition(".")[2])
+    return rate_in_preamble(f"{quantity}: {cell} {unit}")[0]
 
 
 def _parts_of_rows(frame: pd.DataFrame, options: LoadOptions) -> list[str]:
@@ -1206,6 +1289,7 @@ def _from_long(
     if not has_dates:
         _check_together(rows_of_part)
     places = [frame.columns.get_loc(name) for name in collector.channels]
+    stated_units = _unit_columns(frame[others]) if len(places) == 1 else {}
 
     def read(rows: pd.DataFrame) -> Recording:
         """Return the rows of a part as a trace, in the order of their times."""
@@ -1214,12 +1298,12 @@ def _from_long(
         rows = rows.drop(columns=[SECONDS_COLUMN, RUN_COLUMN, ROW_COLUMN], errors="ignore")
         units_row = [column_units.get(name, "") for name in rows.columns]
         timed = rows_to_trace(rows, places, options, collector.notes, units_row)
-        channel_units = (
+        channel_units = _single_units(stated_units, rows.index) or tuple(
             column_units.get(name) or units.split(name)[1] for name in collector.channels
         )
         clock = timed.reading.clock.replace(ANY_ORDER, form)  # a part's rows may not tell it
         reading = timed.reading._replace(numbers=first.numbers, clock=clock)
-        return timed._replace(units=tuple(channel_units), start=start, reading=reading)
+        return timed._replace(units=channel_units, start=start, reading=reading)
 
     labels.collect_recordings(rows_of_part, read, label_source, collector)
     collector.order_by_start(apart=True, has_dates=has_dates)

@@ -86,7 +86,7 @@ COUNTER_NAME = re.compile(
 ONE_CELL = re.compile(rf"{IN_LINE}|(?:{WORD_DATE})(?: +\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?)?")
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 # A cell of a row of units, beside the units that `units.parse` knows.
-UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|")
+UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|[\d.,]+ ?k?Hz|")
 NUMBER_AND_UNIT = re.compile(
     r"(?P<number>[-+−]?\d[\d.,]*([eE][-+]?\d+)?) *(?P<unit>[^\W\d][^\d:,;]*)"
 )
@@ -447,6 +447,8 @@ def _find_header(
     above = [_without_comment_mark(row, delimiter) for row in rows[: max(data, 1)]]
     is_units = [any(row) and all(map(_is_unit, row)) for row in above]
     header = max(data - 1 - (data > 1 and is_units[-1]), 0)
+    if header and is_units[header] and any(cell.endswith("Hz") for cell in above[-1]):
+        header -= 1  # catman writes the units and, below them, the rates
     is_remark = (
         header == 1 and units.COMMENT_MARK.match(rows[0][0]) and not _numeric_columns(rows[1])
     )
@@ -454,7 +456,7 @@ def _find_header(
         group_names = list(filter(None, rows[0]))
         has_groups = len(set(group_names)) < len(group_names)
         has_groups |= len(group_names) < len(above[1]) > len({*above[1]}) and all(above[1])
-        if not (has_groups or is_remark or is_units[0] or _is_field_above(*above)):
+        if not (has_groups or is_remark or is_units[0] or _is_field_above(*above[:2])):
             header = data = 0
     if header > 1:
         titles = _titles_above_columns(above, len(rows[data]))

@@ -2,6 +2,7 @@
 state.
 """
 
+import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -1243,3 +1244,102 @@ def test_a_channel_that_is_not_beside_columns_of_one_name_is_an_error(tmp_path: 
     """g05: a clock for each channel, and a channel that is not there, ended in a traceback."""
     write(tmp_path / "a_OK.csv", ["Time", "Fx", "Time", "Fz"], times(), texts(), times(), texts())
     assert "Expected a column F, got Time, Fx" in one_line("data", tmp_path, "--channel", "F")
+
+
+def parts_of_two(scale: float = 1.0) -> dict[str, list[float]]:
+    """The samples of two parts, by their serial numbers."""
+    return {"0000073": (VALUES * scale).tolist(), "0000074": (-VALUES * scale).tolist()}
+
+
+def test_a_wide_table_is_labelled_by_a_listing_that_names_its_parts(tmp_path: Path) -> None:
+    wide = tmp_path / "curves.csv"
+    frame = pd.DataFrame(parts_of_two()).T.rename(columns="Y{}".format)
+    frame.rename_axis("Serial Number").reset_index().to_csv(wide, index=False)
+    listing = tmp_path / "erp.csv"
+    listing.write_text("Serial,Result\n74,Fail\n73,Pass\n")
+    assert "--part 'Serial Number'" in one_line("data", wide, "--labels", listing)
+    data = load_dataset(wide, labels=listing, part="Serial Number")
+    assert data.y.tolist() == [1, 0]
+    assert data.source.tolist() == ["0000073", "0000074"]
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    listing.write_text("Serial,Result\n73,Pass\n")
+    assert len(load_dataset(wide, labels=listing, part="Serial Number").faults) == 1
+
+
+def test_columns_that_state_units_and_rates_hold_for_their_rows(tmp_path: Path) -> None:
+    records = [
+        {"sn": sn, "force": [value / scale for value in values], "unit": unit, "ok": True}
+        for (sn, values), unit, scale in zip(
+            parts_of_two().items(), ("N", "kN"), (1.0, 1000.0), strict=True
+        )
+    ]
+    path = tmp_path / "a.jsonl"
+    path.write_text("\n".join(json.dumps(record | {"fs_hz": 250}) for record in records))
+    data = load_dataset(path, label="ok")
+    np.testing.assert_allclose(data.X, np.float32([VALUES, -VALUES]), rtol=1e-6)
+    assert (data.unit, data.rate_hz) == ("N", 250.0)
+    long = pd.DataFrame(records).explode("force").rename(columns={"sn": "part", "ok": "label"})
+    long["time"] = np.tile(STEP * np.arange(N), 2)
+    data = load_dataset(long.reset_index(drop=True).astype({"force": float}), time="time")
+    np.testing.assert_allclose(data.X, np.float32([VALUES, -VALUES]), rtol=1e-6)
+    long = long.reset_index(drop=True).astype({"force": float})
+    long.loc[5, "unit"] = "kN"
+    (fault,) = load_dataset(long, time="time").faults
+    assert "Expected one unit of a recording, got N, kN in column unit" in str(fault)
+
+
+def test_json_files_of_one_part_each_are_rows_of_one_table(tmp_path: Path) -> None:
+    for sn, values in parts_of_two().items():
+        record = {"id": sn, "result": "OK", "force": values, "errors": [{"code": 7}]}
+        (tmp_path / f"{sn}.json").write_text(json.dumps(record))
+    data = load_dataset(tmp_path, label="result", part="id")
+    np.testing.assert_array_equal(data.X, np.float32([VALUES, -VALUES]))
+
+
+def test_a_part_whose_curve_is_in_pieces_is_refused(tmp_path: Path) -> None:
+    """A nutrunner's steps would each have become a part, with the step's result."""
+    steps = [{"result": "OK", "torque": VALUES.tolist()}] * 2
+    for name in ("1.json", "2.json"):
+        (tmp_path / name).write_text(json.dumps({"id": name, "result": "OK", "steps": steps}))
+    assert "it is one part, whose lists are of objects" in one_line("data", tmp_path)
+
+
+def test_a_folder_that_states_a_column_states_it_of_the_tables_in_it(tmp_path: Path) -> None:
+    frame = pd.DataFrame({"force_N": list(parts_of_two().values())})
+    for result in ("PASS", "FAIL", "__HIVE_DEFAULT_PARTITION__"):
+        folder = tmp_path / "line=3" / f"result={result}"
+        folder.mkdir(parents=True)
+        frame.to_parquet(folder / "part-0.parquet")
+    data = load_dataset(tmp_path)
+    assert (data.y.tolist(), data.unlabelled) == ([0, 0, 1, 1], 2)
+
+
+def test_the_only_signal_of_a_table_is_named_by_its_tag() -> None:
+    frame = pd.DataFrame(parts_of_two()).melt(var_name="part", value_name="_value")
+    frame["_time"] = np.tile(STEP * np.arange(N), 2)
+    frame["_field"] = "force_N"
+    data = load_dataset(frame.assign(label="ok"), time="_time", channel="force_N")
+    np.testing.assert_array_equal(data.X, np.float32([VALUES, -VALUES]))
+
+
+def test_titles_may_stand_above_a_table_with_a_column_for_each_part(tmp_path: Path) -> None:
+    numbers = [f"D{i}" for i in range(10)]
+    verdicts = ["gut"] * 7 + ["Ausschuss"] * 3
+    rows = [[str(4 * i), *([cell] * 10)] for i, cell in enumerate(texts())]
+    head = [["AST40;Program 12"], ["Nummer", *numbers], ["Befund", *verdicts]]
+    lines = [";".join(row) for row in [*head, ["Zeit [ms]", *["Moment [Nm]"] * 10], *rows]]
+    path = tmp_path / "shift.csv"
+    path.write_text("\n".join(lines))
+    assert "'Ausschuss' 3 times beside 7 good ones" in one_line("data", path)
+    data = load_dataset(path, label_map="Ausschuss=bad", part="Nummer")
+    assert data.y.tolist() == [1] * 7 + [0] * 3
+    assert data.part.tolist() == numbers
+    np.testing.assert_array_equal(data.X[9], VALUES.astype(np.float32))
+
+
+def test_rates_below_the_row_of_units_are_no_header(tmp_path: Path) -> None:
+    lines = ["Temps\tForce", "s\tkN", "250 Hz\t250 Hz"]
+    lines += ["\t".join(cells) for cells in zip(times(), texts(), strict=True)]
+    (tmp_path / "a_OK.asc").write_text("\n".join(lines))
+    data = load_dataset(tmp_path)
+    assert (data.channels, data.unit, data.rate_hz) == (("Force",), "kN", 250.0)
