@@ -40,10 +40,10 @@ def data(source: DataChoice, out: Out | None) -> None:
     shows drift; --out draws the traces too.
 
     DATA is one of: a folder of CSV files, one for each insertion, with the label in its name or in
-    a column; a wide .csv or .parquet file, with a row for each insertion; a long one, with a row
-    for each sample, read by --part, --time and --label; an .npz file with X (traces, samples) and y
-    (1 success, 0 failure); one long .mcap file, cut by --trigger; the file of a store, for its
-    labelled traces; or the bundled set, insertion.
+    a column; a wide .csv, .parquet or .jsonl file, with a row for each insertion; a long one, with
+    a row for each sample, read by --part, --time and --label; an .npz file with X (traces, samples)
+    and y (1 success, 0 failure); one long .mcap file, cut by --trigger; the file of a store, for
+    its labelled traces; or the bundled set, insertion.
     """
     from ..datasets import load_dataset
     from ..experiments.figures import data_picture
