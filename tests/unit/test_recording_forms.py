@@ -898,11 +898,11 @@ def test_lists_in_cells_of_a_text_file_are_named(tmp_path: Path) -> None:
 
 def test_a_column_without_a_name_is_not_listed(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    path.write_text(",fs,force,label\n0,500,1.5,OK\n1,500,2.0,NOK\n")
-    with pytest.raises(DataError, match="found fs, force"):
+    path.write_text(",heat,force,label\n0,500,1.5,OK\n1,500,2.0,NOK\n")
+    with pytest.raises(DataError, match="found heat, force"):
         load_dataset(path)
-    path.write_text(",fs,F_0,F_1,label\n7,500,1.5,1.5,OK\n8,500,2.0,1.5,NOK\n")
-    assert "Not read: the columns fs." in load_dataset(path).notes
+    path.write_text(",heat,F_0,F_1,label\n7,500,1.5,1.5,OK\n8,500,2.0,1.5,NOK\n")
+    assert "Not read: the columns heat." in load_dataset(path).notes
 
 
 def test_a_date_a_time_and_milliseconds_are_one_clock(tmp_path: Path) -> None:
