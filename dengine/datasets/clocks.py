@@ -47,30 +47,13 @@ EPOCHS = (
 # What the sampling rate, or the time from sample to sample, is called above a header or as an array
 # of an archive, in lower case, without blanks and marks.
 RATE_NAMES = (
-    *(
-        "fs",
-        "fshz",
-        "sampleratehz",
-        "samplingratehz",
-        "rate",
-        "samplerate",
-        "samplingrate",
-        "samplefrequency",
-        "samplingfrequency",
-    ),
-    *("abtastrate", "abtastfrequenz", "messrate", "messfrequenz", "datarate"),
+    *("fs", "fshz", "rate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency"),
+    *("sampleratehz", "samplingratehz", "abtastrate", "abtastfrequenz", "messrate", "messfrequenz"),
+    "datarate",
 )
 STEP_NAMES = (
-    *(
-        "dt",
-        "deltat",
-        "timestep",
-        "timestampstep",
-        "sampletime",
-        "sampleinterval",
-        "samplinginterval",
-    ),
-    *("samplingtime", "sampleperiod", "samplingperiod", "abtastzeit", "abtastintervall"),
+    *("dt", "deltat", "timestep", "timestampstep", "sampletime", "sampleinterval", "sampleperiod"),
+    *("samplinginterval", "samplingtime", "samplingperiod", "abtastzeit", "abtastintervall"),
 )
 UNSURE_RATES = ("rate", "datarate")  # of samples only in hertz
 FREQUENCIES = ("frequency", "frequenz", "freq")  # of samples, or of something else
@@ -93,15 +76,9 @@ STATED_UNIT = re.compile(
 )
 # The beginnings of the months' names in English, German, French, Italian and Spanish.
 MONTHS = (
-    *(
-        "jan gen ene",
-        "feb fév fev",
-        "mar mär mae mrz",
-        "apr avr abr",
-        "may mai mag",
-        "jun juin giu",
-    ),
-    *("jul juil lug", "aug aoû aou ago", "sep set", "oct okt ott", "nov", "dec dez dic déc"),
+    *("jan gen ene", "feb fév fev", "mar mär mae mrz", "apr avr abr", "may mai mag"),
+    *("jun juin giu", "jul juil lug", "aug aoû aou ago", "sep set", "oct okt ott"),
+    *("nov", "dec dez dic déc"),
 )
 MONTH = f"(?:{'|'.join(' '.join(MONTHS).split())})[^\\W\\d_]{{0,6}}\\.?"
 # Dates as 11.03.2024 or 11.03.24, 11-Mar-24 or 11. März 2024, and Mar 11, 2024.

@@ -647,9 +647,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         notes.append(f"{collector.unlabelled_text(n)}: they are left out.")
     if not rate:
         notes.append(UNKNOWN_RATE)
-    n_good = sum(recording.label for recording in recordings)
-    if n_good in (0, len(recordings)) and len(recordings) >= MANY:
-        notes.append(f"No recording is {'bad' if n_good else 'good'}: check how labels are read.")
+    notes += odd_labels_note(sum(recording.label for recording in recordings), len(recordings))
     first = as_read[recordings[0].source]
     channel_units = split_unit(unit, len(first.trace))
     channel_units = [
@@ -797,6 +795,16 @@ def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) ->
         target or guess_unit(collector.channels[c : c + 1]) for c, target in enumerate(targets)
     ]
     return channel_units[0] if len(set(channel_units)) == 1 else ", ".join(channel_units)
+
+
+def odd_labels_note(n_good: int, n: int) -> list[str]:
+    """Return a note if all of n labels are alike, or more than half are bad; empty otherwise."""
+    if n < MANY or 2 * n_good >= n > n_good:
+        return []
+    odd = f"{n - n_good} of {n} recordings are bad"
+    if n_good in (0, n):
+        odd = f"No recording is {'bad' if n_good else 'good'}"
+    return [f"{odd}: check how labels are read."]
 
 
 def split_unit(unit: str | Sequence[str] | None, n: int) -> list[str]:

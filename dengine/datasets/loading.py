@@ -44,6 +44,7 @@ from .dataset import (
     expect_data,
     guess_unit,
     make_dataset,
+    odd_labels_note,
     refit,
     split_names,
     split_unit,
@@ -365,19 +366,36 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         if "rate_hz" in arrays:
             about["rate_hz"] = float(arrays["rate_hz"])
         names = tuple(map(str, arrays.get("channels", ())))
-        if "unit" in arrays:
-            stored_unit = arrays["unit"]
-            about["unit"] = ", ".join(map(str, np.atleast_1d(stored_unit).tolist()))
-        else:
-            about["unit"] = guess_unit(names or channels)
+        stated_units = map(str, np.atleast_1d(arrays.get("unit", "")).tolist())
+        about["unit"] = ", ".join(stated_units) or guess_unit(names or channels)
         if len(channels) == 1 and X.ndim == 3:  # it is the name of an array of several channels
             channels = ()
             options = replace(options, channels=())
         about["channels"] = channels or names
+        X, lengths = _without_padding(X, stored)
         data = _from_arrays(X, arrays[label], options, name, label_column, **about)
         data = _refit_without_padding(data, options, has_unit="unit" in arrays)
-    read = {label, *traces, options.part, *ARRAYS, *SIMULATED, *arrays}
+    read = {label, *traces, options.part, *lengths, *ARRAYS, *SIMULATED, *arrays}
     return replace(data, notes=(*data.notes, *_archive_notes(data, all_names, read)))
+
+
+def _without_padding(
+    X: NDArray[Any], stored: Mapping[str, NDArray[Any]]
+) -> tuple[NDArray[Any], list[str]]:
+    """Return traces (n, T) or (n, C, T) with NaN in place of zeros behind their ends, and a name.
+
+    It is that of the array of whole numbers, shape (n,), that says how long each trace is: behind
+    that all samples are 0. Without such an array the traces are returned as they are, and no name.
+    """
+    n, samples = len(X), X.shape[-1]
+    for key, length in stored.items():
+        if length.shape != (n,) or length.dtype.kind not in "iu" or X.dtype.kind != "f":
+            continue
+        is_behind = np.arange(samples) >= length[:, None]
+        is_behind = is_behind.reshape(n, *[1] * (X.ndim - 2), samples)
+        if length.min() >= MIN_PADDING < samples - length.min() and not (is_behind * X).any():
+            return np.where(is_behind, np.nan, X), [key]
+    return X, []
 
 
 def _refit_without_padding(data: Dataset, options: LoadOptions, *, has_unit: bool) -> Dataset:
@@ -393,7 +411,9 @@ def _refit_without_padding(data: Dataset, options: LoadOptions, *, has_unit: boo
         return refit(data, options, has_unit=has_unit)
     about = refit(data, replace(options, samples=None, fit=None), has_unit=has_unit)
     collector = RecordingCollector(data.name, about.channels)
-    collector.notes[f"{n_padded} of {len(data)} traces end at their last number, before NaN"] = 1
+    collector.notes[
+        f"{n_padded} of {len(data)} traces end before their row, by NaN or an array of lengths"
+    ] = 1
     traces = as_traces(about.X)
     channel_units = tuple(split_unit(about.unit, traces.shape[1]))
     parts = [None] * len(data) if data.part is None else map(str, data.part)
@@ -460,7 +480,7 @@ def _arrays_by_meaning(
 
 
 def _archive_notes(data: Dataset, names: Sequence[str], read: set[str]) -> list[str]:
-    """Return notes for the user: traces that end in many zeros, arrays not read, an unknown rate.
+    """Return notes for the user: zeros at the ends of traces, arrays not read, odd labels, no rate.
 
     names, read : its arrays, and those that are read.
     """
@@ -473,6 +493,8 @@ def _archive_notes(data: Dataset, names: Sequence[str], read: set[str]) -> list[
         notes.append(f"{text}: if they are padded, cut them (samples), or leave the zeros out.")
     if unread := [name for name in names if name not in read]:
         notes.append(f"Not read: the arrays {listed(unread)}.")
+    odd_labels = odd_labels_note(int(data.y.sum()), len(data))
+    notes += [note for note in odd_labels if note not in data.notes]
     if data.rate_hz is None:
         notes.append(UNKNOWN_RATE)
     return notes

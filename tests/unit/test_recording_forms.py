@@ -943,7 +943,7 @@ def test_nan_behind_the_last_number_ends_a_trace_of_an_archive(tmp_path: Path) -
     assert (data.lengths.tolist(), data.y.tolist()) == ([100, N, N, N, N], [1, 1, 0, 1, 1])
     assert [fault.source for fault in data.faults] == ["trace 2"]
     assert data.part.tolist() == ["10", "12", "13", "14", "15"]
-    assert "2 of 6 traces end at their last number, before NaN." in data.notes
+    assert "2 of 6 traces end before their row, by NaN or an array of lengths." in data.notes
     assert load_dataset(tmp_path / "a.npz", samples=90).X.shape == (5, 90)
 
 
@@ -1343,3 +1343,23 @@ def test_rates_below_the_row_of_units_are_no_header(tmp_path: Path) -> None:
     (tmp_path / "a_OK.asc").write_text("\n".join(lines))
     data = load_dataset(tmp_path)
     assert (data.channels, data.unit, data.rate_hz) == (("Force",), "kN", 250.0)
+
+
+def test_zeros_behind_the_length_of_each_trace_are_no_samples(tmp_path: Path) -> None:
+    X = np.tile(VALUES, (12, 1))
+    lengths = np.array([N - 30, *[N] * 11])
+    X[0, -30:] = 0.0
+    y = np.array([0, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 0])
+    np.savez(tmp_path / "a.npz", X=X, y=y, n_valid=lengths)
+    data = load_dataset(tmp_path / "a.npz")
+    assert data.X[0, -1] == np.float32(VALUES[-31])
+    assert data.lengths.tolist() == lengths.tolist()
+    np.savez(tmp_path / "b.npz", X=X, y=y, count=lengths - 1)  # no length: samples lie behind it
+    assert "Not read: the arrays count." in load_dataset(tmp_path / "b.npz").notes
+
+
+def test_labels_of_which_most_are_bad_are_questioned(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", X=np.tile(VALUES, (12, 1)), y=np.array([0] * 7 + [1] * 5))
+    note = "7 of 12 recordings are bad: check how labels are read."
+    assert note in load_dataset(tmp_path / "a.npz").notes
+    assert note not in load_dataset(tmp_path / "a.npz", label_map="0=good,1=bad").notes
