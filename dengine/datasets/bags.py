@@ -8,6 +8,7 @@ has begun counts, or a file of labels by the insertions' numbers. `load_dataset`
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -70,10 +71,13 @@ class Messages(NamedTuple):
         """Return an axis of the wrench, or the value of a topic at each wrench, shape (n,).
 
         The value of a topic is its newest one when the wrench was logged, NaN before its first. The
-        name is not checked: one that is neither gives MZ.
+        name is not checked: one that is neither gives MZ. Raises DataError for texts.
         """
         if name not in self.others:
             return self.wrench[:, axis_of(name)]
+        texts = [value for _, value in self.others[name] if isinstance(value, str)]
+        do = "name a topic of numbers in the trigger"
+        expect_data(not texts, f"numbers on topic {name}", repr(texts[0]) if texts else "", do)
         values = np.array([np.nan, *(float(value) for _, value in self.others[name])])
         logged = [time for time, _ in self.others[name]]
         return values[np.searchsorted(logged, self.logged, side="right")]
@@ -218,6 +222,7 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
     expect_data(len(wrenches) == 1, wanted, listed(wrenches or types) or "none")
     topics = [signal for signal in trigger.signals if axis_of(signal) < 0]
     topics += [options.label] if options.label and options.labels is None else []
+    topics += [options.part] if options.part in types else []
     for topic in topics:
         if topic not in types:
             actual = listed(types) or "none"
@@ -253,7 +258,8 @@ def _cut_dataset(
 ) -> Dataset:
     """Cut a stream into insertions by its trigger, and return them with their labels as a data set.
 
-    Insertions are named NAME/1, NAME/2, ... By default each lasts two seconds. Those with missing
+    Insertions are named NAME/1, NAME/2, ..., or by the topic of parts. By default each lasts two
+    seconds. Those with missing
     messages become faults. Raises DataError if the trigger never starts.
     """
     active = trigger.active({signal: messages.signal(signal) for signal in trigger.signals})
@@ -266,8 +272,11 @@ def _cut_dataset(
     if not cuts:
         message = f"Expected insertions in {name}, where {trigger} goes on; it never does."
         raise DataError(message)
-    insertions = {f"{name}/{i}": cut for i, cut in enumerate(cuts, start=1)}
-    names = list(insertions)
+    names = [f"{name}/{i}" for i in range(1, len(cuts) + 1)]
+    if options.part in messages.others:
+        names = _parts_in_topic(options.part, messages, cuts)
+        options = replace(options, part="part")
+    insertions = dict(zip(names, cuts, strict=True))
     if options.labels is not None:
         source = labels.labels_in_file(options.labels, names, options)
     else:
@@ -281,7 +290,29 @@ def _cut_dataset(
     reading = Reading(clock="" if options.rate_hz else messages.clock)
     collector = RecordingCollector(name, channels, order="as in the bag")
     labels.collect_recordings(insertions, read, source, collector)
+    ends = np.append(np.flatnonzero(~active), len(active))  # where the trigger is off
+    lengths = [int(ends[np.searchsorted(ends, cut.first)]) - cut.first for cut in cuts]
+    if options.samples is None and np.median(lengths) > samples:
+        goes_on = f"The trigger goes on for {min(lengths)} to {max(lengths)} samples"
+        collector.notes[f"{goes_on}: the first {samples}, two seconds, are used (samples)"] = 1
     return as_dataset(collector, options)
+
+
+def _parts_in_topic(
+    topic: str, messages: Messages, cuts: "Sequence[RecordedInsertion]"
+) -> list[str]:
+    """Return the part of each insertion: the newest message of a topic when it began, as a text.
+
+    Raises DataError if an insertion has none, or two have the same.
+    """
+    logged = [time for time, _ in messages.others[topic]]
+    texts = [str(word) for _, word in messages.others[topic]]
+    places = np.searchsorted(logged, messages.logged[[cut.first for cut in cuts]], side="right")
+    expect_data(all(places > 0), f"a message of {topic} before each insertion", "none before one")
+    parts = [texts[i - 1] for i in places]
+    repeated = [part for part, n in Counter(parts).items() if n > 1]
+    expect_data(not repeated, f"another part on {topic} for each insertion", listed(repeated))
+    return parts
 
 
 def _labels_in_topic(

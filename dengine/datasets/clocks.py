@@ -53,7 +53,14 @@ RATE_NAMES = (
 )
 STEP_NAMES = (
     *("dt", "deltat", "timestep", "timestampstep", "sampletime", "sampleinterval", "sampleperiod"),
-    *("samplinginterval", "samplingtime", "samplingperiod", "abtastzeit", "abtastintervall"),
+    *(
+        "deltax",
+        "samplinginterval",
+        "samplingtime",
+        "samplingperiod",
+        "abtastzeit",
+        "abtastintervall",
+    ),
 )
 UNSURE_RATES = ("rate", "datarate")  # of samples only in hertz
 FREQUENCIES = ("frequency", "frequenz", "freq")  # of samples, or of something else
@@ -197,7 +204,8 @@ def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
         if not places:
             raise UnreadableError(f"Expected a column {time} of times, found {listed(names)}")
         return places[0]
-    if places := [i for i, name in enumerate(names) if is_time_column(name)]:
+    filled = [i for i in range(len(names)) if (frame.iloc[:, i].fillna("") != "").any()]
+    if places := [i for i in filled if is_time_column(names[i])]:
         # Of a date and a time of day, only the latter rises.
         return max(places, key=lambda i: _rising_share(head.iloc[:, i]))
     return next((i for i in range(len(names)) if _is_clock(head.iloc[:, i], names[i])), None)
@@ -646,7 +654,8 @@ def rate_in_preamble(text: str) -> tuple[float | None, str]:
         unit = (match["bracketed"] or match["unit"]).lower()
         names = (*RATE_NAMES, *FREQUENCIES)
         rate = number * HERTZ.get(unit or "hz", 0.0) if name in names else 0.0
-        step = number * (units.seconds_in(unit) or 0.0) if name in STEP_NAMES else 0.0
+        in_seconds = units.seconds_in("s" if name == "deltax" else unit) or 0.0  # LabVIEW's Delta_X
+        step = number * in_seconds if name in STEP_NAMES else 0.0
         rate = 1.0 / step if step else rate
         is_unsure = name in FREQUENCIES or (name in UNSURE_RATES and not unit)
         if RATES[0] <= rate <= RATES[1] and not is_unsure:

@@ -629,6 +629,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     collector.check_label_words()
     as_read = {recording.source: recording for recording in collector.recordings}
     unit = _convert_to_one_unit(collector, options)
+    _leave_out_overflows(collector)
     options, rate = _bring_to_one_rate(collector, options)
     lengths = np.array([r.trace.shape[1] for r in collector.recordings], dtype=np.int64)
     fit, samples = choose_fit(lengths, options.fit, options.samples)
@@ -711,6 +712,24 @@ def _fit_odd_lengths(
     wanted = f"Expected {_fit_text(samples, fit)}"
     do = f"fit={PAD_ALL!r} keeps it"
     collector.leave_out({i: f"{wanted}, got {lengths[i]}; {do}" for i in odd})
+
+
+def _leave_out_overflows(collector: RecordingCollector) -> None:
+    """Make faults of the recordings in which an overflow mark, as 1000000, stands for samples.
+
+    That is one value in several samples, `FAR` times larger than the peaks of most recordings.
+    """
+    with np.errstate(invalid="ignore"):
+        peaks = np.array([np.nan_to_num(np.abs(r.trace)).max() for r in collector.recordings])
+        largest = FAR * float(np.median(peaks))
+        reasons = {}
+        for i in np.flatnonzero((peaks > largest) & (largest > 0)):
+            trace = collector.recordings[i].trace
+            marks = trace[np.abs(trace) > largest]
+            if len(marks) > 1 and len({*marks.tolist()}) == 1:
+                actual = f"{len(marks)} samples are {marks[0]:g}, as of an overflow"
+                reasons[int(i)] = f"Expected measured samples, {actual}"
+    collector.leave_out(reasons)
 
 
 def _note_scales(collector: RecordingCollector) -> None:

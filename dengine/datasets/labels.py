@@ -1148,8 +1148,12 @@ def _label_file_columns(
     with_words : the words of those that have few, whose meaning may be asked for.
     column : the one of labels, if the user stated it.
     """
-    of_file = column_among(header, LISTS["file_columns"])
     of_label = column_among(header, LABEL_COLUMNS if column is None else (column.lower(),))
+    of_labels_alone = {*with_labels} - {
+        *with_names
+    }  # as a column `insertion` of success and failure
+    candidates = ["" if i in of_labels_alone else name for i, name in enumerate(header)]
+    of_file = column_among(candidates, LISTS["file_columns"])
     if column is not None and of_label is None:
         wanted = f"a column {column} of labels in {path}"
         raise DataError(f"Expected {wanted}, got {', '.join(header)}; leave it out (label).")

@@ -84,7 +84,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FORCE = "FZ_Base"  # what a UR cell calls the force along the insertion
-NUMBER_LAST = re.compile(r"(?P<channel>.*?)[_\-. \[]*(?P<number>\d+)\]?")  # FZ_0
+# FZ_0, or FZ_0ms, FZ_4ms, ...
+NUMBER_LAST = re.compile(r"(?P<channel>.*?)[_\-. \[]*(?P<number>\d+)(?P<unit> ?[mµu]s)?\]?")
 NUMBER_FIRST = re.compile(
     r"[A-Za-z]{0,6}[_\-. ]?(?P<number>\d+)[_\-. ]+(?P<channel>\D.*)"
 )  # s000_fz
@@ -109,7 +110,7 @@ STATION = re.compile(
     r"|spindle|spindel|nest|cavity|tool|head|lane",
     re.IGNORECASE,
 )
-UNIT_COLUMN = re.compile(r"(.*\W)?\w*(units?|einheit|uom)", re.IGNORECASE)
+UNIT_COLUMN = re.compile(r"(.*\W)?\w*(units?|einheit|uom|unit[éà]|unidad|単位|单位|단위)", re.IGNORECASE)
 # A folder that states the value of a column for the tables in it, as Spark and Hive name it.
 PARTITION = re.compile(r"([^/=]+)=([^/]*)/")
 NO_PARTITION = "__HIVE_DEFAULT_PARTITION__"
@@ -848,7 +849,31 @@ def _from_tables(
     for source, table in tables.items():
         for line, _, read in _wide_rows(table, options, collector, source):
             collector.add(source, read, line)
+    _leave_out_repeated_rows(collector)
     return as_dataset(collector, options)
+
+
+def _leave_out_repeated_rows(collector: RecordingCollector) -> None:
+    """Leave out the rows of wide tables that repeat a row of another file, or of the same part.
+
+    All samples and the label are equal, so that the part counts once; a note names these rows.
+    """
+    first_of = dict[tuple[bytes, int], Recording]()
+    repeated = list[str]()
+    kept = list[Recording]()
+    for recording in collector.recordings:
+        first = first_of.setdefault((recording.trace.tobytes(), recording.label), recording)
+        file, first_file = (r.source.rpartition(", line ")[0] for r in (recording, first))
+        is_same_part = recording.part == first.part
+        is_known = recording.part is not None or file != first_file
+        if first is not recording and is_same_part and is_known and np.ptp(recording.trace) > 0:
+            repeated.append(recording.source)
+        else:
+            kept.append(recording)
+    if repeated:
+        collector.recordings = kept
+        text = f"{len(repeated)} rows repeat an earlier one, and are left out: {listed(repeated)}"
+        collector.notes[text] = 1
 
 
 def _largest_channel(frame: pd.DataFrame) -> int:
@@ -1101,6 +1126,15 @@ def _unit_columns(frame: pd.DataFrame) -> dict[str, dict[int, str]]:
     return result if len(result) == 1 else {}
 
 
+def _step_in_names(names: Iterable[str]) -> float | None:
+    """Return the seconds between samples that the names of columns state, as FZ_0ms, FZ_4ms, ..."""
+    matches = [match for name in names if (match := NUMBER_LAST.fullmatch(name)) and match["unit"]]
+    if len(matches) < MIN_NUMBERED:
+        return None
+    second = units.seconds_in(matches[0]["unit"].strip()) or 0.0
+    return (int(matches[1]["number"]) - int(matches[0]["number"])) * second
+
+
 def _single_units(
     stated_units: Mapping[str, Mapping[int, str]], lines: Iterable[int]
 ) -> tuple[str, ...]:
@@ -1126,9 +1160,12 @@ def _stated_in_rows(frame: pd.DataFrame, table: TextTable) -> StatedByRow:
     filled = {str(name): cells[cells.notna() & (cells != "")] for name, cells in frame.items()}
     in_units = _unit_columns(frame)
     unit_of = next(iter(in_units.values()), {})
-    if table.rate_hz is not None:
-        rate_of = dict.fromkeys(table.frame.index, table.rate_hz)
-        return StatedByRow(unit_of, rate_of, table.clock, list(in_units))
+    rate_hz, clock = table.rate_hz, table.clock
+    if step := _step_in_names(table.frame.columns):
+        rate_hz, clock = 1.0 / step, "times in the names of the columns"
+    if rate_hz is not None:
+        rate_of = dict.fromkeys(table.frame.index, rate_hz)
+        return StatedByRow(unit_of, rate_of, clock, list(in_units))
     for name, cells in filled.items():
         rates = {line: _stated_rate(name, cell) for line, cell in cells.items()}
         rate_of = {line: rate for line, rate in rates.items() if rate is not None}
