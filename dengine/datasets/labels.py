@@ -26,6 +26,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from ..errors import DataError, instead, listed
+from . import units
 from .clocks import EMPTY_CELLS
 from .containers import PACKED
 from .dataset import (
@@ -121,6 +122,10 @@ class NoLabelError(UnreadableError):
         form = "a label at the end of the name, as in 0001_True.csv or 0001_NOK.csv"
         super().__init__(f"Expected {form}, found none")
         self.words = tuple(words)
+
+
+class NoColumnError(UnreadableError):
+    """A file without the column that tells the labels of others."""
 
 
 class SourcedLabel(NamedTuple):
@@ -473,6 +478,9 @@ def read_cells(path: Path, column: str, options: LoadOptions) -> list[str]:
         fields = {**table.fields, **fields_beside(path)}
         if column in fields:
             return [fields[column]]
+        if not units.find_columns(column, list(frame.columns)):
+            actual = listed([*frame.columns, *fields])
+            raise NoColumnError(f"Expected a column {column}, got {actual}", table.line)
     return list(map(str, frame.iloc[:, column_place(column, list(frame.columns))]))
 
 
@@ -578,10 +586,11 @@ def agreed_label(
     for place, find in finders.items():
         try:
             other = _find_beside(label, find, place, do)
-        except (NoLabelError, UnlabelledError) as error:
+        except (NoLabelError, NoColumnError, UnlabelledError) as error:
             if label is None and not fills_in:
                 raise
-            if label is None or isinstance(error, UnlabelledError):
+            has_column = not isinstance(error, NoColumnError)
+            if has_column and (label is None or isinstance(error, UnlabelledError)):
                 places_without.append(place)
             last_error = error
             continue
@@ -609,7 +618,7 @@ def _find_beside(
     """
     try:
         return find()
-    except (NoLabelError, UnlabelledError):
+    except (NoLabelError, NoColumnError, UnlabelledError):
         raise
     except UnknownWordError as error:
         if label is not None:

@@ -8,6 +8,7 @@ and a column of parts. `load_dataset` calls `read_folder`, `read_tables` and `fr
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import zlib
@@ -110,7 +111,9 @@ STATION = re.compile(
     r"|spindle|spindel|nest|cavity|tool|head|lane",
     re.IGNORECASE,
 )
-UNIT_COLUMN = re.compile(r"(.*\W)?\w*(units?|einheit|uom|unit[éà]|unidad|単位|单位|단위)", re.IGNORECASE)
+UNIT_COLUMN = re.compile(
+    r"(.*\W)?\w*(units?|einheit|uom|unit[éà]|unidad|単位|单位|단위)", re.IGNORECASE
+)
 # A folder that states the value of a column for the tables in it, as Spark and Hive name it.
 PARTITION = re.compile(r"([^/=]+)=([^/]*)/")
 NO_PARTITION = "__HIVE_DEFAULT_PARTITION__"
@@ -205,7 +208,8 @@ class FolderHeads(NamedTuple):
     verdicts : dict
         The labels in all heads for each column or field whose head is one verdict in each file.
     fields : list of str
-        What lines above the header of that file state, as `TextCells.fields`.
+        What lines above the header of that file state, as `TextCells.fields`, and what files with
+        another header have.
     """
 
     header: list[str]
@@ -235,11 +239,15 @@ def read_heads(named: Mapping[str, Path], options: LoadOptions) -> FolderHeads:
     sample = {path: _first_rows(path, options) for path in paths[::step]}
     usual_header, _ = Counter(tuple(cells.header) for cells in sample.values()).most_common(1)[0]
     first = next(cells for cells in sample.values() if tuple(cells.header) == usual_header)
-    heads = FolderHeads(first.header, Counter(), {}, list(first.fields))
+    kinds = {(*cells.header, *cells.fields): cells for cells in (*sample.values(), first)}
+    fields = dict.fromkeys([*first.fields, *itertools.chain.from_iterable(kinds)])
+    heads = FolderHeads(first.header, Counter(), {}, list(fields))
     usual = _usual_label_columns(heads.label_places)
-    for name in heads.label_places:
-        if name not in usual and labels.is_verdict(name, _cells_of(first, name), options.words):
-            heads.verdicts[name] = set()
+    for places, cells in kinds.items():
+        for name in places:
+            is_verdict = labels.is_verdict(name, _cells_of(cells, name), options.words)
+            if name not in usual and is_verdict:
+                heads.verdicts[name] = set()
     for path in paths:
         cells = sample.get(path) or _first_rows(path, options)
         rows = list(cells.rows.values())
@@ -358,6 +366,7 @@ def read_folder(
     except DataError as error:
         check = partial(collect, _read_nothing, RecordingCollector(name, ()))
         raise _with_label_error(error, check) from error
+    _check_headers(heads, channels)
     collector = RecordingCollector(name, channels)
     in_order = sorted(named, key=lambda name: natural_key(source.without_label(name)))
     collector.ordered = sorted(named, key=natural_key) == in_order
@@ -497,7 +506,8 @@ def _label_source(
     if has_names or not columns:
         sources = [in_names, *sources]
     do = f"name the one to trust: label={listed(columns[:1])!r}, or a pattern of the path (label)"
-    return labels.labels_that_agree(sources[0], sources[1:], do, fills_in=has_names), columns
+    fills_in = has_names or len(columns) > 1  # files of other languages have other columns
+    return labels.labels_that_agree(sources[0], sources[1:], do, fills_in=fills_in), columns
 
 
 def _usual_label_columns(header: Sequence[str]) -> list[str]:
@@ -741,6 +751,28 @@ def _usual_channels(
     if not lower or FORCE.lower() in lower:
         return (FORCE,)
     return choose_channels(choices.most_common(1)[0][0], options)
+
+
+def _check_headers(heads: FolderHeads, channels: Sequence[str]) -> None:
+    """Raise DataError if a fifth of the files has other channels, as many as those with the stated.
+
+    Then a setting of the recorder was changed, as its language.
+    """
+    n_files = heads.channel_choices.total()
+    for name in channels:
+        has_it = {
+            names: units.find_columns(name, names) for names in heads.channel_choices if names
+        }
+        known = next((names for names, places in has_it.items() if places), ())
+        for names, places in has_it.items():
+            n = heads.channel_choices[names]
+            if places or len(names) != len(known) or 5 * n < n_files:
+                continue
+            columns = ["time", *(f"c{i}" for i in range(1, len(names) + 1))]
+            channel = columns[has_it[known][0] + 1]
+            actual = f"{n} of {n_files} files have {listed(names)} instead"
+            do = f"name the columns of all, columns={','.join(columns)!r}, channel={channel!r}"
+            raise DataError(f"Expected the channel {name} in each file, {actual}; {do}.")
 
 
 def _columns_without_clock(

@@ -201,7 +201,8 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
     cells = _find_header(_names_and_units_of_keys(rows), delimiter, list(columns))
     remarks = _remarks(cells)
     last = max(cells.rows.keys() - remarks, default=0)
-    outside = [line for i, line in lines.items() if i < cells.line or i > last]
+    begin = cells.line or min(cells.rows, default=0)  # without a header of its own
+    outside = [line for i, line in lines.items() if i < begin or i > last]
     kept = {i: row for i, row in cells.rows.items() if i not in remarks}
     return cells._replace(
         rows=kept, fields=_fields_in(outside), n_remarks=cells.n_remarks + len(remarks)
