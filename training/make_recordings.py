@@ -172,6 +172,7 @@ STAMPED_WRENCH = STAMPED_FIELDS + "".join(PARTS.values())
 TOPICS = {
     "/phase": ("std_msgs/msg/Int32", "int32 data"),
     "/height_check/ok": ("std_msgs/msg/Bool", "bool data"),
+    "/part_id": ("std_msgs/msg/String", "string data"),
 }
 Message = tuple[int, str, dict[str, Any]]  # nanoseconds, topic, content
 

@@ -23,6 +23,7 @@ REST = 40
 FORCE = "/ft/wrench"
 PHASE = "/phase"
 CHECK = "/height_check/ok"
+PART = "/part_id"
 
 
 def vector(values: np.ndarray) -> dict[str, float]:
@@ -50,14 +51,18 @@ class Bag:
         self.lost: set[int] = set()
         self.stamped = True
         self.told = {i: bool(good) for i, good in enumerate(self.good)}
+        self.parts: list[str] = []
 
     def write(self, path: Path, parts: slice = slice(None)) -> Path:
         return write_messages(path, self.messages(parts), self.stamped, FORCE)
 
     def messages(self, parts: slice) -> Iterator[tuple[int, str, dict]]:
         ends = {start + SAMPLES + 10: i for i, start in enumerate(self.starts)}
+        starts = dict(zip(self.starts, self.parts, strict=False))
         for i in range(len(self.wrench))[parts]:
             time = int(self.logged[i])
+            if i in starts:
+                yield time, PART, {"data": starts[i]}
             yield time, PHASE, {"data": int(self.phase[i])}
             if i not in self.lost:
                 yield time, FORCE, self.message(i)
@@ -164,6 +169,38 @@ def test_labels_are_listed_by_number_too_with_the_parts(bag: Bag, tmp_path: Path
     np.testing.assert_array_equal(data.y, bag.good[:-1])
     assert data.part.tolist() == [f"P{i // 2}" for i in range(1, 8)]
     assert [fault.source for fault in data.faults] == ["labels.csv", "cell/8"]
+
+
+def test_a_topic_names_the_parts_that_a_file_labels(bag: Bag, tmp_path: Path) -> None:
+    bag.parts = [f"PCB-{i}" for i in range(8)]
+    path = bag.write(tmp_path / "cell.mcap")
+    table = tmp_path / "labels.csv"
+    words = ["success" if good else "failure" for good in bag.good]
+    rows = [f"{part},{word}" for part, word in zip(bag.parts, words, strict=True)]
+    table.write_text("\n".join(["part_id,insertion", *reversed(rows)]), encoding="utf-8")
+    options = {"trigger": ASKED["trigger"], "labels": table, "part": PART}
+    data = load_dataset(path, samples=SAMPLES, **options)
+    np.testing.assert_array_equal(data.y, bag.good)
+    assert data.source.tolist() == bag.parts
+    assert not data.notes
+    bag.parts[1] = "PCB-0"
+    with pytest.raises(DataError, match="Expected another part on /part_id for each insertion"):
+        load_dataset(bag.write(tmp_path / "twice.mcap"), **options)
+    with pytest.raises(DataError, match="Expected numbers on topic /part_id, got 'PCB-0'"):
+        load_dataset(path, **{**ASKED, "trigger": "register@/part_id"})
+
+
+def test_insertions_that_last_longer_than_two_seconds_are_noted(tmp_path: Path) -> None:
+    bag = Bag()
+    bag.stamps = BEGIN + 40 * STEP * np.arange(len(bag.stamps))  # at 12.5 Hz
+    bag.logged = bag.stamps + 500_000
+    options = {key: ASKED[key] for key in ("trigger", "label")}
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), **options)
+    assert data.X.shape == (8, 25)
+    note = (
+        "The trigger goes on for 60 to 60 samples: the first 25, two seconds, are used (samples)."
+    )
+    assert note in data.notes
 
 
 def test_an_insertion_that_nobody_labelled_is_a_fault_and_most_of_them_an_error(

@@ -1301,7 +1301,7 @@ def test_a_part_whose_curve_is_in_pieces_is_refused(tmp_path: Path) -> None:
     steps = [{"result": "OK", "torque": VALUES.tolist()}] * 2
     for name in ("1.json", "2.json"):
         (tmp_path / name).write_text(json.dumps({"id": name, "result": "OK", "steps": steps}))
-    assert "it is one part, whose lists are of objects" in one_line("data", tmp_path)
+    assert "it is one part in 2 pieces, steps; write one list" in one_line("data", tmp_path)
 
 
 def test_a_folder_that_states_a_column_states_it_of_the_tables_in_it(tmp_path: Path) -> None:
@@ -1363,3 +1363,61 @@ def test_labels_of_which_most_are_bad_are_questioned(tmp_path: Path) -> None:
     note = "7 of 12 recordings are bad: check how labels are read."
     assert note in load_dataset(tmp_path / "a.npz").notes
     assert note not in load_dataset(tmp_path / "a.npz", label_map="0=good,1=bad").notes
+
+
+def test_times_in_the_names_of_columns_tell_the_rate() -> None:
+    frame = pd.DataFrame([VALUES, -VALUES]).rename(columns=lambda i: f"F_{4 * int(i)}ms")
+    data = load_dataset(frame.assign(label=["OK", "NOK"]))
+    assert (data.channels, data.rate_hz, data.X.shape) == (("F",), 250.0, (2, N))
+
+
+def test_a_mark_of_overflow_is_a_fault(tmp_path: Path) -> None:
+    for i in range(6):
+        values = VALUES.copy()
+        values[50:53] = 1e6 if i == 2 else values[50:53]
+        write(tmp_path / f"{i}_OK.csv", ["t [s]", "F [N]"], times(), texts(values))
+    (fault,) = load_dataset(tmp_path).faults
+    assert (
+        str(fault) == "2_OK.csv: Expected measured samples, 3 samples are 1e+06, as of an overflow"
+    )
+
+
+def test_a_row_of_another_file_again_counts_once(tmp_path: Path) -> None:
+    rows = [[f"P{i}", "OK", *(VALUES + i).tolist()] for i in range(12)]
+    columns = ["part", "label", *(f"F_{i}" for i in range(N))]
+    pd.DataFrame(rows[:8], columns=columns).to_parquet(tmp_path / "a.parquet")
+    pd.DataFrame(rows[6:], columns=columns).to_parquet(tmp_path / "b.parquet")
+    data = load_dataset(tmp_path)
+    assert data.part.tolist() == [f"P{i}" for i in range(12)]
+    text = "2 rows repeat an earlier one, and are left out: b.parquet, line 1, b.parquet, line 2."
+    assert text in data.notes
+
+
+def test_an_empty_clock_of_labview_leaves_the_rate_to_delta_x(tmp_path: Path) -> None:
+    head = ["LabVIEW Measurement\t", "***End_of_Header***\t", "Delta_X\t0.004\t0.004"]
+    head += ["***End_of_Header***\t\t", "X_Value\tForce\tFeed\tComment"]
+    rows = [f"\t{cell}\t0.5" for cell in texts()]
+    (tmp_path / "a_OK.lvm").write_text("\n".join([*head, *rows]))
+    data = load_dataset(tmp_path, channel="Force")
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    assert data.rate_hz == 250.0
+
+
+def test_files_in_two_languages_are_read_by_the_columns_that_the_error_names(
+    tmp_path: Path,
+) -> None:
+    languages = {
+        "de": (["Gesamtergebnis;{}", "Zeit;Weg;Kraft"], ("IO", "NIO")),
+        "en": (["Total result;{}", "Time;Way;Force"], ("OK", "NOK")),
+    }
+    for language, (head, words) in languages.items():
+        for i in range(4):
+            lines = [head[0].format(words[i % 2]), "", head[1], "s;mm;N"]
+            lines += [f"{t};1.5;{x}" for t, x in zip(times(), texts(VALUES + i), strict=True)]
+            (tmp_path / f"{language}{i}.csv").write_text("\n".join(lines))
+    error = one_line("data", tmp_path, "--channel", "Kraft")
+    assert "4 of 8 files have Way, Force instead" in error
+    advice = re.search("--columns (.+), --channel ([^.]+)", error)
+    data = load_dataset(tmp_path, columns=advice[1], channel=advice[2])
+    assert (data.y.tolist(), data.unit) == ([1, 0] * 4, "N")
+    np.testing.assert_array_equal(data.X[3], (VALUES + 3).astype(np.float32))
