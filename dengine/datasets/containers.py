@@ -152,7 +152,7 @@ def _json_rows(text: str) -> list[dict[str, Any]]:
         lists = [value for value in rows.values() if isinstance(value, list)]
         if lists and any(isinstance(value, str) for value in rows.values()):
             pieces = next(name for name, value in rows.items() if value in lists)
-            do = "write one list of its samples, as in \"force\": [0.1, 0.2]"
+            do = 'write one list of its samples, as in "force": [0.1, 0.2]'
             raise ValueError(f"it is one part in {len(rows[pieces])} pieces, {pieces}; {do}")
         named = [
             {"file": name, **(value if isinstance(value, dict) else {"label": value})}

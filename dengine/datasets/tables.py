@@ -886,26 +886,24 @@ def _from_tables(
 
 
 def _leave_out_repeated_rows(collector: RecordingCollector) -> None:
-    """Leave out the rows of wide tables that repeat a row of another file, or of the same part.
+    """Leave out the rows of wide tables that repeat a row of another file, as of an upload again.
 
-    All samples and the label are equal, so that the part counts once; a note names these rows.
+    Part, label and all samples are equal; a note names these rows.
     """
-    first_of = dict[tuple[bytes, int], Recording]()
+    file_of = dict[tuple[Any, ...], str]()
     repeated = list[str]()
     kept = list[Recording]()
     for recording in collector.recordings:
-        first = first_of.setdefault((recording.trace.tobytes(), recording.label), recording)
-        file, first_file = (r.source.rpartition(", line ")[0] for r in (recording, first))
-        is_same_part = recording.part == first.part
-        is_known = recording.part is not None or file != first_file
-        if first is not recording and is_same_part and is_known and np.ptp(recording.trace) > 0:
+        file = recording.source.rpartition(", line ")[0]
+        content = (recording.part, recording.label, recording.trace.tobytes())
+        if file_of.setdefault(content, file) != file and np.ptp(recording.trace) > 0:
             repeated.append(recording.source)
         else:
             kept.append(recording)
     if repeated:
         collector.recordings = kept
-        text = f"{len(repeated)} rows repeat an earlier one, and are left out: {listed(repeated)}"
-        collector.notes[text] = 1
+        text = f"{len(repeated)} rows repeat one of another file, and are left out"
+        collector.notes[f"{text}: {listed(repeated)}"] = 1
 
 
 def _largest_channel(frame: pd.DataFrame) -> int:

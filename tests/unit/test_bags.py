@@ -178,8 +178,8 @@ def test_a_topic_names_the_parts_that_a_file_labels(bag: Bag, tmp_path: Path) ->
     words = ["success" if good else "failure" for good in bag.good]
     rows = [f"{part},{word}" for part, word in zip(bag.parts, words, strict=True)]
     table.write_text("\n".join(["part_id,insertion", *reversed(rows)]), encoding="utf-8")
-    options = {"trigger": ASKED["trigger"], "labels": table, "part": PART}
-    data = load_dataset(path, samples=SAMPLES, **options)
+    options = {**ASKED, "labels": table, "label": None, "part": PART}
+    data = load_dataset(path, **options)
     np.testing.assert_array_equal(data.y, bag.good)
     assert data.source.tolist() == bag.parts
     assert not data.notes

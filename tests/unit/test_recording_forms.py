@@ -947,7 +947,7 @@ def test_nan_behind_the_last_number_ends_a_trace_of_an_archive(tmp_path: Path) -
     assert load_dataset(tmp_path / "a.npz", samples=90).X.shape == (5, 90)
 
 
-@pytest.mark.parametrize("form", ["coarse", "equal", "empty", "fine"])
+@pytest.mark.parametrize("form", ["coarse", "equal", "fine"])
 def test_a_clock_too_coarse_to_show_lost_rows_is_said_to_be(form: str, tmp_path: Path) -> None:
     cells = {
         "coarse": [f"06:00:{i // 50:02d}" for i in range(N)],
@@ -1389,7 +1389,9 @@ def test_a_row_of_another_file_again_counts_once(tmp_path: Path) -> None:
     pd.DataFrame(rows[6:], columns=columns).to_parquet(tmp_path / "b.parquet")
     data = load_dataset(tmp_path)
     assert data.part.tolist() == [f"P{i}" for i in range(12)]
-    text = "2 rows repeat an earlier one, and are left out: b.parquet, line 1, b.parquet, line 2."
+    text = (
+        "2 rows repeat one of another file, and are left out: b.parquet, line 1, b.parquet, line 2."
+    )
     assert text in data.notes
 
 
