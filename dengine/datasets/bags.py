@@ -77,7 +77,7 @@ class Messages(NamedTuple):
             return self.wrench[:, axis_of(name)]
         texts = [value for _, value in self.others[name] if isinstance(value, str)]
         do = "name a topic of numbers in the trigger"
-        expect_data(not texts, f"numbers on topic {name}", repr(texts[0]) if texts else "", do)
+        expect_data(not texts, f"numbers on topic {name}", texts[0] if texts else "", do)
         values = np.array([np.nan, *(float(value) for _, value in self.others[name])])
         logged = [time for time, _ in self.others[name]]
         return values[np.searchsorted(logged, self.logged, side="right")]
