@@ -165,8 +165,8 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
         if unusual:
             chosen = [max(unusual, key=counts.__getitem__)]
     n_json = max(counts[suffix] for suffix in JSON)
-    if not chosen or n_json > sum(counts[suffix] for suffix in chosen):  # else they tell of these
-        chosen = [suffix for suffix in JSON if counts[suffix] == n_json > 0]
+    if n_json > FEW_LISTINGS * sum(counts[suffix] for suffix in chosen):  # else they tell of these
+        chosen = [suffix for suffix in JSON if counts[suffix] == n_json]
     if not chosen:
         raise DataError(_no_recordings(folder, firsts))
     names = [name for name, path in named.items() if suffix_of(path) in chosen]
@@ -759,20 +759,20 @@ def _check_headers(heads: FolderHeads, channels: Sequence[str]) -> None:
     Then a setting of the recorder was changed, as its language.
     """
     n_files = heads.channel_choices.total()
+    is_channel = [any(name in names for names in heads.channel_choices) for name in heads.header]
+    columns = [f"c{i}" if is_one else f"x{i}" for i, is_one in enumerate(is_channel)]
+    chosen = [column for column, is_one in zip(columns, is_channel, strict=True) if is_one]
+    columns = ["time" if column == "x0" else column for column in columns]
     for name in channels:
-        has_it = {
-            names: units.find_columns(name, names) for names in heads.channel_choices if names
-        }
-        known = next((names for names, places in has_it.items() if places), ())
-        for names, places in has_it.items():
-            n = heads.channel_choices[names]
-            if places or len(names) != len(known) or 5 * n < n_files:
-                continue
-            columns = ["time", *(f"c{i}" for i in range(1, len(names) + 1))]
-            channel = columns[has_it[known][0] + 1]
-            actual = f"{n} of {n_files} files have {listed(names)} instead"
-            do = f"name the columns of all, columns={','.join(columns)!r}, channel={channel!r}"
-            raise DataError(f"Expected the channel {name} in each file, {actual}; {do}.")
+        places_in = {names: units.find_columns(name, names) for names in heads.channel_choices}
+        known, place = next(((names, x[0]) for names, x in places_in.items() if x), ((), 0))
+        for names, n in heads.channel_choices.items():
+            is_other = not places_in[names] and 0 < len(names) == len(known) == len(chosen)
+            if is_other and 5 * n >= n_files:
+                actual = f"{n} of {n_files} files have {listed(names)} instead"
+                do = f"columns={','.join(columns)!r}, channel={chosen[place]!r}"
+                wanted = f"the channel {name} in each file"
+                raise DataError(f"Expected {wanted}, {actual}; name the columns of all, {do}.")
 
 
 def _columns_without_clock(
@@ -810,7 +810,8 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
         if table.frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
         for key, value in PARTITION.findall(source):
-            if key not in table.frame:
+            is_used = key in (options.label, options.part) or key.lower() in labels.LABEL_COLUMNS
+            if is_used and key not in table.frame:
                 table.frame[key] = "" if value == NO_PARTITION else value
         collector.faults += [replace(fault, source=source) for fault in table.faults]
         tables[source] = table
@@ -864,8 +865,10 @@ def _from_tables(
             if constant:
                 do = f"; if a file is one recording, name its label's column: label={constant[0]!r}"
             raise DataError(f"Expected {wanted}, only one of them has {differing}{do}.")
-    is_wide = options.time is None and _largest_channel(frames[first]) >= MIN_NUMBERED
-    if options.labels is not None and is_wide:
+    has_rows_of_parts = options.part in frames[first] and frames[first][options.part].is_unique
+    is_wide = has_rows_of_parts or options.part not in frames[first]
+    is_wide = is_wide and _largest_channel(frames[first]) >= MIN_NUMBERED
+    if options.labels is not None and options.time is None and is_wide:
         return _join_listing(tables, options, collector)
     if options.time is not None or options.labels is not None:
         cut_lines = {(source, table.cut_line) for source, table in tables.items()}
@@ -1158,7 +1161,8 @@ def _unit_columns(frame: pd.DataFrame) -> dict[str, dict[int, str]]:
 
 def _step_in_names(names: Iterable[str]) -> float | None:
     """Return the seconds between samples that the names of columns state, as FZ_0ms, FZ_4ms, ..."""
-    matches = [match for name in names if (match := NUMBER_LAST.fullmatch(name)) and match["unit"]]
+    matches = [match for match in map(NUMBER_LAST.fullmatch, names) if match and match["unit"]]
+    matches = [match for match in matches if match["channel"] == matches[0]["channel"]]
     if len(matches) < MIN_NUMBERED:
         return None
     second = units.seconds_in(matches[0]["unit"].strip()) or 0.0
