@@ -20,6 +20,7 @@ from ..errors import DataError, listed
 from ..files import read_archive
 from ..traces import is_time_column
 from . import labels
+from .columns import choose_channels
 from .dataset import (
     Dataset,
     LoadOptions,
@@ -29,7 +30,6 @@ from .dataset import (
     UnreadableError,
     as_dataset,
 )
-from .tables import choose_channels
 from .text import rows_to_trace
 
 if TYPE_CHECKING:

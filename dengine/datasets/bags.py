@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..errors import DataError, listed
 from ..files import check_size, read_errors
 from . import labels
+from .columns import natural_key
 from .dataset import (
     Dataset,
     LoadOptions,
@@ -28,7 +29,6 @@ from .dataset import (
     as_dataset,
     expect_data,
 )
-from .tables import natural_key
 from .triggers import Active, StartFinder, Trigger, as_trigger, place
 
 if TYPE_CHECKING:

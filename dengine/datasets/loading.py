@@ -27,6 +27,7 @@ from . import units
 from .archives import hold_one_each, read_archive_each
 from .bags import is_stream, read_bag
 from .clocks import RATE_NAMES, STEP_NAMES, clock_of, rate_of
+from .columns import FORCE
 from .containers import HEAD, JSON, NPZ, PARQUET, binary_kind, is_text, suffix_of
 from .dataset import (
     UNKNOWN_RATE,
@@ -49,6 +50,7 @@ from .dataset import (
     split_names,
     split_unit,
 )
+from .folders import are_tables, find_recordings, read_folder, read_heads
 from .labels import (
     LabelColumn,
     label_of,
@@ -56,18 +58,10 @@ from .labels import (
     parse_label_map,
     read_ordered_labels,
 )
-from .tables import (
-    FORCE,
-    are_tables,
-    find_recordings,
-    from_frame,
-    read_folder,
-    read_heads,
-    read_tables,
-    without_trailing_nan,
-)
+from .tables import from_frame, read_tables
 from .text import SUFFIXES as TEXTS
 from .triggers import Trigger
+from .wide_tables import without_trailing_nan
 
 BUNDLED = {"insertion": "insertion.npz"}
 ARRAYS = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")  # beside the parts' numbers
