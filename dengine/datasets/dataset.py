@@ -393,7 +393,8 @@ def describe_reading(
     no_clock = "none, the rate is stated" if rate_hz else "none"
     for name, default in (("clock", no_clock), ("rows", "all"), ("numbers", "")):
         counts = Counter(getattr(reading, name) or default for reading in readings)
-        about[name] = _with_counts(counts) if len(counts) > 1 else next(iter(counts))
+        several = [f"{text} ({n} of {len(labels)})" for text, n in counts.most_common()]
+        about[name] = listed(several) if len(counts) > 1 else next(iter(counts))
     about |= {"order": order, "first": first}
     return {name: text for name, text in about.items() if text not in ("", "all")}
 

@@ -149,7 +149,7 @@ def split(name: str) -> tuple[str, str]:
     match = ENDING.fullmatch(plain)
     if match is None:
         return plain, ""
-    unit = match["unit"]
+    unit = spelling(match["unit"]) if plain.isupper() else match["unit"]  # FORCE_KN
     # One letter is more often an axis or an index, as in v_s, than a unit, except N. The `in` of
     # `pos_in` is no inch.
     is_unit = (len(unit) > 1 or unit == "N") and unit not in ALONE and parse(unit)

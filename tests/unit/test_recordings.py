@@ -2018,6 +2018,30 @@ def test_a_line_above_the_header_tells_the_rate_of_samples_without_a_clock(
     assert load_dataset(tmp_path, channel="Force", rate_hz=250.0).rate_hz == 250.0
 
 
+def test_columns_of_a_database_in_capitals_tell_rate_and_unit(
+    small: Dataset, tmp_path: Path
+) -> None:
+    lists = pd.DataFrame({"FORCE_KN": [list(map(float, x)) for x in small.X]})
+    lists["SAMPLE_INTERVAL_MS"] = 2.5
+    lists["RESULT"] = words(small)
+    lists.to_parquet(tmp_path / "curves.parquet")
+    data = load_dataset(tmp_path / "curves.parquet", label="RESULT", channel="FORCE_KN")
+    assert (data.rate_hz, data.unit) == (400.0, "kN")
+
+
+def test_how_rows_were_read_is_told_with_the_number_of_recordings(
+    small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        above = "Machine: 4\n" * (1 if i else 2)
+        rows = "\n".join(f"{k},{v}" for k, v in enumerate(x))
+        (tmp_path / f"{i:03}_{word}.csv").write_text(f"{above}\nSample,Force\n{rows}\n")
+    data = load_dataset(tmp_path, channel="Force")
+    n = len(small) - 1
+    told = f"header in line 3 ({n} of {n + 1}), header in line 4 (1 of {n + 1})"
+    assert data.reading["rows"] == told
+
+
 @pytest.mark.parametrize("line", ["dt: 2", "Rate: 3 parts/min", "Sample rate: fast"])
 def test_a_line_that_states_no_rate_leaves_it_unknown(
     line: str, small: Dataset, tmp_path: Path
