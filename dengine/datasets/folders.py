@@ -481,7 +481,7 @@ def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOpt
     Such a file names other files in the last of its first 100 lines, and has labels for most
     recordings. None if there is none.
     """
-    stems = {path.stem.lower() for path in named.values()}
+    stems = {name.lower() for path in named.values() for name in (path.stem, path.parent.name)}
     forms = (*TEXTS, *PARQUET, *JSON)
     for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in forms):
         cells = _first_rows(path, LoadOptions())

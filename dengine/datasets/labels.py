@@ -1023,7 +1023,11 @@ def _read_label_rows(
         for i, column in enumerate(columns)
         if any(_path_words(cell)[0] in files for cell in column)
     ]
-    full_names = {} if with_names else {i: _names_with(x, names) for i, x in enumerate(columns)}
+    full_names = {
+        i: _names_with(column, names) or _names_in_folders(column, names)
+        for i, column in enumerate(columns)
+        if not with_names
+    }
     n_named = max(map(len, full_names.values()), default=0)
     among = names if full_names else ()
     place, texts, names_of_texts = _names_in_two_columns(cells, among, more_than=n_named)
@@ -1129,6 +1133,31 @@ def _names_with(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
         if len(matches) == 1:
             name_of[text] = matches[0]
     return name_of if 2 * len(set(name_of.values())) > len(texts) else {}
+
+
+def _names_in_folders(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Return for texts that name a folder, by the end of its path, the one recording inside it.
+
+    The result is empty if a text names folders of several, or most name none.
+    """
+    inside = defaultdict[tuple[str, ...], list[str]](list)
+    for name in names:
+        for folder in PurePosixPath(name).parents:
+            inside[_path_words(str(folder))].append(name)
+    name_of = dict[str, str]()
+    for text in filter(None, texts):
+        wanted = _path_words(text)
+        matches = [
+            name
+            for words, held in inside.items()
+            if words != ("",) and all(a == b for a, b in zip(wanted, words, strict=False))
+            for name in held
+        ]
+        if len(matches) > 1:
+            return {}
+        for name in matches:
+            name_of[text] = name
+    return name_of if 2 * len(name_of) > len(texts) else {}
 
 
 def column_among(header: Sequence[str], names: Sequence[str]) -> int | None:

@@ -27,6 +27,7 @@ from . import units
 from .clocks import (
     EMPTY_CELLS,
     MAX_MISSING,
+    NO_CLOCK,
     TIMESTAMP,
     WORD_DATE,
     Clock,
@@ -74,6 +75,12 @@ FIELD_MARK = re.compile(r"\s*[:;=\t,|]\s*")  # the first of them stands before t
 CELL_MARK = re.compile(r"[;,\t|]")
 ROW_COUNT = re.compile(r"\(\d+ [^\W\d].*\)")  # what a database's client writes below a table
 LABVIEW_END = "***End_of_Header***"
+# A line alone behind the valid rows of a log, as //END: what stands below it is of former parts.
+END_MARK = re.compile(
+    r"\W*(eof|(data|file|log|records?)[ _-]?end|ende?([ _-]?(of|der)?[ _-]?(the |valid |all )*"
+    r"(data|file|log|records?|recording|measurements?|samples|table|daten|datei|messung))?)\W*",
+    re.IGNORECASE,
+)
 INFLUX_COLUMNS = {"result", "table"}  # in the header of each of InfluxDB's tables
 COMMENT_COLUMNS = ("comment", "comments", "kommentar", "remark")
 RATE_ABOVE = "none, a line above the header states the rate"
@@ -113,8 +120,12 @@ class TextCells(NamedTuple):
     fields : dict of str to str
         What lines above the header and below the samples state, as `Result;OK` or `# Operator: A`.
     n_remarks : int
-        Number of the remarks that were left out below the header, or of all lines that were if
-        the user stated the columns.
+        Number of the lines that were left out below the header, or of all if it is not known.
+    blocks : dict of int to str
+        The lines of the header where it comes again, and the first, each with the time X0 that
+        LabVIEW states above it, else ""; empty for one block.
+    notes : tuple of str
+        What users should know.
     """
 
     header: list[str]
@@ -124,6 +135,8 @@ class TextCells(NamedTuple):
     delimiter: str
     fields: dict[str, str]
     n_remarks: int = 0
+    blocks: Mapping[int, str] = {}
+    notes: tuple[str, ...] = ()
 
 
 class TextTable(NamedTuple):
@@ -144,7 +157,8 @@ class TextTable(NamedTuple):
     fields : mapping of str to str
         As in `TextCells`.
     n_remarks : int
-        As in `TextCells`.
+    blocks : mapping of int to str
+        Both as in `TextCells`.
     rate_hz : float, optional
         That a line above the header states, or of a wide table whose samples have times.
     offer : str
@@ -165,6 +179,7 @@ class TextTable(NamedTuple):
     numbers: str = ""
     fields: Mapping[str, str] = {}
     n_remarks: int = 0
+    blocks: Mapping[int, str] = {}
     rate_hz: float | None = None
     offer: str = ""
     clock: str = RATE_ABOVE
@@ -176,37 +191,150 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
     """Split a text into cells; blank lines are left out.
 
     A first line sep=; states the delimiter, which is found otherwise. What stands above LabVIEW's
-    last ***End_of_Header*** is left out. Raises UnreadableError for a cell of more than 131,072
-    characters, and for numbers without a header; the header of an empty text is empty.
+    first header is left out. Raises UnreadableError for a cell of more than 131,072 characters,
+    LabVIEW's blocks of different columns, and numbers without a header; the header of an empty text
+    is empty.
 
     columns : names of the columns, if the file has no header or another one.
     """
     lines = {i: line for i, line in enumerate(text.splitlines(), start=1) if line.strip()}
-    end = max((i for i, line in lines.items() if line.startswith(LABVIEW_END)), default=0)
-    lines = {i: line for i, line in lines.items() if i > end}
     lines = {
         i: UNQUOTED.sub(r'"\g<0>"', line) if "[" in line else line for i, line in lines.items()
     }
+    end = _end_of_head(lines)
+    top = {i: line for i, line in lines.items() if i <= end}
+    lines = {i: line for i, line in lines.items() if i > end}
     stated = DELIMITER_LINE.fullmatch(next(iter(lines.values()), "").strip())
     if stated:
         del lines[min(lines)]
     try:
         delimiter = stated[1] if stated else _find_delimiter(list(lines.values()))
-        split = {i: _split_line(line, delimiter) for i, line in lines.items()}
+        split = {i: _split_line(line, delimiter) for i, line in (top | lines).items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
-    rows = _under_one_header({i: row for i, row in split.items() if any(row)})
+    rows = _under_one_header({i: row for i, row in split.items() if i > end and any(row)})
+    _check_blocks_of_labview(rows)
     if _is_horizontal(rows.values()):
         rows = dict(enumerate(map(list, zip(*rows.values(), strict=True)), start=1))
-    cells = _find_header(_names_and_units_of_keys(rows), delimiter, list(columns))
-    remarks = _remarks(cells)
-    last = max(cells.rows.keys() - remarks, default=0)
-    begin = cells.line or min(cells.rows, default=0)  # without a header of its own
-    outside = [line for i, line in lines.items() if i < begin or i > last]
-    kept = {i: row for i, row in cells.rows.items() if i not in remarks}
+    cells = None if columns else _beside_settings(rows, delimiter)
+    if cells is None:
+        cells = _find_header(_names_and_units_of_keys(rows), delimiter, list(columns))
+    first = min(cells.rows, default=0)
+    above = {i: split[i] for i in top} | {i: row for i, row in rows.items() if i < first}
+    below = {i: rows.get(i, row) for i, row in cells.rows.items()}  # with LabVIEW's comments
+    blocks, heads = _find_blocks(cells.line, above, below)
+    remarks, stale = _remarks(cells, heads)
+    out = remarks | stale
+    last = max(cells.rows.keys() - out, default=0)
+    begin = cells.line or first  # without a header of its own
+    outside = [line for i, line in lines.items() if i < begin or (i > last and i not in stale)]
     return cells._replace(
-        rows=kept, fields=_fields_in(outside), n_remarks=cells.n_remarks + len(remarks)
+        rows={i: row for i, row in cells.rows.items() if i not in out},
+        fields=cells.fields | _fields_in(outside),
+        n_remarks=len(out) + (0 if cells.line else len(above)),
+        blocks=blocks,
+        notes=(
+            *_tables_in(list(above.values())),
+            *(["Rows below a line that marks the end, as //END, are left out"] if stale else []),
+        ),
     )
+
+
+def _tables_in(above: Sequence[list[str]]) -> list[str]:
+    """Return a note on each table among the rows above the header that is read.
+
+    It has names and, below them, eight rows of numbers or more.
+    """
+    notes = []
+    n_rows = width = 0
+    for row in reversed(above):
+        if 0 in _numeric_columns(row):
+            n_rows = n_rows + 1 if len(row) == width else 1
+            width = len(row)
+            continue
+        if n_rows >= MIN_TIMES and len(row) == width > 1 and not any(map(_is_value, row)):
+            text = f"Not read: {n_rows} rows of another table, which has the columns"
+            notes.append(f"{text} {listed(row)}")
+        n_rows = 0
+    return notes
+
+
+def _end_of_head(lines: Mapping[int, str]) -> int:
+    """Return the line of the last ***End_of_Header*** above LabVIEW's first samples, 0 for none."""
+    end = 0
+    for i, line in lines.items():
+        if line.startswith(LABVIEW_END):
+            end = i
+        elif end and not (line[0].isalpha() or line[0] in '*"'):
+            break
+    return end
+
+
+def _check_blocks_of_labview(rows: Mapping[int, list[str]]) -> None:
+    """Raise UnreadableError if LabVIEW's blocks have different columns, given those from the first
+    header on.
+    """
+    headers = {next(iter(rows), 0): next(iter(rows.values()), [])}
+    for (_, row), (line, below) in itertools.pairwise(rows.items()):
+        if row[0].startswith(LABVIEW_END):
+            headers[line] = below
+    for line, header in headers.items():
+        if header != (first := next(iter(headers.values()))):
+            actual = f"{len(headers)} blocks: line {min(headers)} has {listed(first)}, this one"
+            do = "write each block into a file of its own"
+            raise UnreadableError(
+                f"Expected blocks of the same columns, got {actual} {listed(header)}; {do}", line
+            )
+
+
+def _find_blocks(
+    line: int, above: Mapping[int, list[str]], below: Mapping[int, list[str]]
+) -> tuple[dict[int, str], set[int]]:
+    """Return the blocks of a text whose header comes again, as `TextCells.blocks`, and all lines
+    of the heads of the later ones.
+
+    A head is the header, the lines above it that begin with the same words as those above the first
+    header, but for numbers, and the lines below it, as of units, that stand below the first.
+
+    line : of the first header, 0 if unknown. above, below : the rows up to the first data, and on.
+    """
+    rows = list(below.values())
+    lines = list(below)
+    n_filled = {i: sum(map(bool, row)) for i, row in above.items()}
+    line = line or max(above, key=lambda i: (n_filled[i], i), default=0)
+    names = above.get(line, [])
+    first_head = list(above.values())
+    keys = {_head_key(row) for row in above.values()} - {""}
+    blocks = {line: _x0_in(first_head)}
+    heads = set[int]()
+
+    def is_in_head(row: list[str]) -> bool:
+        """Return whether a row above a header belongs to the head, and is no data."""
+        is_data = _is_value(row[0]) == _is_value(rows[0][0])
+        is_data = is_data and _numeric_columns(row) == _numeric_columns(rows[0])
+        return row in first_head or (_head_key(row) in keys and not is_data)
+
+    for k in [k for k, row in enumerate(rows) if row == names]:
+        start = k
+        while start and is_in_head(rows[start - 1]):
+            start -= 1
+        stop = k + 1
+        while stop < len(rows) and rows[stop] in first_head:
+            stop += 1
+        blocks[lines[k]] = _x0_in(rows[start:k])
+        heads.update(lines[start:stop])
+    return blocks if len(blocks) > 1 else {}, heads
+
+
+def _head_key(row: Sequence[str]) -> str:
+    """Return the first cell of a row with 0 for its numbers, "" for one without letters."""
+    key = re.sub(r"\d+", "0", row[0].lower())
+    return key if any(map(str.isalpha, key)) else ""
+
+
+def _x0_in(head: Iterable[Sequence[str]]) -> str:
+    """Return the time of the first sample that LabVIEW states in the head of a block, or ""."""
+    return next((row[1] for row in head if row[0] == "X0" and len(row) > 1), "")
 
 
 def _under_one_header(rows: dict[int, list[str]]) -> dict[int, list[str]]:
@@ -258,28 +386,60 @@ def _names_and_units_of_keys(rows: dict[int, list[str]]) -> dict[int, list[str]]
     return {i: ["", *rows[i][1:]] for i in (names, units_line)} | kept
 
 
-def _remarks(cells: TextCells) -> set[int]:
-    """Return the line numbers of rows below the header that are no data.
+def _beside_settings(rows: dict[int, list[str]], delimiter: str) -> TextCells | None:
+    """Return the samples of an oscilloscope that writes its settings beside them, without a header.
 
-    Four kinds of rows are meant: the header again; rows that begin with a comment mark and have no
-    numbers; rows in which only the first cell is filled, with a word, as `//END` or `(90 rows
-    affected)`; and, behind all data, rows of a name and a value, as `Result;OK`, in a table of more
-    columns. In a table of one column only the first kind counts.
+    So Tektronix writes: "Source" or "Sample Interval" and its value are in the first columns of the
+    first rows, times and samples in the last two columns of all. The channel is named as the
+    source, "Value" if none is stated. None for any other text.
     """
-    remarks = set[int]()
+    last = next(reversed(rows.values()), [])
+    n = next((i for i, cell in enumerate(last) if cell), 0)
+    fields = {row[0].strip(": "): row[1] for row in rows.values() if 1 < n < len(row) and row[0]}
+    by_key = {key.lower(): value for key, value in fields.items()}
+    samples = {i: _without_trailing_empty(row[n:]) for i, row in rows.items()}
+    has_header = _numeric_columns(next(iter(samples.values()), [])) != {0, 1}
+    if has_header or by_key.keys().isdisjoint(("source", "sample interval")):
+        return None
+    stated = [by_key.get(f"{axis} units", "") for axis in ("horizontal", "vertical")]
+    names = ["Time", by_key.get("source") or "Value"]
+    return TextCells(names, 0, _pad_units(stated, 2), samples, delimiter, fields)
+
+
+def _remarks(cells: TextCells, heads: Collection[int]) -> tuple[set[int], set[int]]:
+    """Return the line numbers of rows below the header that are no data, and of stale rows.
+
+    Five kinds of rows are no data: the heads of blocks; marks of the end, as `//END`; rows that
+    begin with a comment mark and have no numbers; rows in which only the first cell is filled, with
+    a word or as `(90 rows affected)`; and, behind all data, rows of a name and a value, as
+    `Result;OK`, in a table of more columns. In a table of one column only the first two count.
+
+    Others are stale if they stand below a mark of the end, up to the head of the next block.
+    """
+    remarks = set(heads)
+    below = set[int]()
+    is_below = False
+    for i, row in cells.rows.items():
+        if i in heads:
+            is_below = False
+        elif END_MARK.fullmatch(" ".join(filter(None, row))):
+            is_below = True
+            remarks.add(i)
+        elif is_below:
+            below.add(i)
     is_at_end = True
     for i, row in reversed(cells.rows.items()):
         words = list(filter(None, row))
         is_word = words == row[:1] and not any(map(str.isdigit, row[0]))
         is_word |= words == row[:1] and ROW_COUNT.fullmatch(row[0]) is not None
         is_comment = REMARK.match(row[0]) is not None and not _numeric_columns(row)
-        is_field = is_at_end and len(words) == 2 and len(words) < len(cells.header)
+        is_field = is_at_end and len(words) == 2 and (i in below or len(cells.header) > 2)
         is_field = is_field and FIELD_KEY.fullmatch(row[0]) is not None
-        if row == cells.header or (len(cells.header) > 1 and (is_word or is_comment or is_field)):
+        if len(cells.header) > 1 and (is_word or is_comment or is_field):
             remarks.add(i)
-        else:
+        elif i not in remarks | below:
             is_at_end = False
-    return remarks
+    return remarks, below - remarks
 
 
 def _fields_in(lines: Iterable[str]) -> dict[str, str]:
@@ -466,19 +626,18 @@ def _find_header(
     if not columns and above and _numeric_columns(above[header]):
         header, data = _true_header(above, is_units, header, data)
     units_row = above[header + 1] if header + 1 < data else []
-    if columns:
-        data_rows = dict(zip(lines[data:], rows[data:], strict=True))
-        column_units = _pad_units(units_row, len(columns))
-        return TextCells(columns, 0, column_units, data_rows, delimiter, {}, data)
-    header, names, units_row = _names_in(above, header, units_row)
-    names = _without_times(names, rows, lines[header] if lines else 0)
-    first = max(data, 1)
-    data_rows = dict(zip(lines[first:], rows[first:], strict=True))
+    line = 0
+    names = columns
+    if not columns:
+        header, names, units_row = _names_in(above, header, units_row)
+        line = lines[header] if lines else 0
+        names = _without_times(names, rows, line)
+        data = max(data, 1)
+    data_rows = dict(zip(lines[data:], rows[data:], strict=True))
     n_narrower = sum(len(row) < len(names) for row in data_rows.values())
     if _ends_in_comment(names) and 2 * n_narrower > len(data_rows):
         names = names[:-1]  # LabVIEW's, which most of its rows leave out
         data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
-    line = lines[header] if lines else 0
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter, {})
 
 
@@ -695,14 +854,14 @@ def read_table(
         list(complete.values()), index=list(complete), columns=header, dtype=object
     )
     mark = numbers = ""
-    notes: tuple[str, ...] = ()
+    notes = cells.notes
     if not as_text:
         decimal = options.decimal or decimal
         write_curves(frame)
         cell_units = _take_units_off(frame, options)
         mark, group, odd_cells = write_as_python(frame, cells.delimiter, decimal, options.thousands)
         wrong |= odd_cells
-        units_text, notes = _convert_cells(frame, cell_units, cells.units)
+        units_text, unit_notes = _convert_cells(frame, cell_units, cells.units)
         parts = (
             f"decimal mark {mark!r}" if mark else "whole numbers",
             f"thousands mark {group!r}" if group else "",
@@ -711,13 +870,14 @@ def read_table(
             units_text,
         )
         numbers = ", ".join(filter(None, parts))
+        notes += unit_notes
         join_date_and_time(frame)
     faults = [Fault(path.name, i, message) for i, message in sorted(wrong.items())]
     frame = frame.drop(index=[i for i in wrong if i in complete])
     column_units = cells.units[:n]
     _add_stated_units(column_units, header, _lines_above(text, cells.line))
     rate_and_offer = rate_in_preamble(_lines_above(text, min(cells.rows, default=1)))
-    about = (cells.fields, cells.n_remarks, *rate_and_offer, RATE_ABOVE, notes)
+    about = (cells.fields, cells.n_remarks, cells.blocks, *rate_and_offer, RATE_ABOVE, notes)
     return TextTable(*(frame, faults, cells.line, column_units, mark, numbers, *about), cut_line)
 
 
@@ -930,6 +1090,11 @@ def read_recording(
         notes[cut_note(fault)] += 1
     if table.frame.empty:
         raise UnreadableError("Expected samples below the header, found none", table.line)
+    is_name = (table.frame.to_numpy(dtype=object) == np.array(header, dtype=object)).any(axis=1)
+    for line, *cells in table.frame[is_name].itertuples():
+        if not any(_is_value(str(cell)) for cell in cells):
+            do = "write the rows below it into a file of their own"
+            raise UnreadableError(f"Expected one header, got another: {listed(cells)}; {do}", line)
     frame, kept = _beside_their_clock(table.frame, places)
     places = [kept.index(place) for place in places]
     table = table._replace(frame=frame, units=[table.units[i] for i in kept])
@@ -937,7 +1102,14 @@ def read_recording(
     notes.update(table.notes)
     rows = _without_unfilled(_without_summary(frame, options, notes), places, options, notes)
     channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
-    timed = rows_to_trace(rows, places, options, notes, table.units, table.rate_hz)
+    joined = _check_blocks(rows, table, options) if table.blocks else ""
+    try:
+        timed = rows_to_trace(rows, places, options, notes, table.units, table.rate_hz)
+    except UnreadableError as error:
+        error.args = (f"{error}; it has {joined}",) if joined else error.args
+        raise
+    if joined:
+        notes[f"The file has {joined}: they are joined in one recording"] += 1
     if table.offer and not (timed.reading.clock or options.rate_hz):
         notes[table.offer] += 1
     n_out = len(frame) - len(rows) + table.n_remarks
@@ -952,6 +1124,38 @@ def read_recording(
         place = place_of_clock(rows, options.time)
         start = None if place is None else start_of(rows.iloc[:, place])
     return timed._replace(units=channel_units, start=start, reading=reading)
+
+
+def _check_blocks(rows: pd.DataFrame, table: TextTable, options: LoadOptions) -> str:
+    """Return a text on the blocks of a recording, as "3 blocks of 500 rows under one header".
+
+    It is "" for one block. Raises UnreadableError if the blocks overlap in time, by the clock, or
+    without one by LabVIEW's X0.
+    """
+    places = rows.index.searchsorted(list(table.blocks)[1:])
+    blocks = [block for block in np.split(np.arange(len(rows)), places) if len(block)]
+    sizes = sorted({len(block) for block in blocks})
+    if len(blocks) < 2:
+        return ""
+    up_to = "up to " if len(sizes) > 1 else ""
+    text = f"{len(blocks)} blocks of {up_to}{sizes[-1]} rows, each under the same header"
+    clock = None
+    with suppress(UnreadableError):
+        clock = clock_of(rows, options.time, table.units)
+    starts = set(table.blocks.values())
+    overlaps = options.time != NO_CLOCK and "" not in starts and len(starts) < len(table.blocks)
+    if clock is not None and not np.isnan(clock.seconds).any():
+        times = [clock.seconds[block] for block in blocks]
+        spans = sorted((block.min(), block.max()) for block in times)
+        overlaps = any(a[1] > b[0] for a, b in itertools.pairwise(spans))
+    if overlaps:
+        do = "write each into a file of its own, or, if they follow each other without a pause,"
+        raise UnreadableError(
+            f"Expected one recording, got {text}, and their times overlap; {do} "
+            f"time={NO_CLOCK!r} and the rate (rate_hz)",
+            int(rows.index[blocks[1][0]]),
+        )
+    return text
 
 
 def cut_note(fault: Fault) -> str:

@@ -1108,6 +1108,168 @@ def test_settings_beside_samples_without_a_header_ask_for_names(tmp_path: Path) 
         load_dataset(tmp_path, channel="c3")
 
 
+def blocks(head: Sequence[str], *starts: int, n: int = 40, form: str = "{t}\t{x}") -> str:
+    """A text of blocks of n rows whose times begin at sample 0, 40, ...; each has a head."""
+    lines = []
+    for i, start in enumerate(starts):
+        lines += [line.format(number=i + 1, start=STEP * start) for line in head]
+        rows = zip(times(N)[start:], texts()[n * i : n * (i + 1)], strict=False)
+        lines += [form.format(t=t, x=x) for t, x in rows]
+    return "\n".join([*lines, ""])
+
+
+LABVIEW = ["LabVIEW Measurement\t", "Date\t2024/05/13", "***End_of_Header***\t", ""]
+SEGMENT = [
+    *("", "Channels\t1\t", "Samples\t40\t", "Date\t2024/05/13\t", "X0\t{start:.3E}\t"),
+    *("Delta_X\t0.004\t", "***End_of_Header***\t\t", "X_Value\tForce\tComment"),
+]
+
+
+@pytest.mark.parametrize(
+    ("above", "head", "form"),
+    [
+        (LABVIEW, SEGMENT, "{t}\t{x}"),
+        (LABVIEW, SEGMENT, "\t{x}"),
+        ([], ["# Segment {number}", "Operator;Me", "fs;250", "", "t;Force", "s;N"], "{t};{x}"),
+        ([], ["time,Force"], "{t},{x}"),
+    ],
+)
+def test_blocks_under_the_same_header_are_joined_with_a_note(
+    above: list[str], head: list[str], form: str, tmp_path: Path
+) -> None:
+    text = "\n".join(above) + blocks(head, 0, 40, 80, form=form)
+    (tmp_path / "a_OK.lvm").write_text(text)
+    data = load_dataset(tmp_path, channel="Force")
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    assert data.rate_hz == 250.0
+    note = "The file has 3 blocks of 40 rows, each under the same header: they are joined"
+    assert note in data.notes[0]
+    (tmp_path / "a_OK.lvm").write_text("\n".join(text.splitlines()[:-37]))
+    data = load_dataset(tmp_path, channel="Force")
+    assert data.X.shape == (1, 83)
+    assert "3 blocks of up to 40 rows" in data.notes[0]
+
+
+def test_lines_left_out_of_blocks_with_stated_columns_are_all_counted(tmp_path: Path) -> None:
+    (tmp_path / "a_OK.lvm").write_text("\n".join(LABVIEW) + blocks(SEGMENT, 0, 40, 80))
+    for columns in ("t,F", "t,F,Comment"):
+        data = load_dataset(tmp_path, columns=columns, time="t", channel="F")
+        np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+        assert data.reading["rows"] == "24 left out"  # 3 of the file, 3 times 7 of a segment
+
+
+@pytest.mark.parametrize("form", ["{t}\t{x}", "\t{x}"])
+def test_blocks_whose_clock_starts_again_are_refused_with_their_number(
+    form: str, tmp_path: Path
+) -> None:
+    text = "\n".join(LABVIEW) + blocks(SEGMENT, 0, 0, 0, form=form)
+    (tmp_path / "a_OK.lvm").write_text(text)
+    wanted = r"got 3 blocks of 40 rows, .* times overlap; .* time='none' and the rate \(rate_hz\)"
+    with pytest.raises(DataError, match=wanted):
+        load_dataset(tmp_path, channel="Force")
+    data = load_dataset(tmp_path, channel="Force", time="none", rate_hz=250)
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+
+
+def test_a_pause_between_blocks_is_refused_with_their_number(tmp_path: Path) -> None:
+    (tmp_path / "a_OK.csv").write_text(blocks(["time,FZ"], 0, 70, form="{t},{x}"))
+    with pytest.raises(DataError, match=r"got a gap of 0\.124 s; it has 2 blocks of 40 rows"):
+        load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("time", [None, "none"])
+def test_blocks_of_different_columns_are_refused(time: str | None, tmp_path: Path) -> None:
+    first = blocks(SEGMENT, 0)
+    (tmp_path / "a_OK.lvm").write_text("\n".join(LABVIEW) + first + first.replace("Force", "Way"))
+    wanted = "got 2 blocks: line 11 has X_Value, Force, Comment, this one X_Value, Way, Comment"
+    with pytest.raises(DataError, match=wanted):
+        load_dataset(tmp_path, channel="Force", time=time)
+    other = blocks(["time,Way"], 40, form="{t},{x}")
+    (tmp_path / "a_OK.lvm").write_text(blocks(["time,FZ"], 0, form="{t},{x}") + other)
+    with pytest.raises(DataError, match="Expected one header, got another: time, Way"):
+        load_dataset(tmp_path, time=time)
+
+
+def test_a_table_above_that_of_more_columns_is_noted(tmp_path: Path) -> None:
+    text = blocks(["time,FZ"], 0, form="{t},{x}") + blocks(
+        ["time,FZ,a,b,c"], 40, form="{t},{x},1,2,3"
+    )
+    (tmp_path / "a_OK.csv").write_text(text)
+    note = "Not read: 40 rows of another table, which has the columns time, FZ."
+    assert note in load_dataset(tmp_path, channel="FZ").notes
+
+
+@pytest.mark.parametrize(
+    "mark",
+    [
+        *("//END", "//END                 ", "//END,,", "END", "[END]", "<END>", "#EOF", "Ende"),
+        *("*** END OF DATA ***", "End of file", "-- end of records --", "EndOfFile", "Data end"),
+    ],
+)
+def test_rows_below_a_mark_of_the_end_are_left_out_with_a_note(mark: str, tmp_path: Path) -> None:
+    rows = [f"{t},{x},1" for t, x in zip(times(), texts(), strict=True)]
+    stale = [f"{t},400.0,1" for t in times(50)]
+    lines = ["time,FZ,pos", *rows, mark, *stale, "Result,OK", ""]
+    for i in range(2):
+        (tmp_path / f"{i}.csv").write_text("\n".join(lines).replace("OK", "NOK" if i else "OK"))
+    data = load_dataset(tmp_path, channel="FZ")
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    assert data.y.tolist() == [1, 0]
+    assert data.reading["rows"] == "52 left out"
+    note = "Rows below a line that marks the end, as //END, are left out (2 times)."
+    assert note in data.notes
+
+
+def test_blocks_that_each_end_in_a_mark_of_the_end_are_joined(tmp_path: Path) -> None:
+    text = blocks(["//END", "time,FZ"], 0, 40, 80, form="{t},{x}").removeprefix("//END\n")
+    (tmp_path / "a_OK.csv").write_text(f"{text}//END\n")
+    data = load_dataset(tmp_path)
+    np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+    assert "3 blocks of 40 rows" in data.notes[0]
+
+
+@pytest.mark.parametrize("source", ["Source,CH1", ","])
+def test_the_settings_of_an_oscilloscope_beside_its_samples_are_fields(
+    source: str, tmp_path: Path
+) -> None:
+    settings = ["Record Length,1.2e+02", "Sample Interval,4.0e-03", ",", source]
+    settings += ["Vertical Units,V", "Horizontal Units,s", "Operator,Me"]
+    settings += [","] * (N - len(settings))
+    seconds = times(form="{:.12f}")
+    for i in range(4):
+        rows = zip(settings, seconds, texts(VALUES + i), strict=True)
+        path = tmp_path / "scope" / f"ALL000{i}" / f"F000{i}CH1.CSV"
+        path.parent.mkdir(parents=True)
+        path.write_text("".join(f"{setting},,{t}, {x},\n" for setting, t, x in rows))
+    listing = tmp_path / "verdicts.csv"
+    listing.write_text("folder;verdict\nALL0000;bad\nall0001/;good\nALL0002;bad\nALL0003;good\n")
+    name = "CH1" if "CH1" in source else "Value"
+    for channel in (None, name):
+        data = load_dataset(tmp_path / "scope", labels=listing, channel=channel)
+        np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+        assert (data.channels, data.unit, data.rate_hz) == ((name,), "V", 250.0)
+        assert data.y.tolist() == [0, 1, 0, 1]
+    words = {"label": "Operator", "label_map": "Me=good"}
+    assert load_dataset(tmp_path / "scope", channel=name, **words).y.tolist() == [1] * 4
+
+
+def test_a_listing_of_folders_that_hold_several_recordings_is_refused(tmp_path: Path) -> None:
+    for i in range(4):
+        write(tmp_path / "data" / f"P{i // 2}" / f"{i}x.csv", ["time", "FZ"], times(), texts())
+    listing = tmp_path / "verdicts.csv"
+    listing.write_text("folder;verdict\nP0;bad\nP1;good\n")
+    with pytest.raises(DataError, match=r"verdicts\.csv names P0, P1"):
+        load_dataset(tmp_path / "data", labels=listing)
+
+
+def test_a_listing_of_folders_in_the_folder_is_offered(tmp_path: Path) -> None:
+    for i in range(4):
+        write(tmp_path / f"P{i}" / "curve.dat", ["time", "FZ"], times(), texts(VALUES + i))
+    rows = [f"P{i};{('bad', 'good')[i % 2]}" for i in range(4)]
+    (tmp_path / "verdicts.csv").write_text("\n".join(["folder;verdict", *rows]))
+    assert "verdicts.csv names files: give it, --labels" in one_line("data", tmp_path)
+
+
 def test_a_word_among_the_values_of_a_signal_is_a_lost_sample(tmp_path: Path) -> None:
     for name, last in (("a_OK", "I/O Timeout"), ("b_OK", "1.0")):
         columns = [["F"] * N, times(), [*texts()[:-1], last], ["Good"] * N]
