@@ -59,6 +59,8 @@ COPY_SUFFIX = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)
 COPY_PREFIX = re.compile(r"^(copy of|kopie von|copie de) ", re.IGNORECASE)
 LEADING_ZEROS = re.compile(r"(?<=_)0+(?=\d)")
 FILE_SUFFIX = re.compile(r"\.[A-Za-z]\w{1,5}$")
+# A long number as a spreadsheet saves it, without its last digits: 2,40311E+11.
+SHORTENED = re.compile(r"\d([.,]\d{0,8})?[eE]\+(09|[1-9]\d)")
 LAST_WORD = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # without a number
 LETTER = r"[^\W\d_]"
 # Ends of a word in a name: partOK has the word OK, token does not.
@@ -896,7 +898,10 @@ def labels_in_file(
     n_names = Counter(row for matching in matches.values() for row in matching)
     for row in rows:
         if not n_names[row]:
-            message = f"Expected the name of a recording, found no file {row.file}"
+            why = ", a number that a spreadsheet has shortened" * bool(
+                SHORTENED.fullmatch(row.file)
+            )
+            message = f"Expected the name of a recording, found no file {row.file}{why}"
             faults.append(Fault(source, row.lines[0], message))
 
     def find(name: str) -> SourcedLabel:
@@ -1029,12 +1034,15 @@ def _read_label_rows(
         if not with_names
     }
     n_named = max(map(len, full_names.values()), default=0)
-    among = names if full_names else ()
-    place, texts, names_of_texts = _names_in_two_columns(cells, among, more_than=n_named)
+    place, texts, names_of_texts = _names_in_two_columns(
+        cells, names if full_names else (), more_than=n_named
+    )
     if texts:
         full_names = {place: names_of_texts}
         n_named = len(names_of_texts)
     with_names = with_names or [i for i, x in full_names.items() if len(x) == n_named > 0]
+    if names and not with_names:
+        _check_not_shortened(dict(zip(header, columns, strict=False)), path)
     with_labels = [
         i
         for i, column in enumerate(columns)
@@ -1057,6 +1065,21 @@ def _read_label_rows(
         lines = (*row.lines, line)
         rows[words] = row._replace(lines=lines, labels=(*row.labels, values[of_label]))
     return list(rows.values()), faults, header[of_label], header
+
+
+def _check_not_shortened(
+    columns: Mapping[str, Sequence[str]], path: str | os.PathLike[str]
+) -> None:
+    """Raise DataError if a column of a file holds nothing but long numbers in short, 2,40311E+11.
+
+    columns : the texts of each; none of them names a recording.
+    """
+    for name, column in columns.items():
+        texts = list(filter(None, column))
+        if texts and all(map(SHORTENED.fullmatch, texts)):
+            actual = f"got {listed(texts[:3])}: a spreadsheet has shortened its numbers"
+            do = "they name no recording; export the list anew, with this column as text"
+            raise DataError(f"Expected whole numbers in column {name} of {path}, {actual}, {do}.")
 
 
 def _path_words(path: str) -> tuple[str, ...]:

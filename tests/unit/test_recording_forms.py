@@ -1067,6 +1067,33 @@ def test_serial_numbers_without_leading_zeros_name_recordings(column: str, tmp_p
     assert ("call its columns" in str(error.value)) == (column != "file")
 
 
+def test_a_list_whose_numbers_a_spreadsheet_has_shortened_is_told_so_at_once(
+    tmp_path: Path,
+) -> None:
+    barcodes = [f"2403110{i:05d}" for i in range(12)]
+    for barcode in barcodes:
+        write(tmp_path / "data" / f"{barcode}.csv", ["time", "FZ"], times(), texts())
+    listing = tmp_path / "list.csv"
+    rows = [
+        f"{barcode};11.03.2024;{'OK' if i % 3 else 'NOK'}" for i, barcode in enumerate(barcodes)
+    ]
+    for asked in ([], ["--label", "Ergebnis"], ["--label", "Ergebnis", "--part", "Barcode"]):
+        command = ("data", tmp_path / "data", "--labels", listing, *asked)
+        for number in ("2,40311E+11", "2.4E+11"):
+            short = [row.replace(barcodes[i], number) for i, row in enumerate(rows)]
+            listing.write_text("\n".join(["Barcode;Datum;Ergebnis", *short]))
+            message = one_line(*command)
+            assert f"column Barcode of {listing}, got {number}: a spreadsheet" in message
+            assert "export the list anew" in message
+        listing.write_text("\n".join(["Barcode;Datum;Ergebnis", *rows]))
+        options = {"label": "Ergebnis"} if asked else {}
+        data = load_dataset(tmp_path / "data", labels=listing, **options)
+        assert data.y.tolist() == [int(i % 3 > 0) for i in range(12)]
+    listing.write_text("\n".join(["Barcode;Datum;Ergebnis", *rows[1:], "2,4E+11;11.03.2024;NOK"]))
+    data = load_dataset(tmp_path / "data", labels=listing)
+    assert any("a number that a spreadsheet has shortened" in str(x) for x in data.faults)
+
+
 @pytest.mark.parametrize("line", ["Datum;02.03.2026", "Result;OK", "Table 1;"])
 def test_one_line_above_a_header_with_units_is_no_header(line: str, tmp_path: Path) -> None:
     cells = [times(form="{:.3f}"), texts(VALUES / 1000, "{:.4f}")]
