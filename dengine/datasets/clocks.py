@@ -60,6 +60,9 @@ STEP_NAMES = (
         "samplingperiod",
         "abtastzeit",
         "abtastintervall",
+        "sample",
+        "sampling",
+        "samplestep",
     ),
 )
 UNSURE_RATES = ("rate", "datarate")  # of samples only in hertz

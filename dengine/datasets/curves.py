@@ -27,6 +27,8 @@ NUMBER = r"(?:[-+−]?\.?\d[\d.eE+\-−]*|nan|null|NaN|None)"
 ITEMS = rf"{NUMBER}(?:(?:\s*[,;|]\s*|\s+){NUMBER}){{{MIN_SAMPLES - 1},}}"
 BRACKETED = rf"[\[({{]\s*{ITEMS}\s*[\])}}]"
 CURVE = re.compile(rf"\s*(?:{BRACKETED}|{ITEMS}[;|,]?)\s*")
+# The same with fewer numbers, but not one with a comma, which may be the decimal mark of one.
+SHORT = re.compile(rf"(?!\s*\d+,\d+\s*$){CURVE.pattern.replace(f'{{{MIN_SAMPLES - 1},}}', '*')}")
 UNQUOTED = re.compile(rf'(?<!")\[\s*{ITEMS}\s*\](?!")')  # its commas would be delimiters
 # A curve in a line of text: in quotes or brackets, or between delimiters of another kind.
 BETWEEN = "|".join(
@@ -37,15 +39,16 @@ BETWEEN = "|".join(
 IN_LINE = rf'"\s*(?:{BRACKETED}|{ITEMS}[;|,]?)\s*"|{BRACKETED}|{BETWEEN}'
 
 
-def split_curve(cell: Any) -> list[Any] | NDArray[Any] | None:
+def split_curve(cell: Any, *, is_short: bool = False) -> list[Any] | None:
     """Return the samples in a cell, those of a text as texts with a decimal point.
 
-    None if the cell is neither a list of plain items nor a text of eight numbers or more.
+    None if the cell is neither a list of plain items nor a text of eight numbers or more, or with
+    `is_short` of fewer.
     """
     if isinstance(cell, list | tuple | np.ndarray):
         is_flat = len(cell) > 0 and not isinstance(cell[0], list | tuple | np.ndarray | dict)
         return list(cell) if is_flat else None
-    if not isinstance(cell, str) or CURVE.fullmatch(cell) is None:
+    if not isinstance(cell, str) or (SHORT if is_short else CURVE).fullmatch(cell) is None:
         return None
     text = cell.strip(" \t[](){};|,")
     if re.search(r"[;|\t]", text):
@@ -70,6 +73,15 @@ def write_curves(frame: pd.DataFrame) -> None:
                 for cell, curve in zip(cells, curves, strict=True)
             ]
             frame.isetitem(i, texts)
+
+
+def curve_columns(frame: pd.DataFrame) -> list[str]:
+    """Return the columns of a table whose first filled cell is a curve, or a list of numbers."""
+    return [
+        str(name)
+        for name in frame.columns[~frame.columns.duplicated(keep=False)]
+        if split_curve(next((c for c in frame[name] if not _is_empty(c)), None)) is not None
+    ]
 
 
 def expand_curves(
@@ -98,11 +110,7 @@ def expand_curves(
     """
     import pandas as pd
 
-    curves = {
-        str(name): [split_curve(cell) for cell in frame[name]]
-        for name in frame.columns[~frame.columns.duplicated(keep=False)]
-        if split_curve(next((c for c in frame[name] if not _is_empty(c)), None)) is not None
-    }
+    curves = {name: [split_curve(cell) for cell in frame[name]] for name in curve_columns(frame)}
     clocks = [name for name in curves if name == options.time or is_time_column(name)]
     longest = {name: max(len(c) for c in cells if c is not None) for name, cells in curves.items()}
     channels = [name for name, n in longest.items() if name not in clocks and n >= MIN_SAMPLES]

@@ -31,6 +31,7 @@ from .dataset import (
     RecordingCollector,
     UnreadableError,
 )
+from .pieces import join_pieces
 from .text import (
     TextTable,
     is_mostly_numbers,
@@ -56,9 +57,11 @@ def with_samples_in_columns(
 ) -> tuple[Mapping[str, TextTable], LoadOptions]:
     """Return tables with a column for each sample where a cell holds a curve, and their options.
 
-    Raises DataError if the clocks of the curves contradict them or each other.
+    Pieces of a curve are joined. Raises DataError if the clocks of the curves contradict them or
+    each other.
     """
     result = dict[str, TextTable]()
+    tables = join_pieces(tables, options, collector)
     for source, table in tables.items():
         try:
             frame, rate, name, unread = expand_curves(table.frame, options)

@@ -2327,6 +2327,82 @@ def test_lists_in_cells_are_traces_with_the_rate_of_the_times_beside_them(
         load_dataset(pd.DataFrame(rows), part="serial")
 
 
+def pieces_of(data: Dataset, **names: str) -> list[dict[str, Any]]:
+    """Each trace in four rows of 17, 17, 13 and 3 samples, those of two parts interleaved."""
+    rows = []
+    for i, (x, word) in enumerate(zip(data.X, words(data), strict=True)):
+        for n, start, end in ((0, 0, 17), (1, 17, 34), (2, 34, 47), (3, 47, 50)):
+            counters = {"chunk": n, "chunks": 4, "seq": n + 1, "offset": start}
+            row = {"ts": 60 * (i // 2) + 2 * n + i % 2, "serial": f"P{i:02}", "sample_ms": 2}
+            row |= {names[name]: value for name, value in counters.items() if name in names}
+            rows.append(row | {"verdict": word if n == 3 else None, "force": x[start:end].tolist()})
+    # Pieces 1 and 2 of the first part came in the other order.
+    rows[1]["ts"], rows[2]["ts"] = rows[2]["ts"], rows[1]["ts"]
+    return sorted(rows, key=lambda row: row["ts"])
+
+
+def write_pieces(rows: list[dict[str, Any]], form: str, folder: Path) -> Any:
+    path = folder / f"curves.{form}"
+    if form == "jsonl":
+        path.write_text("\n".join(map(json.dumps, rows)))
+    elif form == "json":
+        (folder / "messages").mkdir()
+        for i, row in enumerate(rows):
+            row = {name: cell for name, cell in row.items() if cell is not None}
+            (folder / "messages" / f"{i:04}.json").write_text(json.dumps(row))
+        return folder / "messages"
+    elif form == "parquet":
+        pd.DataFrame(rows).to_parquet(path)
+    else:
+        frame = pd.DataFrame(rows)
+        frame["force"] = [";".join(map(repr, cell)).replace(".", ",") for cell in frame["force"]]
+        frame.to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("form", "names"),
+    [
+        ("jsonl", {"chunk": "chunk", "chunks": "chunks"}),
+        ("json", {"seq": "blockNo"}),
+        ("parquet", {"offset": "offset"}),
+        ("csv", {"seq": "segment_index", "chunks": "n_segments"}),
+    ],
+)
+def test_curves_in_pieces_are_joined_in_the_order_of_their_counter(
+    form: str, names: dict[str, str], small: Dataset, tmp_path: Path
+) -> None:
+    rows = pieces_of(small, **names)
+    data = load_dataset(write_pieces(rows, form, tmp_path), part="serial")
+    np.testing.assert_array_equal(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
+    assert (data.rate_hz, data.faults) == (500.0, ())
+    counter = next(iter(names.values()))
+    text = f"24 curves are joined of 96 pieces, in the order of column {counter}"
+    assert f"{text}." in data.notes
+    with pytest.raises(DataError, match=r"whose pieces column \w+ counts, as in part='serial'"):
+        load_dataset(pd.DataFrame(pieces_of(small, chunk="chunk", chunks="chunks")))
+    del rows[9]
+    rows.append(rows[20])
+    data = load_dataset(pd.DataFrame(rows), part="serial")
+    assert (len(data), len(data.faults)) == (23, 1)
+    assert "Expected all 4 pieces of serial P03, got " in data.faults[0].message
+    assert any("92 pieces" in note and note.endswith("; 1 came twice.") for note in data.notes)
+
+
+def test_rows_of_a_part_that_are_whole_curves_are_not_joined(small: Dataset) -> None:
+    rows = [
+        {"vin": f"V{i // 4}", "seq": i % 4 + 1, "torque": x.tolist(), "result": "OK"}
+        for i, x in enumerate(small.X)
+    ]
+    data = load_dataset(pd.DataFrame(rows), part="vin")
+    np.testing.assert_array_equal(data.X, small.X)
+    note = "Rows of one vin are read as a curve each; if they are pieces of one curve, call"
+    assert any(text.startswith(note) for text in data.notes)
+    rows[5]["result"] = rows[10]["result"] = rows[12]["result"] = rows[16]["result"] = "NOK"
+    assert len(load_dataset(pd.DataFrame(rows).rename(columns={"seq": "block"}), part="vin")) == 24
+
+
 def test_a_wide_table_whose_cells_have_several_units_is_refused_or_converted(
     small: Dataset, tmp_path: Path
 ) -> None:
