@@ -113,6 +113,7 @@ DATE = re.compile(
     r"(19|20)\d\d([-/.]?)[01]?\d\2[0-3]?\d|[0-3]?\d[./-][01]?\d[./-](19|20)?\d\d|" + WORD_DATE
 )
 DAY_TIME = re.compile(r"\d{1,2}:\d\d:\d\d(?P<fraction>[.,]\d+)?( ?[AaPp][Mm])?")
+WHOLE_SECONDS = re.compile(rf"({DATE_FORM})[T ]\d{{1,2}}:\d\d:\d\d")
 TIMESTAMP = re.compile(
     rf"({DATE_FORM})([T ]\s*{TIME_FORM})?|\d{{1,2}}:\d\d(:\d\d)?([.,]\d+)?", re.IGNORECASE
 )
@@ -163,9 +164,10 @@ def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
 def join_date_and_time(frame: pd.DataFrame) -> None:
     """Join a column of dates and one of times of day, in place, in a table of texts.
 
-    Both columns get date and time. A column of whole milliseconds, as of `MILLISECONDS`, is added
-    to times without a fraction, and gets the same. The columns stay as they are if the time passes
-    midnight but the date stays, as that of the first row.
+    Both columns get date and time. A column of milliseconds from 0 to 999, as of `MILLISECONDS`, is
+    added to times without a fraction, also to those that have their date in one cell, and gets the
+    same. The columns stay as they are if the time passes midnight but the date stays, as that of
+    the first row.
     """
     import pandas as pd
 
@@ -176,21 +178,30 @@ def join_date_and_time(frame: pd.DataFrame) -> None:
     cells = list(enumerate(zip(first, last, strict=True)))
     dates = [i for i, pair in cells if all(re.fullmatch(DATE, cell) for cell in pair)]
     times = [i for i, pair in cells if all(re.fullmatch(DAY_TIME, cell) for cell in pair)]
-    if len(dates) != 1 or len(times) != 1:
-        return
-    date = frame.iloc[:, dates[0]]
-    time = frame.iloc[:, times[0]]
-    hours = pd.to_numeric(time.str.partition(":")[0], errors="coerce")
-    if ((hours.diff() <= -HALF_DAY) & (date == date.shift())).any():
+    stamps = [i for i, pair in cells if all(WHOLE_SECONDS.fullmatch(cell) for cell in pair)]
+    places = [*dates, *times]
+    if len(dates) == len(times) == 1:
+        date = frame.iloc[:, dates[0]]
+        time = frame.iloc[:, times[0]]
+        hours = pd.to_numeric(time.str.partition(":")[0], errors="coerce")
+        if ((hours.diff() <= -HALF_DAY) & (date == date.shift())).any():
+            return
+        joined = date + " " + time
+    elif len(stamps) == 1 and not places:
+        places = stamps
+        joined = frame.iloc[:, stamps[0]]
+    else:
         return
     names = [str(name).lower() for name in frame.columns]
-    milliseconds = [i for i, name in enumerate(names) if name in MILLISECONDS]
-    if milliseconds and not ends.iloc[:, times[0]].str.contains("[.,]").any():
-        time = time + "." + frame.iloc[:, milliseconds[0]].str.zfill(3)
-    else:
-        milliseconds = []
-    for place in (dates[0], times[0], *milliseconds[:1]):
-        frame.isetitem(place, date + " " + time)
+    milliseconds = [i for i, name in enumerate(names) if name in MILLISECONDS][:1]
+    has_fraction = joined.iloc[[0, -1]].str.contains(r":\d\d[.,]").any()
+    for place in () if has_fraction else milliseconds:
+        fraction = frame.iloc[:, place].astype(str)
+        if fraction.str.fullmatch(r"\d{1,3}").all():
+            joined = joined + "." + fraction.str.zfill(3)
+            places = [*places, place]
+    for place in places:
+        frame.isetitem(place, joined)
 
 
 def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
@@ -715,14 +726,18 @@ def check_rows(clock: Clock, lines: pd.Index, time: str | None = None) -> None:
         raise _gap_error(usual, steps[gaps[0]], lines[rows[gaps[0] + 1]])
 
 
-def lost_rows_text(clock: Clock) -> str:
-    """Return a text for the reading: would a clock show it if rows were lost, or is it too coarse?
+def shows_lost_rows(clock: Clock) -> bool:
+    """Return whether a clock would show it if rows were lost, or is too coarse.
 
-    Whether rows are lost is not looked at here. A clock is too coarse if half of its steps or more
-    are 0; a step from or to an empty cell counts as one of 0. The clock has two rows or more.
+    It is too coarse if half of its steps or more are 0; a step from or to an empty cell counts as
+    one of 0. The clock has two rows or more.
     """
-    is_fine = (np.abs(np.diff(clock.seconds)) > 0).mean() > 0.5  # a step from or to NaN is not
-    shows = "shows" if is_fine else "is too coarse to show"
+    return bool((np.abs(np.diff(clock.seconds)) > 0).mean() > 0.5)
+
+
+def lost_rows_text(clock: Clock) -> str:
+    """Return a text for the reading: does a clock show lost rows? They are not looked for here."""
+    shows = "shows" if shows_lost_rows(clock) else "is too coarse to show"
     return f"column {clock.name} {shows} lost rows"
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MARKS = ".,"  # that may be the decimal mark
 SPACES = r"'’\s"  # marks that can only group thousands; \s includes the narrow and the fixed blank
 EXPONENT = r"(?:[eE][+\-−]?\d+)?"
-SIGN = r"[+\-−]?"
+SIGN = r"(?:[+\-−][^\S\n]*)?"  # loggers write "-   0.41"
 NUMERAL = re.compile(
     rf"{SIGN}(?:\d+(?:[.,]\d*)?|[.,]\d+|\d{{1,3}}([.,{SPACES}])\d{{3}}(?:\1\d{{3}})*(?:[.,]\d*)?)"
     rf"{EXPONENT}"
@@ -213,7 +213,7 @@ def write_as_python(
                 groups.update(match["mark"] or "")
                 digits = re.sub(r"\D", "", match["whole"])
                 decimals = (match["tail"] or "").replace(decimal, ".")
-                python = match["sign"] + digits + decimals + match["power"]
+                python = match["sign"].rstrip() + digits + decimals + match["power"]
                 cells[k] = python.replace("−", "-")
             elif is_numeral(cell):
                 message = f"Expected {wanted}, as the file has, got {cell!r}"

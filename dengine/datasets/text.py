@@ -45,6 +45,7 @@ from .clocks import (
     rate_of,
     resample_evenly,
     rising_columns,
+    shows_lost_rows,
     start_of,
 )
 from .containers import as_texts, read_content, read_frame
@@ -95,7 +96,7 @@ DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 # A cell of a row of units, beside the units that `units.parse` knows.
 UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|[\d.,]+ ?k?Hz|")
 NUMBER_AND_UNIT = re.compile(
-    r"(?P<number>[-+−]?\d[\d.,]*([eE][-+]?\d+)?) *(?P<unit>[^\W\d][^\d:,;]*)"
+    r"(?P<number>(?:[-+−] *)?\d[\d.,]*([eE][-+]?\d+)?) *(?P<unit>[^\W\d][^\d:,;]*)"
 )
 # What stands where there is no number, as Bad Input, #N/A or C's 1.#QNAN: it has no digit, or a
 # word before its first one, but for a code in brackets. A damaged number, as 12x5, is none.
@@ -606,6 +607,7 @@ def _find_header(
     )
     data = next((k for k, is_row_data in enumerate(is_data) if is_row_data), 0)
     above = [_without_comment_mark(row, delimiter) for row in rows[: max(data, 1)]]
+    above[-1:] = _without_names_among_units(above[-2:], numeric)
     is_units = [any(row) and all(map(_is_unit, row)) for row in above]
     header = max(data - 1 - (data > 1 and is_units[-1]), 0)
     if header and is_units[header] and any(cell.endswith("Hz") for cell in above[-1]):
@@ -615,13 +617,14 @@ def _find_header(
     )
     if header == 1 and len(rows[0]) >= len(rows[data]):
         group_names = list(filter(None, rows[0]))
-        has_groups = len(set(group_names)) < len(group_names)
-        has_groups |= len(group_names) < len(above[1]) > len({*above[1]}) and all(above[1])
+        has_groups = len(set(group_names)) < len(group_names) or (
+            len(group_names) < len(above[1]) > len({*above[1]}) and all(above[1])
+        )
         if not (has_groups or is_remark or is_units[0] or _is_field_above(*above[:2])):
             header = data = 0
     if header > 1:
         titles = _titles_above_columns(above, len(rows[data]))
-        if titles is not None:
+        if titles is not None and not (titles == header and is_units[-1]):
             header = data = titles
     if not columns and above and _numeric_columns(above[header]):
         header, data = _true_header(above, is_units, header, data)
@@ -653,6 +656,27 @@ def _is_field_above(first: list[str], second: list[str]) -> bool:
     is_field |= _n_measured(names) > _n_measured(words)
     has_mark = len(words) == 1 and len(FIELD_MARK.split(words[0])) > 1
     return is_field and (len(names) > 1 or has_mark) and not any(map(_is_value, names))
+
+
+def _without_names_among_units(last: list[list[str]], numeric: Collection[int]) -> list[list[str]]:
+    """Return the last row above the data, with units alone if it states those of the row above it.
+
+    Graphtec's second row has units for most columns of numbers, and beside them names again, as
+    `NO.,Time,ms,N,A1234` below `Number,Date&Time,ms,CH1,Alarm`. Any other row stays as it is.
+
+    last : the last two rows above the data, or fewer.
+    numeric : positions of the columns of numbers.
+    """
+    if len(last) < 2 or len(last[0]) != len(last[1]):
+        return last[-1:]
+    names, words = last
+    measured = [i for i in numeric if i < len(words) and not COUNTER_NAME.fullmatch(names[i])]
+    n_units = sum(words[i] != "" and _is_unit(words[i]) for i in measured)
+    are_names = all(names) and len({*names}) == len(names) and not any(map(_is_value, names))
+    is_more = n_units > sum(_is_unit(names[i]) for i in measured)
+    if are_names and is_more and 2 * n_units > len(measured):
+        return [[word if _is_unit(word) else "" for word in words]]
+    return [words]
 
 
 def _n_measured(names: Sequence[str]) -> int:
@@ -1288,7 +1312,8 @@ def rows_to_trace(
     units_row : sequence of str
         Unit of each column, if there is a row of units.
     rate_hz : float, optional
-        Rate that the file states above the rows, for rows without a clock.
+        Rate that the file states above the rows, for rows without a clock, or with one that is too
+        coarse to tell it.
 
     Returns
     -------
@@ -1326,6 +1351,10 @@ def rows_to_trace(
         rows = rows.iloc[order]
     check_rows(clock, rows.index, options.time)
     _check_repeated(rows, clock)
+    if options.rate_hz is None and rate_hz is not None and not shows_lost_rows(clock):
+        clock_text = f"{RATE_ABOVE}; {lost_rows_text(clock)}"
+        if not rate_contradiction(clock, rate_hz):
+            return Recording(trace, rate_hz, reading=Reading(clock=clock_text))
     return _trace_at_rate(trace, clock, rows.index, options, notes)
 
 

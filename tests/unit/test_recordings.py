@@ -2573,3 +2573,51 @@ def test_of_two_channels_each_has_its_own_unit_or_none(small: Dataset, tmp_path:
     assert data.spec.unit == ("N", "units")
     assert load_dataset(tmp_path / "a.npz", channel="Torque").spec.unit == "units"
     assert load_dataset(tmp_path / "a.npz", unit="N, Nm").spec.unit == ("N", "Nm")
+
+
+GRAPHTEC_ABOVE = '"Vendor","GRAPHTEC Corporation"\n"Sampling interval","1ms"\n"Data"\n'
+
+
+@pytest.mark.parametrize(
+    ("names", "units_row", "clock"),
+    [
+        ("NO,Date&Time,ms,CH1,Alarm", "NO.,Time,ms,N,A1234", "column Date&Time (dates)"),
+        ("NO,Date,Time,ms,CH1", "NO.,,,ms,N", "column Date (dates)"),
+        (
+            f"NO,Date&Time,ms,{','.join(f'CH{i}' for i in range(1, 11))},Alarm",
+            "NO.,Time,ms,N,mm,degC,V,V,V,mV,V,V,V,A1234",
+            "column Date&Time (dates)",
+        ),
+        (
+            "NO,Date&Time,CH1,Alarm",
+            "NO.,Time,N,A1234",
+            "none, a line above the header states the rate; "
+            "column Date&Time is too coarse to show lost rows",
+        ),
+    ],
+)
+def test_a_second_header_of_units_and_blanks_behind_signs_are_read(
+    names: str, units_row: str, clock: str, tmp_path: Path
+) -> None:
+    values = np.round(40 * np.sin(np.arange(1500) / 200), 2)
+    cells = {"Alarm": "LLLL", "Date": "2024/07/02", **{f"CH{i}": "+   7.00" for i in range(2, 11)}}
+    for name in ("1_OK", "2_NOK"):
+        text = GRAPHTEC_ABOVE + f"{names}\n{units_row}\n"
+        for i, value in enumerate(values):
+            sign = "-" if value < 0 else "+"
+            row = {"NO": i + 1, "ms": i % 1000, "CH1": f"{sign} {abs(value):6.2f}", **cells}
+            row["Time"] = f"09:13:{2 + i // 1000:02d}"
+            row["Date&Time"] = f"2024/07/02 {row['Time']}"
+            text += ",".join(f'"{row[column]}"' for column in names.split(",")) + "\n"
+        (tmp_path / f"{name}.csv").write_text(text)
+    data = load_dataset(tmp_path, channel="CH1")
+    assert (data.rate_hz, data.unit, data.reading["clock"], data.notes) == (1000.0, "N", clock, ())
+    np.testing.assert_allclose(data.X, np.tile(values, (2, 1)), rtol=1e-5)
+
+
+def test_a_column_of_milliseconds_since_the_start_is_not_joined_to_seconds(tmp_path: Path) -> None:
+    for name in ("1_OK", "2_NOK"):
+        rows = [f"2024/07/02 09:13:{i // 1000:02d},{i},{i % 7}.5" for i in range(1500)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["Date&Time,ms,Force", *rows]))
+    data = load_dataset(tmp_path, channel="Force")
+    assert (data.rate_hz, data.reading["clock"]) == (1000.0, "column ms (ms)")
