@@ -316,6 +316,8 @@ def read_folder(
     if options.labels is None and options.part != "part":
         wanted = f"a file of labels with a column {options.part}"
         raise DataError(f"Expected {wanted}: a folder's names tell no parts' numbers.")
+    others = _of_other_channels(named, options.channels, options)
+    named = {name: path for name, path in named.items() if name not in others}
     source, label_columns = _label_source(named, heads, options)
     collect = partial(_collect_folder, folder, named, heads, source, options)
     try:
@@ -323,8 +325,15 @@ def read_folder(
     except DataError as error:
         check = partial(collect, read_nothing, RecordingCollector(name, ()))
         raise with_label_error(error, check) from error
-    _check_headers(heads, channels)
+    if beside := [] if options.channels else _of_other_channels(named, channels, options):
+        wanted = f"the channel to be named, as in channel={channels[0]!r}"
+        raise DataError(f"Expected {wanted}; other files have others, as {beside[0]}.")
+    if not others:
+        _check_headers(heads, channels)
     collector = RecordingCollector(name, channels)
+    collector.notes.update(
+        [f"Not read, for they have other channels: {listed(others)}"][: len(others)]
+    )
     in_order = sorted(named, key=lambda name: natural_key(source.without_label(name)))
     collector.ordered = sorted(named, key=natural_key) == in_order
     collector.order = "by name, numbers by size"
@@ -349,6 +358,29 @@ def read_folder(
     _leave_out_copies(collector)
     collector.order_by_start()
     return as_dataset(collector, options)
+
+
+def _of_other_channels(
+    named: Mapping[str, Path], channels: Sequence[str], options: LoadOptions
+) -> list[str]:
+    """Return the files of other channels than a single one, where each channel has its own file.
+
+    Such a file has not that channel, and its name is that of another file but for the channel, as
+    F0000CH2.CSV beside F0000CH1.CSV.
+    """
+    channel = "".join(channels).lower()
+    names = {name.lower() for name in named}
+    if len(channels) != 1 or not any(channel in name.rpartition("/")[2] for name in names):
+        return []
+    others = []
+    for name, path in named.items():
+        folder, slash, file = name.lower().rpartition("/")
+        header = [] if channel in file else _first_rows(path, options).header
+        owns = [own.lower() for own in header if own and own.lower() in file]
+        beside = {f"{folder}{slash}{file.replace(own, channel)}" for own in owns}
+        if beside & names and not units.find_columns(channels[0], header):
+            others.append(name)
+    return others
 
 
 def _leave_out_copies(collector: RecordingCollector) -> None:

@@ -2,6 +2,7 @@
 state.
 """
 
+import itertools
 import json
 import re
 from collections.abc import Callable, Sequence
@@ -1286,6 +1287,24 @@ def test_a_listing_of_folders_that_hold_several_recordings_is_refused(tmp_path: 
     listing = tmp_path / "verdicts.csv"
     listing.write_text("folder;verdict\nP0;bad\nP1;good\n")
     with pytest.raises(DataError, match=r"verdicts\.csv names P0, P1"):
+        load_dataset(tmp_path / "data", labels=listing)
+
+
+def test_files_of_other_channels_beside_those_of_the_stated_one_are_not_read(
+    tmp_path: Path,
+) -> None:
+    for i, channel in itertools.product(range(4), ("CH1", "CH2")):
+        values = VALUES + i if channel == "CH1" else -VALUES
+        path = tmp_path / "data" / f"ALL{i}" / f"F{i}{channel}.CSV"
+        write(path, ["time", channel], times(), texts(values))
+    listing = tmp_path / "verdicts.csv"
+    listing.write_text("folder;verdict\nALL0;bad\nALL1;good\nALL2;bad\nALL3;good\n")
+    data = load_dataset(tmp_path / "data", labels=listing, channel="CH1")
+    np.testing.assert_array_equal(data.X[3], (VALUES + 3).astype(np.float32))
+    assert data.y.tolist() == [0, 1, 0, 1]
+    assert not data.faults
+    assert any("Not read, for they have other channels: ALL0/F0CH2.CSV" in n for n in data.notes)
+    with pytest.raises(DataError, match="channel to be named, as in channel='CH1'"):
         load_dataset(tmp_path / "data", labels=listing)
 
 
