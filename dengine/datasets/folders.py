@@ -331,13 +331,10 @@ def read_folder(
     if not others:
         _check_headers(heads, channels)
     collector = RecordingCollector(name, channels)
-    collector.notes.update(
-        [f"Not read, for they have other channels: {listed(others)}"][: len(others)]
-    )
     in_order = sorted(named, key=lambda name: natural_key(source.without_label(name)))
     collector.ordered = sorted(named, key=natural_key) == in_order
     collector.order = "by name, numbers by size"
-    collector.notes.update(_unread_files_note(folder, named, options))
+    collector.notes.update(_unread_files_notes(folder, named, others, options))
     common_mark = cache(partial(_common_decimal_mark, list(named.values()), options))
 
     def read(path: Path) -> Recording:
@@ -580,8 +577,15 @@ def _common_decimal_mark(paths: Sequence[Path], options: LoadOptions) -> str | N
     return marks.pop() if len(marks) == 1 else None
 
 
-def _unread_files_note(folder: Path, named: Mapping[str, Path], options: LoadOptions) -> list[str]:
-    """Return a note on the tables and text files of another suffix than the recordings, or none."""
+def _unread_files_notes(
+    folder: Path, named: Mapping[str, Path], others: Sequence[str], options: LoadOptions
+) -> list[str]:
+    """Return notes on the tables and text files of another suffix than the recordings, and on the
+    files of other channels.
+    """
+    notes = []
+    if others:
+        notes.append(f"Not read, for they have other channels: {listed(others)}")
     suffix = suffix_of(next(iter(named.values())))
     label_file = None if options.labels is None else Path(options.labels).resolve()
     paths = [path for path in folder.rglob("*") if path.is_file() and suffix_of(path) != suffix]
@@ -591,9 +595,11 @@ def _unread_files_note(folder: Path, named: Mapping[str, Path], options: LoadOpt
         for other, path in firsts.items()
         if other in SUFFIXES or (other not in JSON and _is_of_numbers(_first_rows(path, options)))
     }
-    others = (path for path in paths if suffix_of(path) in tables)
-    unread = sorted(path.name for path in others if path.resolve() != label_file)
-    return [f"Not read, for most files are {suffix}: {listed(unread)}"] if unread else []
+    texts = (path for path in paths if suffix_of(path) in tables)
+    unread = sorted(path.name for path in texts if path.resolve() != label_file)
+    if unread:
+        notes.append(f"Not read, for most files are {suffix}: {listed(unread)}")
+    return notes
 
 
 def _first_rows(path: Path, options: LoadOptions) -> TextCells:
