@@ -1,4 +1,5 @@
-"""Insertions in a bag: one long recording of a wrench in MCAP files, cut by a trigger.
+"""Insertions in a bag: one long recording of a wrench in MCAP files, cut by a trigger or by the
+windows of a listing.
 
 The force is a topic of geometry_msgs/WrenchStamped or Wrench. Its times are the stamps in the
 headers, or else those of the log. Labels are a topic, of which the first message after an insertion
@@ -29,7 +30,8 @@ from .dataset import (
     as_dataset,
     expect_data,
 )
-from .triggers import Active, StartFinder, Trigger, as_trigger, place
+from .triggers import MAX_STEP, Active, Start, StartFinder, Trigger, as_trigger, place
+from .windows import Windows, read_windows
 
 if TYPE_CHECKING:
     from mcap.reader import McapReader
@@ -41,8 +43,11 @@ AXES = ("FX", "FY", "FZ", "MX", "MY", "MZ")  # in the frame that the topic is in
 UR_NAMES = ("FX_Base", "FY_Base", "FZ_Base", "MuX_Base", "MuY_Base", "MuZ_Base")
 ALIASES = dict(zip(UR_NAMES, AXES, strict=True))
 MESSAGE_BYTES = 8 * (len(AXES) + 4)  # in memory
+LOG_CLOCK = "times of the log"
+LATE_LOG = 0.1  # seconds from stamp to log that users should know
 LATE_MESSAGES = 100  # that come in one burst are no gap
 SPAN = 100  # messages over which the step is measured, if they come in bursts
+MEAN_TOLERANCE = 0.1  # of a step: a mean one that is further off is no step, as of a clock set back
 BURST_TOLERANCE = 0.3  # of a step: single steps that are further off it are those of bursts
 Times = NDArray[np.float64]
 
@@ -50,22 +55,30 @@ Times = NDArray[np.float64]
 class Messages(NamedTuple):
     """The messages of a bag.
 
-    times : array of float64, shape (n,)
-        Seconds since the first wrench.
+    dated : array of int64, shape (n,)
+        The time of each wrench, in nanoseconds since 1970 or since another start.
     logged : array of int64, shape (n,)
         When each wrench was logged, in nanoseconds.
     wrench : array of float64, shape (n, 6)
     others : dict
         For each other topic its messages, as (nanoseconds of the log, value).
     clock : str
-        Which times they are, in words.
+        Which times `dated` are, in words.
+    begin : int
+        When the bag begins, in nanoseconds of the log.
     """
 
-    times: Times
+    dated: NDArray[np.int64]
     logged: NDArray[np.int64]
     wrench: NDArray[np.float64]
     others: dict[str, list[tuple[int, Any]]]
     clock: str
+    begin: int
+
+    @property
+    def times(self) -> Times:
+        """Seconds since the first wrench, shape (n,)."""
+        return np.asarray((self.dated - self.dated[0]) / NANOSECONDS)
 
     def signal(self, name: str) -> NDArray[np.float64]:
         """Return an axis of the wrench, or the value of a topic at each wrench, shape (n,).
@@ -113,13 +126,14 @@ def _open_reader(path: Path) -> "Iterator[McapReader]":
         yield make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
 
 
-def _find_topics(files: Sequence[Path]) -> dict[str, str]:
-    """Return the topics of the files, each with the name of its message type.
+def _find_topics(files: Sequence[Path]) -> tuple[dict[str, str], int]:
+    """Return the topics of the files, each with the name of its message type, and their begin.
 
-    Only the summaries are read. Raises DataError if a file has none, or is too large for the
-    memory.
+    That is the time of the log of the first message, in nanoseconds. Only the summaries are read.
+    Raises DataError if a file has none, or is too large for the memory.
     """
     topics: dict[str, str] = {}
+    begins = []
     for path in files:
         with _open_reader(path) as reader:
             summary = reader.get_summary()
@@ -132,10 +146,14 @@ def _find_topics(files: Sequence[Path]) -> dict[str, str]:
             types = {number: schema.name for number, schema in summary.schemas.items()}
             for channel in summary.channels.values():
                 topics[channel.topic] = types.get(channel.schema_id, "")
-    return topics
+            if summary.statistics.message_count:
+                begins.append(summary.statistics.message_start_time)
+    return topics, min(begins, default=0)
 
 
-def _read_messages(files: Sequence[Path], wrench: str, topics: Sequence[str]) -> Messages:
+def _read_messages(
+    files: Sequence[Path], wrench: str, topics: Sequence[str], begin: int
+) -> Messages:
     """Read all messages of the wrench's topic and of other topics, in the order of the log.
 
     Times are the stamps of the wrench if all of its messages have one, else those of the log.
@@ -166,9 +184,8 @@ def _read_messages(files: Sequence[Path], wrench: str, topics: Sequence[str]) ->
                     others[topic].append((record.log_time, message.data))
     expect_data(len(logged) >= 2, f"messages of {wrench} in {files[0]}", len(logged))
     exact = np.array(logged if 0 in stamped else stamped, dtype=np.int64)
-    clock = "times of the log" if 0 in stamped else "stamps of the headers"
-    times = (exact - exact[0]) / NANOSECONDS
-    return Messages(times, np.array(logged), np.array(forces), others, clock)
+    clock = LOG_CLOCK if 0 in stamped else "stamps of the headers"
+    return Messages(exact, np.array(logged), np.array(forces), others, clock, begin)
 
 
 def _nanoseconds_of(stamp: Any) -> int:
@@ -185,7 +202,7 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
     name : str
         Name of the data set.
     options : LoadOptions
-        A trigger and labels must be stated.
+        A trigger and labels must be stated, or a listing with windows and labels.
 
     Returns
     -------
@@ -210,9 +227,18 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
         do = "ros2 bag convert makes them of .db3 files"
         raise DataError(f"Expected MCAP files in the bag {path}, found none; {do}.")
     with read_errors(path, "MCAP files", "mcap_ros2", "mcap"):
-        types = _find_topics(files)
-    _check_cutting_options(path, types, options)
-    trigger = as_trigger(options.trigger)
+        types, begin = _find_topics(files)
+    windows = read_windows(name, options)
+    if windows is not None and options.trigger is not None:
+        actual = f"{windows.file} says from when to when each part ran"
+        do = "leave one out: the trigger, or the columns of times in the file"
+        raise DataError(
+            f"Expected a trigger or windows, got {options.trigger}, and {actual}; {do}."
+        )
+    signals: tuple[str, ...] = ()
+    if windows is None:
+        _check_cutting_options(path, types, options)
+        signals = as_trigger(options.trigger).signals
     wrenches = [
         topic
         for topic, message_type in types.items()
@@ -220,15 +246,17 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
     ]
     wanted = f"a topic of a wrench in {path}, named where there are several (topic='...')"
     expect_data(len(wrenches) == 1, wanted, listed(wrenches or types) or "none")
-    topics = [signal for signal in trigger.signals if axis_of(signal) < 0]
+    topics = [signal for signal in signals if axis_of(signal) < 0]
     topics += [options.label] if options.label and options.labels is None else []
     topics += [options.part] if options.part in types else []
     for topic in topics:
         if topic not in types:
             actual = listed(types) or "none"
             raise DataError(f"Expected the topic {topic} in {path}, found {actual}.")
-    messages = _read_messages(files, wrenches[0], topics)
-    return _cut_dataset(messages, trigger, channels, name, options)
+    messages = _read_messages(files, wrenches[0], topics, begin)
+    if windows is not None:
+        return _cut_windows(messages, windows, channels, name, options)
+    return _cut_dataset(messages, as_trigger(options.trigger), channels, name, options)
 
 
 def _check_cutting_options(path: Path, types: Mapping[str, str], options: LoadOptions) -> None:
@@ -244,7 +272,8 @@ def _check_cutting_options(path: Path, types: Mapping[str, str], options: LoadOp
         registers = (f"register@{topic}" for kind, topic in topic_of.items() if "Int" in kind)
         trigger = f"trigger={next(registers, 'contact=5')!r}"
         wanted = f"what cuts {path} into insertions, and their labels"
-        raise DataError(f"Expected {wanted}, as {trigger} and {label}.")
+        listing = "labels=... of a CSV file with columns start, end and result"
+        raise DataError(f"Expected {wanted}, as {trigger} and {label}, or {listing}.")
     if options.label is None and options.labels is None:
         raise DataError(f"Expected the labels of the insertions in {path}, as {label}.")
 
@@ -259,16 +288,14 @@ def _cut_dataset(
     """Cut a stream into insertions by its trigger, and return them with their labels as a data set.
 
     Insertions are named NAME/1, NAME/2, ..., or by the topic of parts. By default each lasts two
-    seconds. Those with missing
-    messages become faults. Raises DataError if the trigger never starts.
+    seconds. Those with missing messages become faults. Raises DataError if the trigger never
+    starts.
     """
     active = trigger.active({signal: messages.signal(signal) for signal in trigger.signals})
     values = messages.wrench[:, [axis_of(channel) for channel in channels]]
-    rate = options.rate_hz or float(f"{1.0 / _usual_step(messages.times):.4g}")
+    rate = options.rate_hz or _rate_of(messages.times)
     samples = options.samples or round(2.0 * rate)  # two seconds
-    cuts = list(
-        _cut_stream(messages.times, values, active, samples, trigger.quiet_s, options.rate_hz)
-    )
+    cuts = list(_cut_stream(messages.times, values, active, samples, trigger.quiet_s, options))
     if not cuts:
         message = f"Expected insertions in {name}, where {trigger} goes on; it never does."
         raise DataError(message)
@@ -281,20 +308,89 @@ def _cut_dataset(
         source = labels.labels_in_file(options.labels, names, options)
     else:
         source = _labels_in_topic(options, messages, cuts, names)
+    collector = RecordingCollector(name, channels, order="as in the bag")
+    _collect_insertions(insertions, messages, rate, source, collector, options)
+    ends = np.append(np.flatnonzero(~active), len(active))  # where the trigger is off
+    lengths = [int(ends[np.searchsorted(ends, cut.first)]) - cut.first for cut in cuts]
+    if options.samples is None and np.median(lengths) > samples:
+        goes_on = f"The trigger goes on for {min(lengths)} to {max(lengths)} samples"
+        collector.notes[f"{goes_on}: the first {samples}, two seconds, are used (samples)"] = 1
+    return as_dataset(collector, options)
+
+
+def _collect_insertions(
+    insertions: "Mapping[str, RecordedInsertion]",
+    messages: Messages,
+    rate: float,
+    source: labels.LabelSource,
+    collector: RecordingCollector,
+    options: LoadOptions,
+) -> None:
+    """Collect insertions with their labels; `rate` is the one by their clock, or the stated one."""
+    reading = Reading(clock="" if options.rate_hz else messages.clock)
 
     def read(insertion: "RecordedInsertion") -> Recording:
         if insertion.fault:
             raise UnreadableError(insertion.fault)
         return Recording(insertion.trace, None if options.rate_hz else rate, reading=reading)
 
-    reading = Reading(clock="" if options.rate_hz else messages.clock)
-    collector = RecordingCollector(name, channels, order="as in the bag")
     labels.collect_recordings(insertions, read, source, collector)
-    ends = np.append(np.flatnonzero(~active), len(active))  # where the trigger is off
-    lengths = [int(ends[np.searchsorted(ends, cut.first)]) - cut.first for cut in cuts]
-    if options.samples is None and np.median(lengths) > samples:
-        goes_on = f"The trigger goes on for {min(lengths)} to {max(lengths)} samples"
-        collector.notes[f"{goes_on}: the first {samples}, two seconds, are used (samples)"] = 1
+
+
+def _cut_windows(
+    messages: Messages,
+    windows: Windows,
+    channels: tuple[str, ...],
+    name: str,
+    options: LoadOptions,
+) -> Dataset:
+    """Cut a stream by the windows of a listing, and return them with its labels as a data set.
+
+    The windows are compared with the stamps of the headers, or with the times of the log if no
+    window lies within the stamps, or if they count from the start of the bag; a note says which.
+    Raises DataError if no window lies within the bag.
+    """
+    collector = RecordingCollector(name, channels, order="by the starts of the windows")
+    begin = 0.0 if windows.since_1970 else messages.begin / NANOSECONDS
+    if not windows.since_1970 or not windows.n_inside(messages.dated / NANOSECONDS):
+        messages = messages._replace(dated=messages.logged, clock=LOG_CLOCK)
+        windows.check_inside(messages.dated / NANOSECONDS - begin, name)
+    counts = "UTC" if windows.since_1970 else "seconds from the start of the bag"
+    note = f"{windows.file} is read as {counts}, and compared with the {messages.clock}"
+    late_s = float(np.median(messages.logged - messages.dated)) / NANOSECONDS
+    if messages.clock == LOG_CLOCK and windows.since_1970:
+        note = f"{note}: no stamps of the headers are of its times"
+    elif abs(late_s) > LATE_LOG:
+        note = f"{note}; the times of the log are {late_s:.3g} s later"
+    collector.notes[note] = 1
+    times = messages.times
+    rate = options.rate_hz or _rate_of(times)
+    step = 1.0 / _rate_of(times)
+    places = np.arange(len(times)) if options.rate_hz else _place_messages(times, step)
+    values = messages.wrench[:, [axis_of(channel) for channel in channels]]
+    insertions = {}
+    cuts = windows.cut(messages.dated / NANOSECONDS - begin, step)
+    for part, window in zip(windows.names, cuts, strict=True):
+        if window.fault:
+            insertions[part] = RecordedInsertion(
+                np.empty((len(channels), 0), dtype=np.float32), 0, window.fault
+            )
+            continue
+        first = int(window.positions[0])
+        samples = round(window.seconds * rate)
+        n_left = int(places[-1] - places[first]) + 1
+        if options.rate_hz:
+            samples = len(window.positions)
+        elif n_left == samples - 1:  # the last message of the bag came early
+            samples = n_left
+        is_behind_gap = first > 0 and places[first] - places[first - 1] > 1
+        is_late = window.late > MAX_STEP * step
+        start = Start(float(places[first]), seen=not (is_behind_gap and is_late))
+        insertions[part] = _take(times, places, values, first, start, samples, step, options)
+    source = labels.labels_in_file(
+        str(options.labels), windows.names, windows.options, windows.frame
+    )
+    _collect_insertions(insertions, messages, rate, source, collector, options)
     return as_dataset(collector, options)
 
 
@@ -370,6 +466,14 @@ def _usual_step(times: Times) -> float:
     return single if abs(single - many) < BURST_TOLERANCE * many else many
 
 
+def _rate_of(times: Times) -> float:
+    """Return the rate of messages in hertz, to four digits: that of most, lost ones counted."""
+    step = _usual_step(times)
+    n = max(len(times) - LATE_MESSAGES, 2)  # of the last ones lost and late are not told apart
+    mean, _ = np.polyfit(_place_messages(times, step)[:n], times[:n], 1)
+    return float(f"{1.0 / (mean if abs(mean - step) < MEAN_TOLERANCE * step else step):.4g}")
+
+
 def _place_messages(times: Times, step: float) -> NDArray[np.int64]:
     """Return the place of each message on a grid of steps, shape (n,).
 
@@ -392,7 +496,7 @@ def _cut_stream(
     active: Active,
     samples: int,
     quiet_s: float,
-    rate_hz: float | None,
+    options: LoadOptions,
 ) -> Iterator[RecordedInsertion]:
     """Cut a stream where its trigger starts, and yield each insertion with its trace, or its fault.
 
@@ -408,11 +512,11 @@ def _cut_stream(
         Of each insertion.
     quiet_s : float
         Seconds that the trigger must have been off before it starts an insertion.
-    rate_hz : float or None
-        Stated rate; then the times are not looked at, and no message counts as lost.
+    options : LoadOptions
+        With a stated rate the times are not looked at, and no message counts as lost.
     """
-    step = 1.0 / rate_hz if rate_hz else _usual_step(times)
-    places = np.arange(len(times)) if rate_hz else _place_messages(times, step)
+    step = 1.0 / options.rate_hz if options.rate_hz else _usual_step(times)
+    places = np.arange(len(times)) if options.rate_hz else _place_messages(times, step)
     finder = StartFinder(1.0, quiet_s / step)
     next_free = 0.0
     for i, (position, is_on) in enumerate(zip(places.tolist(), active.tolist(), strict=True)):
@@ -420,17 +524,35 @@ def _cut_stream(
         if start is None or start.time < next_free:
             continue
         next_free = start.time + samples
-        stop = int(np.searchsorted(places, next_free))
-        placed = place(places[i:stop].tolist(), values[i:stop], start.time, samples, 1.0)
-        backwards = np.flatnonzero(np.diff(times[i:stop]) <= 0)
-        fault = ""
-        if not start.seen:
-            fault = "Expected the message that it begins with, that one fell into a gap"
-        elif len(backwards) and not rate_hz:
-            sample = int(backwards[0]) + 1
-            fault = f"Expected later times from message to message, sample {sample} is not later"
-        elif len(placed.missing):
-            first = f"the first at sample {placed.missing[0]}"
-            lost = f"{len(placed.missing)} of {samples} are missing, {first}"
-            fault = f"Expected a message each {step:.3g} s, {lost}"
-        yield RecordedInsertion(placed.trace, i, fault)
+        yield _take(times, places, values, i, start, samples, step, options)
+
+
+def _take(
+    times: Times,
+    places: NDArray[np.int64],
+    values: NDArray[np.float64],
+    first: int,
+    start: Start,
+    samples: int,
+    step: float,
+    options: LoadOptions,
+) -> RecordedInsertion:
+    """Return the insertion whose first message is at position `first`, with its trace or its fault.
+
+    Its messages are put at their `places` (n,), from that of `start` on, whose time is a place.
+    With a stated rate their times are not looked at.
+    """
+    stop = int(np.searchsorted(places, start.time + samples))
+    placed = place(places[first:stop].tolist(), values[first:stop], start.time, samples, 1.0)
+    backwards = np.flatnonzero(np.diff(times[first:stop]) <= 0)
+    fault = ""
+    if not start.seen:
+        fault = "Expected the message that it begins with, that one fell into a gap"
+    elif len(backwards) and not options.rate_hz:
+        sample = int(backwards[0]) + 1
+        fault = f"Expected later times from message to message, sample {sample} is not later"
+    elif len(placed.missing):
+        lost = f"{len(placed.missing)} of {samples} are missing"
+        lost = f"{lost}, the first at sample {placed.missing[0]}"
+        fault = f"Expected a message each {step:.3g} s, {lost}"
+    return RecordedInsertion(placed.trace, first, fault)

@@ -467,6 +467,40 @@ def start_of(column: pd.Series) -> float | None:
     return None if epoch is None else float(times[0]) * epoch[0] - epoch[1]
 
 
+def times_of(column: pd.Series) -> tuple[NDArray[np.float64], bool]:
+    """Return the times that a column of texts or numbers states, in any order, and since when.
+
+    Returns
+    -------
+    times : array of float64, shape (n,)
+        In seconds; NaN where a cell states none. Those of dates without a zone are in UTC.
+    since_1970 : bool
+        Whether they count since 1970; else since a start that is not known. Times of day are NaN.
+
+    Raises
+    ------
+    UnreadableError
+        If dates as 3/2/2026 may have the day or the month first.
+    """
+    import pandas as pd
+
+    times, wrong = floats(column.astype(str).str.replace(r"^(\d+),(\d+)$", r"\1.\2", regex=True))
+    is_time = ~np.isnan(times)
+    if 2 * len(wrong) < len(times) and is_time.any():
+        epoch = _epoch_of(times[is_time])
+        if epoch is not None:
+            return times * epoch[0] - epoch[1], True
+        return times * (_stated_unit(str(column.name), "") or 1.0), False
+    text = column.astype(str).str.strip()
+    if text.str.match(SLASHED_DATE).any() and not _date_order(text):
+        wanted = f"dates in {column.name} that tell day and month, as 2026-03-01"
+        raise UnreadableError(f"Expected {wanted}, got {text.iloc[0]}")
+    if text.str.fullmatch(TIME_OF_DAY).mean() > 0.5:
+        return np.full(len(text), np.nan), True
+    seconds, _ = _parse_timestamps(pd.concat([pd.Series(["1970-01-01T00:00:00Z"]), text]))
+    return seconds[1:], True
+
+
 def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return seconds since the first time of a column, shape (n,), and which cells are no time.
 

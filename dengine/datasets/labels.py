@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import DataError, instead, listed
 from . import units
@@ -44,6 +44,9 @@ from .dataset import (
     label_map_of,
 )
 from .text import SUFFIXES, column_place, fields_beside, read_table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # The words of labels, and the names of their columns.
 LISTS = tomllib.loads((files("dengine") / "data" / "label_words.toml").read_text("utf-8"))
@@ -850,7 +853,10 @@ class _LabelRow(NamedTuple):
 
 
 def labels_in_file(
-    path: str | os.PathLike[str], names: Sequence[str], options: LoadOptions
+    path: str | os.PathLike[str],
+    names: Sequence[str],
+    options: LoadOptions,
+    frame: "pd.DataFrame | None" = None,
 ) -> LabelSource:
     """Return a source of labels in a CSV file with a column of files and one of labels.
 
@@ -870,6 +876,8 @@ def labels_in_file(
     options : LoadOptions
         `label` and `part` are columns of the file. If `label` is None, the columns whose names are
         those of labels (`LABEL_COLUMNS`) must not contradict each other.
+    frame : DataFrame, optional
+        The rows of the file, by their lines, if it was read before.
 
     Raises
     ------
@@ -877,7 +885,7 @@ def labels_in_file(
         If the file cannot be read as one of labels.
     """
     source = Path(path).name
-    rows, faults, column, header = _read_label_rows(path, options, names)
+    rows, faults, column, header = _read_label_rows(path, options, names, frame)
     notes = Counter[str]()
     if any(len(row.lines) > 1 for row in rows):
         notes[f"{source} names recordings more than once: their labels must be equal"] = 1
@@ -928,7 +936,10 @@ def labels_in_file(
     if options.label is not None:
         return listing
     others = [
-        replace(labels_in_file(path, names, replace(options, label=name)), place=f"column {name}")
+        replace(
+            labels_in_file(path, names, replace(options, label=name), frame),
+            place=f"column {name}",
+        )
         for name in header
         if name != column and name.lower() in LABEL_COLUMNS
     ]
@@ -1001,7 +1012,10 @@ def read_ordered_labels(
 
 
 def _read_label_rows(
-    path: str | os.PathLike[str], options: LoadOptions, names: Sequence[str] = ()
+    path: str | os.PathLike[str],
+    options: LoadOptions,
+    names: Sequence[str] = (),
+    frame: "pd.DataFrame | None" = None,
 ) -> tuple[list[_LabelRow], list[Fault], str, list[str]]:
     """Return the rows of a file of labels, file by file, and the faults of its other lines.
 
@@ -1013,8 +1027,9 @@ def _read_label_rows(
         table = read_table(Path(path), replace(options, columns=()), as_text=True)
     except (OSError, UnreadableError) as error:
         raise DataError(f"Cannot read the labels in {path}: {error}.") from error
-    header = list(table.frame.columns)
-    rows_by_line = zip(table.frame.index, table.frame.to_numpy().tolist(), strict=True)
+    frame = table.frame if frame is None else frame
+    header = list(frame.columns)
+    rows_by_line = zip(frame.index, frame.to_numpy().tolist(), strict=True)
     cells = {line: row for line, row in rows_by_line if any(row)}
     faults = table.faults
     files = {_path_words(name)[0] for name in names}

@@ -141,7 +141,8 @@ def load_dataset(
     trigger : Trigger or str, optional
         When an insertion begins in one long recording, see `as_trigger`. Its channels are FX ...
         MZ, by default FZ; `label` is the topic that gives labels, and a file of `labels` names
-        insertions by their number; `samples` is two seconds by default.
+        insertions by their number; `samples` is two seconds by default. Instead of a trigger, a
+        file of `labels` may say from when to when each part ran.
     topic : str, optional
         Topic of the wrench of a long recording, if there are several.
     time : str, optional

@@ -257,3 +257,171 @@ def test_a_damaged_file_is_refused_or_read_and_never_raises_anything_else(
     except DataError:
         return
     np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32)[: len(data)])
+
+
+def date(nanoseconds: int) -> str:
+    return f"{np.datetime64(nanoseconds // 10**6, 'ms')}"
+
+
+def since_begin(nanoseconds: int) -> str:
+    return f"{(nanoseconds - BEGIN - 500_000) / 1e9:.4f}"
+
+
+def day_first(nanoseconds: int) -> str:
+    day, _, time = date(nanoseconds).partition("T")
+    return f"{'.'.join(reversed(day.split('-')))} {time.replace('.', ',')}"
+
+
+WINDOWS = {
+    "dates with a zone": ("start,end", lambda a, b: f"{date(a)}Z,{date(b)}Z"),
+    "dates of another zone": (
+        "t_start,t_end",
+        lambda a, b: f"{date(a + 3600 * 10**9)}+01:00,{date(b)}Z",
+    ),
+    "dates in UTC": ("start_time,end_time", lambda a, b: f"{date(a)},{date(b)}"),
+    "seconds since 1970": ("Start;Stop", lambda a, b: f"{a / 1e9:.3f};{b / 1e9:.3f}"),
+    "milliseconds": ("cycle_start;cycle_end", lambda a, b: f"{a // 10**6};{b // 10**6}"),
+    "microseconds": ("begin_us,end_us", lambda a, b: f"{a // 1000},{b // 1000}"),
+    "nanoseconds": ("from,to", lambda a, b: f"{a},{b}"),
+    "since the start": ("start,end", lambda a, b: f"{since_begin(a)},{since_begin(b)}"),
+    "decimal commas": (
+        "Start [s];Ende [s]",
+        lambda a, b: f"{since_begin(a)};{since_begin(b)}".replace(".", ","),
+    ),
+    "milliseconds since the start": (
+        "start [ms],end [ms]",
+        lambda a, b: f"{1e3 * float(since_begin(a))},{1e3 * float(since_begin(b))}",
+    ),
+    "German dates": ("Beginn;Ende", lambda a, b: f"{day_first(a)};{day_first(b)}"),
+    "von and bis": ("von;bis", lambda a, b: f"{date(a)};{date(b)}"),
+    "French": ("début,fin", lambda a, b: f"{date(a)},{date(b)}"),
+    "Japanese": ("開始時刻,終了時刻", lambda a, b: f"{date(a)},{date(b)}"),
+    "a duration": ("start,duration", lambda a, b: f"{date(a)},{(b - a) / 1e9}"),
+    "one in milliseconds": ("Start;Dauer [ms]", lambda a, b: f"{date(a)};{(b - a) / 1e6:g}"),
+    "a date and times of day": (
+        "date,start,end",
+        lambda a, b: ",".join([*date(a).split("T"), date(b).partition("T")[2]]),
+    ),
+}
+
+
+def write_windows(path: Path, bag: Bag, form: str = "dates with a zone") -> Path:
+    header, row_of = WINDOWS[form]
+    mark = ";" if ";" in header else ","
+    rows = [f"part{mark}{header}{mark}result"]
+    for i, start in enumerate(bag.starts):
+        window = row_of(BEGIN + STEP * start, BEGIN + STEP * (start + SAMPLES))
+        rows.append(f"P{i}{mark}{window}{mark}{'success' if bag.good[i] else 'failure'}")
+    path.write_text("\n".join(rows), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("form", WINDOWS)
+def test_a_listing_of_starts_and_ends_cuts_it(bag: Bag, tmp_path: Path, form: str) -> None:
+    path = bag.write(tmp_path / "cell.mcap")
+    listing = write_windows(tmp_path / "cycles.csv", bag, form)
+    data = load_dataset(path, labels=listing)
+    np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
+    np.testing.assert_array_equal(data.y, bag.good)
+    assert data.source.tolist() == [f"P{i}" for i in range(8)]
+    assert (data.rate_hz, data.faults) == (500.0, ())
+    is_relative = "since the start" in form or form == "decimal commas"
+    clock = "times of the log" if is_relative else "stamps of the headers"
+    assert any(note.endswith(f"compared with the {clock}.") for note in data.notes)
+    named = load_dataset(path, labels=listing, label="result", part="part", channel="FZ")
+    np.testing.assert_array_equal(named.X, data.X)
+    assert named.part.tolist() == data.source.tolist()
+
+
+@pytest.mark.parametrize("stamps", ["none", "zeros", "since the controller began"])
+def test_windows_are_compared_with_the_log_if_no_stamp_is_of_their_time(
+    bag: Bag, tmp_path: Path, stamps: str
+) -> None:
+    bag.stamped = stamps != "none"
+    bag.stamps = (bag.stamps - BEGIN + 10**10) * (stamps != "zeros")
+    listing = write_windows(tmp_path / "cycles.csv", bag)
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), labels=listing)
+    np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
+    note = "cycles.csv is read as UTC, and compared with the times of the log: no stamps"
+    assert any(text.startswith(note) for text in data.notes)
+
+
+def test_stamps_that_are_far_from_the_log_are_noted(bag: Bag, tmp_path: Path) -> None:
+    bag.logged = bag.stamps + 10**8 * 3
+    listing = write_windows(tmp_path / "cycles.csv", bag)
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), labels=listing)
+    np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
+    assert any(
+        text.endswith("headers; the times of the log are 0.3 s later.") for text in data.notes
+    )
+
+
+def test_windows_that_cannot_be_used_are_named_and_the_rest_is_read(
+    bag: Bag, tmp_path: Path
+) -> None:
+    start = bag.starts
+    bag.lost = {start[1] + 30, *range(start[2] - 2, start[2] + 8), *range(start[7], start[7] + 62)}
+    listing = write_windows(tmp_path / "cycles.csv", bag)
+    *lines, last = listing.read_text("utf-8").splitlines()
+    lines[5] = lines[5].replace(date(BEGIN + STEP * (start[4] + SAMPLES)), date(BEGIN + 11 * 10**8))
+    lines[4] = lines[4].replace("P3,", "P3,?")
+    lines.append("P9,2023-11-14T22:13:21.620Z,2023-11-14T22:13:23.000Z,success")
+    listing.write_text("\n".join([*lines, last]), encoding="utf-8")
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), labels=listing)
+    assert data.source.tolist() == ["P0", "P6"]
+    np.testing.assert_array_equal(data.X, bag.traces[[0, 6], 2].astype(np.float32))
+    faults = {fault.source: fault.message for fault in data.faults}
+    assert f"1 of {SAMPLES} are missing, the first at sample 30" in faults["P1"]
+    assert "the message that it begins with, that one fell into a gap" in faults["P2"]
+    assert "Expected times of its start and, later, of its end, got none to" in faults["P3"]
+    assert "overlaps that of P5" in faults["P4"]
+    assert "overlaps that of P4" in faults["P5"]
+    assert "found none" in faults["P7"]
+    assert "Expected a window in the recording, from 2023-11-14T22:13:20.000Z to" in faults["P9"]
+
+
+def test_a_part_that_is_listed_twice_was_tried_twice(bag: Bag, tmp_path: Path) -> None:
+    listing = write_windows(tmp_path / "cycles.csv", bag)
+    text = listing.read_text("utf-8").replace("P1,", "P0,").replace("part", "Serial No")
+    listing.write_text(text, encoding="utf-8")
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), labels=listing)
+    np.testing.assert_array_equal(data.y, bag.good)
+    assert data.source.tolist()[:3] == ["P0, line 2", "P0, line 3", "P2"]
+    assert data.part.tolist()[:3] == ["P0", "P0", "P2"]
+
+
+def test_windows_without_names_of_parts_are_numbered_and_of_any_length(
+    bag: Bag, tmp_path: Path
+) -> None:
+    rows = [
+        f"{date(BEGIN + STEP * start)},{date(BEGIN + STEP * (start + SAMPLES - i))},OK"
+        for i, start in enumerate(bag.starts)
+    ]
+    listing = tmp_path / "cycles.csv"
+    listing.write_text("\n".join(["start,end,verdict", *rows]), encoding="utf-8")
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), labels=listing, samples=50)
+    np.testing.assert_array_equal(data.X, bag.traces[:, 2, :50].astype(np.float32))
+    assert data.source.tolist() == [f"cell/{i}" for i in range(1, 9)]
+
+
+def test_windows_that_do_not_fit_are_refused_with_what_to_do(bag: Bag, tmp_path: Path) -> None:
+    path = bag.write(tmp_path / "cell.mcap")
+    listing = write_windows(tmp_path / "cycles.csv", bag)
+    with pytest.raises(DataError, match="Expected a trigger or windows, got register@/phase, and"):
+        load_dataset(path, labels=listing, trigger="register@/phase")
+    text = listing.read_text("utf-8")
+    for old, new, message in (
+        ("T22:", "T23:", r"1 h earlier they would be.* as 2023-11-14T23:13:20.080\+01:00"),
+        ("2023-11-14", "2023-10-14", "is it another recording"),
+        ("2023-11-14T22:13:2", "", r"unit into the columns' names: start \[ms\]"),
+        ("2023-11-14T", "", "Expected dates with the times of day in start and end"),
+        ("2023-11-14T", "11/10/2023 ", "Expected dates in start that tell day and month"),
+    ):
+        changed = text.replace(old, new)
+        if not new:
+            changed = changed.replace("Z", "")
+        if "unit" in message:
+            changed = changed.replace("0.", "80").replace("1.", "81")
+        listing.write_text(changed, encoding="utf-8")
+        with pytest.raises(DataError, match=message):
+            load_dataset(path, labels=listing)
