@@ -387,9 +387,7 @@ def _cut_windows(
         is_late = window.late > MAX_STEP * step
         start = Start(float(places[first]), seen=not (is_behind_gap and is_late))
         insertions[part] = _take(times, places, values, first, start, samples, step, options)
-    source = labels.labels_in_file(
-        str(options.labels), windows.names, windows.options, windows.frame
-    )
+    source = windows.label_source()
     _collect_insertions(insertions, messages, rate, source, collector, options)
     return as_dataset(collector, options)
 

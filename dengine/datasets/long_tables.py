@@ -24,20 +24,24 @@ from .clocks import (
     is_rising,
     place_of_clock,
     seconds_of,
+    times_of,
 )
 from .dataset import (
     Dataset,
+    Fault,
     LoadOptions,
     Recording,
     RecordingCollector,
     UnreadableError,
     as_dataset,
+    expect_data,
 )
 from .text import (
     TextTable,
     is_mostly_numbers,
     rows_to_trace,
 )
+from .windows import Windows, read_windows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -123,6 +127,7 @@ def from_long(
     collector: RecordingCollector,
     source: str,
     first: TextTable,
+    windows: Windows | None = None,
 ) -> Dataset:
     """Make a data set of a long table: the rows of a part, by their times, are one insertion.
 
@@ -132,6 +137,7 @@ def from_long(
     is_repeated : which rows are in another file, too: their label is compared with that of the
         part, but their samples are left out, and a note of the collector says so.
     first : the first of the tables that `frame` is of, for the units of columns.
+    windows : those of the file of labels, by which `cut_by_windows` found the parts.
     """
     column_units = dict(zip(first.frame.columns, first.units, strict=False))
     frame, time = _with_times(frame, options, collector.label_file, source)
@@ -140,7 +146,7 @@ def from_long(
     label = None if options.labels is not None else choose_label_column(frame, options)
     label_columns = [*([label] if label else []), *compared_columns(frame, label, options)]
     all_rows = {str(part): rows for part, rows in frame.groupby(options.part, sort=False)}
-    label_source = _label_source_of_parts(all_rows, label_columns, options)
+    label_source = _label_source_of_parts(all_rows, label_columns, options, windows)
     if is_repeated.any():
         text = "Parts are in two files at the same times: they count once"
         collector.notes[text] = frame[options.part][is_repeated].nunique()
@@ -290,17 +296,85 @@ def _check_together(rows_of_part: Mapping[str, pd.DataFrame]) -> None:
     raise DataError(f"Expected {wanted}, other parts between; make the parts' numbers unique.")
 
 
+def cut_by_windows(
+    frame: pd.DataFrame, first: TextTable, options: LoadOptions, collector: RecordingCollector
+) -> tuple[pd.DataFrame, Windows | None]:
+    """Return the rows of a long table that are in the windows of the file of labels, with a column
+    of parts, and the windows.
+
+    A table that has parts, or whose file of labels has no windows, is returned unchanged. Windows
+    that cannot be used are faults of the collector. Raises DataError if there is no column
+    of times, or the windows are of other times or none can be used.
+    """
+    windows = None if options.part in frame else read_windows(collector.name, options)
+    if windows is None:
+        return frame, None
+    name = _time_column(frame, options)
+    if name not in frame:
+        wanted = f"the column of times (time), with which {windows.file} cuts the table"
+        raise DataError(f"Expected {wanted}, found {listed(frame.columns)}.")
+    column_units = dict(zip(first.frame.columns, first.units, strict=False))
+    times = _times_for_windows(frame[name], column_units.get(name, ""), windows)
+    known = np.flatnonzero(~np.isnan(times))
+    expect_data(len(known) >= 2, f"dates and times in column {name}", frame[name].iloc[0])
+    windows.check_inside(times[known], collector.name)
+    step = float(np.median(np.diff(np.sort(times[known]))))
+    parts = np.full(len(frame), None, dtype=object)
+    for part, window in zip(windows.names, windows.cut(times[known], step), strict=True):
+        fault = window.fault
+        if not fault and max(window.late, window.early) > MAX_GAP * step:
+            wanted = "rows from the start of its window to its end"
+            fault = f"Expected {wanted}, lost {window.late:.3g} s before and {window.early:.3g} s"
+            fault = f"{fault} behind those that are there"
+        if fault:
+            collector.faults.append(Fault(part, 0, fault))
+        else:
+            parts[known[window.positions]] = part
+    is_inside = np.array([part is not None for part in parts])
+    expect_data(bool(is_inside.any()), f"rows in windows of {windows.file}", collector.faults[:1])
+    counted = "UTC" if windows.since_1970 else "seconds of the recording"
+    collector.notes[f"{windows.file} is read as {counted}, and tells which rows are a part"] = 1
+    return frame.assign(**{options.part: parts})[is_inside], windows
+
+
+def _times_for_windows(column: pd.Series, unit: str, windows: Windows) -> NDArray[np.float64]:
+    """Return the times of rows as the windows count, shape (n,): in seconds since 1970, since the
+    zero of the clock, or since the first row if the clock holds dates and the windows none.
+
+    Raises DataError if the windows are dates and the clock has none.
+    """
+    name = str(column.name)
+    times, since_1970 = times_of(column)
+    seconds, _, _, _ = seconds_of(column, name, unit)
+    if since_1970:
+        return times if windows.since_1970 else seconds
+    if windows.since_1970:
+        wanted = f"dates in column {name}, as {windows.file} has"
+        do = "write the windows in the times of the table"
+        raise DataError(f"Expected {wanted}, got {column.iloc[0]}; {do}.")
+    counts, _ = floats(column)  # since zero, in the unit of the clock
+    zero: float = counts[0] * np.nanmedian(np.diff(seconds)) / np.nanmedian(np.diff(counts))
+    return seconds + zero
+
+
 def _label_source_of_parts(
-    rows_of_part: Mapping[str, pd.DataFrame], label_columns: Sequence[str], options: LoadOptions
+    rows_of_part: Mapping[str, pd.DataFrame],
+    label_columns: Sequence[str],
+    options: LoadOptions,
+    windows: Windows | None,
 ) -> labels.LabelSource:
     """Return the source of the labels of a long table: a file of labels, or the first column.
 
-    The other columns of labels are compared with it.
+    The other columns of labels are compared with it. `windows` are those of the file, if any.
     """
     sources = [_labels_of_parts(rows_of_part, name, options) for name in label_columns]
     if options.labels is not None:
         listed_by = replace(options, part="part")
-        listing = labels.labels_in_file(options.labels, list(rows_of_part), listed_by)
+        listing = (
+            labels.labels_in_file(options.labels, list(rows_of_part), listed_by)
+            if windows is None
+            else windows.label_source()
+        )
         return labels.labels_that_agree(listing, sources, listing.trust)
     do = f"name the column to trust: label={label_columns[0]!r}"
     return labels.labels_that_agree(sources[0], sources[1:], do)

@@ -38,7 +38,7 @@ from .text import (
 if TYPE_CHECKING:
     import pandas as pd
 from .columns import MIN_NUMBERED, numbered_columns
-from .long_tables import concatenate_long, from_long, long_table_advice
+from .long_tables import concatenate_long, cut_by_windows, from_long, long_table_advice
 from .wide_tables import turn_table, wide_rows, with_samples_in_columns
 
 LIST_CELL = re.compile(r"[\[(]\s*[-+]?[\d.]+[\s,]")  # a list as text
@@ -129,7 +129,8 @@ def _from_tables(
         collector.faults = [fault for fault in collector.faults if fault not in cut]
         collector.notes.update(map(cut_note, cut))
         frame, is_repeated = concatenate_long(frames, options)
-        return from_long(frame, is_repeated, options, collector, first, tables[first])
+        frame, windows = cut_by_windows(frame, tables[first], options, collector)
+        return from_long(frame, is_repeated, options, collector, first, tables[first], windows)
     if advice := long_table_advice(frames[first], options, collector.label_file):
         columns = listed(frames[first].columns)
         actual = f"a row a sample: {columns}"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from .clocks import DATE, TIME_OF_DAY, join_date_and_time, times_of
 from .dataset import LoadOptions, UnreadableError
-from .labels import LISTS, normalized
+from .labels import LISTS, LabelSource, labels_in_file, normalized
 from .text import read_table
 
 if TYPE_CHECKING:
@@ -34,8 +34,9 @@ class Window(NamedTuple):
 
     positions : array of int64
         Of the samples in the recording.
-    seconds, late : float
-        How long it is, and when its first sample comes after its start.
+    seconds, late, early : float
+        How long it is, how long after its start the first sample comes, and before its end the
+        last one.
     fault : str
         Why it cannot be used; "" if it can.
     """
@@ -43,6 +44,7 @@ class Window(NamedTuple):
     positions: NDArray[np.int64]
     seconds: float
     late: float
+    early: float
     fault: str
 
 
@@ -70,6 +72,10 @@ class Windows(NamedTuple):
     since_1970: bool
     frame: "pd.DataFrame"
     options: LoadOptions
+
+    def label_source(self) -> LabelSource:
+        """Return the source of the labels of the parts, which the listing tells, too."""
+        return labels_in_file(str(self.options.labels), self.names, self.options, self.frame)
 
     def n_inside(self, times: Times, shift: float = 0.0) -> int:
         """Return how many windows, later by `shift` seconds, begin and end within times."""
@@ -139,7 +145,9 @@ class Windows(NamedTuple):
             elif not is_inside.any():
                 fault = f"Expected samples in the window {window}, found none"
             late = float(times[is_inside].min(initial=np.inf) - first)
-            cuts.append(Window(np.flatnonzero(is_inside), float(last - first), late, fault))
+            early = float(last - times[is_inside].max(initial=-np.inf))
+            positions = np.flatnonzero(is_inside)
+            cuts.append(Window(positions, float(last - first), late, early, fault))
         return cuts
 
     def _overlaps(self) -> dict[int, str]:

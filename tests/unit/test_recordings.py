@@ -2621,3 +2621,51 @@ def test_a_column_of_milliseconds_since_the_start_is_not_joined_to_seconds(tmp_p
         (tmp_path / f"{name}.csv").write_text("\n".join(["Date&Time,ms,Force", *rows]))
     data = load_dataset(tmp_path, channel="Force")
     assert (data.rate_hz, data.reading["clock"]) == (1000.0, "column ms (ms)")
+
+
+@pytest.mark.parametrize("clock", ["dates", "seconds", "milliseconds", "a late start", "Parquet"])
+def test_windows_of_a_listing_cut_one_long_table(tmp_path: Path, clock: str) -> None:
+    force = np.random.default_rng(0).normal(size=2000).round(3)
+    seconds = 0.004 * np.arange(2000) + (12.5 if clock == "a late start" else 0.0)
+    dates = [f"2024-06-10T07:10:{second:06.3f}" for second in seconds]
+    times = {"dates": dates, "Parquet": dates, "milliseconds": (1000 * seconds).round()}
+    frame = pd.DataFrame({"time": times.get(clock, seconds), "Fz": force})
+    lost = [*range(420, 425), *range(700, 710), *range(999, 1009)]
+    frame = frame.drop(index=lost)
+    path = tmp_path / "press.csv"
+    if clock == "Parquet":
+        path = tmp_path / "press.parquet"
+        frame.assign(time=pd.to_datetime(frame["time"])).to_parquet(path)
+    else:
+        frame.to_csv(path, index=False, float_format="%.3f")
+    texts = [f"{date}Z" for date in dates] if times.get(clock) is dates else seconds.round(3)
+    starts = [*range(100, 1900, 150), 1950]
+    rows = [
+        f"{texts[i]},{texts[min(i + 100, 1999)]},P{i},{'NOK' if i % 4 else 'OK'}" for i in starts
+    ]
+    rows.append(rows[2].replace("P400", "P401").replace(str(texts[500]), str(texts[510])))
+    listing = tmp_path / "cycles.csv"
+    listing.write_text("\n".join(["von,bis,Serial,result", *rows]), encoding="utf-8")
+    data = load_dataset(path, labels=listing, fit="pad-all")
+    left_out = {fault.source: fault.message for fault in data.faults}
+    used = [i for i in starts if i not in (400, 700, 1000)]
+    assert data.source.tolist() == [f"P{i}" for i in used]
+    assert left_out["P400"].endswith("overlaps that of P401")
+    assert left_out["P401"].endswith("overlaps that of P400")
+    assert "Expected rows from the start of its window" in left_out["P700"]
+    assert "Expected rows from the start of its window" in left_out["P1000"]
+    X = np.stack([force[i : i + 100] for i in used[:-1]])
+    np.testing.assert_allclose(data.X[:-1], X, rtol=1e-6)
+    assert data.y.tolist() == [int(i % 4 == 0) for i in used]
+    assert data.rate_hz == 250.0
+
+
+def test_windows_of_dates_do_not_cut_a_table_without_dates(tmp_path: Path) -> None:
+    rows = [f"{0.004 * i:.3f},{i % 7}" for i in range(500)]
+    (tmp_path / "press.csv").write_text("\n".join(["time,Fz", *rows]), encoding="utf-8")
+    listing = tmp_path / "cycles.csv"
+    listing.write_text(
+        "part,start,end,result\nA,2024-06-10T07:10:00Z,2024-06-10T07:10:01Z,OK\n", encoding="utf-8"
+    )
+    with pytest.raises(DataError, match="Expected dates in column time, as cycles"):
+        load_dataset(tmp_path / "press.csv", labels=listing)
