@@ -1031,7 +1031,6 @@ def _read_label_rows(
     header = list(frame.columns)
     rows_by_line = zip(frame.index, frame.to_numpy().tolist(), strict=True)
     cells = {line: row for line, row in rows_by_line if any(row)}
-    faults = table.faults
     files = {_path_words(name)[0] for name in names}
     # No header, but the first row.
     if header[0].lower().endswith(SUFFIXES) or _path_words(header[0])[0] in files:
@@ -1079,7 +1078,7 @@ def _read_label_rows(
         row = rows.get(words, _LabelRow((), words, file, (), number or None))
         lines = (*row.lines, line)
         rows[words] = row._replace(lines=lines, labels=(*row.labels, values[of_label]))
-    return list(rows.values()), faults, header[of_label], header
+    return list(rows.values()), table.faults, header[of_label], header
 
 
 def _check_not_shortened(
