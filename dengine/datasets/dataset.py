@@ -23,6 +23,7 @@ from ..records import FITS, TraceSpec
 from ..representation import to_html
 from ..traces import as_traces, can_fit_length, fit_length
 from . import units
+from .scales import COUNTS, scale_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -467,6 +468,8 @@ class Recording(NamedTuple):
         Number of its part.
     length : int
         Samples as recorded, if the trace has others by now; else 0.
+    factors : mapping of str to float
+        What it states that may make a quantity of counts, by name, as `scales.stated_factors`.
     """
 
     trace: NDArray[np.float32]
@@ -478,6 +481,7 @@ class Recording(NamedTuple):
     source: str = ""
     part: str | None = None
     length: int = 0
+    factors: Mapping[str, float] = {}
 
 
 @dataclass
@@ -628,6 +632,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         `fit="strict"`.
     """
     collector.check_label_words()
+    _scale_counts(collector)
     as_read = {recording.source: recording for recording in collector.recordings}
     unit = _convert_to_one_unit(collector, options)
     _leave_out_overflows(collector)
@@ -764,6 +769,40 @@ def _note_scales(collector: RecordingCollector) -> None:
         if is_odd.any():
             names = [r.source for r, odd in zip(collector.recordings, is_odd, strict=True) if odd]
             collector.notes[f"{text}: {listed(names)}"] = 1
+
+
+def _scale_counts(collector: RecordingCollector) -> None:
+    """Make quantities of counts, by the factors that recordings state; notes, the first, say so.
+
+    A recording that states none, where others do, becomes a fault.
+    """
+    recordings = collector.recordings
+    stated = [recording.factors for recording in recordings]
+    if not any(stated) or len({len(recording.trace) for recording in recordings}) > 1:
+        return
+    reasons = dict[int, str]()
+    notes = Counter[str]()
+    n = len(recordings[0].trace)
+    for c in range(n):
+        rows = [recording.trace[c][np.isfinite(recording.trace[c])] for recording in recordings]
+        is_whole = all((row % 1 == 0).all() for row in rows)
+        channel = collector.channels[c] if c < len(collector.channels) else "the channel"
+        scale = scale_of(stated, channel, n, is_whole)
+        if scale is None:
+            continue
+        notes[scale.note] = 1
+        scaled = zip(recordings, scale.factors, scale.offsets, strict=False)
+        for i, (recording, factor, offset) in enumerate(scaled):
+            if not 0 < abs(factor) < np.inf:
+                reasons[i] = f"Expected a factor of the counts of {channel}, got none"
+            trace = recording.trace.copy()
+            trace[c] = trace[c].astype(np.float64) * factor + offset
+            of_channels = list(recording.units)
+            if of_channels[c : c + 1] and of_channels[c] in COUNTS:
+                of_channels[c] = ""
+            recordings[i] = recording._replace(trace=trace, units=tuple(of_channels))
+    collector.notes = notes + collector.notes
+    collector.leave_out(reasons)
 
 
 def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) -> str:

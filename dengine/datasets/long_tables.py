@@ -36,6 +36,7 @@ from .dataset import (
     as_dataset,
     expect_data,
 )
+from .scales import factors_in_columns
 from .text import (
     TextTable,
     is_mostly_numbers,
@@ -177,7 +178,8 @@ def from_long(
         )
         clock = timed.reading.clock.replace(ANY_ORDER, form)  # a part's rows may not tell it
         reading = timed.reading._replace(numbers=first.numbers, clock=clock)
-        return timed._replace(units=channel_units, start=start, reading=reading)
+        factors = {**first.factors, **factors_in_columns(rows.drop(columns=[*collector.channels]))}
+        return timed._replace(units=channel_units, start=start, reading=reading, factors=factors)
 
     labels.collect_recordings(rows_of_part, read, label_source, collector)
     collector.order_by_start(apart=True, has_dates=has_dates)

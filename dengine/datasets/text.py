@@ -53,6 +53,7 @@ from .curves import IN_LINE, UNQUOTED, write_curves
 from .dataset import Fault, LoadOptions, Reading, Recording, UnreadableError
 from .encodings import decode
 from .numerals import is_numeral, write_as_python
+from .scales import factors_in_columns, lines_of_factors
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -170,6 +171,8 @@ class TextTable(NamedTuple):
         What users should know, as of units that were converted.
     cut_line : int
         Line of the last row if it is cut off, which is among the faults; 0 for none.
+    factors : mapping of str to float
+        Of the lines above the samples, as in `Recording`.
     """
 
     frame: pd.DataFrame
@@ -186,6 +189,7 @@ class TextTable(NamedTuple):
     clock: str = RATE_ABOVE
     notes: tuple[str, ...] = ()
     cut_line: int = 0
+    factors: Mapping[str, float] = {}
 
 
 def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
@@ -900,9 +904,10 @@ def read_table(
     frame = frame.drop(index=[i for i in wrong if i in complete])
     column_units = cells.units[:n]
     _add_stated_units(column_units, header, _lines_above(text, cells.line))
-    rate_and_offer = rate_in_preamble(_lines_above(text, min(cells.rows, default=1)))
-    about = (cells.fields, cells.n_remarks, cells.blocks, *rate_and_offer, RATE_ABOVE, notes)
-    return TextTable(*(frame, faults, cells.line, column_units, mark, numbers, *about), cut_line)
+    preamble = _lines_above(text, min(cells.rows, default=1))
+    about = (cells.fields, cells.n_remarks, cells.blocks, *rate_in_preamble(preamble), RATE_ABOVE)
+    first = (frame, faults, cells.line, column_units, mark, numbers)
+    return TextTable(*first, *about, notes, cut_line, lines_of_factors(preamble))
 
 
 def _lines_above(text: str, line: int) -> str:
@@ -1143,11 +1148,17 @@ def read_recording(
         timed.reading.rows,
     )
     reading = timed.reading._replace(rows=", ".join(filter(None, left_out)), numbers=table.numbers)
+    others = [i for i in range(len(header)) if i not in places]
     start = None
     with suppress(UnreadableError):
         place = place_of_clock(rows, options.time)
         start = None if place is None else start_of(rows.iloc[:, place])
-    return timed._replace(units=channel_units, start=start, reading=reading)
+    return timed._replace(
+        units=channel_units,
+        start=start,
+        reading=reading,
+        factors={**table.factors, **factors_in_columns(rows.iloc[:, others])},
+    )
 
 
 def _check_blocks(rows: pd.DataFrame, table: TextTable, options: LoadOptions) -> str:

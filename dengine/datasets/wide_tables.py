@@ -32,6 +32,7 @@ from .dataset import (
     UnreadableError,
 )
 from .pieces import join_pieces
+from .scales import may_scale, operation, stated_factors
 from .text import (
     TextTable,
     is_mostly_numbers,
@@ -167,8 +168,8 @@ def wide_rows(
     unread = [name for name in others if name and name not in all_columns]
     stated = _stated_in_rows(frame[unread], table)
     unread = [name for name in unread if name not in stated.columns]
-    if unread := [_describe_column(frame, name) for name in unread]:
-        collector.notes[f"Not read: the columns {listed(unread)}"] = 1
+    in_rows = frame[[name for name in unread if may_scale(name)]].to_dict("index")
+    _note_unread(frame[unread], list(columns), not (values % 1 > 0).any(), collector)
     label_cells = [
         labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
     ]
@@ -190,6 +191,7 @@ def wide_rows(
             reading=Reading(numbers=table.numbers, clock="" if rate is None else stated.clock),
             source=f"{source}, line {line}",
             part=part or None,
+            factors={**table.factors, **stated_factors(in_rows.get(line, {}))},
         )
         if not words:
             return recording
@@ -206,6 +208,23 @@ def wide_rows(
     words = frame[label_columns].to_numpy(dtype=object).tolist()
     rows = zip(frame.index, traces, words, parts, strict=True)
     return [(row[0], row[3], partial(read, *row)) for row in rows]
+
+
+def _note_unread(
+    frame: pd.DataFrame, channels: Sequence[str], is_whole: bool, collector: RecordingCollector
+) -> None:
+    """Add a note on the columns that were not read, but for the factors of whole numbers.
+
+    Of these `as_dataset` says what it did with them.
+    """
+    n = len(channels)
+    unread = [
+        _describe_column(frame, name)
+        for name in frame
+        if not (is_whole and any(operation(name, channel, n) for channel in channels))
+    ]
+    if unread:
+        collector.notes[f"Not read: the columns {listed(unread)}"] = 1
 
 
 class StatedByRow(NamedTuple):

@@ -2403,6 +2403,106 @@ def test_rows_of_a_part_that_are_whole_curves_are_not_joined(small: Dataset) -> 
     assert len(load_dataset(pd.DataFrame(rows).rename(columns={"seq": "block"}), part="vin")) == 24
 
 
+def counts_of(data: Dataset) -> tuple[np.ndarray, list[float]]:
+    """Each trace in counts, and what one of them is, by turns 0.001 and 0.004."""
+    factors = [0.001 if i % 3 else 0.004 for i in range(len(data))]
+    return np.round(data.X / np.array(factors)[:, None]), factors
+
+
+def write_counts(data: Dataset, form: str, folder: Path) -> tuple[Any, dict[str, Any]]:
+    counts, factors = counts_of(data)
+    rows = [
+        {"vin": f"V{i:02}", "status": word, "unit": "Nm", "samples": x.astype(int).tolist()}
+        for i, (x, word) in enumerate(zip(counts, words(data), strict=True))
+    ]
+    folder = folder / "data"
+    folder.mkdir()
+    for row, factor in zip(rows, factors, strict=True):
+        if form == "json":
+            row["coefficient_multiply"] = factor
+        if form == "parquet":
+            row["countsPerNm"] = round(1 / factor)
+        if form in ("json", "parquet"):
+            (folder / f"{row['vin']}.json").write_text(json.dumps(row))
+            continue
+        mark = "," if form == "header" else "."
+        above = f"Skalierungsfaktor [Nm/digit];{factor}\n".replace(".", mark)
+        lines = ["raw", *map(str, row["samples"])]
+        if form == "column":
+            above = ""
+            lines = ["raw;lsb", *(f"{x};{factor}" for x in row["samples"])]
+        (folder / f"{row['vin']}_{row['status']}.csv").write_text(above + "\n".join(lines) + "\n")
+    if form == "parquet":
+        pd.DataFrame(rows).to_parquet(folder / "all.parquet")
+        return folder / "all.parquet", {"part": "vin", "channel": "samples"}
+    if form == "json":
+        return folder, {"part": "vin", "channel": "samples"}
+    return folder, {"channel": "raw", "unit": "Nm"}
+
+
+@pytest.mark.parametrize("form", ["json", "parquet", "header", "column"])
+def test_counts_are_multiplied_by_the_factor_that_each_part_states(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    source, options = write_counts(small, form, tmp_path)
+    data = load_dataset(source, **options)
+    np.testing.assert_allclose(data.X, small.X, atol=0.0021)
+    np.testing.assert_array_equal(data.y, small.y)
+    assert (data.unit, data.faults) == ("Nm", ())
+    range_of = "(250 to 1000)" if form == "parquet" else "(0.001 to 0.004)"
+    assert " is in counts, " in data.notes[0]
+    assert range_of in data.notes[0]
+    assert not any("Not read" in note and "oefficient" in note for note in data.notes)
+
+
+@pytest.mark.parametrize(
+    ("channel", "others", "scale", "note"),
+    [
+        ("a", {"gain": [1, 2]}, (1, 0), "gain (1 to 2) may scale the whole numbers of a, which is"),
+        ("a", {"angle_factor": [0.1, 0.2]}, (1, 0), "Not read: the columns angle_factor"),
+        (
+            "a [N]",
+            {"lsb": [0.1, 0.1]},
+            (1, 0),
+            "lsb (0.1) is not applied, for the samples of a [N]",
+        ),
+        ("a", {"lsb": [0.1, 0.1], "offset": [0, 5]}, (0.1, 0), "; offset (0 to 5) is not applied"),
+        ("a", {"factor": [2, 2], "add_offset": [1, 1]}, (2, 1), "plus add_offset (1)."),
+        ("a", {"a_divisor": [4, 4], "b_divisor": [3, 5]}, (0.25, 0), "over a_divisor (4)."),
+        ("a", {"factor": [0.5, None]}, (0.5, 0), "a is in counts, times factor (0.5)."),
+    ],
+)
+def test_only_a_plain_factor_of_whole_numbers_is_applied(
+    channel: str,
+    others: dict[str, list[float]],
+    scale: tuple[float, float],
+    note: str,
+    small: Dataset,
+) -> None:
+    counts, _ = counts_of(small)
+    frame = pd.DataFrame({channel: counts.tolist(), "verdict": words(small)})
+    frame = frame.assign(**{name: cells * 12 for name, cells in others.items()})
+    data = load_dataset(frame, channel=channel)
+    assert note in data.notes[0]
+    is_kept = frame.notna().all(axis=1).to_numpy()
+    np.testing.assert_allclose(data.X, counts[is_kept] * scale[0] + scale[1], rtol=1e-6)
+    messages = [fault.message for fault in data.faults]
+    assert messages == ["Expected a factor of the counts of a, got none"] * int((~is_kept).sum())
+    frame[channel] = (counts + 0.5).tolist()
+    data = load_dataset(frame, channel=channel)
+    np.testing.assert_allclose(data.X, counts + 0.5, rtol=1e-6)
+
+
+def test_each_of_two_channels_has_the_factor_that_names_it(small: Dataset) -> None:
+    counts, _ = counts_of(small)
+    frame = pd.DataFrame({"torque_raw": counts.tolist(), "angle_raw": (counts + 1).tolist()})
+    frame = frame.assign(torque_factor=0.5, angle_factor=0.25, factor=3, verdict=words(small))
+    data = load_dataset(frame, channel="torque_raw,angle_raw")
+    np.testing.assert_allclose(data.X, np.stack([counts / 2, (counts + 1) / 4], axis=1))
+    data = load_dataset(frame, channel="angle_raw")
+    np.testing.assert_allclose(data.X, (counts + 1) / 4)
+
+
 def test_a_wide_table_whose_cells_have_several_units_is_refused_or_converted(
     small: Dataset, tmp_path: Path
 ) -> None:
