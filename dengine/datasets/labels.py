@@ -1037,11 +1037,8 @@ def _read_label_rows(
         cells = {1: header, **cells}
         header = ["file", "label", *header[2:]]
     columns = [list(dict.fromkeys(column)) for column in zip(*cells.values(), strict=True)]
-    with_names = [
-        i
-        for i, column in enumerate(columns)
-        if any(_path_words(cell)[0] in files for cell in column)
-    ]
+    n_names = [sum(_path_words(cell)[0] in files for cell in column) for column in columns]
+    with_names = {i: n for i, n in enumerate(n_names) if n}
     full_names = {
         i: _names_with(column, names) or _names_in_folders(column, names)
         for i, column in enumerate(columns)
@@ -1054,7 +1051,7 @@ def _read_label_rows(
     if texts:
         full_names = {place: names_of_texts}
         n_named = len(names_of_texts)
-    with_names = with_names or [i for i, x in full_names.items() if len(x) == n_named > 0]
+    with_names = with_names or {i: n_named for i, x in full_names.items() if len(x) == n_named > 0}
     if names and not with_names:
         _check_not_shortened(dict(zip(header, columns, strict=False)), path)
     with_labels = [
@@ -1064,8 +1061,9 @@ def _read_label_rows(
     ]
     most = min(MAX_LABEL_WORDS, len(cells) / 2)
     with_words = {i: column for i, column in enumerate(columns) if 2 <= len(column) <= most}
-    found_in = (with_names, with_labels, with_words)
-    of_file, of_label = _label_file_columns(header, path, *found_in, options.label)
+    of_file, of_label = _label_file_columns(
+        header, path, with_names, with_labels, with_words, options, names
+    )
     part = options.part
     if part != "part" and part not in header:
         wanted = f"a column {part} of parts' numbers in {path}"
@@ -1206,34 +1204,32 @@ def column_among(header: Sequence[str], names: Sequence[str]) -> int | None:
 def _label_file_columns(
     header: Sequence[str],
     path: str | os.PathLike[str],
-    with_names: Sequence[int],
+    with_names: Mapping[int, int],
     with_labels: Sequence[int],
     with_words: Mapping[int, Sequence[str]],
-    column: str | None = None,
+    options: LoadOptions,
+    names: Sequence[str],
 ) -> tuple[int, int]:
     """Return the positions of the column of files and of the column of labels.
 
-    They are found by their names. Without a column of files by its name, it is the only one of
-    `with_names`. Of two columns, the one that is not of files has the labels; if both have other
-    names, files come first. Of more columns, the only one whose name means the bad outcome has the
-    labels, else the only one of `with_labels`, or of `with_words`. Raises DataError if one is not
-    found.
+    They are found by their names; the first else by `_columns_of_files`. Of two columns, the one
+    that is not of files has the labels; if both have other names, files come first. Of more
+    columns, the only one whose name means the bad outcome has the labels, else the only one of
+    `with_labels`, or of `with_words`. Raises DataError if one is not found.
 
-    with_names, with_labels : the columns in which recordings are named, and those of labels alone.
+    with_names : how many recordings are named in each column in which some are.
+    with_labels : the columns of labels alone.
     with_words : the words of those that have few, whose meaning may be asked for.
-    column : the one of labels, if the user stated it.
+    options : `label` and `part` are the columns of labels and of parts, if the user stated them.
+    names : of the recordings, for the error.
     """
+    column = options.label
     of_label = column_among(header, LABEL_COLUMNS if column is None else (column.lower(),))
-    of_labels_alone = {*with_labels} - {
-        *with_names
-    }  # as a column `insertion` of success and failure
-    candidates = ["" if i in of_labels_alone else name for i, name in enumerate(header)]
-    of_file = column_among(candidates, LISTS["file_columns"])
     if column is not None and of_label is None:
         wanted = f"a column {column} of labels in {path}"
         raise DataError(f"Expected {wanted}, got {', '.join(header)}; leave it out (label).")
-    if of_file is None and len(with_names) == 1:
-        of_file = with_names[0]
+    of_files = _columns_of_files(header, with_names, with_labels, options.part)
+    of_file = of_files[0] if len(of_files) == 1 else None
     if len(header) == 2:
         if of_file is None:
             of_file = 0 if of_label is None else 1 - of_label
@@ -1243,16 +1239,39 @@ def _label_file_columns(
         others = [i for i in likely if i != of_file]
         if of_label is None and len(others) == 1:
             of_label = others[0]
-    if of_file is None or of_label is None:
-        do = "name that of labels (label)"
-        if choice := {header[i]: words for i, words in with_words.items() if i != of_file}:
-            do = f"name that of labels, {propose_columns(choice)}"
-        if of_file is None:
-            do = f"call that of files' names file, and {do}"
-        raise DataError(
-            f"Expected columns file and label in {path}, got {', '.join(header)}; {do}."
-        )
-    return of_file, of_label
+    if of_file is not None and of_label is not None:
+        return of_file, of_label
+    hints = []
+    if of_file is None:
+        choice = " or ".join(f"part={header[i]!r}" for i in of_files)
+        in_file = f"write their names into a column file, as {listed(names[:2])}"
+        hints.append(f"name that of recordings, {choice}" if of_files else in_file)
+    if of_label is None:
+        labels_in = {header[i]: words for i, words in with_words.items() if i not in of_files}
+        do = f", {propose_columns(labels_in)}" if labels_in else " (label)"
+        hints.append(f"name that of labels{do}")
+    wanted = f"a column that names recordings and one of labels in {path}"
+    raise DataError(f"Expected {wanted}, got {', '.join(header)}; {', and '.join(hints)}.")
+
+
+def _columns_of_files(
+    header: Sequence[str], with_names: Mapping[int, int], with_labels: Sequence[int], part: str
+) -> list[int]:
+    """Return the positions of the columns that may name recordings: one, or several alike, or none.
+
+    It is the one called so, if recordings are named in it or in no column; else that in which most
+    are named. If these are several, or none, it is the column of parts.
+
+    with_names, with_labels : as in `_label_file_columns`.
+    """
+    # A column `insertion` of success and failure has labels.
+    of_labels_alone = {*with_labels} - {*with_names}
+    candidates = ["" if i in of_labels_alone else name for i, name in enumerate(header)]
+    of_file = column_among(candidates, LISTS["file_columns"])
+    if of_file is not None and (of_file in with_names or not with_names):
+        return [of_file]
+    most = [i for i, n in with_names.items() if n == max(with_names.values())]
+    return [header.index(part)] if len(most) != 1 and part in header else most
 
 
 def columns_with_labels(

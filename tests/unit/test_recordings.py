@@ -1543,7 +1543,9 @@ def test_a_listing_with_other_columns_is_one_error_that_says_what_each_needs(
     few: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "mes.csv").write_text("DMC,Line,Finding\nA1,L3,x\n")
-    with pytest.raises(DataError, match=r"got DMC, Line, Finding; call that of files' names file"):
+    with pytest.raises(
+        DataError, match=r"got DMC, Line, Finding; write their names into a column file"
+    ):
         load_dataset(few, labels=tmp_path / "mes.csv")
 
 
@@ -1600,7 +1602,7 @@ def test_a_listing_by_serial_numbers_finds_the_files_that_have_them_in_their_nam
     # Several files have the words of a row, and no column holds labels alone: one error says all.
     write_rows(*(f"20260301;L3;{word};2" for word in ("Riss", "gut", "heil", "gut")))
     with pytest.raises(
-        DataError, match="got DMC, Line, Prüfurteil, Shift; call that of files' names file"
+        DataError, match="got DMC, Line, Prüfurteil, Shift; write their names into a column file"
     ):
         load_dataset(tmp_path / "cell", labels=path)
 
@@ -2769,3 +2771,59 @@ def test_windows_of_dates_do_not_cut_a_table_without_dates(tmp_path: Path) -> No
     )
     with pytest.raises(DataError, match="Expected dates in column time, as cycles"):
         load_dataset(tmp_path / "press.csv", labels=listing)
+
+
+def write_numbered(tmp_path: Path) -> Path:
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    for i in range(1, 7):
+        rows = "\n".join(f"{0.002 * k:.3f},{i + k}" for k in range(30))
+        (folder / f"{i}.csv").write_text(f"time,FZ\n{rows}\n", encoding="utf-8")
+    return folder
+
+
+def write_columns(tmp_path: Path, header: str, *columns: list[object]) -> Path:
+    rows = [",".join(map(str, row)) for row in zip(*columns, strict=True)]
+    listing = tmp_path / "listing.csv"
+    listing.write_text("\n".join([header, *rows]), encoding="utf-8")
+    return listing
+
+
+FIRST_NUMBERS = list(range(1, 7))
+VERDICTS = ["OK", "NOK"] * 3
+
+
+@pytest.mark.parametrize("name", ["part", "trial", "cycle", "nr", "Versuch"])
+def test_the_column_in_which_most_recordings_are_named_names_them(
+    tmp_path: Path, name: str
+) -> None:
+    stations = [1, 2, 1, 2, 1, 2]
+    header = f"station,{name},name,result"
+    listing = write_columns(tmp_path, header, stations, FIRST_NUMBERS, ["Ann"] * 6, VERDICTS)
+    data = load_dataset(write_numbered(tmp_path), labels=listing)
+    assert data.y.tolist() == [1, 0] * 3
+
+
+def test_of_two_columns_that_name_recordings_the_one_of_parts_is_asked_for(tmp_path: Path) -> None:
+    folder = write_numbered(tmp_path)
+    listing = write_columns(
+        tmp_path, "nr,trial,result", FIRST_NUMBERS[::-1], FIRST_NUMBERS, VERDICTS
+    )
+    message = "got nr, trial, result; name that of recordings, part='nr' or part='trial'"
+    with pytest.raises(DataError, match=message):
+        load_dataset(folder, labels=listing)
+    assert load_dataset(folder, labels=listing, part="trial").y.tolist() == [1, 0] * 3
+    assert load_dataset(folder, labels=listing, part="nr").y.tolist() == [0, 1] * 3
+
+
+def test_a_listing_that_names_no_recording_is_refused_with_their_names(tmp_path: Path) -> None:
+    folder = write_numbered(tmp_path)
+    pegs = [f"peg_{i}" for i in "abcdef"]
+    listing = write_columns(tmp_path, "trial,who,result", pegs, ["Ann", "Bo"] * 3, VERDICTS)
+    message = r"got trial, who, result; write their names into a column file, as 1\.csv, 2\.csv"
+    with pytest.raises(DataError, match=message):
+        load_dataset(folder, labels=listing)
+    with pytest.raises(
+        DataError, match=r"names peg_a, peg_b, peg_c: .*write the files as they are"
+    ):
+        load_dataset(folder, labels=listing, part="trial")
