@@ -273,6 +273,8 @@ def _check_cutting_options(path: Path, types: Mapping[str, str], options: LoadOp
         trigger = f"trigger={next(registers, 'contact=5')!r}"
         wanted = f"what cuts {path} into insertions, and their labels"
         listing = "labels=... of a CSV file with columns start, end and result"
+        if options.labels is not None:
+            listing = f"columns start and end, of dates, in {options.labels}"
         raise DataError(f"Expected {wanted}, as {trigger} and {label}, or {listing}.")
     if options.label is None and options.labels is None:
         raise DataError(f"Expected the labels of the insertions in {path}, as {label}.")

@@ -6,7 +6,7 @@ window. The reader of bags and that of long tables use both.
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError
+from ..errors import DataError, listed
 from .clocks import DATE, TIME_OF_DAY, join_date_and_time, times_of
 from .dataset import LoadOptions, UnreadableError
 from .labels import LISTS, LabelSource, labels_in_file, normalized
@@ -197,23 +197,52 @@ def read_windows(name: str, options: LoadOptions) -> Windows | None:
             return None
         wanted = f"dates with the times of day in {of_start} and {of_end} of {path}"
         raise DataError(f"Expected {wanted}, got {frame[of_start].iloc[0]}; write both in one.")
-    frame = frame.drop(columns=[name for names in columns.values() for name in names])
-    part = _part_column(frame, options.part)
-    texts = [f"{name}/{i}" for i in range(1, len(frame) + 1)]
-    if part is not None:
-        cells = zip(frame[part].str.strip(), texts, strict=True)
-        texts = [cell or text for cell, text in cells]
-        counts = Counter(text.lower() for text in texts)
-        if max(counts.values()) > 1:
-            options = replace(options, part=part)
-        lines = zip(texts, frame.index, strict=True)
-        texts = [f"{t}, line {line}" if counts[t.lower()] > 1 else t for t, line in lines]
+    _check_header(frame, {column for names in columns.values() for column in names}, path, options)
+    frame = frame.drop(columns=[column for names in columns.values() for column in names])
+    texts, options = _name_parts(frame, name, options)
     frame = frame.drop(columns=[column for column in frame if column.lower() == "file"])
     frame.insert(0, "file", texts)
     order = np.argsort(starts, kind="stable")
     times = (starts[order], ends[order])
     names = [texts[i] for i in order.tolist()]
     return Windows(path.name, names, *times, since_1970, frame, options)
+
+
+def _check_header(
+    frame: "pd.DataFrame", of_times: Collection[str], path: Path, options: LoadOptions
+) -> None:
+    """Raise DataError if a listing of windows has no stated column, or none that may be labels."""
+    header = listed(frame.columns)
+    stated = {"part": None if options.part == "part" else options.part, "label": options.label}
+    for option, column in stated.items():
+        if column is not None and column.lower() not in map(str.lower, frame):
+            raise DataError(
+                f"Expected a column {column} in {path}, got {header}; leave it out ({option})."
+            )
+    others = frame.drop(columns=list(of_times))
+    if set(others.columns) <= {_part_column(others, options.part)}:
+        do = "add one, as result with OK and NOK"
+        raise DataError(f"Expected a column of labels in {path}, got {header}; {do}.")
+
+
+def _name_parts(
+    frame: "pd.DataFrame", name: str, options: LoadOptions
+) -> tuple[list[str], LoadOptions]:
+    """Return a name for each row of a listing without its times, and the options for its labels.
+
+    It is that of the part, with its line behind if it is there twice, or a number behind `name`.
+    """
+    part = _part_column(frame, options.part)
+    texts = [f"{name}/{i}" for i in range(1, len(frame) + 1)]
+    if part is None:
+        return texts, options
+    cells = zip(frame[part].str.strip(), texts, strict=True)
+    texts = [cell or text for cell, text in cells]
+    counts = Counter(text.lower() for text in texts)
+    if max(counts.values()) > 1:
+        options = replace(options, part=part)
+    lines = zip(texts, frame.index, strict=True)
+    return [f"{t}, line {line}" if counts[t.lower()] > 1 else t for t, line in lines], options
 
 
 def _times_of_both(

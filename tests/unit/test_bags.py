@@ -425,3 +425,23 @@ def test_windows_that_do_not_fit_are_refused_with_what_to_do(bag: Bag, tmp_path:
         listing.write_text(changed, encoding="utf-8")
         with pytest.raises(DataError, match=message):
             load_dataset(path, labels=listing)
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "message"),
+    [
+        ("part,start,end", {}, "Expected a column of labels in .*got part, start, end; add one"),
+        ("part,when,result", {}, "or columns start and end, of dates, in "),
+        ("part,start,end,result", {"part": "Serial"}, r"got part, start, end, result; .*\(part\)"),
+        ("part,start,end,result", {"label": "ok"}, r"got part, start, end, result; .*\(label\)"),
+    ],
+)
+def test_the_error_on_a_listing_names_its_columns(
+    bag: Bag, tmp_path: Path, columns: str, options: dict[str, str], message: str
+) -> None:
+    row = {"part": "A", "start": date(BEGIN), "end": date(BEGIN + 10**9), "when": "7:10"}
+    cells = [row.get(name, "OK") for name in columns.split(",")]
+    listing = tmp_path / "cycles.csv"
+    listing.write_text(f"{columns}\n{','.join(cells)}\n", encoding="utf-8")
+    with pytest.raises(DataError, match=message):
+        load_dataset(bag.write(tmp_path / "cell.mcap"), labels=listing, **options)
