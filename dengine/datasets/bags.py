@@ -272,7 +272,7 @@ def _check_cutting_options(path: Path, types: Mapping[str, str], options: LoadOp
         registers = (f"register@{topic}" for kind, topic in topic_of.items() if "Int" in kind)
         trigger = f"trigger={next(registers, 'contact=5')!r}"
         wanted = f"what cuts {path} into insertions, and their labels"
-        listing = "labels=... of a CSV file with columns start, end and result"
+        listing = "a CSV file with columns start, end and result (labels)"
         if options.labels is not None:
             listing = f"columns start and end, of dates, in {options.labels}"
         raise DataError(f"Expected {wanted}, as {trigger} and {label}, or {listing}.")
