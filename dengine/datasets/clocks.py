@@ -65,12 +65,13 @@ STEP_NAMES = (
         "samplestep",
     ),
 )
+SAMPLE_RATES = ("samplerate", "samplingrate", "samplefrequency", "samplingfrequency", "abtastrate")
 UNSURE_RATES = ("rate", "datarate")  # of samples only in hertz
 FREQUENCIES = ("frequency", "frequenz", "freq")  # of samples, or of something else
 # A line above a header that states one of these: Sample rate: 500 Hz, dt [ms];2, # fs = 500
 RATE_LINE = re.compile(
     r"[#%\s\"']*(?P<name>[^\W\d][^\d:;=,|\[(]*?)\s*([\[(](?P<bracketed>\w+)[\])])?[\"']?"
-    r"\s*[:;=,\t|\s]\s*[\"']?(?P<number>\d+([.,]\d+)?(e[+-]?\d+)?)"
+    r"\s*:?[:;=,\t|\s]\s*[\"']?(?P<number>\d+([.,]\d+)?(e[+-]?\d+)?)"
     r"([;,|\t]+\s*(?P=number))*[\s;,|\"'\[(]*(?P<unit>[a-zµμ]*)[\s;,|\"'\])]*",
     re.IGNORECASE,
 )
@@ -701,7 +702,8 @@ def rate_in_preamble(text: str) -> tuple[float | None, str]:
         number = float(match["number"].replace(",", "."))
         unit = (match["bracketed"] or match["unit"]).lower()
         names = (*RATE_NAMES, *FREQUENCIES)
-        rate = number * HERTZ.get(unit or "hz", 0.0) if name in names else 0.0
+        is_rate = name in names or name.endswith(SAMPLE_RATES)  # RDT Sample Rate
+        rate = number * HERTZ.get(unit or "hz", 0.0) if is_rate else 0.0
         in_seconds = units.seconds_in("s" if name == "deltax" else unit) or 0.0  # LabVIEW's Delta_X
         step = number * in_seconds if name in STEP_NAMES else 0.0
         rate = 1.0 / step if step else rate

@@ -39,6 +39,7 @@ NUMBER_FIRST = re.compile(
     r"[A-Za-z]{0,6}[_\-. ]?(?P<number>\d+)[_\-. ]+(?P<channel>\D.*)"
 )  # s000_fz
 MIN_NUMBERED = 8  # columns of a channel; a single recording has fewer numbered ones
+TRIED = 20  # recordings or parts, on which it is tried how a column is meant
 MAX_STATIONS = 12  # more different values in the rows of a part are no stations
 # What a column is called that tells where a part was made.
 STATION = re.compile(
@@ -227,11 +228,13 @@ def _likely_channel(names: Sequence[str]) -> str:
 def choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str, ...]:
     """Return the channels that the user stated, else the force, else the only one available.
 
-    Raises DataError for a channel that is not available, and if none was stated where several, or
-    none, are.
+    A stated one may be written in another case or without its unit. Raises DataError for a channel
+    that is not available, and if none was stated where several, or none, are.
     """
-    default = (FORCE,) if FORCE in available else tuple(available)
-    chosen = options.channels or default
+    chosen = (FORCE,) if FORCE in available else tuple(available)
+    if options.channels:
+        places = {name: units.find_columns(name, available) for name in options.channels}
+        chosen = tuple(available[at[0]] if len(at) == 1 else name for name, at in places.items())
     missing = [name for name in chosen if name not in available]
     if missing or not chosen:
         wanted = f"the channel {listed(missing) or 'of the samples'}"

@@ -43,6 +43,7 @@ LABEL_FORMS = "as True/False, OK/NOK, pass/fail or 1/0"
 MEANINGS = ("bad", "good")  # of the labels 0 and 1
 # A range of numbered names, as c0..c498.
 NAME_RANGE = re.compile(r"(?P<name>[^\W\d]\w*?)(?P<first>\d{1,5})\.\.(?P=name)(?P<last>\d{1,5})")
+MARKS_OF_MISSING = [s * m for s in (-1, 1) for m in (999, 9999, 99999, 999999)]
 MAX_LABEL_WORDS = 12  # more different words are no labels
 PAD_ALL = "pad-all"  # as "pad", for recordings of any length
 expect_data = partial(expect, error=DataError)
@@ -632,6 +633,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         `fit="strict"`.
     """
     collector.check_label_words()
+    _cut_padding(collector)
     _scale_counts(collector)
     as_read = {recording.source: recording for recording in collector.recordings}
     unit = _convert_to_one_unit(collector, options)
@@ -718,6 +720,31 @@ def _fit_odd_lengths(
     wanted = f"Expected {_fit_text(samples, fit)}"
     do = f"fit={PAD_ALL!r} keeps it"
     collector.leave_out({i: f"{wanted}, got {lengths[i]}; {do}" for i in odd})
+
+
+def _cut_padding(collector: RecordingCollector) -> None:
+    """Cut marks of missing samples, as -9999, off the ends of recordings.
+
+    Elsewhere they are faults. Such a mark stands twice or more, in all channels, and far from all
+    samples.
+    """
+    reasons = {}
+    for i, recording in enumerate(collector.recordings):
+        trace = recording.trace
+        is_mark = np.asarray(np.isin(trace, MARKS_OF_MISSING).all(axis=0))
+        if is_mark.sum() < 2 or is_mark.all():
+            continue
+        mark = trace[0, is_mark][0]
+        samples = trace[:, ~is_mark]
+        if np.abs(mark - samples).min() < np.ptp(samples):
+            continue
+        end = int(np.flatnonzero(~is_mark)[-1]) + 1
+        if n_inside := int(is_mark[:end].sum()):
+            reasons[i] = f"Expected measured samples, {n_inside} samples are {mark:g}"
+        text = f"{mark:g} behind the last sample is left out, as what fills up a row"
+        collector.notes[text] += 1
+        collector.recordings[i] = recording._replace(trace=trace[:, :end])
+    collector.leave_out(reasons)
 
 
 def _leave_out_overflows(collector: RecordingCollector) -> None:

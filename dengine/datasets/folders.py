@@ -56,6 +56,7 @@ if TYPE_CHECKING:
 from .columns import (
     FORCE,
     MIN_NUMBERED,
+    TRIED,
     cells_of,
     choose_channels,
     count_labels,
@@ -73,7 +74,6 @@ NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 FEW_LISTINGS = 5  # text files for each archive, as lists of its labels
 FEW_ROWS = 5  # a text file of as few tells of a recording, and is none
 HIDDEN = (".", "~$")  # begin the names of files that no user wrote, as Excel's locks
-TRIED = 20  # recordings, on which advice about a column is tried
 NO_TEXTS = (*PARQUET, NPZ)
 SUFFIXES = (*TEXTS, *NO_TEXTS, *JSON)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -19,6 +20,7 @@ from .clocks import (
     HEAD,
     MAX_GAP,
     NO_CLOCK,
+    STEADY,
     floats,
     holds_dates,
     is_rising,
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
 from .columns import (
     MAX_STATIONS,
     STATION,
+    TRIED,
     channel_hint,
     check_labels,
     choose_channels,
@@ -78,7 +81,8 @@ def concatenate_long(
     """Return long tables as one, in their order, and which of its rows repeat a file before.
 
     The same part's number in two files means two parts: both get their file's name before the
-    number. But a part that ends one file and begins the next is one part, and so is one that has
+    number. But parts whose rows lie here and there in several files, as Spark writes them, are one
+    each; a part that ends one file and begins the next is one part, and so is one that has
     rows of the same date and nearly the same numbers in both, as exports that overlap have: these
     rows are the repeated ones.
     """
@@ -89,6 +93,8 @@ def concatenate_long(
         return frame, np.zeros(len(frame), dtype=np.bool_)
     time = _time_column(frame, options)
     files = np.repeat(list(tables), [len(table) for table in tables.values()])
+    if _are_spread(frame, files, time, options):
+        return frame, np.zeros(len(frame), dtype=np.bool_)
     parts = frame[options.part].astype(str).to_numpy()
     first_files = files
     if time in frame and holds_dates(frame[time]):
@@ -119,6 +125,34 @@ def concatenate_long(
     full_name = pd.Series(full_names, frame.index)
     is_ambiguous = full_name.groupby(part.to_numpy()).transform("nunique") > 1
     return frame.assign(**{options.part: part.where(~is_ambiguous, full_name)}), is_repeated
+
+
+def _are_spread(
+    frame: pd.DataFrame, files: NDArray[np.str_], time: str, options: LoadOptions
+) -> bool:
+    """Return whether the rows of parts lie in several files without an order.
+
+    For most of the first parts, the times of all files together are evenly spaced, those of a file
+    alone are not.
+    """
+    if time not in frame:
+        return False
+    clock = frame[[options.part, time]].assign(file=files).dropna()
+    clock["seconds"] = seconds_of(clock[time].reset_index(drop=True), time)[0]
+    several = clock.groupby(options.part)["file"].transform("nunique") > 1
+    spread = [
+        _is_even(rows["seconds"])
+        and not any(_is_even(own["seconds"]) for _, own in rows.groupby("file"))
+        for _, rows in itertools.islice(clock[several].groupby(options.part), TRIED)
+    ]
+    return 2 * sum(spread) > len(spread)
+
+
+def _is_even(seconds: pd.Series) -> bool:
+    """Return whether nine of ten steps between times in any order are within 10 % of the median."""
+    steps = np.diff(np.sort(seconds))
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    return usual > 0.0 and (np.abs(steps - usual) < 0.1 * usual).mean() > STEADY
 
 
 def from_long(

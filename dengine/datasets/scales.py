@@ -46,16 +46,26 @@ COUNTS = ("counts", "digits")  # units of a converter
 MEASURED = {"torque", "drehmoment", "moment", "force", "kraft", "load"}  # may name any channel
 # A line above a header: Scale factor: 0.0122, Faktor;0,0122;N
 LINE = re.compile(
-    r"[#%\s\"']*(?P<name>[^\W\d][^\d:;=,|\t]*?)[\"'\s]*(?P<mark>[:;=,|\t])[\s\"']*"
-    r"(?P<number>[-+]?\d*[.,]?\d+(?:e[-+]?\d+)?)(?P<rest>(?![\d.,:/]).*)?",
+    r"[#%\s\"']*(?P<name>[^\W\d][^\d:;=,|\t]*?)[\"'\s]*(?P<mark>:?[:;=,|\t])[\s\"']*"
+    r"(?P<number>[-+]?(?:\d+(?:[.,]\d+)?|\.\d+)(?:e[-+]?\d+)?)(?P<rest>(?![\d.,:/]).*)?",
     re.IGNORECASE,
 )
+# Between a value and the next name in a line: Force Units:,N,Counts per Unit Force:,1000000
+NEXT_NAME = re.compile(r"[,;\t](?=[^,;:\t\n]+:[,;\t])")
 
 
 def words_of(name: str) -> list[str]:
     """Return the words in a name in lower case, `force` and `factor` of `forceFactor_N`."""
     plain = units.split(re.sub(r"\s*[\[(].*", "", name))[0]
     return re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", plain).lower())
+
+
+def words_of_channel(channel: str) -> set[str]:
+    """Return the words in a channel's name, with those of its quantity: of `force` for Fz."""
+    words = set(words_of(channel))
+    if units.TORQUE_NAME.fullmatch(channel) or units.TORQUE_AXIS.fullmatch(channel):
+        return words | {"torque", "drehmoment", "moment"}
+    return words | {"force", "kraft", "load"} if units.FORCE_NAME.fullmatch(channel) else words
 
 
 def may_scale(name: str) -> bool:
@@ -81,18 +91,19 @@ def factors_in_columns(rows: pd.DataFrame) -> dict[str, float]:
 def lines_of_factors(text: str) -> dict[str, float]:
     """Return what `stated_factors` finds in the lines above a header."""
     stated = dict[str, str]()
-    for match in filter(None, map(LINE.fullmatch, text.splitlines())):
+    lines = NEXT_NAME.sub("\n", text).splitlines()
+    for match in filter(None, map(LINE.fullmatch, lines)):
         number = match["number"]
         # Other numbers behind it are those of other channels, or a comma stands between the two.
         is_single = re.search(r"[;,|\t]\s*[-+.\d]", match["rest"] or "") is None
-        if is_single and not ("," in number and match["mark"] == ","):
+        if is_single and not ("," in number and match["mark"][-1] == ","):
             stated.setdefault(match["name"].strip(), number.replace(",", "."))
     return stated_factors(stated)
 
 
 def _is_of_another(name: str, channel: str) -> bool:
     """Return whether a name has the word of a quantity that is not that of a channel."""
-    of_channel = set(words_of(channel))
+    of_channel = words_of_channel(channel)
     others = set(words_of(name)) & OF_SOME - of_channel
     return bool(others and (others - MEASURED or of_channel & OF_SOME))
 
@@ -102,7 +113,7 @@ def operation(name: str, channel: str, n_channels: int) -> str:
 
     "" also for the factor of another channel, and of one among several that it does not name.
     """
-    of_channel = set(words_of(channel))
+    of_channel = words_of_channel(channel)
     is_named = not of_channel.isdisjoint(words_of(name))
     if _is_of_another(name, channel) or (n_channels > 1 and not is_named):
         return ""
@@ -148,7 +159,7 @@ def scale_of(
     frame = frame[[name for name in frame if not _is_of_another(name, channel)]]
     texts = {name: _with_range(name, cells.min(), cells.max()) for name, cells in frame.items()}
     names = [name for name in frame if operation(name, channel, n_channels) in ("*", "/")]
-    named = [name for name in names if set(words_of(name)) & set(words_of(channel)) - OF_ANY]
+    named = [name for name in names if set(words_of(name)) & words_of_channel(channel) - OF_ANY]
     if len(named or names) != 1:
         unsure = [texts[name] for name in frame if frame[name].min() < frame[name].max()]
         do = "which is not done: convert them if so"

@@ -545,10 +545,18 @@ def _find_delimiter(lines: Sequence[str]) -> str:
         )
         return n_values / len(cells) * n_rows / len(rows) * (1.0 if has_header else 0.5)
 
-    scores = {delimiter: score(delimiter) for delimiter in DELIMITERS} if lines else {"": 0.0}
+    # In a list of texts, as of dates with a blank and words, the names tell it.
+    names = plain[0] if plain else ""
+    splits_all = any(
+        len({line.count(mark) for line in (*plain, *sample)}) == 1 and mark in names
+        for mark in "\t;|,"
+    )
+    splits_all &= not any(map(str.isdigit, names)) and " " not in names.strip()
+    marks = [mark for mark in DELIMITERS if mark != " " or not splits_all]
+    scores = {mark: score(mark) for mark in marks} if lines else {"": 0.0}
     best = max(scores.values())
     if best > 0:
-        return next(delimiter for delimiter in DELIMITERS if scores[delimiter] > 0.98 * best)
+        return next(mark for mark in marks if scores[mark] > 0.98 * best)
     for delimiter in "\t;|," if sample else "":
         widths = Counter(len(_split_line(line, delimiter)) for line in sample)
         if widths.most_common(1)[0][0] > 1:
@@ -592,7 +600,6 @@ def _find_header(
 ) -> TextCells:
     """Find the header, the row of units and the data among the rows of a text.
 
-    A row is data if it has numbers in most of the columns that are numeric in the last 20 rows.
     What stands above the header is left out. If two lines stand above the data and the first can be
     the header, it is the header, and the second is a damaged row; a first line in which a name
     occurs twice, as of groups of columns, or that states a field, cannot be. In a header of evenly
@@ -604,12 +611,7 @@ def _find_header(
     last_rows = (rows if columns else rows[1:])[-20:]
     usual = Counter(map(_numeric_columns, last_rows)).most_common(1)
     numeric = usual[0][0] if usual else frozenset()
-    width = max(map(len, last_rows), default=0)
-    is_data = (
-        2 * len(_numeric_columns(row) & numeric) > len(numeric) and len(row) <= width
-        for row in rows
-    )
-    data = next((k for k, is_row_data in enumerate(is_data) if is_row_data), 0)
+    data = _first_data(rows, last_rows, numeric)
     above = [_without_comment_mark(row, delimiter) for row in rows[: max(data, 1)]]
     above[-1:] = _without_names_among_units(above[-2:], numeric)
     is_units = [any(row) and all(map(_is_unit, row)) for row in above]
@@ -646,6 +648,28 @@ def _find_header(
         names = names[:-1]  # LabVIEW's, which most of its rows leave out
         data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter, {})
+
+
+def _first_data(rows: list[list[str]], last_rows: list[list[str]], numeric: Collection[int]) -> int:
+    """Return the position of the first row of data, 0 if there is none.
+
+    A row is data if it has numbers in most of the columns that are numeric in the last rows, and a
+    digit in a column in which these have times: channel numbers, as `CH,,0001,0002`, are none.
+    """
+    width = max(map(len, last_rows), default=0)
+    clocks = _columns_of_times(last_rows) - set(numeric)
+    for k, row in enumerate(rows):
+        is_timed = any(any(map(str.isdigit, row[i])) for i in clocks if i < len(row))
+        is_numeric = 2 * len(_numeric_columns(row) & set(numeric)) > len(numeric)
+        if is_numeric and len(row) <= width and (is_timed or not clocks):
+            return k
+    return 0
+
+
+def _columns_of_times(rows: Sequence[Sequence[str]]) -> set[int]:
+    """Return the positions of the columns that have two digits or more in every row."""
+    n = min(map(len, rows), default=0)
+    return {i for i in range(n) if all(sum(map(str.isdigit, row[i])) > 1 for row in rows)}
 
 
 def _is_field_above(first: list[str], second: list[str]) -> bool:

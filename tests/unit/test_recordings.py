@@ -2031,6 +2031,92 @@ def test_columns_of_a_database_in_capitals_tell_rate_and_unit(
     assert (data.rate_hz, data.unit) == (400.0, "kN")
 
 
+@pytest.mark.parametrize("mark", [-9999, 999.0])
+def test_marks_that_fill_up_rows_are_no_samples_and_inside_a_trace_they_are_a_fault(
+    mark: float, small: Dataset
+) -> None:
+    table = wide(small)
+    lengths = 40 + np.arange(len(small)) % 10
+    for i, n in enumerate(lengths):
+        table.iloc[i, n:-1] = mark
+    data = load_dataset(table, fit="pad")
+    width = data.X.shape[1]
+    for i, n in enumerate(lengths):
+        np.testing.assert_allclose(data.X[i, :n], small.X[i, : min(n, width)])
+        assert (data.X[i, n:] == data.X[i, min(n, width) - 1]).all()
+    assert f"{mark:g} behind the last sample is left out" in " ".join(data.notes)
+    table.iloc[3, 10:12] = mark
+    faults = load_dataset(table, fit="pad").faults
+    assert [fault.message for fault in faults] == [
+        f"Expected measured samples, 2 samples are {mark:g}"
+    ]
+
+
+def test_parts_whose_rows_lie_here_and_there_in_several_files_are_one_each(
+    small: Dataset, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    rows = pd.concat(
+        pd.DataFrame({"serial": f"S{i:02}", "t_ms": np.arange(50) * 4, "force": x, "ok": word})
+        for i, (x, word) in enumerate(zip(small.X, words(small), strict=True))
+    )
+    rows = rows.iloc[rng.permutation(len(rows))]
+    for k in range(4):
+        rows.iloc[k::4].to_parquet(tmp_path / f"part-{k:05}.parquet")
+    data = load_dataset(tmp_path, part="serial", time="t_ms", channel="Force", label="ok")
+    order = np.argsort(data.source)
+    np.testing.assert_allclose(data.X[order], small.X)
+    np.testing.assert_array_equal(data.y[order], small.y)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Counts per Unit Force:,1000",
+        "countsPerN:,1000.0",
+        "Force Units:,N,Counts per Unit Force:,1000.0,Counts per Unit Torque:,5",
+    ],
+)
+def test_counts_per_unit_above_the_header_are_those_of_the_channels_quantity(
+    line: str, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = "\n".join(f"{k},{round(v * 1000)}" for k, v in enumerate(x))
+        text = f"RDT Sample Rate:,500\n{line}\nRDT Sequence,Fz\n{rows}\n"
+        (tmp_path / f"{i:03}_{word}.csv").write_text(text)
+    data = load_dataset(tmp_path, channel="Fz")
+    np.testing.assert_allclose(data.X, small.X, atol=6e-4)
+    assert data.rate_hz == 500.0
+    assert "(1000)" in data.notes[0]
+
+
+def test_a_row_of_channel_numbers_is_no_first_row_of_samples(
+    small: Dataset, tmp_path: Path
+) -> None:
+    above = "Device,GM10\nSampling Interval,5ms\nCH,,0001,0002\nTag,,FORCE,STROKE\nUnit,,N,mm\n"
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = "\n".join(f"2024/06/20,08:{i:02}:12.{5 * k:03},{v},{k}" for k, v in enumerate(x))
+        text = f"{above}Date,Time,FORCE,STROKE\n{rows}\n"
+        (tmp_path / f"{i:03}_{word}.csv").write_text(text)
+    data = load_dataset(tmp_path, channel="FORCE")
+    np.testing.assert_allclose(data.X, small.X, rtol=1e-6)
+    assert data.rate_hz == 200.0
+
+
+def test_a_listing_of_dates_and_words_is_split_at_its_commas(
+    small: Dataset, tmp_path: Path
+) -> None:
+    folder = tmp_path / "parts"
+    lines = ["time,part_id,status"]
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        write_csv(folder / f"B{i:03}.csv", x)
+        lines.append(f"2024-09-04 06:{i:02}:11,B{i:03},{word}")
+    (tmp_path / "results.csv").write_text("\n".join(lines))
+    for label in ("status", None):
+        data = load_dataset(folder, labels=tmp_path / "results.csv", label=label)
+        np.testing.assert_array_equal(data.y, small.y)
+
+
 def test_how_rows_were_read_is_told_with_the_number_of_recordings(
     small: Dataset, tmp_path: Path
 ) -> None:
