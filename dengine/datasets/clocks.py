@@ -30,11 +30,14 @@ MAX_GAP = 5.0  # median steps: a longer pause is no late message
 EVEN_TOLERANCE = 0.1  # steps: times that are less off even ones are read as even
 WRONG_RATE = 1.2  # times longer or shorter than by the clock: then the stated rate is wrong
 MAX_MISSING = 0.03  # of the rows of a recording whose samples are taken as even
+LONG_STEP = 3.0  # median steps: a message of a regular clock comes less late
+MIN_LONG = 3  # such steps at least, where values are stored on a change
 LATE_STEP = 1.5  # median steps: up to here a step is a usual one
 SLOWEST_STEP = 0.5  # seconds: a clock without a unit whose steps are longer counts milliseconds
 RATES = (1.0, 1e6)  # hertz that are plausible
 SPANS = (1e-3, 3600.0)  # plausible durations of a recording, in seconds
 DAY = units.SECONDS["d"]
+HOUR = units.SECONDS["h"]
 HALF_DAY = 12  # hours
 WINCC_DAYS = 1e-6  # days in a count of WinCC's Time_ms
 EXCEL_DAYS = (2e4, 8e4)  # since 1900: the years 1954 to 2119
@@ -103,6 +106,7 @@ DAY_FIRST = tuple(
 )
 SLASHED_DATE = re.compile(r"^(\d\d?)/(\d\d?)/(\d{4})")
 ANY_ORDER = "dates, day or month first"  # the form of a clock where nothing tells which it is
+SUMMER_TIME = "where summer time ends"  # in the form of a clock that goes back an hour there
 TIME_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
 WORD_DATE = (
     rf"\d\d?[-./ ]+(?i:{MONTH})[-./, ]+(?:\d\d){{1,2}}|(?i:{MONTH}) \d\d?[.,]? \d{{4}}"  # 11-Mar-24
@@ -421,12 +425,14 @@ def seconds_of(
             scale, note = _seconds_per_count(times, name, unit)
             unit = next((u for u, s in units.SECONDS.items() if s == scale), f"{scale:g} s")
             return _continue_counter(_elapsed(column, times) * scale, scale), wrong, note, unit
-    seconds, missing = _parse_timestamps(column)
+    seconds, missing, fall = _parse_timestamps(column)
     form = "dates" if holds_dates(column) else "times of day"
     text = column.astype(str).str.strip()
     if text.str.match(SLASHED_DATE).all():
         order = _date_order(text)
         form = f"dates, {order} first" if order else ANY_ORDER
+    if fall:
+        form = f"{form}, an hour later from line {column.index[fall]} on, {SUMMER_TIME}"
     return seconds, column.index[missing].tolist(), "", form
 
 
@@ -462,7 +468,7 @@ def start_of(column: pd.Series) -> float | None:
         text = str(column.iloc[0]).strip()
         if SLASHED_DATE.match(text):
             return None
-        seconds, _ = _parse_timestamps(pd.Series(["1970-01-01T00:00:00Z", text]))
+        seconds, *_ = _parse_timestamps(pd.Series(["1970-01-01T00:00:00Z", text]))
         return float(seconds[1])
     epoch = _epoch_of(times)
     return None if epoch is None else float(times[0]) * epoch[0] - epoch[1]
@@ -498,20 +504,26 @@ def times_of(column: pd.Series) -> tuple[NDArray[np.float64], bool]:
         raise UnreadableError(f"Expected {wanted}, got {text.iloc[0]}")
     if text.str.fullmatch(TIME_OF_DAY).mean() > 0.5:
         return np.full(len(text), np.nan), True
-    seconds, _ = _parse_timestamps(pd.concat([pd.Series(["1970-01-01T00:00:00Z"]), text]))
+    seconds, *_ = _parse_timestamps(pd.concat([pd.Series(["1970-01-01T00:00:00Z"]), text]))
     return seconds[1:], True
 
 
-def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _parse_timestamps(
+    column: pd.Series,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], int]:
     """Return seconds since the first time of a column, shape (n,), and which cells are no time.
 
-    Times are ISO 8601, dates as 02.03.2026, 2-Mar-26 or 3/2/2026 with or without a time, or times
-    of day. Of 3/2/2026 the first number is the month, unless `_date_order` says that it is the day.
+    The third value is the row from which on an hour is added, because summer time ends there; 0 for
+    none. Times are ISO 8601, dates as 02.03.2026, 2-Mar-26 or 3/2/2026 with or without a time, or
+    times of day. Of 3/2/2026 the first number is the month, unless `_date_order` says that it is
+    the day.
     """
     import pandas as pd
 
+    is_local = False
     if pd.api.types.is_datetime64_any_dtype(column):
         stamps = pd.to_datetime(column, utc=True)
+        is_local = column.dt.tz is None
     elif pd.api.types.is_timedelta64_dtype(column):
         stamps = column
     else:
@@ -530,14 +542,33 @@ def _parse_timestamps(column: pd.Series) -> tuple[NDArray[np.float64], NDArray[n
                 SLASHED_DATE, lambda m: f"{m[3]}-{m[month]:0>2}-{m[day]:0>2}", regex=True
             )
             text = text.str.replace(r" (\d):", r" 0\1:", regex=True)
+            is_local = not text.str.contains(r"[T ]\d.*[Z+\-]").any()
             form = "mixed" if text.str.contains(r"\b[AP]M$").any() else "ISO8601"
             stamps = pd.to_datetime(text, errors="coerce", format=form, utc=True)
     missing = stamps.isna().to_numpy()
     valid = stamps[~missing]
     if not len(valid):
-        return np.full(len(column), np.nan), missing
+        return np.full(len(column), np.nan), missing, 0
     elapsed = (stamps - valid.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
-    return (_unwrap(elapsed, DAY) if stamps.dtype.kind == "m" else elapsed), missing
+    if stamps.dtype.kind == "m":
+        return _unwrap(elapsed, DAY), missing, 0
+    fall = _end_of_summer_time(stamps) if is_local else 0
+    is_later = np.arange(len(elapsed)) >= (fall or len(elapsed))
+    return elapsed + HOUR * is_later, missing, fall
+
+
+def _end_of_summer_time(stamps: pd.Series) -> int:
+    """Return the row at which local times, which rise elsewhere, go back as summer time ends.
+
+    They do within one hour of a Sunday's night in April, October or November. 0 for no such row.
+    """
+    falls = np.flatnonzero((stamps.diff() < np.timedelta64(0)).to_numpy())
+    if len(falls) != 1:
+        return 0
+    before = stamps.iloc[falls[0] - 1]
+    after = stamps.iloc[falls[0]]
+    is_night = before.month in (4, 10, 11) and before.day_name() == "Sunday" and before.hour < 4
+    return int(falls[0]) if is_night and before.floor("h") == after.floor("h") else 0
 
 
 def _iso_date(match: re.Match[str]) -> str:
@@ -673,7 +704,7 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     step = float(np.median(steps))
     gaps = np.flatnonzero(steps > MAX_GAP * step)
     if len(gaps):
-        raise _gap_error(step, steps[gaps[0]], lines[int(gaps[0]) + 1])
+        raise _gap_error(clock, step, steps[gaps[0]], lines[int(gaps[0]) + 1])
     # A clock of whole milliseconds steps 4, 4, 5: its mean step tells the rate.
     mean = float(steps[steps <= LATE_STEP * step].mean())
     rate = 1.0 / (step if abs(mean - step) < 0.005 * step else mean)
@@ -759,7 +790,7 @@ def check_rows(clock: Clock, lines: pd.Index, time: str | None = None) -> None:
     # After a late row others come sooner, so that none are missing.
     missing = float(forward.sum()) - len(forward) * usual
     if len(gaps) and missing > (MAX_GAP - 1) * usual:
-        raise _gap_error(usual, steps[gaps[0]], lines[rows[gaps[0] + 1]])
+        raise _gap_error(clock, usual, steps[gaps[0]], lines[rows[gaps[0] + 1]])
 
 
 def shows_lost_rows(clock: Clock) -> bool:
@@ -796,11 +827,36 @@ def rate_contradiction(clock: Clock, rate_hz: float) -> str:
     return f"Column {clock.name} contradicts the stated rate of {rate_hz:g} Hz: check it"
 
 
-def _gap_error(usual: float, gap: float, line: int) -> UnreadableError:
-    """Return the error for a step of `gap` s in time before a line, where others are `usual` s."""
-    return UnreadableError(
-        f"Expected a step of {usual:.3g} s in time, got a gap of {gap:.3g} s", line
-    )
+def _gap_error(clock: Clock, usual: float, gap: float, line: int) -> UnreadableError:
+    """Return the error for a step of `gap` s in time before a line, where others are `usual` s.
+
+    If the steps vary all along, it proposes a rate by the shortest tenth of them.
+    """
+    message = f"Expected a step of {usual:.3g} s in time, got a gap of {gap:.3g} s"
+    if varies_all_along(clock):
+        rate = float(f"{1.0 / np.quantile(np.diff(clock.seconds), 0.1):.2g}")
+        do = f"fit='resample' with rate_hz={rate:g} puts them at even times"
+        why = "steps vary all along, as of values stored when they change"
+        message = f"{message}; {why}: {do}"
+    return UnreadableError(message, line)
+
+
+def varies_all_along(clock: Clock) -> bool:
+    """Return whether the steps of a clock vary all along, as where values are stored when they
+    change.
+
+    They do if all are positive, at least three are longer than three median steps, and more than
+    a tenth of the times that four steps take are off their median by more than half. So a regular
+    clock with a hole, or whose messages come early and late, does not vary. False for a recording
+    outside 1 ms to 1 h.
+    """
+    steps = np.diff(clock.seconds)
+    is_plausible = bool((steps > 0).all()) and SPANS[0] <= steps.sum() <= SPANS[1]
+    if not is_plausible or (steps > LONG_STEP * np.median(steps)).sum() < MIN_LONG:
+        return False
+    spans = clock.seconds[4:] - clock.seconds[:-4]
+    usual = np.median(spans)
+    return bool((np.abs(spans - usual) <= usual / 2).mean() < STEADY)
 
 
 def in_order_of_time(
@@ -853,7 +909,7 @@ def check_even(clock: Clock, rate_hz: float) -> int:
 def resample_evenly(
     values: NDArray[np.float32], clock: Clock, rate_hz: float
 ) -> NDArray[np.float32]:
-    """Interpolate samples (C, T) at even times between the first and the last of a clock.
+    """Interpolate samples (C, T) at even times between the first and the last of a clock, linearly.
 
     Returns the same array if the times are even already.
     """

@@ -967,7 +967,7 @@ def _resample(
         positions = np.arange(1 + int(span * target + 1e-6)) * (rate / target)
         rows = [np.interp(positions, np.arange(length), row) for row in recording.trace]
         trace = np.stack(rows).astype(np.float32)
-        recordings[i] = recording._replace(trace=trace, length=length)
+        recordings[i] = recording._replace(trace=trace, length=recording.length or length)
     lengths = [recording.trace.shape[1] for recording in recordings]
     is_even = all(abs(length - samples) <= 1 + RATE_TOLERANCE * samples for length in lengths)
     how = "" if is_even else "; they do not last as long, so they are padded, not stretched"

@@ -21,6 +21,7 @@ from .clocks import (
     MAX_GAP,
     NO_CLOCK,
     STEADY,
+    SUMMER_TIME,
     floats,
     holds_dates,
     is_rising,
@@ -244,12 +245,15 @@ def _times_of_long(
 ) -> tuple[NDArray[np.float64], str]:
     """Return the times of a long table in seconds, and their form as in `Clock`.
 
-    A note of the collector says so if dates may have the day or the month first.
+    Notes of the collector say so if dates may have the day or the month first, or if summer time
+    ends.
     """
     seconds, _, _, form = seconds_of(column, str(column.name), unit)
     if form == ANY_ORDER:
         text = f"Column {column.name} has {form}: they are read month first"
         collector.notes[f"{text}, which matters for the order of the parts alone"] = 1
+    if SUMMER_TIME in form:
+        collector.notes[f"Column {column.name} holds {form}"] = 1
     return seconds, form
 
 

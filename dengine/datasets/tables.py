@@ -61,7 +61,9 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
             fault = Fault(path.name, error.line, str(error).rstrip("."))
             raise DataError(f"Cannot read {path}: {fault}.") from error
         if table.frame.empty:
-            raise DataError(f"Expected rows that can be read in {path}, found none.")
+            end = f"the header in line {table.line} is its last row"
+            why = str(next(iter(table.faults), end)).rstrip(".")
+            raise DataError(f"Expected rows that can be read in {path}, found none: {why}.")
         for key, value in PARTITION.findall(source):
             is_used = key in (options.label, options.part) or key.lower() in labels.LABEL_COLUMNS
             if is_used and key not in table.frame:

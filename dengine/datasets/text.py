@@ -25,9 +25,11 @@ from ..errors import excerpt, listed
 from ..traces import is_time_column
 from . import units
 from .clocks import (
+    DATE_FORM,
     EMPTY_CELLS,
     MAX_MISSING,
     NO_CLOCK,
+    SUMMER_TIME,
     TIMESTAMP,
     WORD_DATE,
     Clock,
@@ -47,6 +49,7 @@ from .clocks import (
     rising_columns,
     shows_lost_rows,
     start_of,
+    varies_all_along,
 )
 from .containers import as_texts, read_content, read_frame
 from .curves import IN_LINE, UNQUOTED, write_curves
@@ -92,7 +95,10 @@ COUNTER_NAME = re.compile(
     re.IGNORECASE,
 )
 # In it no delimiter is looked for.
-ONE_CELL = re.compile(rf"{IN_LINE}|(?:{WORD_DATE})(?: +\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?)?")
+ONE_CELL = re.compile(
+    rf"{IN_LINE}|(?:{WORD_DATE})(?: +\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?)?"
+    rf"|(?:{DATE_FORM}) +\d\d?:\d\d(?::\d\d(?:\.\d+)?)?(?: *(?:UTC|[AaPp][Mm])\b)?"
+)
 DELIMITER_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)  # Excel's first line
 # A cell of a row of units, beside the units that `units.parse` knows.
 UNIT_CELL = re.compile(r"\[.*\]|\(.*\)|°C?|%|-|[\d.,]+ ?[mµun]?s|[\d.,]+ ?k?Hz|")
@@ -1341,7 +1347,8 @@ def rows_to_trace(
         Positions of the columns of the C channels.
     options : LoadOptions
         A stated rate is taken instead of a clock's, which still shows missing rows. With
-        `fit="resample"` the samples are interpolated at even times.
+        `fit="resample"` the samples are interpolated at even times. Both are needed for
+        a clock whose steps vary all along, with pauses; see `clocks.varies_all_along`.
     notes : Counter
         Counts what users should know; it is added to.
     units_row : sequence of str
@@ -1377,13 +1384,34 @@ def rows_to_trace(
         if options.rate_hz is None:
             _offer_clock(rows, places, notes)
         return Recording(trace)
+    return _trace_by_clock(trace, rows, clock, options, notes, rate_hz)
+
+
+def _trace_by_clock(
+    trace: NDArray[np.float32],
+    rows: pd.DataFrame,
+    clock: Clock,
+    options: LoadOptions,
+    notes: Counter[str],
+    rate_hz: float | None,
+) -> Recording:
+    """Return the trace (C, T) of rows by their clock, as `rows_to_trace` does."""
     if clock.is_continued:
         notes[f"The clock {clock.name} counts from 0 again: its times go on there"] += 1
+    if SUMMER_TIME in clock.form:
+        notes[f"Column {clock.name} holds {clock.form}"] = 1
     order, clock = in_order_of_time(rows, clock, options.time)
     if (order != np.arange(len(rows))).any():
         notes["Rows are put in the order of their times"] += 1
         trace = np.ascontiguousarray(trace[:, order])
         rows = rows.iloc[order]
+    rate_hz = options.rate_hz or rate_hz
+    if options.fit == "resample" and rate_hz is not None and varies_all_along(clock):
+        even = f"put at even times, {rate_hz:g} Hz, linearly between their own"
+        notes[f"Rows come when values change, by column {clock.name}: they are {even}"] += 1
+        reading = Reading(clock=f"column {clock.name} ({clock.form}), at the stated rate")
+        even_trace = resample_evenly(trace, clock, rate_hz)
+        return Recording(even_trace, rate_hz, reading=reading, length=trace.shape[1])
     check_rows(clock, rows.index, options.time)
     _check_repeated(rows, clock)
     if options.rate_hz is None and rate_hz is not None and not shows_lost_rows(clock):

@@ -2913,3 +2913,116 @@ def test_a_listing_that_names_no_recording_is_refused_with_their_names(tmp_path:
         DataError, match=r"names peg_a, peg_b, peg_c: .*write the files as they are"
     ):
         load_dataset(folder, labels=listing, part="trial")
+
+
+def write_night(path: Path, small: Dataset, start: str, form: str, pause: float) -> pd.DataFrame:
+    """A long table in local time that goes back at 3:00, in the order of its rows."""
+    times = pd.Timestamp(start) + pd.to_timedelta(np.arange(24 * 50) // 50 * pause, unit="s")
+    times += pd.to_timedelta(np.tile(np.arange(50), 24) * 10, unit="ms")
+    is_later = times >= times.normalize() + pd.Timedelta(hours=3)
+    times = times.where(~is_later, times - pd.Timedelta(hours=1))
+    frame = pd.DataFrame({"t_stamp": times.strftime(form)}).assign(
+        station="ST40",
+        serial=np.repeat([f"H{i}" for i in range(24)], 50),
+        force=small.X.ravel().astype(np.float64),
+        result=np.repeat(words(small), 50),
+    )
+    frame.to_csv(path, index=False)
+    return frame
+
+
+NIGHT = {"part": "serial", "time": "t_stamp", "label": "result", "channel": "force"}
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S.%f"])
+@pytest.mark.parametrize("start", ["2024-10-27 02:59:50.0", "2024-10-27 02:59:50.25"])
+def test_parts_stay_in_order_where_summer_time_ends_within_or_between_them(
+    start: str, form: str, small: Dataset, tmp_path: Path
+) -> None:
+    frame = write_night(tmp_path / "a.csv", small, start, form, pause=0.75)
+    for source in (
+        tmp_path / "a.csv",
+        frame.assign(t_stamp=pd.to_datetime(frame.t_stamp, format=form)),
+    ):
+        data = load_dataset(source, **NIGHT)
+        assert (data.rate_hz, data.faults) == (100.0, ())
+        np.testing.assert_allclose(data.X, small.X)
+        assert len(data.notes) == 1
+        assert re.search(r"an hour later from line \d+ on, where summer time ends", data.notes[0])
+
+
+@pytest.mark.parametrize("start", ["2024-10-28 02:59:50.0", "2024-06-30 02:59:50.0"])
+def test_a_clock_that_goes_back_an_hour_on_another_day_is_a_fault_of_that_part(
+    start: str, small: Dataset, tmp_path: Path
+) -> None:
+    write_night(tmp_path / "a.csv", small, start, "%Y-%m-%d %H:%M:%S.%f", pause=0.75)
+    data = load_dataset(tmp_path / "a.csv", **NIGHT)
+    assert [fault.source for fault in data.faults] == ["H13"]
+    assert not any("summer" in note for note in data.notes)
+
+
+def test_a_table_of_which_no_row_can_be_read_says_why(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("time,serial\n" + "".join(f"{i / 10},{i},OK,1.5\n" for i in range(20)))
+    with pytest.raises(DataError, match=r"found none: a\.csv, line 2: Expected 2 columns, got 4"):
+        load_dataset(path, part="serial", time="time", label="result")
+    path.write_text("time,serial,result\n")
+    with pytest.raises(DataError, match="found none: the header in line 1 is its last row"):
+        load_dataset(path, part="serial", time="time", label="result")
+
+
+def changes(x: np.ndarray, deadband: float) -> list[int]:
+    """The samples of a signal that a historian stores: the last, and those that have changed."""
+    rows = [0]
+    for i, value in enumerate(x[:-1]):
+        if abs(value - x[rows[-1]]) > deadband:
+            rows.append(i)
+    return [*rows, len(x) - 1]
+
+
+@pytest.mark.parametrize("form", ["folder", "long"])
+def test_values_that_are_stored_on_a_change_are_put_at_even_times_if_that_is_asked_for(
+    form: str, tmp_path: Path
+) -> None:
+    t = np.arange(400) / 100
+    X = np.stack([100 * np.sin((3 + 0.1 * i) * t) + 20 * np.sin(17 * t) for i in range(8)])
+    source = tmp_path / "rows"
+    how = {"channel": "Value"}
+    frames = []
+    for i, x in enumerate(X):
+        rows = changes(x, 6.0)
+        frame = pd.DataFrame({"time": t[rows], "Value": x[rows]})
+        frames.append(frame.assign(frame_id=f"P{i}", result="NOK" if i % 2 else "OK"))
+    if form == "folder":
+        for i, frame in enumerate(frames):
+            source.mkdir(exist_ok=True)
+            frame.to_csv(source / f"{i}_{frame.result[0]}.csv", index=False)
+    else:
+        source = tmp_path / "long.csv"
+        pd.concat(frames).to_csv(source, index=False)
+        how |= {"part": "frame_id", "time": "time", "label": "result"}
+    data = load_dataset(source, **how, fit="resample", rate_hz=100.0)
+    assert (data.rate_hz, data.faults) == (100.0, ())
+    assert data.lengths is not None
+    assert data.lengths.tolist() == [len(frame) for frame in frames]
+    expected = [np.interp(t, frame.time, frame.Value) for frame in frames]
+    np.testing.assert_allclose(data.X, np.stack(expected), atol=1e-4)
+    assert any("Rows come when values change, by column time" in note for note in data.notes)
+    for stated in ({}, {"fit": "resample"}, {"rate_hz": 100.0}):
+        with pytest.raises(DataError, match=r"all along.*: fit='resample' with rate_hz=\d+ puts"):
+            load_dataset(source, **how, **stated)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.003])
+def test_a_regular_clock_with_a_hole_is_a_fault_also_if_it_is_resampled(
+    jitter: float, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    for i in range(6):
+        t = 1.0 + np.arange(300) / 100 + rng.normal(0, jitter, 300)
+        kept = np.delete(np.sort(t), slice(100, 130)) if i == 0 else np.sort(t)
+        frame = pd.DataFrame({"time": kept, "FZ": np.sin(kept)})
+        frame.to_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False)
+    data = load_dataset(tmp_path, fit="resample", rate_hz=100.0)
+    assert [fault.source for fault in data.faults] == ["0_OK.csv"]
+    assert "got a gap of 0.3" in data.faults[0].message
