@@ -551,18 +551,10 @@ def _find_delimiter(lines: Sequence[str]) -> str:
         )
         return n_values / len(cells) * n_rows / len(rows) * (1.0 if has_header else 0.5)
 
-    # In a list of texts, as of dates with a blank and words, the names tell it.
-    names = plain[0] if plain else ""
-    splits_all = any(
-        len({line.count(mark) for line in (*plain, *sample)}) == 1 and mark in names
-        for mark in "\t;|,"
-    )
-    splits_all &= not any(map(str.isdigit, names)) and " " not in names.strip()
-    marks = [mark for mark in DELIMITERS if mark != " " or not splits_all]
-    scores = {mark: score(mark) for mark in marks} if lines else {"": 0.0}
+    scores = {delimiter: score(delimiter) for delimiter in DELIMITERS} if lines else {"": 0.0}
     best = max(scores.values())
     if best > 0:
-        return next(mark for mark in marks if scores[mark] > 0.98 * best)
+        return next(delimiter for delimiter in DELIMITERS if scores[delimiter] > 0.98 * best)
     for delimiter in "\t;|," if sample else "":
         widths = Counter(len(_split_line(line, delimiter)) for line in sample)
         if widths.most_common(1)[0][0] > 1:
@@ -751,7 +743,8 @@ def _without_times(names: list[str], rows: list[list[str]], line: int) -> list[s
     """Return the names of a header, of which evenly rising times are replaced by 0, 1, 2, ...
 
     Whole numbers may be names, and stay. Raises UnreadableError, with the header's line, if most of
-    the names are other numbers: then there is no header.
+    the names are other numbers, or times and numbers are in the same columns as in the row below:
+    then there is no header.
 
     rows : all rows of the text, for advice.
     """
@@ -762,7 +755,11 @@ def _without_times(names: list[str], rows: list[list[str]], line: int) -> list[s
     if is_even and _are_even(names[i] for i in sorted(numbered)):
         numbers = itertools.count()
         return [str(next(numbers)) if i in numbered else name for i, name in enumerate(names)]
-    if 2 * len(numbered) > sum(map(bool, names)):
+    below = next((row for row in rows if row != names), [])
+    # A time and a number, as in the row below it: the header is samples.
+    is_like_below = numbered == _numeric_columns(below)
+    is_like_below = is_like_below and bool(_columns_of_times([names, below]) - numbered)
+    if is_like_below or 2 * len(numbered) > sum(map(bool, names)):
         message = f"Expected a header, its first line is of numbers; {_columns_advice(rows)}"
         raise UnreadableError(message, line)
     return names

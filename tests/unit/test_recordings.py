@@ -2103,6 +2103,17 @@ def test_a_row_of_channel_numbers_is_no_first_row_of_samples(
     assert data.rate_hz == 200.0
 
 
+def test_times_and_numbers_above_the_like_are_no_header(small: Dataset, tmp_path: Path) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        lines = [f"10:15:{k / 80:06.3f} -> {v:.2f}" for k, v in enumerate(x, start=80)]
+        (tmp_path / f"{i:03}_{word}.txt").write_text("\n".join(lines))
+    with pytest.raises(DataError, match="name its 3 columns, columns='c0,c1,c2'"):
+        load_dataset(tmp_path)
+    data = load_dataset(tmp_path, columns=["time", "arrow", "force"], channel="force")
+    np.testing.assert_allclose(data.X, small.X, atol=0.0051)
+    assert data.rate_hz == pytest.approx(80.0, abs=0.2)
+
+
 def test_a_listing_of_dates_and_words_is_split_at_its_commas(
     small: Dataset, tmp_path: Path
 ) -> None:
