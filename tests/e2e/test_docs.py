@@ -165,7 +165,7 @@ def python(words: list[str], desk: Path) -> None:
         kwargs={"init_globals": given, "run_name": "typed"},
     )
     process.start()
-    process.join(300)
+    process.join(900)
     process.kill()
     assert process.exitcode == 0, f"{' '.join(words)}\n{text.read_text(encoding='utf-8')[-4000:]}"
 

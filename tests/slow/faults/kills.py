@@ -200,7 +200,7 @@ def killed(
     Path(answer).write_text("")
     process = CONTEXT.Process(target=_at_home, args=(dict(os.environ), child, place, answer, seed))
     process.start()
-    end = time.monotonic() + 60
+    end = time.monotonic() + 300
     while "\n" not in Path(answer).read_text() and process.is_alive() and time.monotonic() < end:
         time.sleep(0.005)
     timer = threading.Timer(float(np.random.default_rng(seed).uniform(0.0, most)), process.kill)
