@@ -723,10 +723,10 @@ def _fit_odd_lengths(
 
 
 def _cut_padding(collector: RecordingCollector) -> None:
-    """Cut marks of missing samples, as -9999, off the ends of recordings.
+    """Cut trailing sentinel values, as -9999, off recordings; others make a recording a fault.
 
-    Elsewhere they are faults. Such a mark stands twice or more, in all channels, and far from all
-    samples.
+    There are two or more, in all channels, and they differ from all samples by at least the
+    samples' range.
     """
     reasons = {}
     for i, recording in enumerate(collector.recordings):
@@ -741,8 +741,9 @@ def _cut_padding(collector: RecordingCollector) -> None:
         end = int(np.flatnonzero(~is_mark)[-1]) + 1
         if n_inside := int(is_mark[:end].sum()):
             reasons[i] = f"Expected measured samples, {n_inside} samples are {mark:g}"
-        text = f"{mark:g} behind the last sample is left out, as what fills up a row"
-        collector.notes[text] += 1
+        if end < trace.shape[1]:
+            text = f"{mark:g} behind the last sample is left out, as what fills up a row"
+            collector.notes[text] += 1
         collector.recordings[i] = recording._replace(trace=trace[:, :end])
     collector.leave_out(reasons)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,21 @@ from ..traces import is_time_column
 from . import labels, units
 from .clocks import (
     place_of_clock,
+)
+from .columns import (
+    FORCE,
+    MIN_NUMBERED,
+    TRIED,
+    cells_of,
+    choose_channels,
+    count_labels,
+    label_hints,
+    look_like_labels,
+    natural_key,
+    numbered_columns,
+    read_nothing,
+    usual_label_columns,
+    with_label_error,
 )
 from .containers import (
     JSON,
@@ -41,6 +56,7 @@ from .dataset import (
     as_dataset,
 )
 from .encodings import decode, missing_name
+from .long_tables import long_table_advice
 from .numerals import UndecidedError, is_numeral
 from .text import SUFFIXES as TEXTS
 from .text import (
@@ -50,25 +66,6 @@ from .text import (
     read_table,
     split_cells,
 )
-
-if TYPE_CHECKING:
-    pass
-from .columns import (
-    FORCE,
-    MIN_NUMBERED,
-    TRIED,
-    cells_of,
-    choose_channels,
-    count_labels,
-    label_hints,
-    look_like_labels,
-    natural_key,
-    numbered_columns,
-    read_nothing,
-    usual_label_columns,
-    with_label_error,
-)
-from .long_tables import long_table_advice
 
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 FEW_LISTINGS = 5  # text files for each archive, as lists of its labels

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -20,7 +19,6 @@ from .clocks import (
     HEAD,
     MAX_GAP,
     NO_CLOCK,
-    STEADY,
     SUMMER_TIME,
     floats,
     holds_dates,
@@ -28,6 +26,23 @@ from .clocks import (
     place_of_clock,
     seconds_of,
     times_of,
+)
+from .columns import (
+    MAX_STATIONS,
+    STATION,
+    TRIED,
+    channel_hint,
+    check_labels,
+    choose_channels,
+    choose_label_column,
+    compared_columns,
+    count_labels,
+    label_hint,
+    look_like_labels,
+    numbered_columns,
+    single_units,
+    unit_columns,
+    with_label_error,
 )
 from .dataset import (
     Dataset,
@@ -49,23 +64,6 @@ from .windows import Windows, read_windows
 
 if TYPE_CHECKING:
     import pandas as pd
-from .columns import (
-    MAX_STATIONS,
-    STATION,
-    TRIED,
-    channel_hint,
-    check_labels,
-    choose_channels,
-    choose_label_column,
-    compared_columns,
-    count_labels,
-    label_hint,
-    look_like_labels,
-    numbered_columns,
-    single_units,
-    unit_columns,
-    with_label_error,
-)
 
 # Added to a long table; no file has these names.
 SECONDS_COLUMN = "\0seconds"
@@ -79,13 +77,12 @@ FEW_AGAIN = 0.2  # of the parts' numbers: if fewer come again, these are single 
 def concatenate_long(
     tables: Mapping[str, pd.DataFrame], options: LoadOptions
 ) -> tuple[pd.DataFrame, NDArray[np.bool_]]:
-    """Return long tables as one, in their order, and which of its rows repeat a file before.
+    """Return long tables as one, in their order, and a mask of its repeated rows.
 
-    The same part's number in two files means two parts: both get their file's name before the
-    number. But parts whose rows lie here and there in several files, as Spark writes them, are one
-    each; a part that ends one file and begins the next is one part, and so is one that has
-    rows of the same date and nearly the same numbers in both, as exports that overlap have: these
-    rows are the repeated ones.
+    A part's number in two files means two parts: both are prefixed with their file's name. It is
+    one part if its rows are scattered over the files, as Spark writes them, if it ends one file
+    and begins the next, and if exports overlap. These have the same dates and, in most cells of all
+    parts, nearly the same numbers; their rows in later files are the repeated ones.
     """
     import pandas as pd
 
@@ -133,27 +130,22 @@ def _are_spread(
 ) -> bool:
     """Return whether the rows of parts lie in several files without an order.
 
-    For most of the first parts, the times of all files together are evenly spaced, those of a file
-    alone are not.
+    For most of the first parts in several files, all times rise steadily once sorted, and those of
+    no single file do.
     """
     if time not in frame:
         return False
     clock = frame[[options.part, time]].assign(file=files).dropna()
-    clock["seconds"] = seconds_of(clock[time].reset_index(drop=True), time)[0]
-    several = clock.groupby(options.part)["file"].transform("nunique") > 1
+    n_files = clock.groupby(options.part)["file"].nunique()
+    tried = n_files.index[n_files > 1][:TRIED]
+    clock = clock[clock[options.part].isin(tried)].reset_index(drop=True)
+    clock["seconds"] = seconds_of(clock[time], time)[0]
     spread = [
-        _is_even(rows["seconds"])
-        and not any(_is_even(own["seconds"]) for _, own in rows.groupby("file"))
-        for _, rows in itertools.islice(clock[several].groupby(options.part), TRIED)
+        is_rising(np.sort(rows["seconds"]))
+        and not any(is_rising(np.sort(own["seconds"])) for _, own in rows.groupby("file"))
+        for _, rows in clock.groupby(options.part)
     ]
     return 2 * sum(spread) > len(spread)
-
-
-def _is_even(seconds: pd.Series) -> bool:
-    """Return whether nine of ten steps between times in any order are within 10 % of the median."""
-    steps = np.diff(np.sort(seconds))
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    return usual > 0.0 and (np.abs(steps - usual) < 0.1 * usual).mean() > STEADY
 
 
 def from_long(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..errors import DataError, listed
-from . import labels
+from . import labels, units
 from .clocks import EMPTY_CELLS, floats
 from .curves import curve_columns, split_curve
 from .dataset import Fault, LoadOptions, RecordingCollector
@@ -45,18 +45,18 @@ def join_pieces(
 ) -> Mapping[str, TextTable]:
     """Return tables in which the pieces of each part's curves are joined; a note says so.
 
-    A column counts them from 0 or 1 in most parts, or the samples before each; its name is that of
-    a counter. One called `seq` or the like, which may count whole curves, must count samples, or
-    each piece begins where the one before it ends. A part with a missing piece, or with several
-    labels, becomes a fault. Pieces may be in several tables. A joined row has the place of the
-    part's first row, and each first cell that is filled. Other tables are returned as they are.
+    In most parts a counter column numbers them from 0 or 1, or states their sample offset. With a
+    vague name, as `seq`, it must state offsets, or most pieces must continue the one before; else
+    the rows stay apart, and a note says so. A part with a missing piece or several labels is left
+    out as a fault. Pieces may be in several tables. A joined row stands where the part's first did,
+    with each column's first filled cell. Other tables are returned as they are.
 
-    Raises DataError if the pieces are not those of the column of parts, but of another one.
+    Raises DataError if the pieces are numbered within another column than `options.part`.
     """
     import pandas as pd
 
     first = next(iter(tables.values())).frame
-    words = {str(name): _words_of(str(name)) for name in first}
+    words = {str(name): units.words_in(str(name)) for name in first}
     sure = [name for name in words if any(map(PIECE.fullmatch, words[name]))]
     counters = sure + [name for name in words if any(map(COUNTER.fullmatch, words[name]))]
     if not counters or not all(table.frame.columns.is_unique for table in tables.values()):
@@ -96,11 +96,6 @@ def join_pieces(
     return tables
 
 
-def _words_of(name: str) -> list[str]:
-    """Return the words in a name, `block` and `No` of `blockNo_1`."""
-    return re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))
-
-
 class _Pieces(NamedTuple):
     """Which rows of a table are the pieces of one curve.
 
@@ -130,7 +125,7 @@ def _find_pieces(
     counter: str,
     options: LoadOptions,
 ) -> _Pieces | None:
-    """Return the pieces that a column counts for each part; None if it does not so for most.
+    """Return each part's pieces by `counter`; None unless most parts have several and are whole.
 
     curves : the samples in each row, of each curve.
     """

@@ -34,7 +34,8 @@ OVER_PER = re.compile(r"(?:counts?|digits?|lsb|bits?|ticks?)(?:per|pro)\w+")
 # Words of names that may tell of a scale, in which way is not known.
 UNSURE = re.compile(
     r"gain|sensitivity|calibration|resolution|coefficient|multiplier|divisor|factor|faktor|scale"
-    r"|scaling|offset|auflösung|lsb|exponent|decimals|range|empfindlichkeit|verstärkung|messbereich|skalierung|kennwert",
+    r"|scaling|offset|auflösung|lsb|exponent|decimals|range|empfindlichkeit|verstärkung"
+    r"|messbereich|skalierung|kennwert",
     re.IGNORECASE,
 )
 # Words that a name may have beside those of a factor: of any channel, and of some channels.
@@ -55,9 +56,8 @@ NEXT_NAME = re.compile(r"[,;\t](?=[^,;:\t\n]+:[,;\t])")
 
 
 def words_of(name: str) -> list[str]:
-    """Return the words in a name in lower case, `force` and `factor` of `forceFactor_N`."""
-    plain = units.split(re.sub(r"\s*[\[(].*", "", name))[0]
-    return re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", plain).lower())
+    """Return the words in a name without its unit, `force` and `factor` of `forceFactor_N`."""
+    return units.words_in(units.split(re.sub(r"\s*[\[(].*", "", name))[0])
 
 
 def words_of_channel(channel: str) -> set[str]:
@@ -109,9 +109,9 @@ def _is_of_another(name: str, channel: str) -> bool:
 
 
 def operation(name: str, channel: str, n_channels: int) -> str:
-    """Return what a number of this name does with the counts of a channel: "*", "/", "+" or "".
+    """Return how a factor or offset of this name converts raw counts: "*", "/", "+" or "".
 
-    "" also for the factor of another channel, and of one among several that it does not name.
+    "" also if it names another channel or, with several channels, not this one.
     """
     of_channel = words_of_channel(channel)
     is_named = not of_channel.isdisjoint(words_of(name))
@@ -146,10 +146,11 @@ class Scale(NamedTuple):
 def scale_of(
     stated: Sequence[Mapping[str, float]], channel: str, n_channels: int, is_whole: bool
 ) -> Scale | None:
-    """Return the scale of a channel by what recordings state; None if nothing may be one.
+    """Return the scale of a channel, or only a note on one that is not applied; None for neither.
 
-    A factor is applied if its name is plain, it is the only one, the channel's name states no unit,
-    and all samples are whole numbers (`is_whole`).
+    A factor is applied if its name is known to `operation`, and it is the only one or the only one
+    that names the channel. The channel's name must state no unit other than counts, and all samples
+    must be whole numbers (`is_whole`).
 
     stated : `stated_factors` of each recording.
     """
@@ -161,7 +162,8 @@ def scale_of(
     names = [name for name in frame if operation(name, channel, n_channels) in ("*", "/")]
     named = [name for name in names if set(words_of(name)) & words_of_channel(channel) - OF_ANY]
     if len(named or names) != 1:
-        unsure = [texts[name] for name in frame if frame[name].min() < frame[name].max()]
+        differing = [name for name in frame if frame[name].min() < frame[name].max()]
+        unsure = [texts[name] for name in dict.fromkeys([*names, *differing])]
         do = "which is not done: convert them if so"
         note = f"{listed(unsure)} may scale the whole numbers of {channel}, {do}"
         return Scale(note) if is_whole and unsure else None

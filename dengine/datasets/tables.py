@@ -17,6 +17,7 @@ import numpy as np
 
 from ..errors import DataError, listed
 from . import labels
+from .columns import MIN_NUMBERED, numbered_columns
 from .containers import (
     number_rows,
 )
@@ -29,17 +30,16 @@ from .dataset import (
     UnreadableError,
     as_dataset,
 )
+from .long_tables import concatenate_long, cut_by_windows, from_long, long_table_advice
 from .text import (
     TextTable,
     cut_note,
     read_table,
 )
+from .wide_tables import turn_table, wide_rows, with_samples_in_columns
 
 if TYPE_CHECKING:
     import pandas as pd
-from .columns import MIN_NUMBERED, numbered_columns
-from .long_tables import concatenate_long, cut_by_windows, from_long, long_table_advice
-from .wide_tables import turn_table, wide_rows, with_samples_in_columns
 
 LIST_CELL = re.compile(r"[\[(]\s*[-+]?[\d.]+[\s,]")  # a list as text
 # A folder that states the value of a column for the tables in it, as Spark and Hive name it.

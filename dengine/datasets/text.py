@@ -301,13 +301,13 @@ def _check_blocks_of_labview(rows: Mapping[int, list[str]]) -> None:
 def _find_blocks(
     line: int, above: Mapping[int, list[str]], below: Mapping[int, list[str]]
 ) -> tuple[dict[int, str], set[int]]:
-    """Return the blocks of a text whose header comes again, as `TextCells.blocks`, and all lines
-    of the heads of the later ones.
+    """Return X0 by the line of each header (`TextCells.blocks`; {} for one block), and the lines
+    of the heads of later blocks.
 
-    A head is the header, the lines above it that begin with the same words as those above the first
-    header, but for numbers, and the lines below it, as of units, that stand below the first.
+    A head is the header, the lines above it whose first cell, digits aside, stands above the first
+    header too, and the lines below it, as of units, that equal those of the first.
 
-    line : of the first header, 0 if unknown. above, below : the rows up to the first data, and on.
+    line : of the first header, 0 if unknown. above : rows before the first data. below : the rest.
     """
     rows = list(below.values())
     lines = list(below)
@@ -649,10 +649,10 @@ def _find_header(
 
 
 def _first_data(rows: list[list[str]], last_rows: list[list[str]], numeric: Collection[int]) -> int:
-    """Return the position of the first row of data, 0 if there is none.
+    """Return the index of the first row of data; 0 also if there is none.
 
-    A row is data if it has numbers in most of the columns that are numeric in the last rows, and a
-    digit in a column in which these have times: channel numbers, as `CH,,0001,0002`, are none.
+    A row is data if it has numbers in most of the columns that are numeric in the last rows, a
+    digit in a time column if these have one (`CH,,0001,0002` has none), and is no wider than these.
     """
     width = max(map(len, last_rows), default=0)
     clocks = _columns_of_times(last_rows) - set(numeric)

@@ -156,6 +156,11 @@ def split(name: str) -> tuple[str, str]:
     return (match["name"], unit) if is_unit else (plain, "")
 
 
+def words_in(name: str) -> list[str]:
+    """Return the words in a name in lower case, `block` and `no` of `blockNo_1`."""
+    return re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower())
+
+
 def find_columns(name: str, columns: Sequence[str]) -> list[int]:
     """Return the positions of the columns that have a name.
 

@@ -21,6 +21,16 @@ from .clocks import (
     rate_in_preamble,
     rate_of,
 )
+from .columns import (
+    MAX_STATIONS,
+    MIN_NUMBERED,
+    NUMBER_LAST,
+    choose_label_column,
+    compared_columns,
+    count_labels,
+    sample_columns,
+    unit_columns,
+)
 from .curves import expand_curves
 from .dataset import (
     MAX_LABEL_WORDS,
@@ -41,16 +51,6 @@ from .text import (
 
 if TYPE_CHECKING:
     import pandas as pd
-from .columns import (
-    MAX_STATIONS,
-    MIN_NUMBERED,
-    NUMBER_LAST,
-    choose_label_column,
-    compared_columns,
-    count_labels,
-    sample_columns,
-    unit_columns,
-)
 
 
 def with_samples_in_columns(

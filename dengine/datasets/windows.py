@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
-from .clocks import DATE, TIME_OF_DAY, join_date_and_time, times_of
+from .clocks import DATE, HOUR, TIME_OF_DAY, join_date_and_time, times_of
 from .dataset import LoadOptions, UnreadableError
 from .labels import LISTS, LabelSource, labels_in_file, normalized
 from .text import read_table
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 TOLERANCE = 1e-5  # seconds: float64 rounds dates to less
-HOUR = 3600.0
 ZONES = range(-14, 15)  # hours from UTC
 Times = NDArray[np.float64]
 
@@ -54,7 +53,8 @@ class Windows(NamedTuple):
     file : str
         Name of the listing.
     names : list of str
-        Of the n parts in the order of their starts; one that is listed twice has its line behind.
+        Of the n parts in the order of their starts; a duplicate gets its line number
+        appended.
     starts, ends : array of float64, shape (n,)
         In seconds; NaN where the listing states no time.
     since_1970 : bool
@@ -85,9 +85,9 @@ class Windows(NamedTuple):
         return int(is_inside.sum())
 
     def check_inside(self, times: Times, source: str) -> None:
-        """Raise DataError if no window is within the times of a recording; what to do is said.
+        """Raise DataError, with advice, if no window is within the times of a recording.
 
-        Of windows that count from the start of the recording most must be.
+        If they count from its start, most must be within.
         """
         n = self.n_inside(times)
         if n and (self.since_1970 or 2 * n > len(self.names)):
@@ -118,8 +118,8 @@ class Windows(NamedTuple):
     def cut(self, times: Times, step: float) -> list[Window]:
         """Return the samples in each window.
 
-        A window that overlaps another, that is not wholly within the recording, or that has no
-        sample, cannot be used.
+        A window that ends before it starts, overlaps another, leaves the recording by more than 1.5
+        steps, or has no sample gets a `fault`. It includes its start and excludes its end.
 
         Parameters
         ----------
@@ -165,11 +165,12 @@ class Windows(NamedTuple):
 
 
 def read_windows(name: str, options: LoadOptions) -> Windows | None:
-    """Read the windows of the listing that the options name; None if it has none.
+    """Read the windows in the file of labels; None if it lists no windows.
 
-    A listing of windows has a column of starts, and one of ends or of durations. Parts are named by
-    the column that `part` states, or by one with a usual name, else by numbers behind `name`.
-    Raises DataError if dates are not plain.
+    It lists windows if it has a column of starts, and one of ends or of durations. Parts are named
+    by the column `part`, by one with a usual name or by a first column without duplicates, else
+    `name`/1, `name`/2, ... Raises DataError for ambiguous dates, times of day without a date, and
+    if a stated column, or one that may hold labels, is missing.
     """
     if options.labels is None:
         return None
@@ -197,8 +198,9 @@ def read_windows(name: str, options: LoadOptions) -> Windows | None:
             return None
         wanted = f"dates with the times of day in {of_start} and {of_end} of {path}"
         raise DataError(f"Expected {wanted}, got {frame[of_start].iloc[0]}; write both in one.")
-    _check_header(frame, {column for names in columns.values() for column in names}, path, options)
-    frame = frame.drop(columns=[column for names in columns.values() for column in names])
+    of_times = {column for names in columns.values() for column in names}
+    _check_header(frame, of_times, path, options)
+    frame = frame.drop(columns=list(of_times))
     texts, options = _name_parts(frame, name, options)
     frame = frame.drop(columns=[column for column in frame if column.lower() == "file"])
     frame.insert(0, "file", texts)

@@ -2047,6 +2047,9 @@ def test_marks_that_fill_up_rows_are_no_samples_and_inside_a_trace_they_are_a_fa
     assert f"{mark:g} behind the last sample is left out" in " ".join(data.notes)
     table.iloc[3, 10:12] = mark
     faults = load_dataset(table, fit="pad").faults
+    inside = wide(small)
+    inside.iloc[3, 10:12] = mark
+    assert not any("behind the last sample" in note for note in load_dataset(inside).notes)
     assert [fault.message for fault in faults] == [
         f"Expected measured samples, 2 samples are {mark:g}"
     ]
@@ -2569,6 +2572,7 @@ def test_counts_are_multiplied_by_the_factor_that_each_part_states(
         ("a", {"factor": [2, 2], "add_offset": [1, 1]}, (2, 1), "plus add_offset (1)."),
         ("a", {"a_divisor": [4, 4], "b_divisor": [3, 5]}, (0.25, 0), "over a_divisor (4)."),
         ("a", {"factor": [0.5, None]}, (0.5, 0), "a is in counts, times factor (0.5)."),
+        ("a", {"scale": [0.5, 0.5], "factor": [2, 2]}, (1, 0), "scale (0.5), factor (2) may scale"),
     ],
 )
 def test_only_a_plain_factor_of_whole_numbers_is_applied(
