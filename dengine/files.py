@@ -81,6 +81,7 @@ def read_errors(
     package: str = "",
     extra: str = "",
     also: tuple[type[Exception], ...] = (),
+    do: str = "",
 ) -> AbstractContextManager[None]:
     """Return a context manager that raises DataError instead of what a library raises on bad files.
 
@@ -98,11 +99,13 @@ def read_errors(
         Extra of dengine that installs the package, for that error.
     also : tuple of type
         Exceptions to catch beside `UNREADABLE`.
+    do : str
+        What the user can do about it.
     """
     if package and find_spec(package) is None:
         do = f'pip install "dengine[{extra}]"'
         raise DataError(f"Expected {package} for {kind}, it is not installed: {do}.")
-    return instead(DataError, f"Cannot read {source} as {kind}", *UNREADABLE, *also)
+    return instead(DataError, f"Cannot read {source} as {kind}", *UNREADABLE, *also, do=do)
 
 
 def _size_text(n_bytes: float) -> str:

@@ -178,7 +178,11 @@ Message = tuple[int, str, dict[str, Any]]  # nanoseconds, topic, content
 
 
 def write_messages(
-    path: Path, messages: Iterable[Message], stamped: bool = False, wrench: str = "/wrench"
+    path: Path,
+    messages: Iterable[Message],
+    stamped: bool = False,
+    wrench: str = "/wrench",
+    chunk_bytes: int = 2**20,
 ) -> Path:
     """Write ROS 2 messages as an MCAP file.
 
@@ -191,6 +195,8 @@ def write_messages(
         Whether the wrenches have a header with a stamp.
     wrench : str, default "/wrench"
         Topic of the wrenches.
+    chunk_bytes : int, default 2**20
+        Size of a chunk, unpacked.
 
     Returns
     -------
@@ -202,7 +208,7 @@ def write_messages(
     if stamped:
         wrench_type = ("geometry_msgs/msg/WrenchStamped", STAMPED_WRENCH)
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer = Writer(file, chunk_size=chunk_bytes)
         schemas = {
             topic: writer.register_msgdef(*message_type)
             for topic, message_type in (TOPICS | {wrench: wrench_type}).items()

@@ -6,10 +6,13 @@ headers, or else those of the log. Labels are a topic, of which the first messag
 has begun counts, or a file of labels by the insertions' numbers. `load_dataset` calls `read_bag`.
 """
 
+import re
+import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
-from ..files import check_size, read_errors
+from ..files import UNREADABLE, check_size, read_errors
 from . import labels
 from .columns import natural_key
 from .dataset import (
     Dataset,
+    Fault,
     LoadOptions,
     Reading,
     Recording,
@@ -34,7 +38,7 @@ from .triggers import MAX_STEP, Active, Start, StartFinder, Trigger, as_trigger,
 from .windows import Windows, read_windows
 
 if TYPE_CHECKING:
-    from mcap.reader import McapReader
+    from mcap.reader import DecodedMessageTuple
 
 NANOSECONDS = 10**9  # in a second
 SUFFIX = ".mcap"
@@ -42,6 +46,8 @@ WRENCH_TYPES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
 AXES = ("FX", "FY", "FZ", "MX", "MY", "MZ")  # in the frame that the topic is in
 UR_NAMES = ("FX_Base", "FY_Base", "FZ_Base", "MuX_Base", "MuY_Base", "MuZ_Base")
 ALIASES = dict(zip(UR_NAMES, AXES, strict=True))
+FIELD = re.compile(r"(?:wrench[./])?(force|torque)[./_]([xyz])")  # of a ROS message
+RECOVER = "mcap recover or ros2 bag reindex may save what is whole"
 MESSAGE_BYTES = 8 * (len(AXES) + 4)  # in memory
 LOG_CLOCK = "times of the log"
 LATE_LOG = 0.1  # seconds from stamp to log that users should know
@@ -109,51 +115,123 @@ def is_stream(path: Path) -> bool:
 
 def axis_of(name: str) -> int:
     """Return which of the six numbers of a wrench a channel is; -1 if it is none."""
-    axis = ALIASES.get(name, name)
+    axis = ALIASES.get(name, name.upper())
+    if field := FIELD.fullmatch(name.lower()):
+        axis = f"{'F' if field[1] == 'force' else 'M'}{field[2].upper()}"
     return AXES.index(axis) if axis in AXES else -1
 
 
-@contextmanager
-def _open_reader(path: Path) -> "Iterator[McapReader]":
-    """Context manager that gives the reader of a file; DataError if it is damaged or no MCAP."""
+class Contents(NamedTuple):
+    """What an MCAP file holds.
+
+    types : dict
+        The name of the message type of each topic.
+    counts : Counter
+        Messages of each topic that are whole; empty for a file that was closed.
+    begin : int or None
+        Time of the log of the first message, in nanoseconds; None without messages.
+    cut : str
+        How a file ends that was not closed, for a note; "" if it was.
+    """
+
+    types: dict[str, str]
+    counts: Counter[str]
+    begin: int | None
+    cut: str
+
+
+def _damages() -> tuple[type[Exception], ...]:
+    """Return what the libraries raise on damaged files."""
     from mcap.exceptions import McapError
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
     from zstandard import ZstdError
 
-    errors = read_errors(path, "an MCAP file", also=(McapError, ZstdError))
-    with errors, path.open("rb") as file:
-        yield make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+    return (*UNREADABLE, McapError, ZstdError, struct.error)
 
 
-def _find_topics(files: Sequence[Path]) -> tuple[dict[str, str], int]:
-    """Return the topics of the files, each with the name of its message type, and their begin.
+def _read_contents(path: Path) -> Contents:
+    """Return what a file holds, by its summary, or if it has none by all of its messages.
 
-    That is the time of the log of the first message, in nanoseconds. Only the summaries are read.
-    Raises DataError if a file has none, or is too large for the memory.
+    Raises UnreadableError if no message can be read, and DataError if the file is too large for the
+    memory.
     """
-    topics: dict[str, str] = {}
-    begins = []
-    for path in files:
-        with _open_reader(path) as reader:
-            summary = reader.get_summary()
-            if summary is None or summary.statistics is None:
-                do = "was it cut off? mcap recover mends it"
-                raise DataError(f"Expected a summary in {path}, there is none: {do}.")
-            check_size(float(MESSAGE_BYTES) * summary.statistics.message_count, path)
-            chunk_sizes = (chunk.uncompressed_size for chunk in summary.chunk_indexes)
-            check_size(float(max(chunk_sizes, default=0)), path)
-            types = {number: schema.name for number, schema in summary.schemas.items()}
-            for channel in summary.channels.values():
-                topics[channel.topic] = types.get(channel.schema_id, "")
-            if summary.statistics.message_count:
-                begins.append(summary.statistics.message_start_time)
-    return topics, min(begins, default=0)
+    from mcap.reader import make_reader
+
+    summary = None
+    with suppress(*_damages()), path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    if summary is None or summary.statistics is None:
+        return _scan(path)
+    check_size(float(MESSAGE_BYTES) * summary.statistics.message_count, path)
+    chunk_sizes = (chunk.uncompressed_size for chunk in summary.chunk_indexes)
+    check_size(float(max(chunk_sizes, default=0)), path)
+    schemas = {number: schema.name for number, schema in summary.schemas.items()}
+    types = {c.topic: schemas.get(c.schema_id, "") for c in summary.channels.values()}
+    has_messages = summary.statistics.message_count > 0
+    begin = summary.statistics.message_start_time if has_messages else None
+    return Contents(types, Counter(), begin, "")
 
 
-def _read_messages(
-    files: Sequence[Path], wrench: str, topics: Sequence[str], begin: int
-) -> Messages:
+def _scan(path: Path) -> Contents:
+    """Return what a file without a summary holds, up to its end or where it is damaged.
+
+    Raises UnreadableError if no message can be read.
+    """
+    from mcap.exceptions import EndOfFile, InvalidMagic
+    from mcap.reader import NonSeekingReader
+
+    types = dict[str, str]()
+    counts = Counter[str]()
+    begin = end = None
+    n_read = 0
+    damage: Exception | None = None
+    with path.open("rb") as file:
+        reader = NonSeekingReader(file, validate_crcs=True)
+        try:
+            for schema, channel, message in reader.iter_messages(log_time_order=False):
+                types[channel.topic] = schema.name if schema else ""
+                counts[channel.topic] += 1
+                begin = min(message.log_time, begin or message.log_time)
+                end = max(message.log_time, end or 0)
+                n_read = file.tell()
+        except _damages() as error:
+            damage = error
+    if damage is None:
+        return Contents(types, counts, begin, "")
+    is_end = isinstance(damage, EndOfFile | struct.error)
+    if begin is None or end is None:
+        why = "it ends before its first chunk of messages does" if is_end else str(damage)
+        if isinstance(damage, InvalidMagic | struct.error):
+            why = "it does not begin as one: it is of another kind, or its beginning is damaged"
+        why = why if path.stat().st_size else "it is empty"
+        raise UnreadableError(f"Cannot read {path} as an MCAP file: {why}; {RECOVER}.")
+    share = f"{counts.total()} messages, in {n_read} of {path.stat().st_size} bytes, are read"
+    until = f"{np.datetime64(end // 10**6, 'ms')}Z, {(end - begin) / NANOSECONDS:.6g} s after"
+    text = f"{path.name} ends early, it was not closed: {share}, up to {until} the first one."
+    if not is_end:
+        text = f"{text.replace('ends early', 'is damaged')[:-1]}; mcap recover may save more."
+    return Contents(types, counts, begin, text)
+
+
+def _iter_messages(
+    path: Path, contents: Contents, topics: Sequence[str]
+) -> "Iterator[DecodedMessageTuple]":
+    """Yield the messages of some topics that are whole; DataError if the file is damaged."""
+    from mcap.reader import NonSeekingReader, make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    factories = [DecoderFactory()]
+    errors = read_errors(path, "an MCAP file", also=_damages(), do=RECOVER)
+    with errors, path.open("rb") as file:
+        if not contents.counts:
+            yield from make_reader(file, True, factories).iter_decoded_messages(topics)
+            return
+        messages = NonSeekingReader(file, True, factories).iter_decoded_messages(
+            topics, log_time_order=False
+        )
+        yield from islice(messages, sum(contents.counts[topic] for topic in set(topics)))
+
+
+def _read_messages(files: Mapping[Path, Contents], wrench: str, topics: Sequence[str]) -> Messages:
     """Read all messages of the wrench's topic and of other topics, in the order of the log.
 
     Times are the stamps of the wrench if all of its messages have one, else those of the log.
@@ -164,28 +242,30 @@ def _read_messages(
     stamped = []
     logged = []
     forces = []
-    for path in files:
-        with _open_reader(path) as reader:
-            for _, channel, record, message in reader.iter_decoded_messages(
-                topics=[wrench, *topics]
-            ):
-                topic = channel.topic
-                if topic == wrench:
-                    header = getattr(message, "header", None)
-                    vectors = getattr(message, "wrench", message)
-                    stamped.append(0 if header is None else _nanoseconds_of(header.stamp))
-                    logged.append(record.log_time)
-                    both = (vectors.force, vectors.torque)
-                    forces.append([getattr(vector, axis) for vector in both for axis in "xyz"])
-                if topic in others:
-                    if not hasattr(message, "data"):
-                        wanted = f"messages with a field data on {topic}, as of std_msgs"
-                        raise DataError(f"Expected {wanted}, got others.")
-                    others[topic].append((record.log_time, message.data))
-    expect_data(len(logged) >= 2, f"messages of {wrench} in {files[0]}", len(logged))
+    for path, contents in files.items():
+        for _, channel, record, message in _iter_messages(path, contents, [wrench, *topics]):
+            topic = channel.topic
+            if topic == wrench:
+                header = getattr(message, "header", None)
+                vectors = getattr(message, "wrench", message)
+                stamped.append(0 if header is None else _nanoseconds_of(header.stamp))
+                logged.append(record.log_time)
+                both = (vectors.force, vectors.torque)
+                forces.append([getattr(vector, axis) for vector in both for axis in "xyz"])
+            if topic in others:
+                if not hasattr(message, "data"):
+                    wanted = f"messages with a field data on {topic}, as of std_msgs"
+                    raise DataError(f"Expected {wanted}, got others.")
+                others[topic].append((record.log_time, message.data))
+    expect_data(len(logged) >= 2, f"messages of {wrench} in {next(iter(files))}", len(logged))
     exact = np.array(logged if 0 in stamped else stamped, dtype=np.int64)
     clock = LOG_CLOCK if 0 in stamped else "stamps of the headers"
-    return Messages(exact, np.array(logged), np.array(forces), others, clock, begin)
+    begin = min(contents.begin for contents in files.values() if contents.begin is not None)
+    order = np.argsort(logged, kind="stable")
+    for messages in others.values():
+        messages.sort(key=lambda message: message[0])
+    arrays = (exact[order], np.array(logged)[order], np.array(forces)[order])
+    return Messages(*arrays, others, clock, begin)
 
 
 def _nanoseconds_of(stamp: Any) -> int:
@@ -227,7 +307,7 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
         do = "ros2 bag convert makes them of .db3 files"
         raise DataError(f"Expected MCAP files in the bag {path}, found none; {do}.")
     with read_errors(path, "MCAP files", "mcap_ros2", "mcap"):
-        types, begin = _find_topics(files)
+        contents, faults = _read_all_contents(files)
     windows = read_windows(name, options)
     if windows is not None and options.trigger is not None:
         actual = f"{windows.file} says from when to when each part ran"
@@ -235,8 +315,38 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
         raise DataError(
             f"Expected a trigger or windows, got {options.trigger}, and {actual}; {do}."
         )
+    notes = [file_contents.cut for file_contents in contents.values() if file_contents.cut]
+    gaps = [file.name for file in files[:-1] if file not in contents or contents[file].cut]
+    if gaps and windows is None:
+        wanted = f"whole files before the last one of {path}, which a trigger cuts"
+        do = "read the files before it and those behind it alone, or give a listing of windows"
+        why = " ".join([*(f"{fault.message}." for fault in faults), *notes])
+        raise DataError(f"Expected {wanted}, {gaps[0]} is none; {do}. {why}")
+    try:
+        wrench, topics = _find_topics(path, contents.values(), options, has_trigger=windows is None)
+        messages = _read_messages(contents, wrench, topics)
+        if windows is not None:
+            data = _cut_windows(messages, windows, channels, name, options)
+        else:
+            data = _cut_dataset(messages, as_trigger(options.trigger), channels, name, options)
+    except DataError as error:
+        if not notes:
+            raise
+        raise DataError(f"{error} {' '.join(notes)}") from error
+    return replace(data, notes=(*notes, *data.notes), faults=(*faults, *data.faults))
+
+
+def _find_topics(
+    path: Path, contents: Iterable[Contents], options: LoadOptions, *, has_trigger: bool
+) -> tuple[str, list[str]]:
+    """Return the topic of the wrench and the others that are to be read.
+
+    Raises DataError if one is missing, there are several wrenches and none is stated, or the
+    trigger or the labels are not stated where it is to be cut by a trigger.
+    """
+    types = {topic: kind for in_file in contents for topic, kind in in_file.types.items()}
     signals: tuple[str, ...] = ()
-    if windows is None:
+    if has_trigger:
         _check_cutting_options(path, types, options)
         signals = as_trigger(options.trigger).signals
     wrenches = [
@@ -253,10 +363,24 @@ def read_bag(path: Path, name: str, options: LoadOptions) -> Dataset:
         if topic not in types:
             actual = listed(types) or "none"
             raise DataError(f"Expected the topic {topic} in {path}, found {actual}.")
-    messages = _read_messages(files, wrenches[0], topics, begin)
-    if windows is not None:
-        return _cut_windows(messages, windows, channels, name, options)
-    return _cut_dataset(messages, as_trigger(options.trigger), channels, name, options)
+    return wrenches[0], topics
+
+
+def _read_all_contents(files: Sequence[Path]) -> tuple[dict[Path, Contents], list[Fault]]:
+    """Return what the files of a bag hold, and the faults of those that cannot be read.
+
+    Raises DataError if the first cannot be read, with which the bag begins.
+    """
+    contents = dict[Path, Contents]()
+    faults = list[Fault]()
+    for file in files:
+        try:
+            contents[file] = _read_contents(file)
+        except UnreadableError as error:
+            if not contents:
+                raise DataError(str(error)) from error
+            faults.append(Fault(file.name, 0, str(error).rstrip(".")))
+    return contents, faults
 
 
 def _check_cutting_options(path: Path, types: Mapping[str, str], options: LoadOptions) -> None:

@@ -2,7 +2,7 @@
 that mcap writes.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -53,8 +53,8 @@ class Bag:
         self.told = {i: bool(good) for i, good in enumerate(self.good)}
         self.parts: list[str] = []
 
-    def write(self, path: Path, parts: slice = slice(None)) -> Path:
-        return write_messages(path, self.messages(parts), self.stamped, FORCE)
+    def write(self, path: Path, parts: slice = slice(None), chunk_bytes: int = 2**20) -> Path:
+        return write_messages(path, self.messages(parts), self.stamped, FORCE, chunk_bytes)
 
     def messages(self, parts: slice) -> Iterator[tuple[int, str, dict]]:
         ends = {start + SAMPLES + 10: i for i, start in enumerate(self.starts)}
@@ -257,6 +257,88 @@ def test_a_damaged_file_is_refused_or_read_and_never_raises_anything_else(
     except DataError:
         return
     np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32)[: len(data)])
+
+
+def cut(path: Path, share: float = 0.55, tail: bytes = b"") -> Path:
+    """Cut a file at a share of its size, as of a recorder that lost its power."""
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))] + tail)
+    return path
+
+
+@pytest.mark.parametrize("tail", [b"", bytes(5000)], ids=["", "zeros behind"])
+@pytest.mark.parametrize("way", ["trigger", "windows"])
+def test_a_file_that_was_not_closed_is_read_up_to_its_last_whole_chunk(
+    bag: Bag, tmp_path: Path, way: str, tail: bytes
+) -> None:
+    path = cut(bag.write(tmp_path / "cell.mcap", chunk_bytes=4096), tail=tail)
+    listing = write_windows(tmp_path / "cycles.csv", bag)
+    data = load_dataset(path, **(ASKED if way == "trigger" else {"labels": listing}))
+    n = len(data)
+    assert 2 < n < 6
+    np.testing.assert_array_equal(data.X, bag.traces[:n, 2].astype(np.float32))
+    np.testing.assert_array_equal(data.y, bag.good[:n])
+    (note,) = [note for note in data.notes if "was not closed" in note]
+    assert "cell.mcap ends early" in note or (tail and "cell.mcap is damaged" in note)
+    assert f"of {path.stat().st_size} bytes, are read, up to 2023-11-14T22:13:2" in note
+    if way == "windows":
+        assert [fault.source for fault in data.faults] == [f"P{i}" for i in range(n, 8)]
+        assert "Expected a window in the recording" in data.faults[0].message
+
+
+def test_a_file_that_lost_only_its_index_is_read_whole(bag: Bag, tmp_path: Path) -> None:
+    path = bag.write(tmp_path / "cell.mcap", chunk_bytes=4096)
+    path.write_bytes(path.read_bytes()[:-20])
+    data = load_dataset(path, **ASKED)
+    assert (len(data), data.faults) == (8, ())
+    assert any("was not closed" in note for note in data.notes)
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (lambda content: content[:3000], "it ends before its first chunk of messages does"),
+        (lambda content: content[:5], "it does not begin as one"),
+        (lambda content: b"\0" * 300 + content[300:3000], "it does not begin as one"),
+        (lambda content: b"a,b\n1,2\n" * 100, "it does not begin as one"),
+        (lambda content: b"", "it is empty"),
+    ],
+)
+def test_a_file_without_a_whole_message_is_refused_with_what_may_mend_it(
+    bag: Bag, tmp_path: Path, content: Callable[[bytes], bytes], why: str
+) -> None:
+    path = bag.write(tmp_path / "cell.mcap")
+    path.write_bytes(content(path.read_bytes()))
+    with pytest.raises(DataError, match=f"{why}.*; mcap recover or ros2 bag reindex may save"):
+        load_dataset(path, **ASKED)
+
+
+def test_a_bag_of_several_files_is_cut_at_a_damaged_one_by_a_listing_alone(
+    bag: Bag, tmp_path: Path
+) -> None:
+    ends = [0, bag.starts[2] - 10, bag.starts[5] - 10, len(bag.wrench)]
+    for i, part in enumerate(map(slice, ends[:-1], ends[1:])):
+        bag.write(tmp_path / f"cell_{i}.mcap", part, chunk_bytes=4096)
+    listing = write_windows(tmp_path / "cycles.csv", bag)
+    cut(tmp_path / "cell_1.mcap", 0.01)
+    data = load_dataset(tmp_path, labels=listing)
+    assert data.source.tolist() == ["P0", "P1", "P5", "P6", "P7"]
+    np.testing.assert_array_equal(data.X[2:], bag.traces[5:, 2].astype(np.float32))
+    assert [fault.source for fault in data.faults] == ["cell_1.mcap", "P2", "P3", "P4"]
+    with pytest.raises(DataError, match=r"whole files before the last .* cell_1\.mcap is none"):
+        load_dataset(tmp_path, **ASKED)  # the labels behind it would be those of others
+    cut(tmp_path / "cell_0.mcap", 0.01)
+    with pytest.raises(DataError, match=r"Cannot read .*cell_0\.mcap as an MCAP file"):
+        load_dataset(tmp_path, labels=listing)
+
+
+@pytest.mark.parametrize("name", ["wrench.force.z", "force.z", "wrench/force/z", "fz"])
+def test_a_channel_may_be_named_as_the_field_of_the_message(
+    bag: Bag, tmp_path: Path, name: str
+) -> None:
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), channel=name, **ASKED)
+    np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
+    assert data.unit == "N"
 
 
 def date(nanoseconds: int) -> str:
