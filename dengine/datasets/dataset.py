@@ -876,12 +876,22 @@ def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) ->
     collector.leave_out(reasons)
     if options.unit:
         return options.unit
-    if not any(targets):
-        return guess_unit(collector.channels)
-    channel_units = [
-        target or guess_unit(collector.channels[c : c + 1]) for c, target in enumerate(targets)
-    ]
-    return channel_units[0] if len(set(channel_units)) == 1 else ", ".join(channel_units)
+    return _with_guesses(targets, collector)
+
+
+def _with_guesses(stated: Sequence[str], collector: RecordingCollector) -> str:
+    """Return the unit of all channels, or one for each; by their names where none is stated.
+
+    A note names each channel whose name may tell a unit.
+    """
+    names = [*collector.channels, *[""] * (len(stated) - len(collector.channels))]
+    guesses = [units.guess(name) for name in names]
+    guesses[: len(stated)] = [unit or guess for unit, guess in zip(stated, guesses, strict=False)]
+    for name, unit in zip(names, guesses, strict=True):
+        if not unit and (word := units.maybe_unit(name)):
+            do = f"none is assumed, unit={word.partition(' ')[0]!r} states it"
+            collector.notes[f"The name {name} may tell a unit, {word}: {do}"] = 1
+    return ", ".join(guesses if len(set(guesses)) > 1 else guesses[:1])
 
 
 def odd_labels_note(n_good: int, n: int) -> list[str]:

@@ -23,7 +23,8 @@ BRACKETED = re.compile(
 SLASHED = re.compile(
     r"(?P<name>.*\S)\s*/\s*(?P<unit>\S+)|(?P<other>.*\S) in (?P<such>\S+)"
 )  # F/kN, F in kN
-ENDING = re.compile(r"(?P<name>.*[^_. -])[_. -]+(?P<unit>[A-Za-zµμ·]+)")  # FZ_kN
+ENDING = re.compile(r"(?P<name>.*[^_. -])[_. -]+(?P<unit>[A-Za-zµμ·]+)")  # FZ_kN, force_kn
+JOINED = re.compile(r"(?P<name>.*?[a-ln-z])(?P<unit>(?:[kM]?N|Kn|KN)(?:[cm]?m)?)")  # ForcekN
 # A line above a header that states a unit: # Force unit: kN, or Einheit Kraft;kN.
 UNIT_LINE = re.compile(
     r"(?P<before>[\w -]*?)(?<![^\W_])(?:units?|einheit(?:en)?|unité|unidad|unità)(?![^\W_])"
@@ -35,6 +36,12 @@ FORCE_NAME = re.compile(r"f[xyz]?([_ ].*)?|.*(force|kraft|last|load).*", re.IGNO
 # Of a torque whose unit nobody knows, and of one that robots and sensors give in N·m: MuZ_Base.
 TORQUE_NAME = re.compile(r"m[d]?([_ ].*)?|.*(torque|moment|couple|torsion).*", re.IGNORECASE)
 TORQUE_AXIS = re.compile(r"(mu?|t)[xyz](_.*)?", re.IGNORECASE)
+# Words of a force's name that may be its unit, beside those in `SPELLINGS`.
+MAYBE_UNIT = re.compile(
+    r"%|V|g|(?i:percent|pct|.*(newton|pound|kilogram|gram)s?)|.*([a-z]m|[A-Z]k)N"
+)
+# Dimensions that a sensor of force has none of.
+NO_FORCE = ("m", "s", "Hz", "rad", "W", "K", "Nm", "°", "deg", "°C", "in", "inch", "ft")
 COMMENT_MARK = re.compile(r"^\s*[#%]+\s*")  # by which other programs know a comment
 
 
@@ -53,6 +60,14 @@ def parse(unit: str) -> tuple[str, float] | None:
     return None
 
 
+SPELLINGS = dict[str, dict[str, None]]()  # the units that a text may mean, in lower case
+for _base, (_dimension, _) in BASES.items():
+    for _prefix in PREFIXES if _dimension == "Nm" else USUAL_PREFIXES:
+        SPELLINGS.setdefault(f"{_prefix}{_base}".lower(), {})[f"{_prefix}{_base}"] = None
+for _unit in ("daN", *ALONE):
+    SPELLINGS.setdefault(_unit.lower(), {})[_unit] = None
+
+
 def spelling(unit: str) -> str:
     """Return a unit as it is usually spelled: kN for KN; the same text if it is no unit.
 
@@ -60,8 +75,7 @@ def spelling(unit: str) -> str:
     """
     if len(unit) < 2 or parse(unit) is not None:
         return unit
-    prefixed = [f"{prefix}{base}" for base in BASES for prefix in USUAL_PREFIXES]
-    alike = [name for name in (*prefixed, "daN", *ALONE) if name.lower() == unit.lower()]
+    alike = list(SPELLINGS.get(unit.lower(), ()))
     return alike[0] if len({parse(name) for name in alike}) == 1 else unit
 
 
@@ -104,14 +118,39 @@ def stated_in_preamble(text: str, header: Sequence[str], places: Sequence[int]) 
 
 
 def guess(channel: str) -> str:
-    """Return "N" or "N·m" for a channel whose name says that it is a force or a robot's torque.
+    """Return the unit in a channel's name, else "N" for a force and "N·m" for a robot's torque.
 
-    "" for any other, as `Torque`, which is often in N·cm.
+    "" for any other, as `Torque`, which is often in N·cm, and for a force with a `maybe_unit`.
     """
+    if unit := split(channel)[1]:
+        return unit
     if TORQUE_AXIS.fullmatch(channel):
         return "N·m"
-    is_force = FORCE_NAME.fullmatch(channel) and not TORQUE_NAME.fullmatch(channel)
-    return "N" if is_force else ""
+    return "N" if _quantity(channel) == "N" and not maybe_unit(channel) else ""
+
+
+def maybe_unit(channel: str) -> str:
+    """Return what may be a unit, other than N, in the name of a force that states none; or "".
+
+    It is "kN" for kN_force, and "mN or MN" for FORCE_MN.
+    """
+    if _quantity(channel) != "N" or split(channel)[1]:
+        return ""
+    for word in re.findall(r"%|[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z][a-z])", " ", channel)):
+        meant = [] if len(word) < 2 else list(SPELLINGS.get(word.lower(), ()))
+        parsed = {parse(unit) for unit in meant}
+        if any(item and item[0] not in NO_FORCE and item != ("N", 1.0) for item in parsed):
+            return " or ".join(meant[: len(parsed)])
+        if MAYBE_UNIT.fullmatch(word) and not meant:
+            return str(word)
+    return ""
+
+
+def _quantity(channel: str) -> str:
+    """Return the dimension of a channel by its name: "Nm" for a torque, "N" for a force, or ""."""
+    if TORQUE_NAME.fullmatch(channel) or TORQUE_AXIS.fullmatch(channel):
+        return "Nm"
+    return "N" if FORCE_NAME.fullmatch(channel) else ""
 
 
 def factor(unit: str, other: str) -> float | None:
@@ -140,20 +179,43 @@ def split(name: str) -> tuple[str, str]:
     """
     plain = COMMENT_MARK.sub("", name.strip())
     if match := BRACKETED.fullmatch(plain):
-        unit = spelling(match["unit"])
+        unit = _spelling_of(match["name"], match["unit"])
         return (match["name"], unit) if parse(unit) else (plain, "")
     if match := SLASHED.fullmatch(plain):
         before = match["name"] or match["other"]
-        unit = spelling(match["unit"] or match["such"])
+        unit = _spelling_of(before, match["unit"] or match["such"])
         return (before, unit) if parse(unit) else (plain, "")
     match = ENDING.fullmatch(plain)
     if match is None:
-        return plain, ""
-    unit = spelling(match["unit"]) if plain.isupper() else match["unit"]  # FORCE_KN
-    # One letter is more often an axis or an index, as in v_s, than a unit, except N. The `in` of
-    # `pos_in` is no inch.
-    is_unit = (len(unit) > 1 or unit == "N") and unit not in ALONE and parse(unit)
-    return (match["name"], unit) if is_unit else (plain, "")
+        match = JOINED.fullmatch(plain)
+        match = match if match and _quantity(match["name"]) else None
+    unit = _unit_at_end(*match.groups()) if match else ""
+    return (match["name"], unit) if match and unit else (plain, "")
+
+
+def _spelling_of(name: str, unit: str) -> str:
+    """Return a unit as `spelling` does; nm of a torque is Nm."""
+    return "Nm" if unit == "nm" and _quantity(name) == "Nm" else spelling(unit)
+
+
+def _unit_at_end(name: str, text: str) -> str:
+    """Return the unit that stands at the end of a name, behind `name`, in any case; "" for none.
+
+    A unit of the quantity that the name has is preferred: Nm in torque_nm. It is "" for a text that
+    may be two units, as MN if all is in capitals. One letter is more often an axis or an index, as
+    in v_s, than a unit, except N; the `in` of `pos_in` is no inch, and `F_rad` is radial.
+    """
+    quantity = _quantity(name)
+    alike = {unit: parse(unit) for unit in (text, *SPELLINGS.get(text.lower(), ()))}
+    meant = {unit: parsed for unit, parsed in alike.items() if parsed is not None}
+    meant = {unit: meant[unit] for unit in meant if meant[unit][0] == quantity} or meant
+    is_rate = text == "Hz" and name[-1:].isdigit()  # SR: 400 Hz
+    no_units = {"Nm": ALONE, "N": ["rad", "in", "ft"]}.get(quantity, ["in", "ft"])
+    if is_rate or text.lower() in no_units or (len(text) < 2 and text != "N"):
+        return ""
+    if text in meant and not (name + text).isupper():
+        return text
+    return next(iter(meant)) if len(set(meant.values())) == 1 else ""
 
 
 def words_in(name: str) -> list[str]:

@@ -2769,6 +2769,35 @@ def test_a_unit_that_nothing_states_is_unknown_unless_the_name_is_that_of_a_forc
         assert load_dataset(source, channel=name, unit="N·cm").unit == "N·cm"
 
 
+UNITS_AT_ENDS = {
+    **dict.fromkeys(("force_kn", "FORCE_KN", "FZ_kN", "forcekN", "ForceKN", "load.kn"), "kN"),
+    **dict.fromkeys(("torque_nm", "TorqueNm", "M_NM", "Torque [nm]"), "Nm"),
+    "torque_ncm": "Ncm",
+    "torque_cnm": "cNm",
+    "weg_nm": "nm",
+    "F_rad": "N",
+    "F_n": "N",
+    "f_lbf": "lbf",
+    "kraft_dan": "daN",
+    "druck_mbar": "mbar",
+    "force_MN": "MN",
+    **dict.fromkeys(("FORCE_MN", "force_mn", "force_kn_1x", "kN_force", "force_mv"), ""),
+}
+
+
+@pytest.mark.parametrize("name", UNITS_AT_ENDS)
+def test_a_unit_in_a_name_is_read_in_any_case_and_one_that_may_be_another_is_not_guessed(
+    name: str, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        write_csv(tmp_path / f"{i:03}_{word}.csv", x, (name,))
+    data = load_dataset(tmp_path, channel=name)
+    assert data.unit == UNITS_AT_ENDS[name]
+    notes = [note for note in data.notes if f"The name {name} may tell a unit" in note]
+    assert len(notes) == (data.unit == "")
+    assert load_dataset(tmp_path, channel=name, unit=data.unit or "kN").notes == ()
+
+
 def test_of_two_channels_each_has_its_own_unit_or_none(small: Dataset, tmp_path: Path) -> None:
     X = np.stack([small.X, small.X], axis=1)
     np.savez(tmp_path / "a.npz", X=X, y=small.y, channels=np.array(["FZ", "Torque"]))
