@@ -35,6 +35,8 @@ UNREADABLE: tuple[type[Exception], ...] = (
 # First bytes of a store, and of its write-ahead log.
 DATABASES = (b"SQLite format 3\0", b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
 SPECIAL_FILES = {stat.S_IFLNK: "link", stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe"}
+ZIP = b"PK"
+NUMPY = b"\x93NUMPY"
 MANIFEST = "manifest.json"
 MIN_KEY_BYTES = 16
 
@@ -140,16 +142,32 @@ def read_archive(
         which are not unpacked, or these arrays need too much memory (see `check_size`).
     """
     title = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
-    file = io.BytesIO(source) if isinstance(source, bytes) else source
-    kind = "an .npz file of plain arrays"
-    with read_errors(title, kind), np.load(file, allow_pickle=False) as archive:
-        if not isinstance(archive, np.lib.npyio.NpzFile):
+    with (
+        read_errors(title, "an .npz file of plain arrays"),
+        io.BytesIO(source) if isinstance(source, bytes) else Path(source).open("rb") as file,
+    ):
+        head = file.read(len(NUMPY))
+        if head == NUMPY:
             raise ValueError("it is a single array")
+        if why := damage_of(head, ZIP, zipfile.is_zipfile(file)):
+            raise ValueError(why)
+        file.seek(0)
+        archive = np.load(file, allow_pickle=False)
         members = archive.zip.infolist()
         sizes = {member.filename.removesuffix(".npy"): member.file_size for member in members}
         wanted = [key for key in sizes if names is None or key in names]
         check_size(sum(sizes[key] for key in wanted), title)
         return {key: np.asarray(archive[key]) for key in wanted}, list(sizes)
+
+
+def damage_of(head: bytes, magic: bytes, is_whole: bool) -> str:
+    """Return why a file is not of a kind, by its first bytes; "" if it begins and ends as one.
+
+    magic : with which files of the kind begin.
+    """
+    if not head.startswith(magic):
+        return "it is none" if head else "it is empty"
+    return "" if is_whole else "the file is cut off"
 
 
 def is_database(path: Path) -> bool:

@@ -7,6 +7,7 @@ calls `read_archive_each` for a folder of which `hold_one_each` is true.
 
 from __future__ import annotations
 
+import zipfile
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
@@ -17,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
-from ..files import read_archive
+from ..files import read_archive, read_errors
 from ..traces import is_time_column
 from . import labels
 from .columns import choose_channels
 from .dataset import (
     Dataset,
+    Fault,
     LoadOptions,
     Reading,
     Recording,
@@ -36,6 +38,29 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LABEL = "y"
+
+
+def find_whole(named: Mapping[str, Path]) -> tuple[dict[str, Path], list[Fault]]:
+    """Return the archives of a folder that can be unpacked, and the faults of the others.
+
+    A single archive is not tried. Raises DataError if this leaves none.
+    """
+    if len(named) == 1:
+        return dict(named), []
+    whole = dict[str, Path]()
+    faults = list[Fault]()
+    for name, path in named.items():
+        try:
+            read_archive(path, (), name=path.name)
+            with read_errors(path.name, "an .npz file"), zipfile.ZipFile(path) as archive:
+                if (member := archive.testzip()) is not None:
+                    raise ValueError(f"{member} in it is damaged")
+            whole[name] = path
+        except DataError as error:
+            faults.append(Fault(name, 0, str(error).rstrip(".")))
+    if not whole:
+        raise DataError(f"{faults[0].message}.")
+    return whole, faults
 
 
 def hold_one_each(named: Mapping[str, Path], options: LoadOptions) -> bool:

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 import zlib
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
 
-from ..errors import instead
-from ..files import read_errors
+from ..errors import instead, shortened
+from ..files import UNREADABLE, damage_of, read_errors
 from .dataset import UnreadableError
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ PARQUET = (".parquet", ".pq")
 JSON = (".json", ".jsonl", ".ndjson")
 PACKED = ".gz"
 GZIP = b"\x1f\x8b"
+PARQUET_MAGIC = b"PAR1"
+JSON_STRING = re.compile(r'"(?:\\.|[^"\\])*"')
 # First bytes -> what such a file is, and what to do.
 KINDS = {
     b"PK\x03\x04": ("a workbook or a zip archive", "save the sheet as CSV, or unpack it"),
@@ -89,15 +93,23 @@ def open_text(path: Path) -> IO[bytes]:
     return opened
 
 
+@contextmanager
+def unpack_errors() -> Iterator[None]:
+    """Context manager that raises UnreadableError for a packed file that is damaged."""
+    message = "Cannot unpack it"
+    with instead(UnreadableError, message, zlib.error, gzip.BadGzipFile):
+        try:
+            yield
+        except EOFError as error:
+            raise UnreadableError(f"{message}, the file is cut off") from error
+
+
 def read_content(path: Path) -> bytes:
     """Return the bytes of a text file as `open_text` gives them.
 
     Raises UnreadableError, also for more than 128 MB and a packed file that is damaged.
     """
-    with (
-        instead(UnreadableError, "Cannot unpack it", EOFError, zlib.error),
-        open_text(path) as file,
-    ):
+    with unpack_errors(), open_text(path) as file:
         content = file.read(LARGEST + 1)
     if len(content) > LARGEST:
         wanted = f"at most {LARGEST // 2**20} MB"
@@ -112,43 +124,63 @@ def is_text(path: Path) -> bool:
     return False
 
 
-def read_frame(path: Path, content: bytes = b"") -> pd.DataFrame | None:
+def read_frame(path: Path) -> tuple[pd.DataFrame, dict[int, str]] | None:
     """Read a Parquet or JSON file as a table; its rows count from 1. None for another suffix.
 
     JSON is a list of objects, an object on each line, one list of objects in an object, an object
     with lists of numbers, which is a single row, or an object that gives each name a label or an
-    object. An index that has a name is a column of the table.
+    object. An index that has a name is a column of the table. Lines of objects that cannot be read
+    are returned apart, each with what is wrong.
 
-    content : of the file, if it was read. Raises DataError for a file that is none of these.
+    Raises UnreadableError for a file that is none of these, and DataError if pyarrow is missing.
     """
     import pandas as pd
 
-    frame = None
+    wrong = dict[int, str]()
     if suffix_of(path) in PARQUET:
-        with read_errors(path, "a Parquet file", "pyarrow", "files"):
+        with (
+            read_errors(path, "a Parquet file", "pyarrow", "files"),
+            instead(UnreadableError, "Expected a Parquet file", *UNREADABLE),
+        ):
+            content = path.read_bytes()
+            if why := damage_of(content[:4], PARQUET_MAGIC, content.endswith(PARQUET_MAGIC)):
+                raise ValueError(why)
             frame = pd.read_parquet(path)
         if any(frame.index.names):
             frame = frame.reset_index()
+        frame = number_rows(frame)
     elif suffix_of(path) in JSON:
-        with read_errors(path, "a list of JSON objects"):
-            rows = _json_rows((content or path.read_bytes()).decode("utf-8-sig"))
-            frame = pd.json_normalize(rows)
-    if frame is not None and frame.empty:
+        with instead(UnreadableError, "Expected JSON, an object or a list of them", *UNREADABLE):
+            content = path.read_bytes()
+            kind = binary_kind(content[:HEAD])
+            if kind and not content.startswith((b"[", b"{")):
+                raise ValueError(f"it is {kind}")
+            rows, wrong = _json_rows(content.decode("utf-8-sig"))
+            frame = number_rows(pd.json_normalize(list(rows.values()))).set_axis(list(rows))
+    else:
+        return None
+    if frame.empty:
         raise UnreadableError("Expected columns and rows, it is empty")
-    return None if frame is None else number_rows(frame)
+    return frame, wrong
 
 
-def _json_rows(text: str) -> list[dict[str, Any]]:
-    """Return the rows in a JSON text; ValueError if there are none."""
-    rows: Any = None
-    with suppress(ValueError):
+def _json_rows(text: str) -> tuple[dict[int, dict[str, Any]], dict[int, str]]:
+    """Return the rows in a JSON text by their numbers, and what is wrong with other lines.
+
+    Raises ValueError if there are none.
+    """
+    try:
         rows = json.loads(text)
-    if rows is None:
-        rows = [json.loads(line) for line in text.splitlines() if line.strip()]
+    except ValueError as error:
+        in_lines, wrong = _json_lines(text)
+        if len(in_lines) > len(wrong) or len(in_lines) == len(wrong) == 1:
+            return in_lines, wrong
+        why = "the file is cut off" if _is_open(text) else str(error)
+        raise ValueError(why if text.strip() else "it is empty") from error
     if isinstance(rows, dict):
         items = [value[0] for value in rows.values() if isinstance(value, list) and value]
         if any(isinstance(item, int | float) for item in items):
-            return [rows]
+            return {1: rows}, {}
         lists = [value for value in rows.values() if isinstance(value, list)]
         if lists and any(isinstance(value, str) for value in rows.values()):
             pieces = next(name for name, value in rows.items() if value in lists)
@@ -161,7 +193,32 @@ def _json_rows(text: str) -> list[dict[str, Any]]:
         rows = lists[0] if len(lists) == 1 else named
     if not rows or not all(isinstance(row, dict) and row for row in rows):
         raise ValueError("it is none")
-    return list(rows)
+    return dict(enumerate(rows, start=1)), {}
+
+
+def _json_lines(text: str) -> tuple[dict[int, dict[str, Any]], dict[int, str]]:
+    """Return the objects in the lines of a text, and what is wrong with other lines."""
+    rows = dict[int, dict[str, Any]]()
+    wrong = dict[int, str]()
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            row = json.loads(line)
+            if not isinstance(row, dict) or not row:
+                raise ValueError(f"got {shortened(line)}")
+            rows[number] = row
+        except ValueError as error:
+            why = "it is cut off" if _is_open(line) else str(error)
+            wrong[number] = f"Expected an object in JSON, {why}"
+    return rows, wrong
+
+
+def _is_open(text: str) -> bool:
+    """Return whether a JSON text begins with a bracket, and one never closes."""
+    bare = JSON_STRING.sub("", text)
+    n_open = sum(map(bare.count, "[{")) - sum(map(bare.count, "]}"))
+    return text.lstrip()[:1] in ("[", "{") and n_open > 0
 
 
 def number_rows(frame: pd.DataFrame) -> pd.DataFrame:

@@ -45,6 +45,7 @@ from .containers import (
     binary_kind,
     open_text,
     suffix_of,
+    unpack_errors,
 )
 from .dataset import (
     Dataset,
@@ -61,6 +62,7 @@ from .numerals import UndecidedError, is_numeral
 from .text import SUFFIXES as TEXTS
 from .text import (
     TextCells,
+    TextTable,
     fields_beside,
     read_recording,
     read_table,
@@ -99,12 +101,13 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
     }
     counts = Counter(map(suffix_of, named.values()))
     firsts = {suffix_of(path): path for path in named.values()}
+    of_suffix = {suffix: [p for p in named.values() if suffix_of(p) == suffix] for suffix in counts}
     # Beside these, CSV files list labels, or one of these lists those of many CSV files.
     most = max(counts[suffix] for suffix in TEXTS)
     chosen = [suffix for suffix in NO_TEXTS if most <= FEW_LISTINGS * counts[suffix] > 0]
     if not chosen:
         usual = [suffix for suffix in counts if suffix in TEXTS]
-        heads = {suffix: _first_rows(firsts[suffix], options) for suffix in counts}
+        heads = {suffix: _longest_head(of_suffix[suffix], options) for suffix in counts}
         # Files of a few lines beside each recording tell of it.
         tables = [suffix for suffix in usual if len(heads[suffix].rows) > FEW_ROWS]
         most = max((counts[suffix] for suffix in tables or usual), default=0)
@@ -125,6 +128,12 @@ def find_recordings(folder: Path, options: LoadOptions) -> dict[str, Path]:
         raise DataError(_no_recordings(folder, firsts))
     names = [name for name, path in named.items() if suffix_of(path) in chosen]
     return {name: named[name] for name in sorted(names, key=natural_key)}
+
+
+def _longest_head(paths: Sequence[Path], options: LoadOptions) -> TextCells:
+    """Return the first rows of the first file, or of one of the next if they have more."""
+    heads = [_first_rows(path, options) for path in paths[: -FEW_LISTINGS - 1 : -1]]
+    return max(heads, key=lambda cells: min(len(cells.rows), FEW_ROWS + 1))
 
 
 def _no_recordings(folder: Path, firsts: Mapping[str, Path]) -> str:
@@ -223,7 +232,7 @@ def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptio
 
     The first file's type and columns tell, with the names of all and the user's options. True for
     Parquet and .npz files, unread: whether an archive holds one insertion, `hold_one_each` tells
-    later. Raises DataError if the first file cannot be read.
+    later. Raises DataError if no file can be read.
     """
     path = next(iter(named.values()))
     if suffix_of(path) in (*NO_TEXTS, *JSON):
@@ -248,11 +257,25 @@ def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptio
         return True
     if not has_label and options.part not in header:
         return False
-    return bool(long_table_advice(read_table(path, options).frame, options, ""))
+    return bool(long_table_advice(_first_readable(named, options)[1].frame, options, ""))
+
+
+def _first_readable(named: Mapping[str, Path], options: LoadOptions) -> tuple[str, TextTable]:
+    """Return the name and the table of the first file that can be read.
+
+    Raises DataError if none can.
+    """
+    last_error: Exception = DataError("")
+    for name, path in named.items():
+        try:
+            return name, read_table(path, options)
+        except (UnreadableError, OSError) as error:
+            last_error = error
+    raise DataError(f"Cannot read {path}: {last_error}.") from last_error
 
 
 def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
-    """Raise DataError with advice if neither first, middle nor last file can be decoded.
+    """Raise DataError with advice if no file can be decoded.
 
     Also if some files have a name of the options, as of a channel, only in another encoding.
     """
@@ -260,11 +283,11 @@ def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
     names = [*options.channels, *options.words, *filter(None, columns)]
     if not all(map(str.isascii, names)):
         for path in paths[:: max(len(paths) // TRIED, 1)]:
-            with suppress(OSError):
+            with suppress(OSError, UnreadableError):
                 if advice := missing_name(_first_lines(path), names, options.encoding):
                     raise DataError(f"Cannot read {path}: {advice}.")
     error: UnreadableError | None = None
-    for path in (paths[0], paths[len(paths) // 2], paths[-1]):
+    for path in (paths[0], paths[len(paths) // 2], paths[-1], *paths):
         try:
             with suppress(OSError):
                 decode(_first_lines(path), options.encoding)
@@ -275,8 +298,11 @@ def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
 
 
 def _first_lines(path: Path) -> bytes:
-    """Return the complete lines among the first 256 KiB of a file. Raises OSError."""
-    with open_text(path) as file:
+    """Return the complete lines among the first 256 KiB of a file.
+
+    Raises OSError, and UnreadableError for one that is no text or damaged.
+    """
+    with unpack_errors(), open_text(path) as file:
         return file.read(2**18).rpartition(b"\n")[0]
 
 
@@ -497,7 +523,7 @@ def _has_label_column(named: Mapping[str, Path], heads: FolderHeads, options: Lo
         _, columns = _label_source(named, heads, options)
         if columns:
             source = labels.labels_in_column(named, columns[0], options)
-            return count_labels([next(iter(named))], source)[None] == 0
+            return count_labels([_first_readable(named, options)[0]], source)[None] == 0
     return False
 
 

@@ -24,7 +24,7 @@ from ..files import is_database, read_archive, read_errors
 from ..records import stored_trace_spec
 from ..traces import as_trace, as_traces, is_time_column, spec_of
 from . import units
-from .archives import hold_one_each, read_archive_each
+from .archives import find_whole, hold_one_each, read_archive_each
 from .bags import is_stream, read_bag
 from .clocks import RATE_NAMES, STEP_NAMES, clock_of, rate_of
 from .columns import FORCE
@@ -269,8 +269,7 @@ def _find_file_reader(
         read = partial(read_tables, named, name, options)
         return ("label", "labels", "time", *TEXT_FORMAT), read
     if path.is_dir() or path.suffix.lower() == NPZ or _is_archive(path):
-        read_npz = read_archive_each if hold_one_each(named, options) else _read_npz
-        return ("label", "labels", "time"), partial(read_npz, named, name, options)
+        return ("label", "labels", "time"), partial(_read_archives_of_set, named, name, options)
     with path.open("rb") as file:
         kind = binary_kind(file.read(HEAD))
     raise DataError(f"Expected a text file, or one {FORMS}, got {path}, {kind}.")
@@ -324,6 +323,19 @@ def _read_store(path: Path, name: str, options: LoadOptions) -> Dataset:
         fit=spec.fit,
     )
     return refit(data, options)
+
+
+def _read_archives_of_set(named: Files, name: str, options: LoadOptions) -> Dataset:
+    """Read archives, one for each insertion or of many; those that are damaged are faults."""
+    whole, faults = find_whole(named)
+    read = read_archive_each if hold_one_each(whole, options) else _read_npz
+    try:
+        data = read(whole, name, options)
+    except DataError as error:
+        if not faults:
+            raise
+        raise DataError(f"{error} Not read: {listed(faults)}.") from error
+    return replace(data, faults=(*faults, *data.faults))
 
 
 def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:

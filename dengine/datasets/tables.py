@@ -7,8 +7,10 @@ sample and a column of parts. `load_dataset` calls `read_tables` and `from_frame
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,20 +52,23 @@ NO_PARTITION = "__HIVE_DEFAULT_PARTITION__"
 def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> Dataset:
     """Read text and Parquet files that are tables of one form, one after the other.
 
-    Raises DataError if one cannot be read or has no rows, or their columns or units differ.
+    One that cannot be read or has no rows is a fault. Raises DataError if this leaves none, or may
+    leave parts incomplete, or if their columns or units differ.
     """
     collector = RecordingCollector(name, ())
     tables: dict[str, TextTable] = {}
+    unread: list[Fault] = []
     for source, path in named.items():
         try:
             table = read_table(path, options)
-        except UnreadableError as error:
-            fault = Fault(path.name, error.line, str(error).rstrip("."))
-            raise DataError(f"Cannot read {path}: {fault}.") from error
-        if table.frame.empty:
-            end = f"the header in line {table.line} is its last row"
-            why = str(next(iter(table.faults), end)).rstrip(".")
-            raise DataError(f"Expected rows that can be read in {path}, found none: {why}.")
+            if table.frame.empty:
+                end = f"the header in line {table.line} is its last row"
+                why = str(next(iter(table.faults), end)).rstrip(".")
+                raise UnreadableError(f"Expected rows that can be read, found none: {why}")
+        except (OSError, UnreadableError) as error:
+            line = getattr(error, "line", 0)
+            unread.append(Fault(source, line, str(error).rstrip(".")))
+            continue
         for key, value in PARTITION.findall(source):
             is_used = key in (options.label, options.part) or key.lower() in labels.LABEL_COLUMNS
             if is_used and key not in table.frame:
@@ -73,6 +78,9 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
         collector.notes.update(table.notes)
         others = (str(other) for other in path.parent.glob("*.csv") if other not in named.values())
         collector.label_file = next(others, collector.label_file)
+    if unread:
+        _check_parts_are_whole(named, tables, unread, options)
+        collector.faults += unread
     first = next(iter(tables))
     for source, table in tables.items():
         units_of = dict(zip(tables[first].frame.columns, tables[first].units, strict=False))
@@ -82,6 +90,40 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
                 actual = f"{other or 'none'} and {unit or 'none'}"
                 raise DataError(f"Expected {wanted}, got {actual}; convert one.")
     return _from_tables(tables, options, collector)
+
+
+def _check_parts_are_whole(
+    named: Mapping[str, Path],
+    tables: Mapping[str, TextTable],
+    unread: Sequence[Fault],
+    options: LoadOptions,
+) -> None:
+    """Raise DataError if no file is left, or parts may have had rows in a file that is not.
+
+    They may if parts lie in several files, or no two files in a row are left that show where parts
+    end; so do windows that count from the start of a recording whose first file is lost.
+    """
+    why = f"Cannot read {named[unread[0].source]}: {unread[0]}"
+    if not tables:
+        raise DataError(f"{why}.")
+    parts_of = {
+        source: set(map(str, table.frame[options.part]))
+        for source, table in tables.items()
+        if options.part in table.frame
+    }
+    in_order = list(named)
+    pairs = [pair for pair in itertools.pairwise(in_order) if {*pair} <= {*tables}]
+    n_files = Counter(itertools.chain.from_iterable(parts_of.values()))
+    has_rows = any(len(parts_of[source]) < len(tables[source].frame) for source in parts_of)
+    has_several = any(len(parts) > 1 for parts in parts_of.values())
+    lost = "parts have rows in several files"
+    is_lost = max(n_files.values(), default=1) > 1
+    if has_rows and has_several and not (is_lost or pairs):
+        is_lost, lost = True, "parts may have rows in several files"
+    if not parts_of and options.labels is not None and unread[0].source == in_order[0]:
+        is_lost, lost = True, "it is the first file, in which the recording begins"
+    if is_lost:
+        raise DataError(f"{why}; {lost}: mend it, or move it away with the parts that it may have.")
 
 
 def from_frame(frame: pd.DataFrame, options: LoadOptions) -> Dataset:

@@ -880,15 +880,17 @@ def read_table(
     Raises
     ------
     UnreadableError
-        If the file is empty or too large, is no text or cannot be decoded, has no header, or its
-        number format is undecided.
-    DataError
-        If a Parquet or JSON file cannot be read as a table.
+        If the file is empty, cut off or too large, is no text or cannot be decoded, has no header,
+        or its number format is undecided, or if it is no table in Parquet or JSON.
     """
     import pandas as pd
 
     if (stored := read_frame(path)) is not None:
-        return TextTable(as_texts(stored) if as_text else stored, [], 0, [], "")
+        frame, odd_lines = stored
+        faults = [Fault(path.name, i, message) for i, message in odd_lines.items()]
+        table = TextTable(as_texts(frame) if as_text else frame, faults, 0, [], "")
+        last = max(odd_lines, default=0)
+        return table._replace(cut_line=last) if last > max(frame.index) else table
     text, encoding = decode(read_content(path), options.encoding)
     cells = split_cells(text, options.columns)
     if not cells.header:

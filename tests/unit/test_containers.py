@@ -4,6 +4,7 @@ of these is refused by its kind.
 
 import gzip
 import json
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -121,14 +122,104 @@ def test_tables_of_a_rarer_suffix_are_named_in_a_note(tmp_path: Path) -> None:
     assert data.notes == ("Not read, for most files are .csv: late_OK.asc.",)
 
 
-def test_a_packed_file_that_is_cut_off_is_a_fault_and_the_others_are_read(tmp_path: Path) -> None:
-    folder = write_recordings(tmp_path / "cell", ".csv.gz")
-    cut = folder / "rec_001_OK.csv.gz"
-    cut.write_bytes(cut.read_bytes()[:60])
-    data = load_dataset(folder)
-    assert len(data) == N - 1
-    assert data.faults[0].source == "rec_001_OK.csv"
-    assert "Cannot unpack it" in data.faults[0].message
+FORCES = np.random.default_rng(0).normal(10.0, 1.0, (N, 30)).round(3)
+SECONDS = np.arange(30) / 500
+
+
+def as_rows(i: int) -> pd.DataFrame:
+    rows = {"part": f"S{i}", "time": SECONDS, "FZ": FORCES[i], "result": WORDS[i]}
+    return pd.DataFrame(rows)
+
+
+def as_object(i: int) -> dict[str, object]:
+    return {"serial": f"S{i}", "result": WORDS[i], "FZ": FORCES[i].tolist()}
+
+
+def as_wide(i: int) -> pd.DataFrame:
+    columns = [f"FZ_{k}" for k in range(30)]
+    return pd.DataFrame(FORCES[[i]], columns=columns).assign(result=WORDS[i])
+
+
+LONG = {"part": "part", "time": "time"}
+# Name of a file of one recording -> how it is written, and the options to read a folder of them.
+KINDS: dict[str, tuple[Callable[[Path, int], object], dict[str, str]]] = {
+    "object.json": (lambda path, i: path.write_text(json.dumps(as_object(i))), {}),
+    "list.json": (lambda path, i: path.write_text(json.dumps([as_object(i)], indent=1)), {}),
+    "line.jsonl": (lambda path, i: path.write_text(json.dumps(as_object(i)) + "\n"), {}),
+    "list.parquet": (lambda path, i: pd.DataFrame([as_object(i)]).to_parquet(path), {}),
+    "wide.parquet": (lambda path, i: as_wide(i).to_parquet(path), {}),
+    "wide.csv.gz": (lambda path, i: as_wide(i).to_csv(path, index=False), {}),
+    "long.parquet": (lambda path, i: as_rows(i).to_parquet(path), LONG),
+    "long.csv.gz": (lambda path, i: as_rows(i).to_csv(path, index=False), LONG),
+    "each.csv.gz": (lambda path, i: as_rows(i).drop(columns="part").to_csv(path, index=False), {}),
+    "each.npz": (lambda path, i: np.savez(path, FZ=FORCES[i], y=LABELS[i], rate_hz=500.0), {}),
+    "set.npz": (
+        lambda path, i: np.savez(path, FZ=FORCES[[i, i]], y=[LABELS[i]] * 2, rate_hz=500.0),
+        {"label": "y"},
+    ),
+}
+BINARY = bytes(np.random.default_rng(1).integers(0, 256, 500, dtype=np.uint8))
+DAMAGES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "cut": (lambda content: content[: len(content) // 2], "the file is cut off"),
+    "empty": (lambda _: b"", "it is empty"),
+    "binary": (lambda _: BINARY, "it is (none|a binary file)"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("place", [0, N // 2, N - 1])
+def test_a_file_of_a_folder_that_is_damaged_is_a_fault_and_the_others_are_read(
+    kind: str, damage: str, place: int, tmp_path: Path
+) -> None:
+    write, options = KINDS[kind]
+    stem, _, suffix = kind.partition(".")
+    paths = [tmp_path / f"{stem}_{i:02d}.{suffix}" for i in range(N)]
+    for i, path in enumerate(paths):
+        write(path, i)
+    change, why = DAMAGES[damage]
+    paths[place].write_bytes(change(paths[place].read_bytes()))
+    data = load_dataset(tmp_path, channel="FZ", **options)
+    rows = np.repeat(np.arange(N), 2 if kind == "set.npz" else 1)
+    rows = rows[rows != place]
+    np.testing.assert_array_equal(data.X, FORCES[rows].astype(np.float32))
+    np.testing.assert_array_equal(data.y, np.array(LABELS)[rows])
+    (fault,) = data.faults
+    assert fault.source == paths[place].name.removesuffix(".gz")
+    assert re.search(why, fault.message)
+
+
+def test_a_folder_of_damaged_files_is_refused_with_the_first_of_them(tmp_path: Path) -> None:
+    for i in range(3):
+        (tmp_path / f"part_{i}.json").write_text(json.dumps(as_object(i))[:200])
+    with pytest.raises(DataError, match=r"part_0\.json: Expected JSON, an object .* is cut off"):
+        load_dataset(tmp_path, channel="FZ")
+
+
+@pytest.mark.parametrize("n_files", [2, 5])
+def test_parts_that_may_have_rows_in_a_damaged_file_are_not_read(
+    n_files: int, tmp_path: Path
+) -> None:
+    rows = pd.concat(map(as_rows, range(N)))
+    for i, places in enumerate(np.array_split(np.arange(len(rows)), n_files)):
+        rows.iloc[places].to_parquet(tmp_path / f"part-{i}.parquet")
+    broken = tmp_path / f"part-{n_files // 2}.parquet"
+    broken.write_bytes(broken.read_bytes()[:-9])
+    with pytest.raises(DataError, match=f"{broken.name}.* is cut off; parts .* in several files"):
+        load_dataset(tmp_path, channel="FZ", **LONG)
+
+
+def test_a_line_of_json_that_is_cut_off_is_a_fault_and_the_others_are_read(tmp_path: Path) -> None:
+    lines = [json.dumps(as_object(i)) for i in range(N)]
+    lines[4] = lines[4][:80] + "\0" * 20
+    path = tmp_path / "parts.jsonl"
+    path.write_text("\n".join(lines)[:-50], encoding="utf-8")
+    data = load_dataset(path, channel="FZ", part="serial")
+    np.testing.assert_array_equal(data.X, np.delete(FORCES, [4, N - 1], axis=0).astype("f4"))
+    assert [(fault.line, fault.message) for fault in data.faults] == [
+        (5, "Expected an object in JSON, it is cut off"),
+        (N, "Expected an object in JSON, it is cut off"),
+    ]
 
 
 def test_a_folder_of_binary_files_is_refused_by_their_kind(tmp_path: Path) -> None:
