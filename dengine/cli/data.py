@@ -52,7 +52,7 @@ def data(source: DataChoice, out: Out | None) -> None:
 
     dataset = load_dataset(source.data, **source.options)
     survey = survey_dataset(dataset)
-    rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in", "duplicates_in"))
+    rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in"))
     if not survey.rate_hz:
         rows.append(("rate", "unknown"))
     if not survey.unit:
@@ -61,9 +61,6 @@ def data(source: DataChoice, out: Out | None) -> None:
     if survey.not_finite_in:
         files = listed(survey.not_finite_in)
         parts.append(f"Not finite, because cells are empty or hold no number: {files}.")
-    if survey.duplicates_in:
-        files = listed(survey.duplicates_in)
-        parts.append(f"Equal to an earlier recording, sample by sample: {files}.")
     parts.append(table_of_rows("How it was read", dataset.reading.items()))
     if dataset.ordered:
         drifts = map(_drift_row, survey.drift)

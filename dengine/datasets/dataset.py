@@ -6,12 +6,14 @@ up. `LoadOptions` are the options of `load_dataset`.
 """
 
 import codecs
+import hashlib
 import os
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -633,6 +635,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         `fit="strict"`.
     """
     collector.check_label_words()
+    leave_out_repeats(collector)
     _cut_padding(collector)
     _scale_counts(collector)
     as_read = {recording.source: recording for recording in collector.recordings}
@@ -690,6 +693,67 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         lengths=np.array(lengths_read, dtype=np.int64),
         rates=rates if np.isfinite(rates).any() else None,
     )
+
+
+def leave_out_repeats(collector: RecordingCollector) -> list[int]:
+    """Leave out recordings that repeat one of the same part, label and samples; a note names them.
+
+    Equal samples with different labels are faults, each of which names all of them. Equal samples
+    of different parts stay, with a note. Returns the positions of the recordings that stay. Raises
+    DataError if none does.
+    """
+    recordings = collector.recordings
+    reasons = dict[int, str]()
+    repeats = list[int]()
+    pairs = list[str]()
+    names = [
+        r.source if r.part in (None, r.source) else f"{r.source} ({r.part})" for r in recordings
+    ]
+    for equal in _equal_recordings(recordings):
+        of_label: tuple[list[str], list[str]] = ([], [])
+        for i, _ in equal:
+            of_label[recordings[i].label].append(names[i])
+        if all(of_label):
+            actual = f"good in {listed(of_label[1])}, bad in {listed(of_label[0])}"
+            why = f"Expected one label for the same samples, got {actual}; keep the right one"
+            reasons |= {i: why for i, _ in equal}
+            continue
+        first_of = dict[str, int]()  # of each part
+        repeats += [i for i, part in equal if first_of.setdefault(part, i) != i]
+        first, *others = [names[i] for i in first_of.values()]
+        pairs += [f"{other} as {first}" for other in others]
+    if repeats:
+        named = listed(recordings[i].part or recordings[i].source for i in sorted(repeats))
+        are = "repeats of a recording are" if len(repeats) > 1 else "repeat of a recording is"
+        text = f"{len(repeats)} {are} left out, of the same part, label and samples"
+        collector.notes[f"{text}: {named}"] = 1
+    if pairs:
+        collector.notes[f"Equal to another recording, sample by sample: {listed(pairs)}"] = 1
+    collector.leave_out(reasons)
+    kept = sorted({*range(len(recordings))} - {*reasons, *repeats})
+    collector.recordings = [recordings[i] for i in kept]
+    return kept
+
+
+def _equal_recordings(recordings: Sequence[Recording]) -> list[list[tuple[int, str]]]:
+    """Return the groups of recordings with equal samples, by their positions and parts.
+
+    Without a part's number a file's name tells the part, if all recordings of that name are equal.
+    Constant recordings are in no group, and those of fewer than `MANY` values, as of a switch, in
+    one with those of the same part alone: others may be equal by chance.
+    """
+    contents = [hashlib.blake2b(recording.trace.tobytes()).digest() for recording in recordings]
+    names = [PurePosixPath(recording.source).name for recording in recordings]
+    n_contents = Counter(name for name, _ in set(zip(names, contents, strict=True)))
+    n_equal = Counter(contents)
+    groups = dict[tuple[bytes, str], list[tuple[int, str]]]()
+    for i, (recording, content, name) in enumerate(zip(recordings, contents, names, strict=True)):
+        n_values = len(np.unique(recording.trace)) if n_equal[content] > 1 else 0
+        if n_values > 1:
+            part = recording.part or (name if n_contents[name] == 1 else recording.source)
+            key = "" if n_values >= MANY else part
+            groups.setdefault((content, key), []).append((i, part))
+    return [equal for equal in groups.values() if len(equal) > 1]
 
 
 def _fit_odd_lengths(

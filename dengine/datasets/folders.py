@@ -406,17 +406,19 @@ def _of_other_channels(
 def _leave_out_copies(collector: RecordingCollector) -> None:
     """Make faults of copies by a file manager, as `5_ok - Copy.csv` and `Copy of 5_ok.csv`.
 
-    A copy has the samples of the recording whose name is the same without what was added.
+    A copy has the samples and the label of the recording whose name is the same without what was
+    added.
     """
-    traces = {recording.source: recording.trace for recording in collector.recordings}
+    recordings = {recording.source: recording for recording in collector.recordings}
     reasons = {}
     for i, recording in enumerate(collector.recordings):
         path = PurePosixPath(recording.source)
         stem = labels.COPY_PREFIX.sub("", labels.COPY_SUFFIX.sub("", path.stem))
-        original = str(path.with_stem(stem or path.stem))
-        is_other = original != recording.source and original in traces
-        if is_other and np.array_equal(traces[original], recording.trace, equal_nan=True):
-            reasons[i] = f"Expected each recording once, it is a copy of {original}"
+        name = str(path.with_stem(stem or path.stem))
+        original = recordings.get(name, recording)
+        is_copy = original is not recording and original.label == recording.label
+        if is_copy and np.array_equal(original.trace, recording.trace, equal_nan=True):
+            reasons[i] = f"Expected each recording once, it is a copy of {name}"
     collector.leave_out(reasons)
 
 

@@ -44,6 +44,7 @@ from .dataset import (
     describe_reading,
     expect_data,
     guess_unit,
+    leave_out_repeats,
     make_dataset,
     odd_labels_note,
     refit,
@@ -437,7 +438,9 @@ def _refit_without_padding(data: Dataset, options: LoadOptions, *, has_unit: boo
     fitted = as_dataset(collector, replace(options, unit=about.unit))
     reading = {**about.reading, "first": fitted.reading["first"]}
     fitting_notes = [note for note in fitted.notes if note != UNKNOWN_RATE]
-    return replace(fitted, notes=(*about.notes, *fitting_notes), reading=reading)
+    faults = (*about.faults, *fitted.faults)
+    notes = (*about.notes, *fitting_notes)
+    return replace(fitted, notes=notes, faults=faults, reading=reading)
 
 
 def _arrays_by_meaning(
@@ -689,6 +692,7 @@ def _from_arrays(
         labels = np.array([to_label(word) for word in words.tolist()])
         X = np.atleast_1d(X)
     collector.check_label_words()
+    numbers = np.arange(1, len(labels) + 1)
     about["notes"] = tuple(f"{note}." for note in collector.notes)
     if collector.unlabelled and len(labels) == len(X):
         is_labelled = ~np.isnan(labels)
@@ -700,15 +704,38 @@ def _from_arrays(
             if about.get(key) is not None:
                 about[key] = np.asarray(about[key])[is_labelled]
         X = X[is_labelled]
+        numbers = numbers[is_labelled]
         labels = labels[is_labelled]
         words = words[is_labelled]
     data = make_dataset(X, labels, name=name, **{"unit": "", **about})
+    data, kept = _without_repeats(data, numbers)
+    words = words[kept]
     clock = "none, an array tells the rate" if data.rate_hz and not options.rate_hz else ""
     place = f"{'column' if options.labels else 'array'} {label}"
     readings = [Reading(place, str(word), clock) for word in words.tolist()]
     stated = options.rate_hz
     reading = describe_reading(readings, data.y.tolist(), "as the rows", rate_hz=stated)
     return replace(data, reading=reading)
+
+
+def _without_repeats(data: Dataset, numbers: NDArray[np.int64]) -> tuple[Dataset, list[int]]:
+    """Return a data set without the traces that `leave_out_repeats` leaves out, and the positions
+    of the others.
+
+    numbers : by which notes and faults name the traces, shape (n,).
+    """
+    collector = RecordingCollector(data.name, data.channels)
+    parts = [None] * len(data) if data.part is None else map(str, data.part)
+    for number, trace, label, part in zip(numbers, as_traces(data.X), data.y, parts, strict=True):
+        source = f"trace {number}"
+        collector.recordings.append(Recording(trace, label=int(label), source=source, part=part))
+    kept = leave_out_repeats(collector)
+    columns = dict[str, Any]()
+    for key in ("X", "y", "part", "cause"):
+        column = getattr(data, key)
+        columns[key] = None if column is None else column[kept]
+    notes = (*data.notes, *(f"{note}." for note in collector.notes))
+    return replace(data, faults=tuple(collector.faults), notes=notes, **columns), kept
 
 
 def _from_list(traces: list[Any], labels: list[Any], options: LoadOptions) -> Dataset:

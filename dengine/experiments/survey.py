@@ -80,8 +80,6 @@ class Survey:
         Files, or rows, of those that are not finite.
     duplicates, contradicting : int
         Traces equal to an earlier one, sample by sample; and those of them with another label.
-    duplicates_in : tuple of str
-        Files, or rows, of the traces that equal an earlier one.
     near_repeats, looked_at : int
         Among the newest `looked_at` usable traces: those that are much nearer to another part's
         trace than parts are to each other.
@@ -113,7 +111,6 @@ class Survey:
     too_large: int
     duplicates: int
     contradicting: int
-    duplicates_in: tuple[str, ...]
     near_repeats: int
     looked_at: int
     parts: int | None
@@ -164,7 +161,6 @@ def survey_dataset(data: Dataset) -> Survey:
         too_large=int(too_large.sum()),
         duplicates=int(is_duplicate.sum()),
         contradicting=int((labels != labels[firsts[contents]]).sum()),
-        duplicates_in=() if data.source is None else tuple(data.source[is_duplicate].tolist()),
         near_repeats=near_repeats(X[usable], part_hashes[usable]),
         looked_at=min(n_usable, NEWEST),
         parts=None if data.part is None else len(set(parts)),

@@ -571,11 +571,9 @@ def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset])
     X[50], y[50] = X[10], y[10]
     X[51], y[51] = X[11], 1 - y[11]
     X[52:60] = X[20:28] + np.float32(1e-3)
-    source = np.array([f"{i}.csv" for i in range(len(y))])
-    survey = survey_dataset(replace(data, X=X, y=y, source=source))
+    survey = survey_dataset(replace(data, X=X, y=y))
     assert (survey.not_finite, survey.constant, survey.too_large) == (1, 1, 1)
     assert (survey.duplicates, survey.contradicting) == (2, 1)
-    assert survey.duplicates_in == ("50.csv", "51.csv")
     assert 14 <= survey.near_repeats <= 20
     assert survey.looked_at == 117
     assert (survey.good + survey.bad, survey.lengths) == (120, None)

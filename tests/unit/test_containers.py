@@ -231,9 +231,9 @@ def test_a_folder_of_binary_files_is_refused_by_their_kind(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "cp1251"])
 def test_a_text_of_wide_characters_is_no_binary_file(encoding: str, tmp_path: Path) -> None:
-    rows = [f"{k / 500:.3f};{np.sin(k):.3f}" for k in range(30)]
-    content = "\n".join(["# Оператор Иванов", "Время;Сила", *rows, ""]).encode(encoding)
-    for name in ("a_OK.asc", "b_NOK.asc"):
+    for phase, name in enumerate(("a_OK.asc", "b_NOK.asc")):
+        rows = [f"{k / 500:.3f};{np.sin(k + phase):.3f}" for k in range(30)]
+        content = "\n".join(["# Оператор Иванов", "Время;Сила", *rows, ""]).encode(encoding)
         (tmp_path / name).write_bytes(content)
     data = load_dataset(tmp_path, channel="Сила", time="Время", encoding="cp1251")
     assert (len(data), data.faults) == (2, ())

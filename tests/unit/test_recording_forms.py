@@ -235,7 +235,7 @@ def test_a_clock_without_a_name_is_known_by_its_values(tmp_path: Path) -> None:
         data = load_dataset(folder)
         assert (data.channels, data.rate_hz) == (("FZ",), 250.0), name
         assert "by its values" in data.reading["clock"]
-    both = [frames["stamps"], frames["seconds"]]
+    both = [frames["stamps"], frames["seconds"] + 1]
     assert load_dataset((both, [1, 0])).rates.tolist() == [250.0, 250.0]
 
 
@@ -263,8 +263,9 @@ def test_a_date_beside_the_time_of_day_is_not_the_clock(tmp_path: Path) -> None:
 def test_without_a_clock_the_rate_is_unknown_and_a_column_that_rises_is_offered(
     tmp_path: Path,
 ) -> None:
-    for name in ("a_OK.csv", "b_NOK.csv"):
-        write(tmp_path / name, ["Weg", "Kraft"], times(form="{:.4f}", step=0.02), texts())
+    for i, name in enumerate(("a_OK.csv", "b_NOK.csv")):
+        cells = (times(form="{:.4f}", step=0.02), texts(VALUES + i))
+        write(tmp_path / name, ["Weg", "Kraft"], *cells)
     words = ("data", tmp_path, "--channel", "Kraft")
     shown = dengine(*words).stdout
     assert "500" not in shown
@@ -508,24 +509,24 @@ def test_each_channels_unit_is_the_headers(tmp_path: Path) -> None:
 def test_files_of_any_suffix_and_delimiter_are_read(
     suffix: str, delimiter: str, tmp_path: Path
 ) -> None:
-    for name in ("a_OK", "b_NOK"):
+    for i, name in enumerate(("a_OK", "b_NOK")):
         write(
             tmp_path / f"{name}{suffix}",
             ["time", "FZ"],
             times(),
-            texts(),
+            texts(VALUES + i),
             delimiter=DELIMITERS[delimiter],
         )
     (tmp_path / ("readme.txt" if suffix != ".txt" else "readme.dat")).write_text("of cell 3")
     data = load_dataset(tmp_path)
-    np.testing.assert_array_equal(data.X, np.tile(VALUES.astype(np.float32), (2, 1)))
+    np.testing.assert_allclose(data.X, [VALUES, VALUES + 1], rtol=1e-6)
     assert (data.y.tolist(), data.rate_hz, data.faults) == ([1, 0], 250.0, ())
     assert f"Not read, for most files are {suffix}: readme" in data.notes[0]
 
 
 def test_columns_without_a_header_are_named_as_the_error_advises(tmp_path: Path) -> None:
-    for name in ("a_OK.txt", "b_NOK.txt"):
-        np.savetxt(tmp_path / name, np.c_[1.7e9 + STEP * np.arange(N), 0 * VALUES, VALUES])
+    for i, name in enumerate(("a_OK.txt", "b_NOK.txt")):
+        np.savetxt(tmp_path / name, np.c_[1.7e9 + STEP * np.arange(N), 0 * VALUES, VALUES + i])
     refused = dengine("data", tmp_path)
     assert "line 1: Expected a header, its first line is of numbers" in refused.stderr
     advised = re.search(r"--columns (\S+?);", refused.stderr)[1]
@@ -679,7 +680,9 @@ def test_a_matrix_without_a_header_is_read_by_the_range_that_the_error_advises(
 ) -> None:
     """g11: the advice named 500 columns, and was cut off in the middle."""
     path = tmp_path / "m.csv"
-    path.write_text("\n".join(",".join([*texts(), str(i % 2)]) for i in range(4)))
+    path.write_text(
+        "\n".join(",".join([*texts(VALUES + i * (-1) ** i), str(i % 2)]) for i in range(4))
+    )
     with pytest.raises(DataError, match=rf"columns='c0\.\.c{N - 1},label'"):
         load_dataset(path)
     data = load_dataset(path, columns=f"c0..c{N - 1},label", rate_hz=500)
@@ -934,7 +937,7 @@ def test_lines_above_samples_without_a_header_are_counted(tmp_path: Path) -> Non
 
 
 def test_nan_behind_the_last_number_ends_a_trace_of_an_archive(tmp_path: Path) -> None:
-    X = np.tile(VALUES, (6, 1))
+    X = np.arange(6)[:, None] + VALUES
     X[0, 100:] = np.nan
     X[1, 20:] = np.nan
     np.savez(tmp_path / "a.npz", X=X, y=[1, 0, 1, 0, 1, 1], dt=0.004, part=np.arange(6) + 10)
@@ -1032,10 +1035,10 @@ def test_a_row_of_groups_above_the_header_is_none(tmp_path: Path) -> None:
 
 def test_the_samples_of_a_wide_table_may_be_named_by_their_times(tmp_path: Path) -> None:
     header = ["Serial", "Result", *german(times())]
-    rows = [[f"S{i}", "OK" if i % 2 else "NOK", *german(texts())] for i in range(4)]
+    rows = [[f"S{i}", "OK" if i % 2 else "NOK", *german(texts(VALUES + i))] for i in range(4)]
     (tmp_path / "w.csv").write_text("\n".join(";".join(row) for row in [header, *rows]))
     data = load_dataset(tmp_path / "w.csv", part="Serial")
-    np.testing.assert_array_equal(data.X, np.tile(VALUES.astype(np.float32), (4, 1)))
+    np.testing.assert_allclose(data.X, np.arange(4)[:, None] + VALUES, rtol=1e-6)
     assert (data.y.tolist(), data.rate_hz) == ([0, 1, 0, 1], None)
 
 
@@ -1072,8 +1075,8 @@ def test_a_list_whose_numbers_a_spreadsheet_has_shortened_is_told_so_at_once(
     tmp_path: Path,
 ) -> None:
     barcodes = [f"2403110{i:05d}" for i in range(12)]
-    for barcode in barcodes:
-        write(tmp_path / "data" / f"{barcode}.csv", ["time", "FZ"], times(), texts())
+    for i, barcode in enumerate(barcodes):
+        write(tmp_path / "data" / f"{barcode}.csv", ["time", "FZ"], times(), texts(VALUES + i))
     listing = tmp_path / "list.csv"
     rows = [
         f"{barcode};11.03.2024;{'OK' if i % 3 else 'NOK'}" for i, barcode in enumerate(barcodes)
@@ -1116,8 +1119,8 @@ def test_columns_of_one_name_are_named_apart_with_their_unit(tmp_path: Path) -> 
 
 
 def test_a_serial_number_of_two_recordings_leaves_the_others_their_labels(tmp_path: Path) -> None:
-    for name in ("A10", "A11", "A12", "A13_1", "A13_2"):
-        write(tmp_path / "data" / f"{name}_x.csv", ["time", "FZ"], times(), texts())
+    for i, name in enumerate(("A10", "A11", "A12", "A13_1", "A13_2")):
+        write(tmp_path / "data" / f"{name}_x.csv", ["time", "FZ"], times(), texts(VALUES + i))
     listing = tmp_path / "list.csv"
     rows = ["A10,1,OK", "A11,2,NOK", "A12,3,OK", "A13,4,NOK", "A13,5,OK"]
     listing.write_text("\n".join(["Seriennummer,Nr,Ergebnis", *rows]))
@@ -1239,6 +1242,7 @@ def test_rows_below_a_mark_of_the_end_are_left_out_with_a_note(mark: str, tmp_pa
     stale = [f"{t},400.0,1" for t in times(50)]
     lines = ["time,FZ,pos", *rows, mark, *stale, "Result,OK", ""]
     for i in range(2):
+        lines[1] = f"0.000,{VALUES[0] + i},1"
         (tmp_path / f"{i}.csv").write_text("\n".join(lines).replace("OK", "NOK" if i else "OK"))
     data = load_dataset(tmp_path, channel="FZ")
     np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
@@ -1513,8 +1517,8 @@ def test_a_part_whose_curve_is_in_pieces_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_states_a_column_states_it_of_the_tables_in_it(tmp_path: Path) -> None:
-    frame = pd.DataFrame({"force_N": list(parts_of_two().values())})
-    for result in ("PASS", "FAIL", "__HIVE_DEFAULT_PARTITION__"):
+    for scale, result in enumerate(("PASS", "FAIL", "__HIVE_DEFAULT_PARTITION__"), start=1):
+        frame = pd.DataFrame({"force_N": list(parts_of_two(scale).values())})
         folder = tmp_path / "line=3" / f"result={result}"
         folder.mkdir(parents=True)
         frame.to_parquet(folder / "part-0.parquet")
@@ -1533,7 +1537,7 @@ def test_the_only_signal_of_a_table_is_named_by_its_tag() -> None:
 def test_titles_may_stand_above_a_table_with_a_column_for_each_part(tmp_path: Path) -> None:
     numbers = [f"D{i}" for i in range(10)]
     verdicts = ["gut"] * 7 + ["Ausschuss"] * 3
-    rows = [[str(4 * i), *([cell] * 10)] for i, cell in enumerate(texts())]
+    rows = [[str(4 * i), *texts(value + np.arange(10))] for i, value in enumerate(VALUES)]
     head = [["AST40;Program 12"], ["Nummer", *numbers], ["Befund", *verdicts]]
     lines = [";".join(row) for row in [*head, ["Zeit [ms]", *["Moment [Nm]"] * 10], *rows]]
     path = tmp_path / "shift.csv"
@@ -1542,7 +1546,7 @@ def test_titles_may_stand_above_a_table_with_a_column_for_each_part(tmp_path: Pa
     data = load_dataset(path, label_map="Ausschuss=bad", part="Nummer")
     assert data.y.tolist() == [1] * 7 + [0] * 3
     assert data.part.tolist() == numbers
-    np.testing.assert_array_equal(data.X[9], VALUES.astype(np.float32))
+    np.testing.assert_allclose(data.X[9], VALUES + 9, rtol=1e-6)
 
 
 def test_rates_below_the_row_of_units_are_no_header(tmp_path: Path) -> None:
@@ -1554,7 +1558,7 @@ def test_rates_below_the_row_of_units_are_no_header(tmp_path: Path) -> None:
 
 
 def test_zeros_behind_the_length_of_each_trace_are_no_samples(tmp_path: Path) -> None:
-    X = np.tile(VALUES, (12, 1))
+    X = np.arange(12)[:, None] + VALUES
     lengths = np.array([N - 30, *[N] * 11])
     X[0, -30:] = 0.0
     y = np.array([0, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 0])
@@ -1567,7 +1571,7 @@ def test_zeros_behind_the_length_of_each_trace_are_no_samples(tmp_path: Path) ->
 
 
 def test_labels_of_which_most_are_bad_are_questioned(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", X=np.tile(VALUES, (12, 1)), y=np.array([0] * 7 + [1] * 5))
+    np.savez(tmp_path / "a.npz", X=np.arange(12)[:, None] + VALUES, y=np.array([0] * 7 + [1] * 5))
     note = "7 of 12 recordings are bad: check how labels are read."
     assert note in load_dataset(tmp_path / "a.npz").notes
     assert note not in load_dataset(tmp_path / "a.npz", label_map="0=good,1=bad").notes

@@ -238,25 +238,27 @@ def test_two_labels_in_a_name_that_contradict_each_other_are_an_error(name: str)
 
 def as_folder(cells: list[object], column: str, tmp: Path) -> tuple[Path, dict[str, str]]:
     for i, cell in enumerate(cells):
-        path = write_csv(tmp / f"{i}.csv", np.arange(30.0))
+        path = write_csv(tmp / f"{i}.csv", np.arange(30.0) + i)
         pd.read_csv(path).assign(**{column: cell}).to_csv(path, index=False)
     return tmp, {"label": column}
 
 
 def as_wide(cells: list[object], column: str) -> pd.DataFrame:
     return pd.DataFrame(
-        {f"FZ_{i}": np.arange(30.0)[i] for i in range(30)}, range(len(cells))
+        {f"FZ_{i}": np.arange(len(cells)) + i + 0.0 for i in range(30)}, range(len(cells))
     ).assign(**{column: cells})
 
 
 def as_long(cells: list[object], column: str) -> pd.DataFrame:
-    rows = [(part, i / 100, 1.0 * i, cell) for part, cell in enumerate(cells) for i in range(30)]
+    rows = [
+        (part, i / 100, 1.0 * i + part, cell) for part, cell in enumerate(cells) for i in range(30)
+    ]
     return pd.DataFrame(rows, columns=["part", "time", "FZ", column])
 
 
 def as_listing(cells: list[object], column: str, tmp: Path) -> tuple[Path, dict[str, Any]]:
     for i in range(len(cells)):
-        write_csv(tmp / "data" / f"{i}.csv", np.arange(30.0))
+        write_csv(tmp / "data" / f"{i}.csv", np.arange(30.0) + i)
     rows: dict[str, Any] = {"file": range(len(cells)), column: cells}
     if means_bad(column):  # it is found among others
         rows["operator"] = "Jim"
@@ -388,8 +390,8 @@ NAMES_AND_COLUMNS: dict[str, tuple[str, int | None, str]] = {
 
 
 def write_verdicts(folder: Path) -> None:
-    for name, (verdict, *_) in NAMES_AND_COLUMNS.items():
-        path = write_csv(folder / name, np.arange(30.0))
+    for i, (name, (verdict, *_)) in enumerate(NAMES_AND_COLUMNS.items()):
+        path = write_csv(folder / name, np.arange(30.0) + i)
         pd.read_csv(path).assign(verdict=verdict).to_csv(path, index=False)
 
 
@@ -420,8 +422,8 @@ def test_the_user_says_whether_a_name_or_its_column_is_to_be_trusted(
 
 
 def test_a_column_without_labels_is_a_channel_beside_names_that_state_them(tmp_path: Path) -> None:
-    for name in ("1_OK.csv", "2_NOK.csv"):
-        write_csv(tmp_path / name, np.arange(30.0), ("result",))
+    for i, name in enumerate(("1_OK.csv", "2_NOK.csv")):
+        write_csv(tmp_path / name, np.arange(30.0) + i, ("result",))
     data = load_dataset(tmp_path)
     assert (data.channels, data.y.tolist()) == (("result",), [1, 0])
 
@@ -955,7 +957,7 @@ def test_a_column_labels_what_a_name_calls_pending(few: Path, small: Dataset) ->
 def write_listing(folder: Path, words: list[str]) -> Path:
     """Four recordings whose names say good, bad, good, bad, and a listing of other words."""
     for i in range(4):
-        write_csv(folder / "cell" / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", np.arange(30.0))
+        write_csv(folder / "cell" / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", np.arange(30.0) + i)
     rows = [f"{i}_{'NOK' if i % 2 else 'OK'},{word}" for i, word in enumerate(words)]
     (folder / "list.csv").write_text("\n".join(["file,final", *rows]) + "\n")
     return folder / "list.csv"
@@ -1000,7 +1002,8 @@ def test_a_verdict_in_any_column_is_compared_with_the_names(
 ) -> None:
     verdicts = [good, bad, bad, bad]
     for i, verdict in enumerate(verdicts):
-        path = write_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", np.arange(30.0), ("F",))
+        values = np.arange(30.0) + i
+        path = write_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", values, ("F",))
         pd.read_csv(path).assign(**{column: verdict}).to_csv(path, index=False)
     data = load_dataset(tmp_path)
     assert (data.y.tolist(), data.channels) == ([1, 0, 0], ("F",))
@@ -1011,7 +1014,8 @@ def test_a_verdict_in_any_column_is_compared_with_the_names(
 
 def test_a_column_that_is_no_verdict_does_not_contradict_names(tmp_path: Path) -> None:
     for i in range(4):
-        path = write_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", np.arange(30.0), ("F",))
+        values = np.arange(30.0) + i
+        path = write_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", values, ("F",))
         frame = pd.read_csv(path).assign(sensor="OK", status=i % 3 // 2, yes=["no", "yes"][i // 2])
         frame.to_csv(path, index=False)
     data = load_dataset(tmp_path, channel="F")
@@ -1147,7 +1151,7 @@ def test_a_text_in_another_encoding_is_refused_until_it_is_stated(
     channel = header.split(",")[1]
     for i in range(4):
         word = bad if i % 2 else good
-        rows = [f"{4 * t},{t}.5,{word}" for t in range(50)]
+        rows = [f"{4 * t},{t + i}.5,{word}" for t in range(50)]
         (tmp_path / f"{i}.csv").write_bytes("\n".join([header, *rows]).encode(encoding))
     with pytest.raises(DataError, match=r"UTF-8 or Windows-1252, got another encoding") as caught:
         load_dataset(tmp_path)
@@ -1253,7 +1257,9 @@ def test_a_wide_table_with_a_row_for_each_signal_is_refused(small: Dataset) -> N
     both = pd.concat([table.assign(axis="FX"), table.assign(axis="FZ")])
     with pytest.raises(DataError, match=r"a part has one for each axis \(FX, FZ\); keep the rows"):
         load_dataset(both)
-    again = pd.concat([table, table.iloc[:5]]).assign(shift=["a", "b"] * 14 + ["a"])
+    again = pd.concat([table, table.iloc[:5].assign(FZ_0=9.0)]).assign(
+        shift=["a", "b"] * 14 + ["a"]
+    )
     assert len(load_dataset(again)) == 29
 
 
@@ -2694,8 +2700,10 @@ def test_short_recordings_of_stopped_parts_are_kept_if_the_user_says_so(
 def write_below(line: str, folder: Path, columns: str = "FX,FZ", step: int = 0) -> Path:
     """Two recordings of 60 samples below a line; the first of two columns rises by `step`."""
     folder.mkdir()
-    for name in ("a_OK.csv", "b_NOK.csv"):
-        rows = [f"{i * step},{np.sin(i):.3f}"[-6 if columns == "FZ" else 0 :] for i in range(60)]
+    for name, phase in (("a_OK.csv", 0), ("b_NOK.csv", 1)):
+        rows = [
+            f"{i * step},{np.sin(i + phase):.3f}"[-6 if columns == "FZ" else 0 :] for i in range(60)
+        ]
         rows = [row.strip(",") for row in rows]
         (folder / name).write_text("\n".join([*filter(None, [line]), columns, *rows, ""]))
     return folder
@@ -2833,9 +2841,9 @@ def test_a_second_header_of_units_and_blanks_behind_signs_are_read(
 ) -> None:
     values = np.round(40 * np.sin(np.arange(1500) / 200), 2)
     cells = {"Alarm": "LLLL", "Date": "2024/07/02", **{f"CH{i}": "+   7.00" for i in range(2, 11)}}
-    for name in ("1_OK", "2_NOK"):
+    for part, name in enumerate(("1_OK", "2_NOK")):
         text = GRAPHTEC_ABOVE + f"{names}\n{units_row}\n"
-        for i, value in enumerate(values):
+        for i, value in enumerate(values + part):
             sign = "-" if value < 0 else "+"
             row = {"NO": i + 1, "ms": i % 1000, "CH1": f"{sign} {abs(value):6.2f}", **cells}
             row["Time"] = f"09:13:{2 + i // 1000:02d}"
@@ -2844,7 +2852,7 @@ def test_a_second_header_of_units_and_blanks_behind_signs_are_read(
         (tmp_path / f"{name}.csv").write_text(text)
     data = load_dataset(tmp_path, channel="CH1")
     assert (data.rate_hz, data.unit, data.reading["clock"], data.notes) == (1000.0, "N", clock, ())
-    np.testing.assert_allclose(data.X, np.tile(values, (2, 1)), rtol=1e-5)
+    np.testing.assert_allclose(data.X, [values, values + 1], rtol=1e-4)
 
 
 def test_a_column_of_milliseconds_since_the_start_is_not_joined_to_seconds(tmp_path: Path) -> None:
@@ -3065,8 +3073,144 @@ def test_a_regular_clock_with_a_hole_is_a_fault_also_if_it_is_resampled(
     for i in range(6):
         t = 1.0 + np.arange(300) / 100 + rng.normal(0, jitter, 300)
         kept = np.delete(np.sort(t), slice(100, 130)) if i == 0 else np.sort(t)
-        frame = pd.DataFrame({"time": kept, "FZ": np.sin(kept)})
+        frame = pd.DataFrame({"time": kept, "FZ": np.sin(kept + i)})
         frame.to_csv(tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv", index=False)
     data = load_dataset(tmp_path, fit="resample", rate_hz=100.0)
     assert [fault.source for fault in data.faults] == ["0_OK.csv"]
     assert "got a gap of 0.3" in data.faults[0].message
+
+
+# A form of recordings -> writes (name, word, samples), and returns the source and options.
+NAMED: dict[
+    str, Callable[[list[tuple[str, str, np.ndarray]], Path], tuple[Any, dict[str, Any]]]
+] = {
+    "folders": lambda rows, tmp: (
+        [write_csv(tmp / "d" / word / f"{name}.csv", x) for name, word, x in rows] and tmp / "d",
+        {},
+    ),
+    "json lines": lambda rows, tmp: (
+        written(
+            tmp / "a.jsonl",
+            lambda path: path.write_text(
+                "\n".join(
+                    json.dumps({"serial": name, "result": word, "force": x.tolist()})
+                    for name, word, x in rows
+                )
+            ),
+        ),
+        {"part": "serial"},
+    ),
+    "parquet": lambda rows, tmp: (
+        written(
+            tmp / "a.parquet",
+            pd.DataFrame(rows, columns=["serial", "result", "force"]).to_parquet,
+        ),
+        {"part": "serial"},
+    ),
+    "wide": lambda rows, tmp: (
+        pd.DataFrame([x for *_, x in rows])
+        .add_prefix("FZ_")
+        .assign(serial=[name for name, *_ in rows], result=[word for _, word, _ in rows]),
+        {"part": "serial"},
+    ),
+    "npz": lambda rows, tmp: (
+        written(
+            tmp / "a.npz",
+            lambda path: np.savez(
+                path,
+                X=np.stack([x for *_, x in rows]),
+                y=[word for _, word, _ in rows],
+                part=[name for name, *_ in rows],
+            ),
+        ),
+        {},
+    ),
+}
+
+
+def some_parts(n: int = 8) -> list[tuple[str, str, np.ndarray]]:
+    rng = np.random.default_rng(5)
+    return [(f"C{i}", "NOK" if i % 4 == 3 else "OK", rng.normal(size=60)) for i in range(n)]
+
+
+@pytest.mark.parametrize("form", NAMED)
+@pytest.mark.parametrize("name", ["C2", "renamed"])
+def test_equal_samples_whose_labels_contradict_each_other_are_faults_that_name_both(
+    form: str, name: str, tmp_path: Path
+) -> None:
+    rows = some_parts()
+    source, options = NAMED[form]([*rows, (name, "NOK", rows[2][2])], tmp_path)
+    data = load_dataset(source, **options)
+    assert (len(data), int(data.y.sum())) == (7, 5)
+    first, second = data.faults
+    assert first.message == second.message
+    assert "one label for the same samples, got good in" in first.message
+    for fault in data.faults:
+        assert fault.source in first.message
+
+
+def test_long_tables_whose_parts_have_equal_samples_and_other_labels_leave_both_out() -> None:
+    rows = [*some_parts(), ("D1", "NOK", some_parts()[2][2])]
+    frame = pd.DataFrame(
+        [(name, i / 100, v, word) for name, word, x in rows for i, v in enumerate(x)],
+        columns=["part", "time", "FZ", "result"],
+    )
+    data = load_dataset(frame, time="time", label="result")
+    assert {fault.source for fault in data.faults} == {"C2", "D1"}
+    assert "good in C2, bad in D1" in data.faults[0].message
+
+
+@pytest.mark.parametrize("form", [form for form in NAMED if form != "folders"])
+def test_a_repeat_of_part_label_and_samples_is_left_out_with_a_note(
+    form: str, tmp_path: Path
+) -> None:
+    rows = some_parts()
+    again = ("C4", "OK", rows[4][2] + 1.0)  # measured again
+    source, options = NAMED[form]([*rows, rows[1], rows[3], again], tmp_path)
+    data = load_dataset(source, **options)
+    assert (len(data), data.faults) == (9, ())
+    note = "2 repeats of a recording are left out, of the same part, label and samples: C1, C3."
+    assert note in data.notes
+    report = import_labelled(tmp_path / "a.db", data, recipe="pca")
+    assert (report.imported, report.repeated) == (9, 0)
+
+
+def test_a_file_of_the_same_name_and_samples_in_another_folder_is_a_repeat(tmp_path: Path) -> None:
+    for name, word, x in some_parts():
+        write_csv(tmp_path / "d" / "day1" / word / f"{name}.csv", x)
+        write_csv(tmp_path / "d" / "day1" / word / f"{name}_x" / "curve.csv", x + 9.0)
+    name, word, x = some_parts()[1]
+    write_csv(tmp_path / "d" / "day2" / word / f"{name}.csv", x)
+    write_csv(tmp_path / "d" / "day2" / word / f"{name}_x" / "curve.csv", x + 9.0)
+    data = load_dataset(tmp_path / "d")
+    assert len(data) == 17
+    assert any(note.startswith("1 repeat of a recording is left out") for note in data.notes)
+    pair = "day2/OK/C1_x/curve.csv as day1/OK/C1_x/curve.csv"
+    assert f"Equal to another recording, sample by sample: {pair}." in data.notes
+
+
+def test_equal_samples_of_different_parts_stay_and_a_note_names_both(tmp_path: Path) -> None:
+    rows = some_parts()
+    source, options = NAMED["json lines"]([*rows, ("D1", "OK", rows[1][2])], tmp_path)
+    data = load_dataset(source, **options)
+    assert len(data) == 9
+    pair = "a.jsonl, line 9 (D1) as a.jsonl, line 2 (C1)"
+    assert f"Equal to another recording, sample by sample: {pair}." in data.notes
+
+
+def test_signals_of_few_values_may_be_equal_by_chance() -> None:
+    switch = np.repeat([0.0, 1.0], 30)
+    X = [*(x for *_, x in some_parts()), switch, switch, np.zeros(60), np.zeros(60)]
+    y = [1, 1, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0]
+    data = load_dataset((np.array(X), y))
+    assert (data.y.tolist(), data.faults) == (y, ())
+
+
+def test_a_copy_that_a_listing_calls_bad_contradicts_its_original(tmp_path: Path) -> None:
+    for name, _, x in some_parts():
+        write_csv(tmp_path / "d" / f"{name}.csv", x)
+    write_csv(tmp_path / "d" / "C0 - Copy.csv", some_parts()[0][2])
+    rows = ["file,result", *(f"{name},{word}" for name, word, _ in some_parts()), "C0 - Copy,NOK"]
+    (tmp_path / "list.csv").write_text("\n".join(rows))
+    data = load_dataset(tmp_path / "d", labels=tmp_path / "list.csv")
+    assert {fault.source for fault in data.faults} == {"C0.csv", "C0 - Copy.csv"}
