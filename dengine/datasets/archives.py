@@ -108,7 +108,11 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
     DataError
         If no recording can be read, most have no label, or the channel is not named.
     """
-    frame = _to_frame(read_archive(next(iter(named.values())))[0], options)
+    firsts = (read_archive(path)[0] for path in named.values())
+    frame = next(
+        (_to_frame(arrays, options) for arrays in firsts if not _other_length(arrays, options)),
+        _to_frame(read_archive(next(iter(named.values())))[0], options),
+    )
     available = [column for column in frame.columns if not is_time_column(column)]
     several = f"{options.channels[0]}_0" if options.channels else ""
     channels = tuple(column for column in available if several and column.startswith(several[:-1]))
@@ -119,6 +123,8 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
     def read(path: Path) -> Recording:
         """Return the trace of an archive, with the rate that it states or its times tell."""
         arrays, _ = read_archive(path)
+        if why := _other_length(arrays, options):
+            raise UnreadableError(why)
         rows = _to_frame(arrays, options)
         missing = [column for column in channels if column not in rows]
         if missing:
@@ -134,6 +140,29 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
     collector.order = "by name, numbers by size"
     labels.collect_recordings(named, read, _label_source(named, options), collector)
     return as_dataset(collector, options)
+
+
+def _other_length(arrays: Mapping[str, NDArray[Any]], options: LoadOptions) -> str:
+    """Return what is wrong if the only array of times, or that of a stated channel, has another
+    length than the others; "" if all fit. Times do not count where the rate is known without them.
+    """
+    frame = _to_frame(arrays, options)
+    lengths = {
+        name: len(x)
+        for name, x in arrays.items()
+        if x.ndim == 1 and x.size > 1 and x.dtype.kind in "iufMm"
+    }
+    clocks = {name for name in lengths if name == options.time or is_time_column(name)}
+    if options.rate_hz or "rate_hz" in arrays or options.time == "none" or clocks & {*frame}:
+        clocks = set()
+    others = [name for name in (*options.channels, *clocks) if name in lengths]
+    others = [name for name in others if lengths[name] != len(frame)]
+    if not others:
+        return ""
+    actual = {**{str(name): len(frame) for name in frame.columns[:1]}, **lengths}
+    names = dict.fromkeys([*others, *map(str, frame.columns[:1])])
+    texts = ", ".join(f"{name} has {actual[name]}" for name in names)
+    return f"Expected arrays of one length, {texts} values"
 
 
 def _to_frame(arrays: Mapping[str, NDArray[Any]], options: LoadOptions) -> pd.DataFrame:

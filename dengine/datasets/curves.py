@@ -7,8 +7,8 @@ Databases and test benches write such cells: a list as Parquet and JSON have it,
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..traces import is_time_column
 from . import units
 from .clocks import clock_of, rate_of
-from .dataset import LoadOptions, UnreadableError
+from .dataset import LoadOptions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -84,16 +84,9 @@ def curve_columns(frame: pd.DataFrame) -> list[str]:
     ]
 
 
-def expand_curves(
-    frame: pd.DataFrame, options: LoadOptions
-) -> tuple[pd.DataFrame, float | None, str, list[str]]:
-    """Return a table with a numbered column for each sample of its curves, FZ_0, FZ_1, ...
+class Expanded(NamedTuple):
+    """A table with a numbered column for each sample of its curves.
 
-    Only the stated channels are expanded, if all of them are curves. A shorter curve is filled with
-    NaN; a cell without numbers becomes a text, which is a fault when it is read.
-
-    Returns
-    -------
     frame : DataFrame
         The same object if no column has curves of eight samples or more.
     rate_hz : float or None
@@ -102,11 +95,23 @@ def expand_curves(
         The name of that column; "" without one.
     unread : list of str
         Columns of curves that were left out.
+    wrong : dict
+        Why rows were left out, by their lines.
+    """
 
-    Raises
-    ------
-    UnreadableError
-        If the clocks of curves differ by more than 3 %, or have not as many times as samples.
+    frame: pd.DataFrame
+    rate_hz: float | None = None
+    clock: str = ""
+    unread: Sequence[str] = ()
+    wrong: Mapping[int, str] = {}
+
+
+def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
+    """Return a table with a numbered column for each sample of its curves, FZ_0, FZ_1, ...
+
+    Only the stated channels are expanded, if all of them are curves. A shorter curve is filled with
+    NaN; a cell without numbers becomes a text, which is a fault when it is read. A row whose curves
+    differ in length, or whose clock differs from those of most by more than 3 %, is left out.
     """
     import pandas as pd
 
@@ -115,7 +120,7 @@ def expand_curves(
     longest = {name: max(len(c) for c in cells if c is not None) for name, cells in curves.items()}
     channels = [name for name, n in longest.items() if name not in clocks and n >= MIN_SAMPLES]
     if not channels:
-        return frame, None, "", []
+        return Expanded(frame)
     stated = [units.find_columns(name, channels) for name in options.channels]
     if stated and all(stated):
         channels = [channels[places[0]] for places in stated]
@@ -135,12 +140,25 @@ def expand_curves(
             wide.iloc[i, k] = cell
         blocks.append(wide)
     rate = None
-    if clocks and options.rate_hz is None:
-        rate = _rate_of_curves(frame.index, curves[clocks[0]], curves[channels[0]], clocks[0])
+    has_clock = bool(clocks) and options.rate_hz is None
+    compared = [*clocks[:has_clock], *(channels if stated and all(stated) else channels[:1])]
+    wrong = dict[int, str]()
+    for i, line in enumerate(frame.index):
+        in_row = {name: curves[name][i] for name in compared}
+        lengths = {name: len(curve) for name, curve in in_row.items() if curve is not None}
+        if len(set(lengths.values())) > 1:
+            actual = ", ".join(f"{name} has {n}" for name, n in lengths.items())
+            wrong[line] = f"Expected lists of one length, {actual} values"
+    if has_clock:
+        clock_cells = dict(zip(frame.index, curves[clocks[0]], strict=True))
+        cells = {line: x for line, x in clock_cells.items() if line not in wrong and x is not None}
+        rate, odd_rates = _rate_of_curves(cells, clocks[0])
+        wrong |= odd_rates
     unread = [
         name for name in {**curves, **dict.fromkeys(lists)} if name not in (*channels, *clocks[:1])
     ]
-    return pd.concat(blocks, axis=1), rate, clocks[0] if rate else "", unread
+    wide = pd.concat(blocks, axis=1).drop(index=list(wrong))
+    return Expanded(wide, rate, clocks[0] if rate else "", unread, wrong)
 
 
 def _is_empty(cell: Any) -> bool:
@@ -167,31 +185,28 @@ def _numbers(curve: Sequence[Any] | NDArray[Any] | None) -> tuple[list[float], d
 
 
 def _rate_of_curves(
-    lines: pd.Index, clocks: Sequence[Any], curves: Sequence[Any], name: str
-) -> float | None:
-    """Return the median rate by the clocks of curves; None if none can be read.
+    clocks: Mapping[int, Sequence[Any]], name: str
+) -> tuple[float | None, dict[int, str]]:
+    """Return the median rate by the clocks of curves, and what is wrong with other rows.
 
-    Raises UnreadableError, with the line, for a clock whose rate differs by more than 3 %, or that
-    has not as many times as samples.
+    These have a rate that differs by more than 3 %. The rate is None if none can be read.
+
+    clocks : the times in each row that has some, by its line.
     """
     import pandas as pd
 
     rates = dict[int, float]()
-    for line, times, curve in zip(lines, clocks, curves, strict=True):
-        if times is None or curve is None:
-            continue
-        if len(times) != len(curve):
-            wanted = f"as many times in column {name} as samples"
-            raise UnreadableError(f"Expected {wanted}, got {len(times)} and {len(curve)}", line)
+    for line, times in clocks.items():
         clock = clock_of(pd.DataFrame({name: times}), name)
         if clock is not None:
             rates[line] = rate_of(clock, pd.RangeIndex(len(times)))
     if not rates:
-        return None
+        return None, {}
     usual = float(np.median(list(rates.values())))
-    for line, rate in rates.items():
-        if abs(rate - usual) > SAME_RATE * usual:
-            wanted = f"times in column {name} at {usual:g} Hz, as in most rows"
-            do = "state rate_hz=... if the times are wrong"
-            raise UnreadableError(f"Expected {wanted}, got {rate:g} Hz; {do}", line)
-    return usual
+    wanted = f"times in column {name} at {usual:g} Hz, as in most rows"
+    do = "state rate_hz=... if the times are wrong"
+    return usual, {
+        line: f"Expected {wanted}, got {rate:g} Hz; {do}"
+        for line, rate in rates.items()
+        if abs(rate - usual) > SAME_RATE * usual
+    }

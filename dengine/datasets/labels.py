@@ -988,8 +988,9 @@ def read_ordered_labels(
 ) -> tuple[list[str], str]:
     """Return the label words of a file that lists the traces of an array, in the traces' order.
 
-    Its rows are numbered in that order, or name each trace by one of the `keys`. The name of the
-    column of labels comes second. Raises DataError if the file cannot be read, or its rows are in
+    Its rows are numbered in that order, or name traces by one of the `keys`; those that it does not
+    name get an empty word, unless the keys are numbers from 0 or 1. The name of the column of
+    labels comes second. Raises DataError if the file cannot be read, or its rows are in
     an order that is not known.
 
     keys : texts of each trace, as serial numbers, by the names of their arrays.
@@ -999,6 +1000,8 @@ def read_ordered_labels(
     for texts in keys.values():
         if len(texts) == len(rows) and set(texts) == set(label_of_key):
             return [label_of_key[text] for text in texts], column
+        if label_of_key and set(label_of_key) < set(texts) and not {"0", "1"} & set(texts):
+            return [label_of_key.get(text, "") for text in texts], column
     numbers = [int((re.findall(r"\d+", row.words[0]) or [-1])[-1]) for row in rows]
     in_order = numbers == list(range(numbers[0], numbers[0] + len(rows))) if numbers else False
     in_order = in_order and len(label_of_key) == len(rows)

@@ -367,6 +367,7 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         raise DataError(f"Expected {wanted}, found {listed(all_names)}.")
     with read_errors(name, "an .npz file of plain arrays"):
         blocks = [_parts_first(arrays[key], arrays[label]) for key in traces]
+        _check_rows(dict(zip(traces, blocks, strict=True)), arrays, stored, label, options)
         X = np.stack(blocks, axis=1) if len(channels) > 1 else blocks[0]
         if "scale" in arrays:
             X = X.astype(np.float32) * arrays["scale"].astype(np.float32)
@@ -581,6 +582,33 @@ def _parts_first(x: NDArray[Any], labels: NDArray[Any] | None) -> NDArray[Any]:
     if len(x) != len(labels) and x.shape.count(len(labels)) == 1:
         x = np.moveaxis(x, x.shape.index(len(labels)), 0)
     return x.swapaxes(1, 2) if x.ndim == 3 and x.shape[1] > x.shape[2] else x
+
+
+def _check_rows(
+    blocks: Mapping[str, NDArray[Any]],
+    arrays: Mapping[str, NDArray[Any]],
+    stored: Mapping[str, NDArray[Any]],
+    label: str,
+    options: LoadOptions,
+) -> None:
+    """Raise DataError if traces, labels and parts have not as many rows as each other.
+
+    blocks : the traces, with rows first. arrays : with the labels by the name `label`, and perhaps
+    the parts. stored : all arrays, of which one may name the traces for a listing.
+    """
+    of_labels = label if options.labels is None else Path(options.labels).name
+    rows = {key: len(block) for key, block in blocks.items()} | {of_labels: len(arrays[label])}
+    rows |= {key: len(arrays[key]) for key in (options.part,) if key in arrays}
+    n = next(iter(rows.values()))
+    if set(rows.values()) == {n}:
+        return
+    actual = ", ".join(f"{name} has {n_rows}" for name, n_rows in rows.items())
+    do = "export them again"
+    keys = [name for name, texts in _keys_of_traces(stored).items() if len(texts) == n]
+    if keys:
+        do = f"{do}, or list the labels by {listed(keys)} in a CSV file, labels='labels.csv'"
+    wanted = "as many rows of each array"
+    raise DataError(f"Expected {wanted}, {actual}: nobody can tell which are missing; {do}.")
 
 
 def _check_same_labels(

@@ -58,18 +58,18 @@ def with_samples_in_columns(
 ) -> tuple[Mapping[str, TextTable], LoadOptions]:
     """Return tables with a column for each sample where a cell holds a curve, and their options.
 
-    Pieces of a curve are joined. Raises DataError if the clocks of the curves contradict them or
-    each other.
+    Pieces of a curve are joined. Rows whose curves or clocks contradict each other are faults.
+    Raises DataError if no row is left.
     """
     result = dict[str, TextTable]()
     tables = join_pieces(tables, options, collector)
     for source, table in tables.items():
-        try:
-            frame, rate, name, unread = expand_curves(table.frame, options)
-        except UnreadableError as error:
-            raise DataError(f"Cannot read {Fault(source, error.line, str(error))}.") from error
+        frame, rate, name, unread, wrong = expand_curves(table.frame, options)
         if frame is table.frame:
             return tables, options
+        collector.faults += [Fault(source, line, why) for line, why in wrong.items()]
+        if frame.empty:
+            continue
         if options.labels is not None:
             wanted = f"a column of labels beside the curves in the cells of {source}"
             raise DataError(f"Expected {wanted}, got a file of labels; join it to the table.")
@@ -80,6 +80,8 @@ def with_samples_in_columns(
             table = table._replace(rate_hz=rate, clock=clock)
         numbers = table.numbers.replace("whole numbers", "curves in cells")
         result[source] = table._replace(frame=frame, units=[], numbers=numbers)
+    if not result:
+        raise DataError(f"Cannot read {collector.faults[-1]}.")
     return result, replace(options, time=None)
 
 

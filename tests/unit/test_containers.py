@@ -222,6 +222,70 @@ def test_a_line_of_json_that_is_cut_off_is_a_fault_and_the_others_are_read(tmp_p
     ]
 
 
+@pytest.mark.parametrize(
+    ("changed", "rows"),
+    [
+        ({"result": LABELS[:-2]}, f"FZ has {N}, result has {N - 2}"),
+        ({"part": range(N - 1)}, f"FZ has {N}, result has {N}, part has {N - 1}"),
+        ({"FX": FORCES[:-3]}, f"FZ has {N}, FX has {N - 3}, result has {N}"),
+    ],
+)
+def test_arrays_of_other_rows_are_refused_with_the_rows_of_each(
+    changed: dict[str, object], rows: str, tmp_path: Path
+) -> None:
+    serials = [f"B{220 + i}" for i in range(N)]
+    arrays = {"FZ": FORCES, "FX": FORCES, "result": LABELS, "serial": serials} | changed
+    path = tmp_path / "run.npz"
+    np.savez(path, **arrays)
+    channel = "FZ,FX" if "FX" in changed else "FZ"
+    by_serial = "list the labels by serial in a CSV file, labels='labels.csv'"
+    with pytest.raises(DataError, match=f"{rows}: nobody can tell which .* or {by_serial}"):
+        load_dataset(path, channel=channel, label="result")
+
+
+def test_a_listing_by_serial_may_leave_traces_of_an_archive_out(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    serials = np.array([f"B{220 + i}" for i in range(N)])
+    np.savez(path, FZ=FORCES, result=LABELS[:-2], serial=serials)
+    kept = [i for i in range(N) if i not in (3, 7)]
+    listing = pd.DataFrame({"serial": serials[kept], "result": np.array(WORDS)[kept]})
+    listing[::-1].to_csv(tmp_path / "labels.csv", index=False)
+    data = load_dataset(path, channel="FZ", labels=tmp_path / "labels.csv", part="serial")
+    np.testing.assert_array_equal(data.X, FORCES[kept].astype(np.float32))
+    assert (data.y.tolist(), data.unlabelled) == ([LABELS[i] for i in kept], 2)
+    counted = pd.DataFrame({"nr": range(1, N - 1), "result": WORDS[:-2]})
+    counted.to_csv(tmp_path / "counted.csv", index=False)
+    with pytest.raises(DataError, match=f"FZ has {N}, counted.csv has {N - 2}"):
+        load_dataset(path, channel="FZ", labels=tmp_path / "counted.csv")
+
+
+@pytest.mark.parametrize("form", ["json", "jsonl", "parquet", "npz"])
+@pytest.mark.parametrize("short", ["FZ", "time"])
+def test_lists_of_other_lengths_in_a_recording_are_a_fault_that_names_them(
+    form: str, short: str, tmp_path: Path
+) -> None:
+    rows = []
+    for i, word in enumerate(WORDS):
+        row = {"FZ": FORCES[i].tolist(), "time": SECONDS.tolist(), "result": word}
+        row[short] = row[short][: 28 if i == 4 else None]
+        rows.append(row)
+        if form == "json":
+            (tmp_path / f"r_{i:02d}.json").write_text(json.dumps(row))
+        if form == "npz":
+            np.savez(tmp_path / f"r_{i:02d}_{word}.npz", FZ=row["FZ"], time=row["time"])
+    if form == "jsonl":
+        (tmp_path / "all.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    if form == "parquet":
+        pd.DataFrame(rows).to_parquet(tmp_path / "all.parquet")
+    data = load_dataset(tmp_path, channel="FZ")
+    np.testing.assert_array_equal(data.X, np.delete(FORCES, 4, axis=0).astype(np.float32))
+    assert data.rate_hz == 500
+    (fault,) = data.faults
+    lengths = {"FZ": 30, "time": 30} | {short: 28}
+    assert "of one length" in fault.message
+    assert all(f"{name} has {n}" in fault.message for name, n in lengths.items())
+
+
 def test_a_folder_of_binary_files_is_refused_by_their_kind(tmp_path: Path) -> None:
     for name in ("a_OK.tdms", "b_NOK.tdms"):
         (tmp_path / name).write_bytes(b"TDSm" + bytes(200))
