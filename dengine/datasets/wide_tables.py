@@ -282,8 +282,8 @@ def _stated_in_rows(frame: pd.DataFrame, table: TextTable) -> StatedByRow:
 
 def _stated_rate(name: str, cell: object) -> float | None:
     """Return the rate in hertz that a cell of a column states, as 500 of `Sample Rate (Hz)`."""
-    words = name.rpartition(".")[2]
-    quantity, unit = units.split(words.lower() if words.isupper() else words)
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.rpartition(".")[2])  # SampleTimeMs
+    quantity, unit = units.split(words.lower())
     return rate_in_preamble(f"{quantity}: {cell} {unit}")[0]
 
 

@@ -189,6 +189,18 @@ def test_a_file_of_a_folder_that_is_damaged_is_a_fault_and_the_others_are_read(
     assert re.search(why, fault.message)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("SampleTimeMs", 2), ("dt_ms", 2), ("samplingIntervalUs", 2000), ("SampleRateHz", 500)],
+)
+def test_a_value_beside_the_list_of_samples_states_the_rate(
+    name: str, value: int, tmp_path: Path
+) -> None:
+    for i in range(N):
+        (tmp_path / f"part_{i:02d}.json").write_text(json.dumps(as_object(i) | {name: value}))
+    assert load_dataset(tmp_path, channel="FZ").rate_hz == 500
+
+
 def test_a_folder_of_damaged_files_is_refused_with_the_first_of_them(tmp_path: Path) -> None:
     for i in range(3):
         (tmp_path / f"part_{i}.json").write_text(json.dumps(as_object(i))[:200])
