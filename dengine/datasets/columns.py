@@ -217,12 +217,7 @@ def channel_hint(names: Sequence[str], frame: pd.DataFrame, options: LoadOptions
         numeric = list(map(str, frame["_field"].unique()))
     if options.channels or FORCE in numeric or len(numeric) < 2:
         return []
-    return [f"channel={_likely_channel(numeric)!r}"]
-
-
-def _likely_channel(names: Sequence[str]) -> str:
-    """Return the first of some channels whose name is that of a force, else the first."""
-    return next((name for name in names if units.FORCE_NAME.fullmatch(name)), names[0])
+    return [f"channel={units.likely_channel(numeric)!r}"]
 
 
 def choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str, ...]:
@@ -241,7 +236,7 @@ def choose_channels(available: Sequence[str], options: LoadOptions) -> tuple[str
         raise DataError(f"Expected {wanted}, found {listed(available) or 'none'}.")
     if not options.channels and len(chosen) > 1:
         single = [name for name in chosen if chosen.count(name) == 1] or chosen
-        wanted = f"the channel to be named, as in channel={_likely_channel(single)!r}"
+        wanted = f"the channel to be named, as in channel={units.likely_channel(single)!r}"
         raise DataError(f"Expected {wanted}; there are {listed(available)}.")
     return chosen
 

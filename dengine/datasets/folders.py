@@ -349,7 +349,7 @@ def read_folder(
         check = partial(collect, read_nothing, RecordingCollector(name, ()))
         raise with_label_error(error, check) from error
     if beside := [] if options.channels else _of_other_channels(named, channels, options):
-        wanted = f"the channel to be named, as in channel={channels[0]!r}"
+        wanted = f"the channel to be named, as in channel={units.likely_channel(channels)!r}"
         raise DataError(f"Expected {wanted}; other files have others, as {beside[0]}.")
     if not others:
         _check_headers(heads, channels)
@@ -643,7 +643,7 @@ def _first_rows(path: Path, options: LoadOptions) -> TextCells:
             file.seek(max(start, end - 2**10))
             lines += file.read().split(b"\n")[1:]
         text, _ = decode(b"\n".join(lines), options.encoding)
-        cells = split_cells(text, options.columns)
+        cells = split_cells(text, options.columns, options.channels)
         return cells._replace(fields=cells.fields | fields_beside(path))
     return TextCells([], 0, [], {}, "", {})
 

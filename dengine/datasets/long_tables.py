@@ -536,7 +536,7 @@ def _pivot_signals(frame: pd.DataFrame, keys: list[str], options: LoadOptions) -
         return frame
     if not is_named:
         have = f"{listed(signals)}, as column {tag} calls them"
-        wanted = f"the channel to be named, as in channel={signals[0]!r}"
+        wanted = f"the channel to be named, as in channel={units.likely_channel(signals)!r}"
         raise DataError(f"Expected {wanted}; there are {have}.")
     # pivot_table would average.
     wide = rows.pivot(index=keys, columns=tag, values=values[0])  # noqa: PD010

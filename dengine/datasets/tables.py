@@ -147,7 +147,7 @@ def _from_tables(
     tables : by the names of their files, or "row" for a DataFrame; the index is the line.
     """
     tables, options = with_samples_in_columns(tables, options, collector)
-    turned = {source: turn_table(table, options) for source, table in tables.items()}
+    turned = {source: turn_table(table, options, source) for source, table in tables.items()}
     if any(table is not tables[source] for source, table in turned.items()):
         tables = turned
         options = replace(options, time=None)
@@ -181,7 +181,9 @@ def _from_tables(
         raise DataError(f"Expected a row an insertion, got {actual}; a long table needs {advice}.")
     for source, table in tables.items():
         for line, _, read in wide_rows(table, options, collector, source):
-            collector.add(source, read, line)
+            column = table.column_of.get(line)
+            where = source if column is None else f"{source}, column {column}"
+            collector.add(where, read, 0 if column else line)
     _leave_out_repeated_rows(collector)
     return as_dataset(collector, options)
 
@@ -195,7 +197,7 @@ def _leave_out_repeated_rows(collector: RecordingCollector) -> None:
     repeated = list[str]()
     kept = list[Recording]()
     for recording in collector.recordings:
-        file = recording.source.rpartition(", line ")[0]
+        file = recording.source.rpartition(", ")[0]
         content = (recording.part, recording.label, recording.trace.tobytes())
         if file_of.setdefault(content, file) != file and np.ptp(recording.trace) > 0:
             repeated.append(recording.source)

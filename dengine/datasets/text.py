@@ -28,6 +28,7 @@ from .clocks import (
     DATE_FORM,
     EMPTY_CELLS,
     MAX_MISSING,
+    MONTHS,
     NO_CLOCK,
     SUMMER_TIME,
     TIMESTAMP,
@@ -94,6 +95,7 @@ COUNTER_NAME = re.compile(
     r"([se]|er|[ _-]?(no|nr|id|idx|number|\d{1,3}))?\.?",
     re.IGNORECASE,
 )
+SETTING = re.compile(r"(?:.*\W)?\d[\d.,]* ?k?Hz|")  # SR: 400 Hz, in a line that is no header
 # In it no delimiter is looked for.
 ONE_CELL = re.compile(
     rf"{IN_LINE}|(?:{WORD_DATE})(?: +\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?)?"
@@ -108,6 +110,16 @@ NUMBER_AND_UNIT = re.compile(
 # What stands where there is no number, as Bad Input, #N/A or C's 1.#QNAN: it has no digit, or a
 # word before its first one, but for a code in brackets. A damaged number, as 12x5, is none.
 STATUS = re.compile(r"\s*(?:\D+|\D*[^\W\d]{2}.*|\[-?\d+\] *[^\W\d]{2}.*|-?1\.#[A-Z]+)")
+# What a spreadsheet makes of numbers, in its language: 01. Mrz of 1.3, Mrz 75 of 3.75.
+MONTH_WORD = (
+    rf"(?:{'|'.join(' '.join(MONTHS).split())}|mrt|maa|maj|sty|lut|kwi|cze|lip|sie|wrz|paz|paź"
+    r"|lis|gru)[^\W\d_]{0,2}\.?"
+)
+SPREADSHEET_DATE = re.compile(
+    rf"\s*(?:\d\d?[-./ ]+{MONTH_WORD}(?:[-./ ]+\d{{2,4}})?|{MONTH_WORD}[-./ ]+\d{{2,4}}"
+    rf"|\d\d?月(?:\d\d?日)?|(?:{DATE_FORM})(?:[T ]\d\d?:\d\d(?::\d\d)?)?)\s*",
+    re.IGNORECASE,
+)
 MOST = 0.8  # of a column's cells are numbers: the others are lost samples
 # How a row of units states times of day: hh:mm:ss, HH:MM:SS.fff or mm:ss,0.
 TIME_FORMAT = re.compile(r"(h{1,2}:)?m{1,2}:s{1,2}([.,:](f+|s+|m+|z+|x+|0+))?", re.IGNORECASE)
@@ -179,6 +191,12 @@ class TextTable(NamedTuple):
         Line of the last row if it is cut off, which is among the faults; 0 for none.
     factors : mapping of str to float
         Of the lines above the samples, as in `Recording`.
+    preamble : str
+        The lines above the samples, with the header.
+    column_of : mapping of int to str
+        The column of the file that each row was, if rows and columns were exchanged.
+    wrong : mapping of int to UnreadableError
+        What is wrong in such a row, with the line of the file.
     """
 
     frame: pd.DataFrame
@@ -196,9 +214,12 @@ class TextTable(NamedTuple):
     notes: tuple[str, ...] = ()
     cut_line: int = 0
     factors: Mapping[str, float] = {}
+    preamble: str = ""
+    column_of: Mapping[int, str] = {}
+    wrong: Mapping[int, UnreadableError] = {}
 
 
-def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
+def split_cells(text: str, columns: Sequence[str] = (), channels: Sequence[str] = ()) -> TextCells:
     """Split a text into cells; blank lines are left out.
 
     A first line sep=; states the delimiter, which is found otherwise. What stands above LabVIEW's
@@ -207,6 +228,7 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
     is empty.
 
     columns : names of the columns, if the file has no header or another one.
+    channels : names that the header has, as users state them, if several lines may be it.
     """
     lines = {i: line for i, line in enumerate(text.splitlines(), start=1) if line.strip()}
     lines = {
@@ -229,7 +251,8 @@ def split_cells(text: str, columns: Sequence[str] = ()) -> TextCells:
         rows = dict(enumerate(map(list, zip(*rows.values(), strict=True)), start=1))
     cells = None if columns else _beside_settings(rows, delimiter)
     if cells is None:
-        cells = _find_header(_names_and_units_of_keys(rows), delimiter, list(columns))
+        named_rows = _names_and_units_of_keys(rows)
+        cells = _find_header(named_rows, delimiter, list(columns), channels)
     first = min(cells.rows, default=0)
     above = {i: split[i] for i in top} | {i: row for i, row in rows.items() if i < first}
     below = {i: rows.get(i, row) for i, row in cells.rows.items()}  # with LabVIEW's comments
@@ -594,15 +617,20 @@ def _is_unit(cell: str) -> bool:
 
 
 def _find_header(
-    rows_by_line: dict[int, list[str]], delimiter: str, columns: list[str]
+    rows_by_line: dict[int, list[str]],
+    delimiter: str,
+    columns: list[str],
+    channels: Sequence[str],
 ) -> TextCells:
     """Find the header, the row of units and the data among the rows of a text.
 
-    What stands above the header is left out. If two lines stand above the data and the first can be
-    the header, it is the header, and the second is a damaged row; a first line in which a name
-    occurs twice, as of groups of columns, or that states a field, cannot be. In a header of evenly
-    rising times, as that of a wide table, these are replaced by 0, 1, 2, ... Raises UnreadableError
-    for numbers without a header if no `columns` are given; without rows the header is empty.
+    What stands above the header is left out. Of several lines that may be the header, it is that
+    with the stated channels, else that above a row of units. If two lines stand above the data and
+    the first can be the header, it is the header, and the second is a damaged row; a first line in
+    which a name occurs twice, as of groups of columns, or that states a field, cannot be. In a
+    header of evenly rising times, as that of a wide table, these are replaced by 0, 1, 2, ...
+    Raises UnreadableError for numbers without a header if no `columns` are given; without rows the
+    header is empty.
     """
     lines = list(rows_by_line)
     rows = list(rows_by_line.values())
@@ -614,29 +642,25 @@ def _find_header(
     above[-1:] = _without_names_among_units(above[-2:], numeric)
     is_units = [any(row) and all(map(_is_unit, row)) for row in above]
     header = max(data - 1 - (data > 1 and is_units[-1]), 0)
-    if header and is_units[header] and any(cell.endswith("Hz") for cell in above[-1]):
-        header -= 1  # catman writes the units and, below them, the rates
-    is_remark = (
-        header == 1 and units.COMMENT_MARK.match(rows[0][0]) and not _numeric_columns(rows[1])
-    )
-    if header == 1 and len(rows[0]) >= len(rows[data]):
-        group_names = list(filter(None, rows[0]))
-        has_groups = len(set(group_names)) < len(group_names) or (
-            len(group_names) < len(above[1]) > len({*above[1]}) and all(above[1])
-        )
-        if not (has_groups or is_remark or is_units[0] or _is_field_above(*above[:2])):
+    titles = _titles_above_columns(above, len(rows[data])) if header > 1 else None
+    chosen = _header_among(above, is_units, rows[data : data + 1], channels, titles)
+    if chosen is not None:
+        header = chosen
+    elif header == 1 and len(rows[0]) >= len(rows[data]):
+        if not (is_units[0] or _is_no_header(*rows[:2], *above[:2])):
             header = data = 0
-    if header > 1:
-        titles = _titles_above_columns(above, len(rows[data]))
-        if titles is not None and not (titles == header and is_units[-1]):
-            header = data = titles
+    elif titles is not None and not (titles == header and is_units[-1]):
+        header = data = titles
     if not columns and above and _numeric_columns(above[header]):
         header, data = _true_header(above, is_units, header, data)
-    units_row = above[header + 1] if header + 1 < data else []
+    below = range(header + 1, min(data, len(above)))
+    units_row = next((above[i] for i in below if is_units[i]), [])
     line = 0
     names = columns
+    if columns and data:
+        units_row = _units_of_columns(above, is_units, len(columns))
     if not columns:
-        header, names, units_row = _names_in(above, header, units_row)
+        header, names, units_row = _names_in(above, header, units_row, rows[data : data + 2])
         line = lines[header] if lines else 0
         names = _without_times(names, rows, line)
         data = max(data, 1)
@@ -646,6 +670,60 @@ def _find_header(
         names = names[:-1]  # LabVIEW's, which most of its rows leave out
         data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter, {})
+
+
+def _header_among(
+    above: list[list[str]],
+    is_units: list[bool],
+    first: list[list[str]],
+    channels: Sequence[str],
+    titles: int | None,
+) -> int | None:
+    """Return the position of the header if lines that are neither units nor data stand below it.
+
+    It is the last line with the stated channels, below which no numbers stand. Without any, and
+    without `titles`, it is the line above the last row of units, as catman writes it above
+    "Kanal 1" and "SR: 400 Hz", or above such a line of rates. Else the result is None.
+
+    first : the first row of data, if there is any.
+    """
+    widths = {len(_without_trailing_empty(row)) for row in (*above[-1:], *first)}
+    numbers = [i for i, row in enumerate(above) if _numeric_columns(row)]
+    below_numbers = range(max(numbers, default=-1) + 1, len(above))
+    names = []
+    for i in below_numbers:
+        words = _without_trailing_empty(above[i])
+        if len(words) in widths and all(words) and not is_units[i]:
+            names.append(i)
+    if channels:
+        for i in reversed(names):
+            if all(units.find_columns(name, above[i]) for name in channels):
+                return i
+    if titles is not None or not above or (is_units[-1] and not _is_setting(above[-1])):
+        return None
+    for i in reversed(below_numbers):
+        stated = _pad_units(above[i], len(above[i]))
+        if is_units[i] and i - 1 in names and any(map(units.parse, stated)):
+            return i - 1
+    plain = [i for i in names if not _is_setting(above[i])]
+    return max(plain, default=None) if _is_setting(above[-1]) else None
+
+
+def _is_setting(row: Sequence[str]) -> bool:
+    """Return whether all cells of a row state a rate, as "SR: 400 Hz" or 400 Hz, or are empty."""
+    return any(row) and all(map(SETTING.fullmatch, row))
+
+
+def _units_of_columns(above: list[list[str]], is_units: list[bool], n: int) -> list[str]:
+    """Return the units that the lines above the data state for n columns that the user names.
+
+    They are in a row of units, or in the names of a header that is not used.
+    """
+    for row, is_row_of_units in zip(reversed(above), reversed(is_units), strict=True):
+        stated = row if is_row_of_units else [units.split(name)[1] for name in row]
+        if len(_without_trailing_empty(row)) == n and any(map(units.parse, _pad_units(stated, n))):
+            return stated
+    return []
 
 
 def _first_data(rows: list[list[str]], last_rows: list[list[str]], numeric: Collection[int]) -> int:
@@ -668,6 +746,23 @@ def _columns_of_times(rows: Sequence[Sequence[str]]) -> set[int]:
     """Return the positions of the columns that have two digits or more in every row."""
     n = min(map(len, rows), default=0)
     return {i for i in range(n) if all(sum(map(str.isdigit, row[i])) > 1 for row in rows)}
+
+
+def _is_no_header(
+    first_row: list[str], second_row: list[str], first: list[str], second: list[str]
+) -> bool:
+    """Return whether the second of two lines above the data is the header, and the first is none.
+
+    The first is a remark, names groups of columns, or states a field.
+
+    first, second : the lines without a comment mark.
+    """
+    is_comment = units.COMMENT_MARK.match(first_row[0]) is not None
+    groups = list(filter(None, first_row))
+    has_groups = len(set(groups)) < len(groups)
+    has_groups |= len(groups) < len(second) > len({*second}) and all(second)
+    is_remark = is_comment and not _numeric_columns(second_row)
+    return has_groups or is_remark or _is_field_above(first, second)
 
 
 def _is_field_above(first: list[str], second: list[str]) -> bool:
@@ -711,11 +806,12 @@ def _n_measured(names: Sequence[str]) -> int:
 
 
 def _names_in(
-    above: list[list[str]], header: int, units_row: list[str]
+    above: list[list[str]], header: int, units_row: list[str], first: Sequence[Sequence[str]]
 ) -> tuple[int, list[str], list[str]]:
     """Return the position of the header above the data, the names in it, and the units.
 
     TwinCAT Scope writes two columns for each channel: the first, its clock, is named "Time" here.
+    Its unit is ms if its first step is the stated SampleTime[ms].
     In other files with a row of groups above the header, a name that occurs twice gets the name of
     its group before it, except that of a clock.
     """
@@ -724,6 +820,13 @@ def _names_in(
         by_key = {row[0].lower(): row for row in reversed(pairs)}
         names = [name if i % 2 else "Time" for i, name in enumerate(pairs[0])]
         units_row = [unit if i % 2 else "" for i, unit in enumerate(by_key.get("unit", []))]
+        units_row += [""] * (len(names) - len(units_row))
+        steps = by_key.get("sampletime[ms]", [])
+        for i in range(1, min(map(len, (names, steps, *first))), 2):
+            with suppress(ValueError):
+                times = [float(row[i - 1].replace(",", ".")) for row in first]
+                is_confirmed = bool(np.isclose(times[-1] - times[0], float(steps[i])))
+                units_row[i - 1] = "ms" if is_confirmed else ""
         return above.index(pairs[0]), names, units_row
     groups = above[header - 1] if header else []
     if len(groups) == len(names) > len({*names}):
@@ -892,7 +995,7 @@ def read_table(
         last = max(odd_lines, default=0)
         return table._replace(cut_line=last) if last > max(frame.index) else table
     text, encoding = decode(read_content(path), options.encoding)
-    cells = split_cells(text, options.columns)
+    cells = split_cells(text, options.columns, options.channels)
     if not cells.header:
         raise UnreadableError("Expected a header and rows, it is empty")
     header = _without_trailing_empty(cells.header)  # a delimiter at its end
@@ -913,10 +1016,11 @@ def read_table(
     mark = numbers = ""
     notes = cells.notes
     if not as_text:
-        decimal = options.decimal or decimal
         write_curves(frame)
         cell_units = _take_units_off(frame, options)
-        mark, group, odd_cells = write_as_python(frame, cells.delimiter, decimal, options.thousands)
+        mark, group, odd_cells = write_as_python(
+            frame, cells.delimiter, options.decimal or decimal, options.thousands
+        )
         wrong |= odd_cells
         units_text, unit_notes = _convert_cells(frame, cell_units, cells.units)
         parts = (
@@ -932,11 +1036,12 @@ def read_table(
     faults = [Fault(path.name, i, message) for i, message in sorted(wrong.items())]
     frame = frame.drop(index=[i for i in wrong if i in complete])
     column_units = cells.units[:n]
-    _add_stated_units(column_units, header, _lines_above(text, cells.line))
-    preamble = _lines_above(text, min(cells.rows, default=1))
+    begin = min(cells.rows, default=1)
+    preamble = _lines_above(text, begin)
+    _add_stated_units(column_units, header, _lines_above(text, cells.line or begin))
     about = (cells.fields, cells.n_remarks, cells.blocks, *rate_in_preamble(preamble), RATE_ABOVE)
     first = (frame, faults, cells.line, column_units, mark, numbers)
-    return TextTable(*first, *about, notes, cut_line, lines_of_factors(preamble))
+    return TextTable(*first, *about, notes, cut_line, lines_of_factors(preamble), preamble)
 
 
 def _lines_above(text: str, line: int) -> str:
@@ -1098,7 +1203,8 @@ def parse_numbers(
     values : array of float32, shape (n, columns)
         Empty cells and those that are no numbers are NaN.
     wrong : dict of int to str
-        A message for the index of each row that has a cell that is no number.
+        A message for the index of each row that has a cell that is no number. It counts the dates
+        that a spreadsheet made of numbers.
     lost : dict of int to str
         The cell of those rows in which all such cells are a `STATUS`.
     """
@@ -1106,6 +1212,7 @@ def parse_numbers(
     wrong = dict[int, str]()
     lost = dict[int, str]()
     damaged = set[int]()
+    dates = Counter[int]()
     for i, name in enumerate(frame.columns):
         cells = frame.iloc[:, i]
         values[:, i], odd = floats(cells)
@@ -1114,13 +1221,23 @@ def parse_numbers(
             prefix = NUMBER_PREFIX.match(cell)  # always matches: it may be empty
             actual = excerpt(cell, prefix.end() if prefix else 0)
             message = f"Expected a number in column {name}, got {actual}"
-            if NUMBER_AND_UNIT.fullmatch(cell):
+            is_date = SPREADSHEET_DATE.fullmatch(cell) is not None
+            if NUMBER_AND_UNIT.fullmatch(cell) and not is_date:
                 message = f"{message}; export plain numbers, without units"
             wrong.setdefault(index, message)
-            if STATUS.fullmatch(cell):
+            if is_date:
+                dates[index] += 1
+                damaged.add(index)
+            elif STATUS.fullmatch(cell):
                 lost.setdefault(index, cell.strip())
             else:
                 damaged.add(index)
+    turned = "a spreadsheet turned numbers such as 1.3 into dates"
+    for index in dates:
+        count = f"{dates.total()} of {values.size} cells are dates"
+        more = f", {turned}; export again, without opening it in one"
+        more = more if dates.total() < values.size else ""
+        wrong[index] = f"{wrong[index]}: {count}{more}"
     with np.errstate(over="ignore"):  # what overflows becomes an infinity, which the engine finds
         numbers = values.astype(np.float32)
     return numbers, wrong, {i: cell for i, cell in lost.items() if i not in damaged}
@@ -1141,7 +1258,7 @@ def read_recording(
     """
     table = _of_one_signal(read_table(path, options, decimal), channels)
     header = list(table.frame.columns)
-    places = [column_place(name, header, table.line) for name in channels]
+    places = [column_place(name, header, table.line, table.preamble) for name in channels]
     for fault in table.faults:
         if fault.line != table.cut_line:
             raise UnreadableError(fault.message, fault.line)
@@ -1413,6 +1530,9 @@ def _trace_by_clock(
         return Recording(even_trace, rate_hz, reading=reading, length=trace.shape[1])
     check_rows(clock, rows.index, options.time)
     _check_repeated(rows, clock)
+    confirmed = clock._replace(note="")  # on its unit
+    if rate_hz is not None and not rate_contradiction(confirmed, rate_hz):
+        clock = confirmed
     if options.rate_hz is None and rate_hz is not None and not shows_lost_rows(clock):
         clock_text = f"{RATE_ABOVE}; {lost_rows_text(clock)}"
         if not rate_contradiction(clock, rate_hz):
@@ -1508,15 +1628,23 @@ def _offer_clock(rows: pd.DataFrame, places: Sequence[int], notes: Counter[str])
             return
 
 
-def column_place(name: str, header: Sequence[str], line: int = 1) -> int:
+def column_place(name: str, header: Sequence[str], line: int = 1, preamble: str = "") -> int:
     """Return the position of a column in a header, found by `units.find_columns`.
 
     Raises UnreadableError, with the header's line, if there is none or several.
+
+    preamble : the first lines of the file, for the error, in which the column may stand.
     """
     places = units.find_columns(name, header)
     columns = listed(header)
     if not places:
-        raise UnreadableError(f"Expected a column {name}, got {columns}", line)
+        message = f"Expected a column {name}, got {columns}"
+        for i, text in enumerate(preamble.splitlines(), start=1):
+            cells = [cell.strip(" \"'") for cell in CELL_MARK.split(text)]
+            if i != line and units.find_columns(name, cells):
+                do = "if that line is the header, name the columns as it does (columns)"
+                raise UnreadableError(f"{message}; {name} stands in line {i}: {do}", line)
+        raise UnreadableError(message, line)
     if len(places) > 1:
         names = list(header)
         do = "name it as it stands"

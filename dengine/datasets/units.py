@@ -16,6 +16,7 @@ PREFIXES: dict[str, float] = TABLES["prefixes"]
 BASES: dict[str, tuple[str, float]] = TABLES["bases"]  # with their dimension and factor
 SECONDS: dict[str, float] = TABLES["seconds"]
 ALONE: list[str] = TABLES["alone"]
+FORCES: list[str] = TABLES["forces"]
 USUAL_PREFIXES = ("", "k", "m", "M")  # by which a unit is known that is spelled in another case
 BRACKETED = re.compile(
     r"(?P<name>.*?)\s*[\[({<]\s*(?P<unit>[^\[\](){}<>]*?)\s*[\])}>]\s*"
@@ -216,6 +217,23 @@ def _unit_at_end(name: str, text: str) -> str:
     if text in meant and not (name + text).isupper():
         return text
     return next(iter(meant)) if len(set(meant.values())) == 1 else ""
+
+
+def likely_channel(names: Sequence[str]) -> str:
+    """Return the channel that users most likely mean, the first of a force or torque by its name.
+
+    Without any it is the first by its unit, N before mm; without these the first of all.
+    """
+
+    def score(name: str) -> int:
+        """Return 2 for a name of a force, more with such a unit, less with that of another."""
+        dimension, _ = parse(split(name)[1]) or ("", 1.0)
+        words = name.lower()
+        is_named = _quantity(name) != "" or any(word in words for word in FORCES)
+        is_other = dimension in NO_FORCE and dimension != "Nm"
+        return 2 * is_named + (dimension != "") - 4 * is_other
+
+    return max(names, key=score)
 
 
 def words_in(name: str) -> list[str]:

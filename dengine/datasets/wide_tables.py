@@ -85,12 +85,13 @@ def with_samples_in_columns(
     return result, replace(options, time=None)
 
 
-def turn_table(table: TextTable, options: LoadOptions) -> TextTable:
+def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable:
     """Return a table with a column for each part as a wide table, with a row for each part.
 
     Such a table has times in its first column, eight or more columns of numbers beside it, and
     labels in the names of these, or in a row without a time. Any other table is returned as it is.
-    The index of the new rows counts the columns.
+    The index of the new rows counts the columns. Raises DataError if a spreadsheet made dates of
+    numbers.
     """
     import pandas as pd
 
@@ -120,6 +121,7 @@ def turn_table(table: TextTable, options: LoadOptions) -> TextTable:
     has_listing = options.labels is not None
     if not (has_names or rows or has_listing or options.label in about):
         return table
+    wrong = _wrong_in_columns(frame[is_sample].iloc[:, 1:], source)
     samples = frame[is_sample].iloc[:, 1:].T.set_axis(list(map(str, range(len(times)))), axis=1)
     wide = pd.concat([about, samples], axis=1).assign(**{options.part: frame.columns[1:]})
     if has_names and not rows:
@@ -132,7 +134,26 @@ def turn_table(table: TextTable, options: LoadOptions) -> TextTable:
         rate = None if clock is None else rate_of(clock, times.index)
     wide = wide.set_axis(range(2, len(wide) + 2))
     clock_text = "the first column, a column for each part"
-    return table._replace(frame=wide, units=[], rate_hz=rate, clock=clock_text)
+    table = table._replace(frame=wide, units=[], rate_hz=rate, clock=clock_text)
+    return table._replace(column_of=dict(enumerate(frame.columns[1:], start=2)), wrong=wrong)
+
+
+def _wrong_in_columns(samples: pd.DataFrame, source: str) -> dict[int, UnreadableError]:
+    """Return what is wrong in each column of samples, by its place in the file from 2.
+
+    Raises DataError if a spreadsheet made dates of numbers.
+    """
+    _, of_lines, _ = parse_numbers(samples)
+    for line, message in of_lines.items():
+        if " cells are dates" in message:
+            raise DataError(f"Cannot read {Fault(source, line, message)}.")
+    wrong = {}
+    for place, name in enumerate(samples.columns if of_lines else (), start=2):
+        _, of_lines, _ = parse_numbers(samples[[name]])
+        if of_lines:
+            line = min(of_lines)
+            wrong[place] = UnreadableError(of_lines[line], line)
+    return wrong
 
 
 def _word_in_name(name: str, source: labels.LabelSource) -> str:
@@ -183,15 +204,16 @@ def wide_rows(
     def read(line: int, trace: NDArray[np.float32], words: Sequence[Any], part: str) -> Recording:
         """Return a row as a recording; raise UnreadableError for a bad cell or label."""
         if line in wrong:
-            raise UnreadableError(wrong[line])
+            raise table.wrong.get(line) or UnreadableError(wrong[line])
         rate = None if options.rate_hz else stated.rate_of.get(line)
+        place = f"column {table.column_of[line]}" if table.column_of else f"line {line}"
         is_stated = len(columns) == 1 and line in stated.unit_of
         recording = Recording(
             without_trailing_nan(trace),
             rate,
             (stated.unit_of[line],) if is_stated else channel_units,
             reading=Reading(numbers=table.numbers, clock="" if rate is None else stated.clock),
-            source=f"{source}, line {line}",
+            source=f"{source}, {place}",
             part=part or None,
             factors={**table.factors, **stated_factors(in_rows.get(line, {}))},
         )

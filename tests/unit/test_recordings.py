@@ -1756,6 +1756,7 @@ def test_a_table_with_a_column_for_each_part_is_read(
 
 
 def write_rows(path: Path, rows: list[list[str]]) -> Path:
+    path.parent.mkdir(exist_ok=True)
     path.write_text("\n".join(map(";".join, rows)))
     return path
 
@@ -2806,6 +2807,146 @@ def test_a_unit_in_a_name_is_read_in_any_case_and_one_that_may_be_another_is_not
     notes = [note for note in data.notes if f"The name {name} may tell a unit" in note]
     assert len(notes) == (data.unit == "")
     assert load_dataset(tmp_path, channel=name, unit=data.unit or "kN").notes == ()
+
+
+HEADS = {
+    "channels and rates below": "Zeit;Kraft_U9C;Weg\ns;kN;mm\nKanal 0;CH 1;CH 2\n"
+    "SR: 400 Hz;SR: 400 Hz;SR: 400 Hz",
+    "sensors below": "Zeit;Kraft_U9C;Weg\n[s];[kN];[mm]\nUhr;U9C/10kN;WA50",
+    "rates below": "Zeit;Kraft_U9C;Weg\ns;kN;mm\n400 Hz;400 Hz;400 Hz",
+    "a line below": "Zeit;Kraft_U9C;Weg\ns;kN;mm\n---",
+    "descriptions above units": "Zeit;Kraft_U9C;Weg\nclock;upper sensor;sensor of way\ns;kN;mm",
+    "units in the header": "Zeit [s];Kraft_U9C [kN];Weg [mm]\nKanal 0;CH 1;CH 2",
+}
+
+
+def write_heads(head: str, folder: Path, preamble: str = "Job: 7\nMessrate: 400 Hz\n\n") -> Path:
+    """Two recordings of 60 samples at 400 Hz below a head of several lines."""
+    folder.mkdir(exist_ok=True)
+    for scale, name in enumerate(("a_OK.csv", "b_NOK.csv"), start=1):
+        values = [(i / 400, scale * np.sin(i), scale * i / 7) for i in range(60)]
+        rows = [f"{t:.4f};{f:.5f};{x:.4f}".replace(".", ",") for t, f, x in values]
+        (folder / name).write_text("\n".join([preamble + head, "", *rows, ""]))
+    return folder
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_of_several_lines_above_the_samples_that_with_the_channel_is_the_header(
+    head: str, tmp_path: Path
+) -> None:
+    source = write_heads(HEADS[head], tmp_path / "cell")
+    by_name = load_dataset(source, channel="Kraft_U9C")
+    assert (by_name.unit, by_name.rate_hz) == ("kN", 400.0)
+    assert "header in line 4" in by_name.reading["rows"]
+    by_columns = load_dataset(source, columns=["Zeit", "Kraft_U9C", "Weg"], channel="Kraft_U9C")
+    assert (by_columns.unit, by_columns.rate_hz) == ("kN", 400.0)
+    np.testing.assert_array_equal(by_columns.X, by_name.X)
+    if "below" in head:
+        with pytest.raises(DataError, match="channel='Kraft_U9C'; there are Kraft_U9C, Weg"):
+            load_dataset(source)
+
+
+def test_a_rate_in_a_name_is_no_unit_of_the_channel(tmp_path: Path) -> None:
+    source = write_heads("Zeit;CH 1 SR: 400 Hz;Force 10 Hz", tmp_path / "cell")
+    assert load_dataset(source, channel="CH 1 SR: 400 Hz").unit == ""
+    assert load_dataset(source, channel="Force 10 Hz").unit == "N"
+
+
+def test_named_columns_have_the_unit_of_a_line_above_the_samples(tmp_path: Path) -> None:
+    source = write_heads("A;B;C", tmp_path / "cell", "Force unit: kN\n")
+    assert load_dataset(source, columns=["time", "force", "x"], channel="force").unit == "kN"
+
+
+def test_the_error_on_a_channel_says_in_which_line_above_the_samples_it_stands(
+    tmp_path: Path,
+) -> None:
+    source = write_heads("Kraft;7\nzeit;CH 1;CH 2", tmp_path / "cell")
+    with pytest.raises(DataError, match=r"line 5: .*column Kraft, got .*; Kraft stands in line 4"):
+        load_dataset(source, channel="Kraft")
+
+
+def test_a_damaged_first_row_is_a_fault_and_no_header(tmp_path: Path) -> None:
+    source = write_heads("Zeit;Kraft;Weg\n0,0;x12;0,0", tmp_path / "cell", "")
+    with pytest.raises(DataError, match="line 2: Expected a number in column Kraft, got"):
+        load_dataset(source, channel="Kraft")
+
+
+def columns_of_parts(cell: Callable[[int, int], str]) -> list[list[str]]:
+    """A table with a column for each of 12 parts, with times in steps of 5 ms."""
+    header = ["t_ms", *(f"{'NIO' if i % 3 == 0 else 'IO'}_{i}" for i in range(12))]
+    return [header, *([f"{5 * k}", *(cell(i, k) for i in range(12))] for k in range(40))]
+
+
+@pytest.mark.parametrize(
+    "month", ["01. Mrz", "Mrz 75", "1-Mar", "Mar-75", "01-mars", "3. lut", "3月1日"]
+)
+def test_the_error_on_numbers_that_a_spreadsheet_turned_into_dates_says_so_and_counts(
+    month: str, small: Dataset, tmp_path: Path
+) -> None:
+    why = r"cells are dates, a spreadsheet turned numbers such as 1.3 into dates; export again"
+    rows = columns_of_parts(lambda i, k: month if k > 20 and i > 3 else f"{0.01 * k:.2f}")
+    path = write_rows(tmp_path / "parts.csv", rows)
+    where = f"parts.csv, line 23: Expected a number in column IO_4, got '{month}'.*: 152 of 480"
+    with pytest.raises(DataError, match=f"{where} {why}"):
+        load_dataset(path, unit="kN")
+    for i, word in enumerate(words(small)):
+        rows = [
+            ["time", "FZ"],
+            *([f"{k / 100:.2f}", month if k == 7 else "0.5"] for k in range(50)),
+        ]
+        write_rows(tmp_path / "cell" / f"{i:03}_{word}.csv", rows)
+    with pytest.raises(DataError, match=f"000_.*, line 9: Expected .* '{month}'.*: 1 of 50 {why}"):
+        load_dataset(tmp_path / "cell")
+
+
+def test_a_fault_in_a_table_with_a_column_for_each_part_names_line_and_column_of_the_file(
+    tmp_path: Path,
+) -> None:
+    rows = columns_of_parts(lambda i, k: "0x5" if (i, k) == (4, 9) else f"{0.01 * k + i:.2f}")
+    path = write_rows(tmp_path / "parts.csv", rows)
+    data = load_dataset(path)
+    assert len(data) == 11
+    assert [str(fault) for fault in data.faults] == [
+        "parts.csv, column IO_4, line 11: Expected a number in column IO_4, got '0x5'"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("names", "likely"),
+    [
+        (["位移(mm)", "压力(kN)"], "压力(kN)"),
+        (["変位[mm]", "荷重[N]"], "荷重[N]"),
+        (["Droga", "Siła"], "Siła"),
+        (["Kraftweg [mm]", "CH2", "Presskraft"], "Presskraft"),
+        (["Winkel (deg)", "CH1 (Nm)"], "CH1 (Nm)"),
+        (["Pos [mm]", "CH1"], "CH1"),
+    ],
+)
+def test_the_error_on_several_channels_proposes_the_force_by_its_name_or_unit(
+    names: list[str], likely: str, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        write_csv(tmp_path / f"{i:03}_{word}.csv", np.stack([x] * len(names)), tuple(names))
+    with pytest.raises(DataError, match=re.escape(f"as in channel={likely!r}; there are")):
+        load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(("sample_time", "is_noted"), [("1", False), ("2", True), ("", True)])
+def test_a_header_that_confirms_the_unit_of_a_clock_spares_the_note_on_it(
+    sample_time: str, is_noted: bool, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        rows = scope_rows(x, word)
+        if sample_time:
+            rows.insert(3, ["SampleTime[ms]", sample_time, "SampleTime[ms]", "1"])
+        write_rows(tmp_path / "scope" / f"{i:03}_{word}.csv", rows)
+        rate = f"Sample rate: {1000 / float(sample_time or 4):g} Hz"
+        above = [[rate], ["Time", "fForce"], *([f"{k}", f"{v}"] for k, v in enumerate(x))]
+        write_rows(tmp_path / "rate" / f"{i:03}_{word}.csv", above)
+    for form in ("scope", "rate"):
+        data = load_dataset(tmp_path / form, channel="fForce")
+        assert data.rate_hz == 1000.0
+        assert any("names no unit and is read as milli" in note for note in data.notes) == is_noted
 
 
 def test_of_two_channels_each_has_its_own_unit_or_none(small: Dataset, tmp_path: Path) -> None:
