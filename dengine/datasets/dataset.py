@@ -953,7 +953,7 @@ def _with_guesses(stated: Sequence[str], collector: RecordingCollector) -> str:
     guesses[: len(stated)] = [unit or guess for unit, guess in zip(stated, guesses, strict=False)]
     for name, unit in zip(names, guesses, strict=True):
         if not unit and (word := units.maybe_unit(name)):
-            do = f"none is assumed, unit={word.partition(' ')[0]!r} states it"
+            do = "none is assumed, unit=... states it"
             collector.notes[f"The name {name} may tell a unit, {word}: {do}"] = 1
     return ", ".join(guesses if len(set(guesses)) > 1 else guesses[:1])
 
