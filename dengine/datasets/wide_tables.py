@@ -126,7 +126,7 @@ def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable
     wide = pd.concat([about, samples], axis=1).assign(**{options.part: frame.columns[1:]})
     if has_names and not rows:
         wide["label"] = [_word_in_name(name, in_names) for name in frame.columns[1:]]
-    elif options.label is None:
+    elif rows and options.label is None:
         wide = wide.rename(columns={rows[0]: "label"})
     rate = None
     with suppress(UnreadableError):

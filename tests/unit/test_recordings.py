@@ -1728,7 +1728,7 @@ def test_an_archive_names_its_channels_in_an_array_of_texts(
 
 
 @pytest.mark.parametrize(
-    "form", ["words in names", "a row of verdicts", "rows of serials and words"]
+    "form", ["words in names", "a row of verdicts", "rows of serials and words", "a listing"]
 )
 def test_a_table_with_a_column_for_each_part_is_read(
     form: str, small: Dataset, tmp_path: Path
@@ -1740,6 +1740,9 @@ def test_a_table_with_a_column_for_each_part_is_read(
         names = [f"{name} {word}" for name, word in zip(names, words(small), strict=True)]
     elif form == "a row of verdicts":
         rows.insert(0, ["Verdict", *words(small)])
+    elif form == "a listing":
+        pairs = list(map(list, zip(names, words(small), strict=True)))
+        how = {"labels": str(write_rows(tmp_path / "list.csv", [["sample", "result"], *pairs]))}
     else:
         rows.insert(0, ["Bewertung", *np.where(small.y == 1, "heil", "Riss")])
         rows.insert(0, ["Serial", *(f"A{i}" for i in range(24))])
@@ -1751,8 +1754,9 @@ def test_a_table_with_a_column_for_each_part_is_read(
     np.testing.assert_array_equal(data.X, small.X)
     np.testing.assert_array_equal(data.y, small.y)
     assert data.rate_hz == 500.0
-    assert data.part is not None
-    assert data.part.tolist() == names
+    parts = data.source if form == "a listing" else data.part
+    assert parts is not None
+    assert list(parts) == names
 
 
 def write_rows(path: Path, rows: list[list[str]]) -> Path:
