@@ -816,10 +816,13 @@ def _leave_out_overflows(collector: RecordingCollector) -> None:
     """Make faults of the recordings in which an overflow mark, as 1000000, stands for samples.
 
     That is one value in several samples, `FAR` times larger than the peaks of most recordings.
+    Recordings as large that are whole numbers where most have decimals are faults too: a
+    spreadsheet that expects another decimal mark reads 12.345 as 12345.
     """
     with np.errstate(invalid="ignore"):
         peaks = np.array([np.nan_to_num(np.abs(r.trace)).max() for r in collector.recordings])
         largest = FAR * float(np.median(peaks))
+        is_whole = [not (r.trace % 1 > 0).any() for r in collector.recordings]
         reasons = {}
         for i in np.flatnonzero((peaks > largest) & (largest > 0)):
             trace = collector.recordings[i].trace
@@ -827,6 +830,10 @@ def _leave_out_overflows(collector: RecordingCollector) -> None:
             if len(marks) > 1 and len({*marks.tolist()}) == 1:
                 actual = f"{len(marks)} samples are {marks[0]:g}, as of an overflow"
                 reasons[int(i)] = f"Expected measured samples, {actual}"
+            elif is_whole[i] and np.mean(is_whole) < 0.5:
+                actual = f"got whole ones more than {FAR:g} times as large"
+                do = "a spreadsheet may have dropped the decimal mark; export the file again"
+                reasons[int(i)] = f"Expected numbers with decimals as in most, {actual}; {do}"
     collector.leave_out(reasons)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
+from ..traces import is_time_column
 from . import labels, units
 from .clocks import (
     clock_of,
@@ -28,6 +29,7 @@ from .columns import (
     choose_label_column,
     compared_columns,
     count_labels,
+    numbered_columns,
     sample_columns,
     unit_columns,
 )
@@ -89,14 +91,14 @@ def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable
     """Return a table with a column for each part as a wide table, with a row for each part.
 
     Such a table has times in its first column, eight or more columns of numbers beside it, and
-    labels in the names of these, or in a row without a time. Any other table is returned as it is.
-    The index of the new rows counts the columns. Raises DataError if a spreadsheet made dates of
-    numbers.
+    labels in the names of these, in a row without a time, or in a listing. Any other table, as one
+    of serials and numbered samples, is returned as it is. The index of the new rows counts the
+    columns. Raises DataError if a spreadsheet made dates of numbers.
     """
     import pandas as pd
 
     frame = table.frame
-    has_parts = options.part in frame.columns[1:]
+    has_parts = options.part in frame.columns
     if not frame.columns.is_unique or frame.shape[1] <= MIN_NUMBERED or has_parts:
         return table
     first = str(frame.columns[0])
@@ -118,8 +120,10 @@ def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable
     if not (has_names or rows):  # words whose meaning the error asks for
         few = min(MAX_LABEL_WORDS, len(about) / 2)
         rows = [name for name in unique if 2 <= unique[name].nunique() <= few]
-    has_listing = options.labels is not None
-    if not (has_names or rows or has_listing or options.label in about):
+    is_listed = options.labels is not None and (
+        is_time_column(first) or not numbered_columns(frame.columns)
+    )
+    if not (has_names or rows or is_listed or options.label in about):
         return table
     wrong = _wrong_in_columns(frame[is_sample].iloc[:, 1:], source)
     samples = frame[is_sample].iloc[:, 1:].T.set_axis(list(map(str, range(len(times)))), axis=1)

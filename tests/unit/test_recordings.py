@@ -1759,6 +1759,35 @@ def test_a_table_with_a_column_for_each_part_is_read(
     assert list(parts) == names
 
 
+def test_serials_that_rise_evenly_are_no_clock_of_a_table_with_a_listing(
+    small: Dataset, tmp_path: Path
+) -> None:
+    serials = [f"{i:05}" for i in range(24)]
+    table = wide(small).drop(columns="label")
+    table.insert(0, "serial", serials)
+    table.to_csv(tmp_path / "wide.csv", index=False)
+    pairs = map(list, zip(serials, words(small), strict=True))
+    listing = write_rows(tmp_path / "list.csv", [["Serial", "Verdict"], *pairs])
+    with pytest.raises(DataError, match="as in part='serial'"):
+        load_dataset(tmp_path / "wide.csv", labels=str(listing))
+    data = load_dataset(tmp_path / "wide.csv", labels=str(listing), part="serial")
+    np.testing.assert_allclose(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
+
+
+def test_files_whose_decimal_mark_a_spreadsheet_dropped_are_left_out(tmp_path: Path) -> None:
+    clean = np.linspace(0.125, 9.875, 40)
+    for i in range(12):
+        rows = [["Force"], *([f"{value:.3f}"] for value in clean + i / 8)]
+        if i in (3, 7):
+            rows = [[cell.replace(".", "") for cell in row] for row in rows]
+        write_rows(tmp_path / f"{i:03}_{'NOK' if i % 4 == 2 else 'OK'}.csv", rows)
+    data = load_dataset(tmp_path, channel="Force", rate_hz=100)
+    assert len(data.X) == 10
+    assert [fault.source[:3] for fault in data.faults] == ["003", "007"]
+    assert "dropped the decimal mark" in str(data.faults[0])
+
+
 def write_rows(path: Path, rows: list[list[str]]) -> Path:
     path.parent.mkdir(exist_ok=True)
     path.write_text("\n".join(map(";".join, rows)))
