@@ -570,7 +570,8 @@ class RecordingCollector:
         spans = [(r.trace.shape[1] - 1) / (r.rate_hz or np.inf) for r in in_order]
         if not has_dates or (apart and (np.diff(starts) <= spans[:-1]).any()):
             is_other = any(a is not b for a, b in zip(in_order, self.recordings, strict=True))
-            self.order = "as the rows, not by their times" if is_other else self.order
+            if is_other and self.order == "as the rows":
+                self.order = "as the rows, not by their times"
             return
         self.ordered = True
         self.order = "by the dates of their clocks"

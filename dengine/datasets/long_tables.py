@@ -74,6 +74,58 @@ MIN_RUN = 8  # rows on average that stand together in a table that is in the ord
 FEW_AGAIN = 0.2  # of the parts' numbers: if fewer come again, these are single faults
 
 
+def unwrap_ring(
+    frame: pd.DataFrame, options: LoadOptions, collector: RecordingCollector
+) -> pd.DataFrame:
+    """Return the rows of a ring buffer that wrapped, the oldest first; a note says so.
+
+    In such a file one column of dates, or of a running number, goes back once, and its last value
+    comes before its first. Other tables are returned as they are.
+    """
+    import pandas as pd
+
+    for name in frame.columns.difference([options.part, *options.channels], sort=False):
+        oldest = _oldest_row(frame[name]) if (frame.columns == name).sum() == 1 else 0
+        if not oldest:
+            continue
+        line = frame.index[oldest]
+        note = f"Column {name} goes back in line {line}, as in a ring buffer that wrapped: the rows"
+        note = f"{note} from there on are put first"
+        if options.part in frame:
+            parts = frame[options.part].astype(str)
+            if parts.iloc[0] == parts.iloc[-1]:
+                note = f"{note}, and part {parts.iloc[0]} is joined of its two pieces"
+            note = f"{note}; the beginning of part {parts.iloc[oldest]} may be overwritten"
+        collector.notes[note] = 1
+        collector.order = f"as the rows from line {line} on, by column {name}"
+        return pd.concat([frame.iloc[oldest:], frame.iloc[:oldest]])
+    return frame
+
+
+def _oldest_row(column: pd.Series) -> int:
+    """Return the position of the oldest row of a ring buffer by a column of it; 0 if it is none.
+
+    Dates fall there alone, and not where summer time ends. Other numbers rise from row to row, and
+    the first is the next after the last: a counter that started anew would not go on so.
+    """
+    with suppress(UnreadableError):
+        ends, has_dates = times_of(column.iloc[[0, -1]])
+        gap = ends[0] - ends[1]
+        if not (gap > 0 or (gap == 0 and has_dates)):
+            return 0
+        times, _ = times_of(column)
+        steps = np.diff(times)
+        falls = np.flatnonzero(steps < 0)
+        if len(falls) != 1 or np.isnan(times).any():
+            return 0
+        if has_dates:
+            is_ring = SUMMER_TIME not in seconds_of(column, str(column.name))[-1]
+        else:
+            is_ring = gap <= MAX_GAP * np.median(steps) and (steps != 0).all()
+        return int(falls[0]) + 1 if is_ring else 0
+    return 0
+
+
 def concatenate_long(
     tables: Mapping[str, pd.DataFrame], options: LoadOptions
 ) -> tuple[pd.DataFrame, NDArray[np.bool_]]:
@@ -325,7 +377,11 @@ def _check_together(rows_of_part: Mapping[str, pd.DataFrame]) -> None:
         return  # a fault of that part
     lines = listed(run.index[0] for _, run in rows_of_part[part].groupby(RUN_COLUMN))
     wanted = f"the rows of each part together, part {part} begins in lines {lines}"
-    raise DataError(f"Expected {wanted}, other parts between; make the parts' numbers unique.")
+    do = "make the parts' numbers unique"
+    runs = rows_of_part[part][RUN_COLUMN].unique().tolist()
+    if runs == [1, max(rows[RUN_COLUMN].max() for rows in rows_of_part.values())]:
+        do = f"put the rows in order if the file is a ring buffer that wrapped, else {do}"
+    raise DataError(f"Expected {wanted}, other parts between; {do}.")
 
 
 def cut_by_windows(

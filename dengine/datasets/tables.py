@@ -32,7 +32,7 @@ from .dataset import (
     UnreadableError,
     as_dataset,
 )
-from .long_tables import concatenate_long, cut_by_windows, from_long, long_table_advice
+from .long_tables import concatenate_long, cut_by_windows, from_long, long_table_advice, unwrap_ring
 from .text import (
     TextTable,
     cut_note,
@@ -172,6 +172,7 @@ def _from_tables(
         cut = [fault for fault in collector.faults if (fault.source, fault.line) in cut_lines]
         collector.faults = [fault for fault in collector.faults if fault not in cut]
         collector.notes.update(map(cut_note, cut))
+        frames = {key: unwrap_ring(frame, options, collector) for key, frame in frames.items()}
         frame, is_repeated = concatenate_long(frames, options)
         frame, windows = cut_by_windows(frame, tables[first], options, collector)
         return from_long(frame, is_repeated, options, collector, first, tables[first], windows)

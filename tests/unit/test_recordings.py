@@ -3390,3 +3390,58 @@ def test_a_copy_that_a_listing_calls_bad_contradicts_its_original(tmp_path: Path
     (tmp_path / "list.csv").write_text("\n".join(rows))
     data = load_dataset(tmp_path / "d", labels=tmp_path / "list.csv")
     assert {fault.source for fault in data.faults} == {"C0.csv", "C0 - Copy.csv"}
+
+
+def ring(n_parts: int = 8, samples: int = 40, oldest: int = 130) -> pd.DataFrame:
+    """The log of a PLC whose newest row is followed by its oldest; part 3 is in two pieces."""
+    rng = np.random.default_rng(6)
+    n = n_parts * samples
+    frame = pd.DataFrame(
+        {
+            "Record": 7000 + np.arange(n),
+            "Stamp": pd.date_range("2026-03-01 05:59:58", periods=n, freq="10ms").astype(str),
+            "PartNo": np.repeat(np.arange(n_parts), samples),
+            "t_ms": np.tile(10 * np.arange(samples), n_parts),
+            "Force": np.round(rng.normal(size=n), 3),
+            "Result": np.repeat(["OK", "NOK"] * (n_parts // 2), samples),
+        }
+    )
+    return pd.concat([frame.iloc[oldest:], frame.iloc[:oldest]])
+
+
+@pytest.mark.parametrize("proof", ["Record", "Stamp"])
+@pytest.mark.parametrize("time", ["t_ms", "Stamp", "Record", "none"])
+def test_the_rows_of_a_ring_buffer_that_wrapped_are_put_in_order_with_a_note(
+    proof: str, time: str, tmp_path: Path
+) -> None:
+    log = ring().drop(columns={"Record", "Stamp"} - {proof, time})
+    if proof != "Record" and time == "Record":
+        log = log.drop(columns="Stamp")
+    log.to_csv(tmp_path / "log.csv", index=False)
+    rate = {} if time in ("t_ms", "Stamp") else {"rate_hz": 100.0}
+    data = load_dataset(
+        tmp_path / "log.csv", part="PartNo", label="Result", channel="Force", time=time, **rate
+    )
+    in_order = ring().sort_values("Record")["Force"].to_numpy().reshape(8, 40)
+    np.testing.assert_allclose(data.X, in_order, rtol=1e-5)
+    assert data.y.tolist() == [1, 0] * 4
+    note = next(note for note in data.notes if "ring buffer" in note)
+    assert "goes back in line 192" in note
+    assert "part 3 is joined of its two pieces; the beginning of part 0 may be" in note
+    assert "line 192 on" in data.reading["order"] or "by the dates" in data.reading["order"]
+
+
+def test_a_counter_that_starts_anew_is_no_ring_buffer() -> None:
+    log = ring(oldest=0).drop(columns="Stamp")
+    log["Record"] = (np.arange(320) + 50_000) % 50_100
+    data = load_dataset(log, part="PartNo", label="Result", channel="Force", time="t_ms")
+    in_order = ring().sort_values("Record")["Force"].to_numpy().reshape(8, 40)
+    np.testing.assert_allclose(data.X, in_order, rtol=1e-5)
+    assert not any("ring buffer" in note for note in data.notes)
+
+
+def test_a_part_at_both_ends_of_a_table_that_counts_no_rows_may_be_of_a_ring_buffer() -> None:
+    log = ring().drop(columns=["Record", "Stamp"])
+    do = "put the rows in order if the file is a ring buffer that wrapped, else make the parts' num"
+    with pytest.raises(DataError, match=do):
+        load_dataset(log, part="PartNo", label="Result", channel="Force", time="t_ms")
