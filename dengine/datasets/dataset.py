@@ -763,11 +763,17 @@ def _fit_odd_lengths(
     """Make faults of the recordings whose length cannot be fitted, or with `keeps_all` fit them.
 
     A shorter one then repeats its last sample, a longer one is cut. Notes say how many there are,
-    and if most of those left out are bad.
+    which are cut much if `fit` is pad, and if most of those left out are bad.
     """
     recordings = collector.recordings
     lengths = [recording.trace.shape[1] for recording in recordings]
     odd = [i for i, n in enumerate(lengths) if not can_fit_length(n, samples, FITS.index(fit))]
+    if cut := [
+        f"{recordings[i].source} ({n})"
+        for i, n in enumerate(lengths)
+        if fit == "pad" and samples < SHORT * n and (keeps_all or i not in odd)
+    ]:
+        collector.notes[f"Of more samples only the first {samples} are read: {listed(cut)}"] = 1
     if keeps_all:
         for i in odd:
             positions = np.arange(samples).clip(max=lengths[i] - 1)

@@ -1330,10 +1330,9 @@ def _check_blocks(rows: pd.DataFrame, table: TextTable, options: LoadOptions) ->
         spans = sorted((block.min(), block.max()) for block in times)
         overlaps = any(a[1] > b[0] for a, b in itertools.pairwise(spans))
     if overlaps:
-        do = "write each into a file of its own, or, if they follow each other without a pause,"
+        do = "write each into a file of its own: the last one is usually the final measurement"
         raise UnreadableError(
-            f"Expected one recording, got {text}, and their times overlap; {do} "
-            f"time={NO_CLOCK!r} and the rate (rate_hz)",
+            f"Expected one recording, got {text}, and their times overlap; {do}",
             int(rows.index[blocks[1][0]]),
         )
     return text

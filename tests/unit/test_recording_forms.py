@@ -1195,11 +1195,25 @@ def test_blocks_whose_clock_starts_again_are_refused_with_their_number(
 ) -> None:
     text = "\n".join(LABVIEW) + blocks(SEGMENT, 0, 0, 0, form=form)
     (tmp_path / "a_OK.lvm").write_text(text)
-    wanted = r"got 3 blocks of 40 rows, .* times overlap; .* time='none' and the rate \(rate_hz\)"
-    with pytest.raises(DataError, match=wanted):
+    wanted = r"got 3 blocks of 40 rows, .* times overlap; .* last one is usually the final measure"
+    with pytest.raises(DataError, match=wanted) as caught:
         load_dataset(tmp_path, channel="Force")
+    assert "none" not in str(caught.value).partition("line 12")[2]
     data = load_dataset(tmp_path, channel="Force", time="none", rate_hz=250)
     np.testing.assert_array_equal(data.X[0], VALUES.astype(np.float32))
+
+
+@pytest.mark.parametrize("fit", [None, "pad", "pad-all"])
+def test_a_recording_that_is_cut_much_to_the_length_of_the_others_is_named(
+    fit: str | None, tmp_path: Path
+) -> None:
+    for i in range(6):
+        write(tmp_path / f"{i}_OK.csv", ["time", "FZ"], times(), texts(VALUES + i))
+    write(tmp_path / "6_OK.csv", ["time", "FZ"], times(2 * N), texts([*VALUES, *VALUES]))
+    write(tmp_path / "7_OK.csv", ["time", "FZ"], times(N + 10), texts([*VALUES, *VALUES[:10]]))
+    data = load_dataset(tmp_path, fit=fit)
+    note = f"Of more samples only the first {N} are read: 6_OK.csv ({2 * N})."
+    assert (len(data), note in data.notes) == (8, True)
 
 
 def test_a_pause_between_blocks_is_refused_with_their_number(tmp_path: Path) -> None:
