@@ -267,7 +267,7 @@ def choose_label_column(frame: pd.DataFrame, options: LoadOptions) -> str:
         raise DataError(f"Expected a row an insertion, got {listed(others)}, {do}.")
     cells = {name: Counter(frame[name].astype(str)) for name in others}
     likely = {name: n for name, n in cells.items() if 2 <= frame[name].nunique() <= MAX_LABEL_WORDS}
-    do = "add one that is called so, or give a listing, --labels labels.csv"
+    do = "add one that is called so"
     if likely:
         do = f"name it: {label_hints(likely, options)}"
     columns = listed(others or frame.columns)

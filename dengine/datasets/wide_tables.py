@@ -98,7 +98,7 @@ def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable
     import pandas as pd
 
     frame = table.frame
-    has_parts = options.part in frame.columns
+    has_parts = options.part in frame.columns[1:]
     if not frame.columns.is_unique or frame.shape[1] <= MIN_NUMBERED or has_parts:
         return table
     first = str(frame.columns[0])
