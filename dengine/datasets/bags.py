@@ -481,8 +481,10 @@ def _cut_windows(
     if not windows.since_1970 or not windows.n_inside(messages.dated / NANOSECONDS):
         messages = messages._replace(dated=messages.logged, clock=LOG_CLOCK)
         windows.check_inside(messages.dated / NANOSECONDS - begin, name)
-    counts = "UTC" if windows.since_1970 else "seconds from the start of the bag"
-    note = f"{windows.file} is read as {counts}, and compared with the {messages.clock}"
+    counts = (
+        "dates, UTC without a zone," if windows.since_1970 else "seconds from the start of the bag"
+    )
+    note = f"{windows.file} is read as {counts} and compared with the {messages.clock}"
     late_s = float(np.median(messages.logged - messages.dated)) / NANOSECONDS
     if messages.clock == LOG_CLOCK and windows.since_1970:
         note = f"{note}: no stamps of the headers are of its times"

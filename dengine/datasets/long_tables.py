@@ -420,8 +420,8 @@ def cut_by_windows(
             parts[known[window.positions]] = part
     is_inside = np.array([part is not None for part in parts])
     expect_data(bool(is_inside.any()), f"rows in windows of {windows.file}", collector.faults[:1])
-    counted = "UTC" if windows.since_1970 else "seconds of the recording"
-    collector.notes[f"{windows.file} is read as {counted}, and tells which rows are a part"] = 1
+    counted = "dates, UTC without a zone," if windows.since_1970 else "seconds of the recording"
+    collector.notes[f"{windows.file} is read as {counted} and tells which rows are a part"] = 1
     return frame.assign(**{options.part: parts})[is_inside], windows
 
 

@@ -1553,7 +1553,7 @@ def _measured(
         line = min(damaged)
         count = f", and {len(lost)} of {len(rows)} rows are such" if line in lost else ""
         raise UnreadableError(f"{wrong[line]}{count}", line)
-    do = "NaN; fit='resample' interpolates them"
+    do = "NaN; fit='resample' interpolates single ones"
     if lost and options.fit == "resample":
         do = "interpolated"
         is_measured = ~(rows.index.isin(list(lost)) & np.isnan(values).any(axis=1))

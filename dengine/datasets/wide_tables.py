@@ -72,9 +72,6 @@ def with_samples_in_columns(
         collector.faults += [Fault(source, line, why) for line, why in wrong.items()]
         if frame.empty:
             continue
-        if options.labels is not None:
-            wanted = f"a column of labels beside the curves in the cells of {source}"
-            raise DataError(f"Expected {wanted}, got a file of labels; join it to the table.")
         if unread:
             collector.notes[f"Not read: the columns {listed(unread)}"] = 1
         if rate is not None:

@@ -424,7 +424,7 @@ def test_windows_are_compared_with_the_log_if_no_stamp_is_of_their_time(
     listing = write_windows(tmp_path / "cycles.csv", bag)
     data = load_dataset(bag.write(tmp_path / "cell.mcap"), labels=listing)
     np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
-    note = "cycles.csv is read as UTC, and compared with the times of the log: no stamps"
+    note = "cycles.csv is read as dates, UTC without a zone, and compared with the times of the log: no stamps"
     assert any(text.startswith(note) for text in data.notes)
 
 

@@ -2462,8 +2462,13 @@ def test_lists_in_cells_are_traces_with_the_rate_of_the_times_beside_them(
     np.testing.assert_array_equal(data.X[3:], small.X[4:])
     assert (data.rate_hz, data.lengths[2]) == (100.0, 45)
     assert [(fault.line, fault.message[-12:]) for fault in data.faults] == [(4, "'no samples'")]
-    with pytest.raises(DataError, match="got a file of labels; join it to the table"):
-        load_dataset(source, part="serial", labels="listing.csv")
+    frame = pd.DataFrame(rows)
+    frame[["serial", "verdict"]][6:].to_csv(tmp_path / "results.csv", index=False)
+    listed = load_dataset(
+        frame.drop(columns="verdict"), part="serial", labels=str(tmp_path / "results.csv")
+    )
+    np.testing.assert_array_equal(listed.X, small.X[6:])
+    np.testing.assert_array_equal(listed.y, small.y[6:])
     rows[5]["t"] = [k / 50 for k in range(50)]
     data = load_dataset(pd.DataFrame(rows), part="serial")
     (fault, _) = data.faults
