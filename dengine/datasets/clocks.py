@@ -803,9 +803,24 @@ def shows_lost_rows(clock: Clock) -> bool:
 
 
 def lost_rows_text(clock: Clock) -> str:
-    """Return a text for the reading: does a clock show lost rows? They are not looked for here."""
-    shows = "shows" if shows_lost_rows(clock) else "is too coarse to show"
-    return f"column {clock.name} {shows} lost rows"
+    """Return a text for the reading: would a clock show lost rows? They are not looked for here."""
+    if shows_lost_rows(clock):
+        return f"lost rows would be seen in column {clock.name}"
+    return f"column {clock.name} is too coarse to show lost rows"
+
+
+def same_time_text(values: NDArray[np.float32], clock: Clock, lines: pd.Index) -> str:
+    """Return a text that names the first two lines of one time, with their values (C, T); else "".
+
+    lines : line in the file of each time.
+    """
+    first_of = dict[float, int]()
+    for i, time in enumerate(clock.seconds.tolist()):
+        if first_of.setdefault(time, i) != i:
+            pair = [first_of[time], i]
+            cells = " and ".join(listed(f"{x:.6g}" for x in values[:, j]) for j in pair)
+            return f"; lines {lines[pair[0]]} and {lines[i]} have the same time, and {cells}"
+    return ""
 
 
 def rate_contradiction(clock: Clock, rate_hz: float) -> str:

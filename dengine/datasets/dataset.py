@@ -473,6 +473,10 @@ class Recording(NamedTuple):
         Samples as recorded, if the trace has others by now; else 0.
     factors : mapping of str to float
         What it states that may make a quantity of counts, by name, as `scales.stated_factors`.
+    repeated : int
+        Number of its rows that came twice and were left out.
+    goes_back : str
+        Its column of times that goes back, if the user does not trust it; else "".
     """
 
     trace: NDArray[np.float32]
@@ -485,6 +489,8 @@ class Recording(NamedTuple):
     part: str | None = None
     length: int = 0
     factors: Mapping[str, float] = {}
+    repeated: int = 0
+    goes_back: str = ""
 
 
 @dataclass
@@ -636,6 +642,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         `fit="strict"`.
     """
     collector.check_label_words()
+    _note_rows(collector)
     leave_out_repeats(collector)
     _cut_padding(collector)
     _scale_counts(collector)
@@ -694,6 +701,22 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         lengths=np.array(lengths_read, dtype=np.int64),
         rates=rates if np.isfinite(rates).any() else None,
     )
+
+
+def _note_rows(collector: RecordingCollector) -> None:
+    """Add notes on rows that came twice, and on times that are not used and go back."""
+    name_of = {id(r): r.part or r.source for r in collector.recordings}
+    repeated = [r for r in collector.recordings if r.repeated]
+    if repeated:
+        n = sum(r.repeated for r in repeated)
+        names = listed(name_of[id(r)] for r in repeated)
+        rows = f"{n} rows came twice and are" if n > 1 else "1 row came twice and is"
+        parts = f"{len(repeated)} part{'s' if len(repeated) > 1 else ''}"
+        collector.notes[f"{rows} read once, in {parts}: {names}"] = 1
+    for column in sorted({r.goes_back for r in collector.recordings} - {""}):
+        names = listed(name_of[id(r)] for r in collector.recordings if r.goes_back == column)
+        text = f"Column {column} goes back, and rows stay as they are: {names}"
+        collector.notes[f"{text}; time={column!r} uses it"] = 1
 
 
 def leave_out_repeats(collector: RecordingCollector) -> list[int]:

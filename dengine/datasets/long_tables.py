@@ -20,10 +20,12 @@ from .clocks import (
     MAX_GAP,
     NO_CLOCK,
     SUMMER_TIME,
+    Clock,
     floats,
     holds_dates,
     is_rising,
     place_of_clock,
+    same_time_text,
     seconds_of,
     times_of,
 )
@@ -57,6 +59,7 @@ from .dataset import (
 from .scales import factors_in_columns
 from .text import (
     TextTable,
+    column_of_count,
     is_mostly_numbers,
     rows_to_trace,
 )
@@ -231,17 +234,18 @@ def from_long(
         text = "Parts are in two files at the same times: they count once"
         collector.notes[text] = frame[options.part][is_repeated].nunique()
         frame = frame[~is_repeated]
+    frame, n_repeated = _without_repeats(frame, options)
     frame = _pivot_signals(frame, [options.part, time, *label_columns], options)
     others = [name for name in frame.columns if name not in (options.part, time, *label_columns)]
     check = partial(check_labels, all_rows, label_source, collector.name)
     collector.channels = _channels_of_long(frame, others, options, check)
     seconds, form = _times_of_long(frame[time], column_units.get(time, ""), collector)
     rows_of_part = _rows_by_part(frame, seconds, options)
-    no_stations = {options.part, time, *label_columns, *collector.channels}
-    _check_single_station(rows_of_part, [name for name in others if name not in no_stations])
+    stations = [name for name in others if name not in collector.channels]
+    _check_single_station(rows_of_part, stations, collector.channels)
     has_dates = holds_dates(frame[time])
     if not has_dates:
-        _check_together(rows_of_part)
+        _check_together(rows_of_part, collector, has_clock=time != ROW_COLUMN)
     places = [frame.columns.get_loc(name) for name in collector.channels]
     stated_units = unit_columns(frame[others]) if len(places) == 1 else {}
 
@@ -258,7 +262,13 @@ def from_long(
         clock = timed.reading.clock.replace(ANY_ORDER, form)  # a part's rows may not tell it
         reading = timed.reading._replace(numbers=first.numbers, clock=clock)
         factors = {**first.factors, **factors_in_columns(rows.drop(columns=[*collector.channels]))}
-        return timed._replace(units=channel_units, start=start, reading=reading, factors=factors)
+        return timed._replace(
+            units=channel_units,
+            start=start,
+            reading=reading,
+            factors=factors,
+            repeated=n_repeated[str(rows[options.part].iloc[0])],
+        )
 
     labels.collect_recordings(rows_of_part, read, label_source, collector)
     collector.order_by_start(apart=True, has_dates=has_dates)
@@ -282,6 +292,44 @@ def _with_times(
         advice = f"; name {names}" if names else ""
         raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
     return frame, time
+
+
+def _without_repeats(
+    frame: pd.DataFrame, options: LoadOptions
+) -> tuple[pd.DataFrame, Counter[str]]:
+    """Return a long table without rows that came before, as messages that were delivered twice, and
+    how many these are of each part.
+
+    All their cells are equal, but for columns that rise all along, as the number or the time that a
+    database gives each row. None of a part is if two of its other rows have one time, or without
+    a column of times or a running number: then rows may be equal by chance.
+    """
+    no_clocks = [options.part, ROW_COLUMN, *options.channels]
+    count = column_of_count(frame.drop(columns=no_clocks, errors="ignore"), options.time)
+    if count is None:
+        return frame, Counter()
+    keys = [options.part, str(count.name)]
+    cells = frame
+    if frame.duplicated(keys).any():
+        others = frame.columns.difference([*keys, *options.channels], sort=False)
+        cells = frame.drop(columns=[name for name in others if _rises_all_along(frame[name])])
+    is_filled = cells[keys].mask(cells[keys] == "").notna().all(axis=1)
+    is_again = cells.duplicated().to_numpy() & is_filled.to_numpy()
+    rest = cells[~is_again]
+    texts = [name for name in rest if name not in keys and not is_mostly_numbers(rest[name])]
+    parts = frame[options.part]
+    ambiguous = parts[~is_again][rest.duplicated([*keys, *texts]).to_numpy()]
+    is_again = is_again & ~parts.isin(ambiguous).to_numpy()
+    if parts[is_again].nunique() < ambiguous.nunique():  # a coarse clock
+        return frame, Counter()
+    return frame[~is_again], Counter(frame[options.part][is_again].astype(str))
+
+
+def _rises_all_along(column: pd.Series) -> bool:
+    """Return whether the numbers or dates of a column rise from each row to the next."""
+    with suppress(UnreadableError):
+        return bool((np.diff(times_of(column)[0]) > 0).all())
+    return False
 
 
 def _times_of_long(
@@ -358,16 +406,23 @@ def _check_numbers_once(rows_of_part: Mapping[str, pd.DataFrame]) -> None:
     raise DataError(f"Expected {wanted} later, as {part} in line {line}; {do}.")
 
 
-def _check_together(rows_of_part: Mapping[str, pd.DataFrame]) -> None:
+def _check_together(
+    rows_of_part: Mapping[str, pd.DataFrame], collector: RecordingCollector, *, has_clock: bool
+) -> None:
     """Raise DataError if parts of a table, whose clock begins anew in each, stand in it twice.
 
     That is so if all parts stand in few runs of many rows, and one in several without a gap in
     time: a number that was given again, whose times go on, would be one long recording.
     """
+    n_runs = {part: rows[RUN_COLUMN].nunique() for part, rows in rows_of_part.items()}
+    if not has_clock:
+        if names := listed(f"{part} ({n} places)" for part, n in n_runs.items() if n > 1):
+            text = "Rows of a part are in several places of the file, and are joined in this order"
+            collector.notes[f"{text}: {names}"] = 1
+        return
     times = [rows[SECONDS_COLUMN] for rows in rows_of_part.values()]
     if np.median([part_times.min() for part_times in times]) > min(map(max, times)):
         return  # one clock of all parts
-    n_runs = {part: rows[RUN_COLUMN].nunique() for part, rows in rows_of_part.items()}
     n_rows = sum(map(len, rows_of_part.values()))
     part = max(n_runs, key=n_runs.__getitem__, default="")
     if not n_runs or n_runs[part] < 2 or n_rows < MIN_RUN * sum(n_runs.values()):
@@ -482,7 +537,9 @@ def _labels_of_parts(
     return labels.LabelSource(find, advice, f"column {name}", notes=notes)
 
 
-def _check_single_station(rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str]) -> None:
+def _check_single_station(
+    rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str], channels: Sequence[str]
+) -> None:
     """Raise DataError if the rows of a part's number are those of several parts, made at the same
     times at different places.
 
@@ -490,7 +547,7 @@ def _check_single_station(rows_of_part: Mapping[str, pd.DataFrame], columns: Seq
     time, tells them apart if the times of its values overlap, and each value by itself has times
     without gaps.
 
-    columns : that may tell where a part was made.
+    columns : that may tell where a part was made. channels : whose values the error names.
     """
     for part, rows in rows_of_part.items():
         for name in columns:
@@ -504,7 +561,10 @@ def _check_single_station(rows_of_part: Mapping[str, pd.DataFrame], columns: Seq
             lines = listed(run.index[0] for _, run in runs)
             wanted = f"one recording for each part, part {part} begins in lines {lines}"
             do = "make the parts' numbers unique"
-            raise DataError(f"Expected {wanted}, at the same times; {do}.")
+            values = rows[[*channels]].apply(lambda cells: floats(cells)[0]).to_numpy().T
+            clock = Clock("", rows[SECONDS_COLUMN].to_numpy(), "", "")
+            same_time = same_time_text(values, clock, rows.index)
+            raise DataError(f"Expected {wanted}, at the same times{same_time}; {do}.")
 
 
 def _are_stations(rows: pd.DataFrame, name: str) -> bool:

@@ -48,6 +48,7 @@ from .clocks import (
     rate_of,
     resample_evenly,
     rising_columns,
+    same_time_text,
     shows_lost_rows,
     start_of,
     varies_all_along,
@@ -1485,6 +1486,11 @@ def rows_to_trace(
         For a cell that is no number, for rows that are missing or out of order, and, unless a rate
         is stated, for a clock that cannot be read or is not even enough.
     """
+    is_again = _repeated_rows(rows, places, options)
+    if is_again.any():
+        rows = rows[~is_again]
+        timed = rows_to_trace(rows, places, options, notes, units_row, rate_hz)
+        return timed._replace(repeated=int(is_again.sum()))
     rows, values = _measured(rows, places, options, notes)
     trace = np.ascontiguousarray(values.T)
     try:
@@ -1498,8 +1504,12 @@ def rows_to_trace(
             return Recording(trace, rate_hz, reading=Reading(clock=RATE_ABOVE))
         if options.rate_hz is None:
             _offer_clock(rows, places, notes)
-        return Recording(trace)
-    return _trace_by_clock(trace, rows, clock, options, notes, rate_hz)
+        return Recording(trace, goes_back=_column_that_goes_back(rows, options))
+    try:
+        return _trace_by_clock(trace, rows, clock, options, notes, rate_hz)
+    except UnreadableError as error:
+        same_time = same_time_text(trace, clock, rows.index)
+        raise UnreadableError(f"{error}{same_time}", error.line) from error
 
 
 def _trace_by_clock(
@@ -1528,7 +1538,6 @@ def _trace_by_clock(
         even_trace = resample_evenly(trace, clock, rate_hz)
         return Recording(even_trace, rate_hz, reading=reading, length=trace.shape[1])
     check_rows(clock, rows.index, options.time)
-    _check_repeated(rows, clock)
     confirmed = clock._replace(note="")  # on its unit
     if rate_hz is not None and not rate_contradiction(confirmed, rate_hz):
         clock = confirmed
@@ -1599,13 +1608,46 @@ def _trace_at_rate(
     return Recording(trace, rate, reading=reading)
 
 
-def _check_repeated(rows: pd.DataFrame, clock: Clock) -> None:
-    """Raise UnreadableError if all rows of one time are equal, and some times have several."""
-    is_repeated = rows.duplicated().to_numpy()
-    n_repeated = int(is_repeated.sum())
-    if n_repeated and len(np.unique(clock.seconds)) == len(rows) - n_repeated:
-        line = int(rows.index[int(is_repeated.argmax())])
-        raise UnreadableError("Expected each row once, this one came before", line)
+def column_of_count(rows: pd.DataFrame, time: str | None) -> pd.Series | None:
+    """Return the column that tells the rows of a recording apart, or None.
+
+    It is the clock, also if the user does not trust it, else a running number, as `Sample`.
+
+    rows : without the columns of channels.
+    """
+    place = None
+    with suppress(UnreadableError):
+        place = place_of_clock(rows, None if time == NO_CLOCK else time)
+    if place is not None:
+        return rows.iloc[:, place]
+    cells = (rows.iloc[:, i] for i, name in enumerate(rows) if COUNTER_NAME.fullmatch(str(name)))
+    return next((column for column in cells if (floats(column)[0] % 1 == 0).all()), None)
+
+
+def _repeated_rows(
+    rows: pd.DataFrame, places: Sequence[int], options: LoadOptions
+) -> NDArray[np.bool_]:
+    """Return which rows of a recording came before, with all their cells, shape (n,).
+
+    None without a `column_of_count`, or if its values do not tell the others apart: then
+    rows may be equal by chance.
+    """
+    is_again: NDArray[np.bool_] = rows.duplicated().to_numpy()
+    others = rows.drop(columns=rows.columns[places])
+    count = column_of_count(others, options.time) if is_again.any() else None
+    if count is None or not count[~is_again].is_unique:
+        is_again = np.zeros(len(rows), dtype=np.bool_)
+    return is_again
+
+
+def _column_that_goes_back(rows: pd.DataFrame, options: LoadOptions) -> str:
+    """Return the name of a clock that the user does not trust if it goes back, else ""."""
+    if options.time != NO_CLOCK:
+        return ""
+    with suppress(UnreadableError):
+        clock = clock_of(rows)
+        return clock.name if clock is not None and (np.diff(clock.seconds) < 0).any() else ""
+    return ""
 
 
 def _offer_clock(rows: pd.DataFrame, places: Sequence[int], notes: Counter[str]) -> None:

@@ -152,9 +152,10 @@ BROKEN: dict[str, tuple[list[str], int, str]] = {
     "long_row_True.csv": ([*ROWS[:5], ROWS[5] + ",1", *ROWS[6:]], 6, "Expected 2 columns, got 3"),
     "header_False.csv": (ROWS[:1], 1, "Expected samples below the header, found none"),
     "back_True.csv": (
-        [*ROWS[:20], "", ROWS[19], *ROWS[20:]],
+        [*ROWS[:20], "", ROWS[19].split(",")[0] + ",7", *ROWS[20:]],
         22,
-        "Expected each row once, this one came before",
+        "Expected a later time than that of the row before, or a stated rate (rate_hz); "
+        "lines 20 and 22 have the same time, and 9.23077 and 7",
     ),
     "gap_True.csv": (
         [*ROWS[:10], *ROWS[25:]],
@@ -1205,7 +1206,7 @@ def test_a_part_whose_times_begin_again_is_refused(
 ) -> None:
     table = long_table(small, lambda i: offset * (i // 12))
     table["part"] = (table["part"] - 1) % 12 + 1
-    with pytest.raises(DataError, match="part 1 begins in lines 1, 601, at the same times; make"):
+    with pytest.raises(DataError, match=r"part 1 begins in lines 1, 601, at the same times; .*make"):
         load_dataset(table, time="time", rate_hz=rate_hz)
 
 
@@ -1311,15 +1312,34 @@ def test_an_archive_of_a_part_that_contradicts_its_name_is_a_fault(
 
 
 @pytest.mark.parametrize("rate_hz", [None, 500.0])
-def test_rows_that_are_there_twice_are_a_fault(
-    rate_hz: float | None, few: Path, small: Dataset
+@pytest.mark.parametrize("form", ["each row", "a block", "the whole file"])
+def test_rows_of_a_file_that_came_twice_are_read_once_with_a_note(
+    rate_hz: float | None, form: str, few: Path, small: Dataset
 ) -> None:
     path = min(few.iterdir())
+    expected = load_dataset(few, rate_hz=rate_hz)
     header, *rows = path.read_text("utf-8").splitlines()
-    path.write_text("\n".join([header, *(row for row in rows for _ in range(2))]) + "\n")
-    data = load_dataset(few, rate_hz=rate_hz, samples=50)
-    assert [(f.source, f.line) for f in data.faults] == [(path.name, 3)]
-    assert "Expected each row once" in data.faults[0].message
+    twice = {
+        "each row": [row for row in rows for _ in range(2)],
+        "a block": [*rows[:30], *rows[20:30], *rows[30:]],
+        "the whole file": rows * 2,
+    }[form]
+    path.write_text("\n".join([header, *twice]) + "\n")
+    for time in (None, "none") if rate_hz else (None,):
+        data = load_dataset(few, rate_hz=rate_hz, time=time)
+        np.testing.assert_array_equal(data.X, expected.X)
+        n = len(twice) - len(rows)
+        assert f"{n} rows came twice and are read once, in 1 part: {path.name}." in data.notes
+
+
+def test_equal_rows_without_a_clock_are_samples(tmp_path: Path) -> None:
+    trace = np.repeat(np.random.default_rng(0).normal(size=20).round(3), 2)
+    for i in range(4):
+        text = "N\n" + "\n".join(map(str, trace + i))
+        (tmp_path / f"{i}_{'NOK' if i % 2 else 'OK'}.csv").write_text(text + "\n")
+    data = load_dataset(tmp_path, rate_hz=250)
+    assert data.X.shape == (4, 40)
+    assert not any("came twice" in note for note in data.notes)
 
 
 def test_a_wide_table_says_which_columns_are_not_read(small: Dataset) -> None:
@@ -3450,3 +3470,83 @@ def test_a_part_at_both_ends_of_a_table_that_counts_no_rows_may_be_of_a_ring_buf
     do = "put the rows in order if the file is a ring buffer that wrapped, else make the parts' num"
     with pytest.raises(DataError, match=do):
         load_dataset(log, part="PartNo", label="Result", channel="Force", time="t_ms")
+
+
+def delivered(form: str) -> pd.DataFrame:
+    """A long table of MQTT in which ten rows of parts 1 and 3 came again, later."""
+    rng = np.random.default_rng(4)
+    frame = pd.DataFrame(
+        {
+            "part": np.repeat([f"H{i}" for i in range(6)], 40),
+            "time": np.tile(np.arange(40) / 500, 6).round(3),
+            "force": rng.normal(size=240).round(3),
+            "verdict": np.repeat(["ok", "nok"] * 3, 40),
+        }
+    )
+    if form == "dates":
+        frame["time"] = pd.date_range("2026-03-01 06:00", periods=240, freq="2ms", tz="UTC")
+    again = [frame.iloc[start + 10 : start + 20] for start in (40, 120)]
+    pieces = [frame.iloc[:70], again[0], frame.iloc[70:170], again[1], frame.iloc[170:]]
+    frame = pd.concat(pieces, ignore_index=True)
+    if form == "rows of a database":
+        frame.insert(0, "id", np.arange(len(frame)) + 5000)
+        frame["received"] = pd.date_range("2026-03-01", periods=len(frame), freq="3ms").astype(str)
+    return frame
+
+
+OF_MQTT: dict[str, Any] = {"part": "part", "label": "verdict", "channel": "force"}
+
+
+@pytest.mark.parametrize("form", ["seconds", "dates", "rows of a database", "lines"])
+@pytest.mark.parametrize("time", ["time", "none"])
+def test_rows_of_a_long_table_that_came_twice_are_read_once_with_a_note(
+    form: str, time: str, tmp_path: Path
+) -> None:
+    source: Any = delivered(form)
+    expected = source["force"][~source.duplicated(["part", "time"])].to_numpy().reshape(6, 40)
+    if form == "lines":
+        source.to_json(tmp_path / "s.jsonl", orient="records", lines=True)
+        source = tmp_path / "s.jsonl"
+    data = load_dataset(source, **OF_MQTT, time=time, rate_hz=500 if time == "none" else None)
+    np.testing.assert_allclose(data.X, expected, rtol=1e-6)
+    assert "20 rows came twice and are read once, in 2 parts: H1, H3." in data.notes
+
+
+def test_equal_rows_of_a_long_table_stay_if_its_clock_is_coarse() -> None:
+    table = delivered("seconds").drop_duplicates()
+    table["time"] = table["time"] // 0.01
+    table.loc[table["part"] == "H2", "force"] = 0.5
+    data = load_dataset(table, **OF_MQTT, time="time", rate_hz=500)
+    assert set(data.lengths) == {40}
+
+
+def test_rows_of_the_same_times_with_other_values_are_refused_with_both() -> None:
+    table = delivered("seconds")
+    is_again = table.duplicated().to_numpy()
+    table.loc[is_again, "force"] = np.arange(20) + 7.0
+    first = table["force"][50]
+    match = f"same times; lines 51 and 71 have the same time, and {first:.6g} and 7; make"
+    with pytest.raises(DataError, match=match):
+        load_dataset(table, **OF_MQTT, time="time")
+
+
+def test_without_a_clock_a_note_names_parts_in_several_places_and_times_that_go_back() -> None:
+    table = delivered("seconds").drop_duplicates()
+    table = pd.concat([table.iloc[60:], table.iloc[:60]])
+    notes = load_dataset(table, **OF_MQTT, time="none", rate_hz=500).notes
+    text = "Rows of a part are in several places of the file, and are joined in this order"
+    assert f"{text}: H1 (2 places)." in notes
+    text = "Column time goes back, and rows stay as they are: H1; time='time' uses it."
+    assert text in notes
+
+
+def test_a_reading_claims_no_lost_rows() -> None:
+    log = ring(oldest=0).drop(columns="Stamp")
+    options: dict[str, Any] = {
+        "part": "PartNo",
+        "label": "Result",
+        "channel": "Force",
+        "time": "Record",
+    }
+    data = load_dataset(log, **options, rate_hz=100)
+    assert "shows lost rows" not in data.reading["clock"]
