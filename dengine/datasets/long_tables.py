@@ -72,6 +72,7 @@ if TYPE_CHECKING:
 SECONDS_COLUMN = "\0seconds"
 ROW_COLUMN = "\0row"  # number of the row, in place of the times that the user does not trust
 RUN_COLUMN = "\0run"  # number of the rows of a part that stand together and in the order of time
+SAME_STEP = 0.05  # of the step: two steps that differ by less are the same
 NEAR = 0.01  # of the largest number: numbers that differ by less are rounded in two ways
 MIN_RUN = 8  # rows on average that stand together in a table that is in the order of its parts
 FEW_AGAIN = 0.2  # of the parts' numbers: if fewer come again, these are single faults
@@ -147,7 +148,9 @@ def concatenate_long(
     time = _time_column(frame, options)
     files = np.repeat(list(tables), [len(table) for table in tables.values()])
     if _are_spread(frame, files, time, options):
-        return frame, np.zeros(len(frame), dtype=np.bool_)
+        seconds = np.asarray(seconds_of(frame[time].reset_index(drop=True), time)[0])
+        order = np.lexsort((seconds, pd.factorize(frame[options.part])[0]))
+        return frame.iloc[order], np.zeros(len(frame), dtype=np.bool_)
     parts = frame[options.part].astype(str).to_numpy()
     first_files = files
     if time in frame and holds_dates(frame[time]):
@@ -186,7 +189,8 @@ def _are_spread(
     """Return whether the rows of parts lie in several files without an order.
 
     For most of the first parts in several files, all times rise steadily once sorted, and those of
-    no single file do.
+    no single file do. They may, by the same step, if all together have no gap: two stations that
+    alternate have a larger step each, and a part that was measured again has a gap.
     """
     if time not in frame:
         return False
@@ -195,11 +199,15 @@ def _are_spread(
     tried = n_files.index[n_files > 1][:TRIED]
     clock = clock[clock[options.part].isin(tried)].reset_index(drop=True)
     clock["seconds"] = seconds_of(clock[time], time)[0]
-    spread = [
-        is_rising(np.sort(rows["seconds"]))
-        and not any(is_rising(np.sort(own["seconds"])) for _, own in rows.groupby("file"))
-        for _, rows in clock.groupby(options.part)
-    ]
+    spread = list[bool]()
+    for _, rows in clock.groupby(options.part):
+        whole = np.sort(rows["seconds"])
+        steps = np.diff(whole)
+        pieces = [np.sort(own["seconds"]) for _, own in rows.groupby("file")]
+        own_steps = [float(np.median(np.diff(piece))) for piece in pieces if is_rising(piece)]
+        is_gapless = bool((steps <= 1.5 * np.median(steps)).all())
+        is_joined = is_gapless and np.isclose(own_steps, np.median(steps), rtol=SAME_STEP).all()
+        spread.append(is_rising(whole) and bool(not own_steps or is_joined))
     return 2 * sum(spread) > len(spread)
 
 

@@ -2115,21 +2115,43 @@ def test_marks_that_fill_up_rows_are_no_samples_and_inside_a_trace_they_are_a_fa
     ]
 
 
+@pytest.mark.parametrize("size", [1, 13])
+@pytest.mark.parametrize("is_sorted", [False, True])
 def test_parts_whose_rows_lie_here_and_there_in_several_files_are_one_each(
-    small: Dataset, tmp_path: Path
+    size: int, is_sorted: bool, small: Dataset, tmp_path: Path
 ) -> None:
+    """The rows lie in blocks of one size, and may be in order in each file."""
     rng = np.random.default_rng(0)
     rows = pd.concat(
         pd.DataFrame({"serial": f"S{i:02}", "t_ms": np.arange(50) * 4, "force": x, "ok": word})
         for i, (x, word) in enumerate(zip(small.X, words(small), strict=True))
     )
-    rows = rows.iloc[rng.permutation(len(rows))]
+    blocks = np.arange(len(rows)) // size
+    file_of_block = rng.integers(4, size=len(rows))
     for k in range(4):
-        rows.iloc[k::4].to_parquet(tmp_path / f"part-{k:05}.parquet")
+        own = rows[file_of_block[blocks] == k]
+        if not is_sorted:
+            own = own.sample(frac=1, random_state=k)
+        own.to_parquet(tmp_path / f"part-{k:05}.parquet")
     data = load_dataset(tmp_path, part="serial", time="t_ms", channel="Force", label="ok")
     order = np.argsort(data.source)
     np.testing.assert_allclose(data.X[order], small.X)
     np.testing.assert_array_equal(data.y[order], small.y)
+
+
+def test_parts_measured_again_in_another_file_stay_apart(small: Dataset, tmp_path: Path) -> None:
+    for k in range(2):
+        begins = pd.Timestamp("2026-03-01") + pd.Timedelta(days=k)
+        clock = begins + pd.to_timedelta(np.arange(len(small.X) * 60) * 4, unit="ms")
+        rows = [
+            pd.DataFrame(
+                {"serial": f"S{i:02}", "at": clock[60 * i :][:50], "force": x + k, "ok": w}
+            )
+            for i, (x, w) in enumerate(zip(small.X, words(small), strict=True))
+        ]
+        pd.concat(rows).to_parquet(tmp_path / f"day-{k}.parquet")
+    data = load_dataset(tmp_path, part="serial", time="at", channel="Force", label="ok")
+    assert data.X.shape == (2 * len(small.X), 50)
 
 
 @pytest.mark.parametrize(
