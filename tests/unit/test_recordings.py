@@ -1206,7 +1206,9 @@ def test_a_part_whose_times_begin_again_is_refused(
 ) -> None:
     table = long_table(small, lambda i: offset * (i // 12))
     table["part"] = (table["part"] - 1) % 12 + 1
-    with pytest.raises(DataError, match=r"part 1 begins in lines 1, 601, at the same times; .*make"):
+    with pytest.raises(
+        DataError, match=r"part 1 begins in lines 1, 601, at the same times; .*make"
+    ):
         load_dataset(table, time="time", rate_hz=rate_hz)
 
 
