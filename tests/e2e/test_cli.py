@@ -284,7 +284,7 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(
 def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_their_own() -> None:
     easy, store = easy_parts(160, 0), SqlStore()
     X, y = easy.X, easy.y
-    X[0, 3], X[1], X[2:8] = np.nan, 7.0, X[2]
+    X[0, 3], X[1], X[2:8], y[2:8] = np.nan, 7.0, X[2], y[2]
     first, report = import_labelled(store, (X[:70], y[:70]), "pca"), import_labelled(store, (X, y))
     assert (first.imported, first.quarantined, report.imported, report.repeated) == (68, 2, 90, 70)
     np.testing.assert_array_equal(
