@@ -6,6 +6,7 @@ Databases and test benches write such cells: a list as Parquet and JSON have it,
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -97,6 +98,8 @@ class Expanded(NamedTuple):
         Columns of curves that were left out.
     wrong : dict
         Why rows were left out, by their lines.
+    notes : list of str
+        Which columns are read as one.
     """
 
     frame: pd.DataFrame
@@ -104,6 +107,7 @@ class Expanded(NamedTuple):
     clock: str = ""
     unread: Sequence[str] = ()
     wrong: Mapping[int, str] = {}
+    notes: Sequence[str] = ()
 
 
 def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
@@ -116,6 +120,7 @@ def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
     import pandas as pd
 
     curves = {name: [split_curve(cell) for cell in frame[name]] for name in curve_columns(frame)}
+    renamed = _join_renamed(curves)
     clocks = [name for name in curves if name == options.time or is_time_column(name)]
     longest = {name: max(len(c) for c in cells if c is not None) for name, cells in curves.items()}
     channels = [name for name, n in longest.items() if name not in clocks and n >= MIN_SAMPLES]
@@ -125,7 +130,8 @@ def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
     if stated and all(stated):
         channels = [channels[places[0]] for places in stated]
     lists = [str(name) for name, cells in frame.items() if any(map(_is_list, cells))]
-    blocks = [frame.drop(columns=[*curves, *lists])]
+    lists = [name for name in lists if name not in renamed]
+    blocks = [frame.drop(columns=[*curves, *lists, *renamed])]
     for name in channels:
         block = np.full((len(frame), longest[name]), np.nan)
         odd = dict[tuple[int, int], str]()
@@ -158,7 +164,27 @@ def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
         name for name in {**curves, **dict.fromkeys(lists)} if name not in (*channels, *clocks[:1])
     ]
     wide = pd.concat(blocks, axis=1).drop(index=list(wrong))
-    return Expanded(wide, rate, clocks[0] if rate else "", unread, wrong)
+    return Expanded(wide, rate, clocks[0] if rate else "", unread, wrong, [*renamed.values()])
+
+
+def _join_renamed(curves: dict[str, list[Any]]) -> dict[str, str]:
+    """Join columns of curves that differ only by a unit that one of them names.
+
+    That is one channel whose name changed, where no row has both. The joined curves get the name
+    with the unit. Returns a note by each name that is gone.
+    """
+    notes = dict[str, str]()
+    for name, other in itertools.permutations([*curves], 2):
+        plain, unit = units.split(name)
+        if not unit or other.casefold() != plain.casefold() or other in notes:
+            continue
+        if any(a and b for a, b in zip(curves[name], curves[other], strict=True)):
+            continue
+        counts = [sum(map(bool, curves[column])) for column in (other, name)]
+        text = f"{other} ({counts[0]} rows) and {name} ({counts[1]}) are read as one channel"
+        curves[name] = [a or b for a, b in zip(curves[name], curves.pop(other), strict=True)]
+        notes[other] = text
+    return notes
 
 
 def _is_empty(cell: Any) -> bool:

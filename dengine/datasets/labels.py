@@ -450,6 +450,7 @@ class LabelColumn:
         unknown meaning, and SeveralLabelsError if labels differ or one of several words is unknown.
         `place` is what the column is called in errors, by default column NAME.
         """
+        do = "; keep the line that holds" if place else ""
         place = place or f"column {self.name}"
         cells = list(cells)
         is_known = not (self.is_ambiguous or FLAGS.keys() & self.words)
@@ -466,7 +467,7 @@ class LabelColumn:
             labels = {self.label_of(text) for text in stated}
             if len(labels) == 1:
                 return SourcedLabel(labels.pop(), place, listed(stated))
-        message = f"Expected one label in {place}, got {listed(stated)}"
+        message = f"Expected one label in {place}, got {listed(stated)}{do}"
         raise SeveralLabelsError(message, tuple(stated))
 
 

@@ -66,10 +66,11 @@ def with_samples_in_columns(
     result = dict[str, TextTable]()
     tables = join_pieces(tables, options, collector)
     for source, table in tables.items():
-        frame, rate, name, unread, wrong = expand_curves(table.frame, options)
+        frame, rate, name, unread, wrong, notes = expand_curves(table.frame, options)
         if frame is table.frame:
             return tables, options
         collector.faults += [Fault(source, line, why) for line, why in wrong.items()]
+        collector.notes.update(notes)
         if frame.empty:
             continue
         if unread:

@@ -2520,6 +2520,24 @@ def test_lists_in_cells_are_traces_with_the_rate_of_the_times_beside_them(
     np.testing.assert_array_equal(data.X[3:], small.X[[4, *range(6, len(small))]])
 
 
+def test_a_curve_whose_name_changed_by_its_unit_is_one_channel(
+    small: Dataset, tmp_path: Path
+) -> None:
+    rows = [
+        {"serial": f"P{i}", "torque" if i < 15 else "torque_Nm": x.tolist(), "verdict": word}
+        for i, (x, word) in enumerate(zip(small.X, words(small), strict=True))
+    ]
+    path = tmp_path / "curves.jsonl"
+    path.write_text("\n".join(map(json.dumps, rows)))
+    data = load_dataset(path, part="serial", channel="torque", rate_hz=100)
+    np.testing.assert_array_equal(data.X, small.X)
+    assert (data.channels, data.unit) == (("torque_Nm",), "Nm")
+    assert "torque (15 rows) and torque_Nm (9) are read as one channel" in data.notes[0]
+    rows[0]["torque_Nm"] = rows[1]["torque"]
+    path.write_text("\n".join(map(json.dumps, rows)))
+    assert len(load_dataset(path, part="serial", channel="torque", rate_hz=100).X) == 15
+
+
 def pieces_of(data: Dataset, **names: str) -> list[dict[str, Any]]:
     """Each trace in four rows of 17, 17, 13 and 3 samples, those of two parts interleaved."""
     rows = []
