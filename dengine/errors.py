@@ -25,7 +25,9 @@ OPTIONS = (
     "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic|columns"
     "|decimal|thousands|encoding"
 )
-OPTION = re.compile(rf"(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))")
+OPTION = re.compile(
+    rf"(?<![\w=])'[^']*'|(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))"
+)
 TRACE_SPEC = re.compile(r"(?:DataEngine\(trace=)?TraceSpec\(([^()]*)\)\)?")
 MAX_LENGTH = 60  # characters of a value in a message
 _REPR = reprlib.Repr()
@@ -88,11 +90,13 @@ def as_options(text: str) -> str:
     """Return a message in which Python's arguments are written as options of the command line.
 
     `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`. Arguments that are not in
-    `OPTIONS`, and the rest of the text, stay.
+    `OPTIONS`, quoted data, and the rest of the text, stay.
     """
 
     def to_option(match: re.Match[str]) -> str:
-        """Return an option as typed, `--rate-hz 500`, of a match of `OPTION`."""
+        """Return an option as typed, `--rate-hz 500`, of a match of `OPTION`; data as they are."""
+        if not (match[1] or match[3]):
+            return match[0]
         name = (match[1] or match[3]).replace("_", "-")
         value = match[2] or ""
         if value[:1] in QUOTES:

@@ -3592,3 +3592,10 @@ def test_a_reading_claims_no_lost_rows() -> None:
     }
     data = load_dataset(log, **options, rate_hz=100)
     assert "shows lost rows" not in data.reading["clock"]
+
+
+def test_data_in_quotes_are_not_written_as_options() -> None:
+    message = (
+        "Expected numbers, got 'start part=1 label=x'; name parts' numbers, as in part='my nr'"
+    )
+    assert as_options(message) == message.replace("part='my nr'", "--part 'my nr'")
