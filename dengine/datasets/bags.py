@@ -95,7 +95,7 @@ class Messages(NamedTuple):
         if name not in self.others:
             return self.wrench[:, axis_of(name)]
         texts = [value for _, value in self.others[name] if isinstance(value, str)]
-        do = "name a topic of numbers in the trigger"
+        do = "name a topic of numbers, or a CSV file with columns start, end and result (labels)"
         expect_data(not texts, f"numbers on topic {name}", texts[0] if texts else "", do)
         values = np.array([np.nan, *(float(value) for _, value in self.others[name])])
         logged = [time for time, _ in self.others[name]]
