@@ -108,11 +108,9 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
     DataError
         If no recording can be read, most have no label, or the channel is not named.
     """
-    firsts = (read_archive(path)[0] for path in named.values())
-    frame = next(
-        (_to_frame(arrays, options) for arrays in firsts if not _other_length(arrays, options)),
-        _to_frame(read_archive(next(iter(named.values())))[0], options),
-    )
+    all_arrays = (read_archive(path)[0] for path in named.values())
+    fitting = next((arrays for arrays in all_arrays if not _other_length(arrays, options)), None)
+    frame = _to_frame(fitting or read_archive(next(iter(named.values())))[0], options)
     available = [column for column in frame.columns if not is_time_column(column)]
     several = f"{options.channels[0]}_0" if options.channels else ""
     channels = tuple(column for column in available if several and column.startswith(several[:-1]))

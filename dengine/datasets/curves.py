@@ -129,9 +129,9 @@ def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
     stated = [units.find_columns(name, channels) for name in options.channels]
     if stated and all(stated):
         channels = [channels[places[0]] for places in stated]
-    lists = [str(name) for name, cells in frame.items() if any(map(_is_list, cells))]
-    lists = [name for name in lists if name not in renamed]
-    blocks = [frame.drop(columns=[*curves, *lists, *renamed])]
+    others = frame.drop(columns=list(renamed))
+    lists = [str(name) for name, cells in others.items() if any(map(_is_list, cells))]
+    blocks = [others.drop(columns=[*curves, *lists])]
     for name in channels:
         block = np.full((len(frame), longest[name]), np.nan)
         odd = dict[tuple[int, int], str]()

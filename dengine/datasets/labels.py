@@ -351,7 +351,7 @@ def means_good(column: str) -> bool:
 
 def _name_words(column: str) -> list[str]:
     """Return the words of a column's name in lower case, without such as `flag` at its end."""
-    words = re.findall(rf"{LETTER}+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", column).lower())
+    words = units.words_in(column)
     while len(words) > 1 and words[-1] in LISTS["flag_endings"]:
         words.pop()
     return words
