@@ -43,7 +43,7 @@ LABEL = "y"
 def find_whole(named: Mapping[str, Path]) -> tuple[dict[str, Path], list[Fault]]:
     """Return the archives of a folder that can be unpacked, and the faults of the others.
 
-    A single archive is not tried. Raises DataError if this leaves none.
+    A single archive is kept untried. Raises DataError if all are damaged.
     """
     if len(named) == 1:
         return dict(named), []
@@ -141,8 +141,10 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
 
 
 def _other_length(arrays: Mapping[str, NDArray[Any]], options: LoadOptions) -> str:
-    """Return what is wrong if the only array of times, or that of a stated channel, has another
-    length than the others; "" if all fit. Times do not count where the rate is known without them.
+    """Return what is wrong if a stated channel has another length than the samples; "" if all fit.
+
+    So it is if arrays of times have, and none of the samples' length is there. Times do not count
+    where the rate is known without them.
     """
     frame = _to_frame(arrays, options)
     lengths = {

@@ -170,8 +170,8 @@ def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
 def _join_renamed(curves: dict[str, list[Any]]) -> dict[str, str]:
     """Join columns of curves that differ only by a unit that one of them names.
 
-    That is one channel whose name changed, where no row has both. The joined curves get the name
-    with the unit. Returns a note by each name that is gone.
+    Where no row has both, it is one channel that was renamed; case is ignored. `curves` is changed:
+    the joined curves get the name with the unit. Returns a note by each name that is gone.
     """
     notes = dict[str, str]()
     for name, other in itertools.permutations([*curves], 2):

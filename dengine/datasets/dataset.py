@@ -720,7 +720,7 @@ def _note_rows(collector: RecordingCollector) -> None:
 
 
 def leave_out_repeats(collector: RecordingCollector) -> list[int]:
-    """Leave out recordings that repeat one of the same part, label and samples; a note names them.
+    """Leave out later recordings with the part, label and samples of another; a note names them.
 
     Equal samples with different labels are faults, each of which names all of them. Equal samples
     of different parts stay, with a note. Returns the positions of the recordings that stay. Raises
@@ -763,8 +763,8 @@ def _equal_recordings(recordings: Sequence[Recording]) -> list[list[tuple[int, s
     """Return the groups of recordings with equal samples, by their positions and parts.
 
     Without a part's number a file's name tells the part, if all recordings of that name are equal.
-    Constant recordings are in no group, and those of fewer than `MANY` values, as of a switch, in
-    one with those of the same part alone: others may be equal by chance.
+    Constant recordings are in no group, those of fewer than `MANY` distinct values, as of a switch,
+    only in one of their own part: others may be equal by chance.
     """
     contents = [hashlib.blake2b(recording.trace.tobytes()).digest() for recording in recordings]
     names = [PurePosixPath(recording.source).name for recording in recordings]

@@ -83,8 +83,8 @@ def unwrap_ring(
 ) -> pd.DataFrame:
     """Return the rows of a ring buffer that wrapped, the oldest first; a note says so.
 
-    In such a file one column of dates, or of a running number, goes back once, and its last value
-    comes before its first. Other tables are returned as they are.
+    In such a file one column of dates, or of a running number, goes back once, and ends below
+    where it began. Other tables are returned as they are.
     """
     import pandas as pd
 
@@ -186,10 +186,10 @@ def concatenate_long(
 def _are_spread(
     frame: pd.DataFrame, files: NDArray[np.str_], time: str, options: LoadOptions
 ) -> bool:
-    """Return whether the rows of parts lie in several files without an order.
+    """Return whether the rows of one part lie in several files.
 
     For most of the first parts in several files, all times rise steadily once sorted, and those of
-    no single file do. They may, by the same step, if all together have no gap: two stations that
+    no single file do. Those may, by the same step, if the whole has no gap: two stations that
     alternate have a larger step each, and a part that was measured again has a gap.
     """
     if time not in frame:
@@ -309,8 +309,9 @@ def _without_repeats(
     how many these are of each part.
 
     All their cells are equal, but for columns that rise all along, as the number or the time that a
-    database gives each row. None of a part is if two of its other rows have one time, or without
-    a column of times or a running number: then rows may be equal by chance.
+    database gives each row. A part keeps all if two of its other rows share a time; so do all parts
+    if more of them do so than have repeats, or without a column of times or a running number: then
+    rows may be equal by chance.
     """
     no_clocks = [options.part, ROW_COLUMN, *options.channels]
     count = column_of_count(frame.drop(columns=no_clocks, errors="ignore"), options.time)

@@ -220,9 +220,10 @@ def _unit_at_end(name: str, text: str) -> str:
 
 
 def likely_channel(names: Sequence[str]) -> str:
-    """Return the channel that users most likely mean, the first of a force or torque by its name.
+    """Return the channel that users most likely mean, by its name and unit.
 
-    Without any it is the first by its unit, N before mm; without these the first of all.
+    A force or torque by its name comes first, best with such a unit; then another unit than that of
+    a position or time; then none; then theirs. Of equals it is the first.
     """
 
     def score(name: str) -> int:

@@ -86,7 +86,7 @@ def with_samples_in_columns(
 
 
 def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable:
-    """Return a table with a column for each part as a wide table, with a row for each part.
+    """Transpose a table with a column for each part to a wide one, with a row for each part.
 
     Such a table has times in its first column, eight or more columns of numbers beside it, and
     labels in the names of these, in a row without a time, or in a listing. Any other table, as one
