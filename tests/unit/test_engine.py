@@ -123,9 +123,9 @@ def test_the_collector_works_between_decisions_and_leaves_old_objects_alone_unti
     enabled, frozen = [], []
     for cycle in cycles:
         enabled.append(gc.isenabled())
-        if cycle.index in (0, 99, 100, 129):  # a count takes 10 ms
+        if cycle.index in (0, 129):  # a count takes 10 ms
             frozen.append(gc.get_freeze_count() > before)
-    assert (enabled, frozen) == ([True] * 130, [False, False, True, True])
+    assert (enabled, frozen) == ([True] * 130, [True, True])
     assert set(at_work) == {False}
     assert (gc.get_freeze_count(), gc.isenabled()) == (before, True)
 
