@@ -15,6 +15,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -635,6 +636,8 @@ def _find_header(
     """
     lines = list(rows_by_line)
     rows = list(rows_by_line.values())
+    if not columns and (last := _header_at_end(rows, channels)) is not None:
+        return TextCells(rows[last], lines[last], [""] * len(rows[last]), {}, delimiter, {})
     last_rows = (rows if columns else rows[1:])[-20:]
     usual = Counter(map(_numeric_columns, last_rows)).most_common(1)
     numeric = usual[0][0] if usual else frozenset()
@@ -671,6 +674,21 @@ def _find_header(
         names = names[:-1]  # LabVIEW's, which most of its rows leave out
         data_rows = {i: row[: len(names)] for i, row in data_rows.items()}
     return TextCells(names, line, _pad_units(units_row, len(names)), data_rows, delimiter, {})
+
+
+def _header_at_end(rows: Sequence[list[str]], channels: Sequence[str]) -> int | None:
+    """Return the position of a header with no row below it but units; None if there is none.
+
+    It is the only row that names the stated channels, and has no numbers.
+    """
+
+    def is_header(row: list[str]) -> bool:
+        named = all(units.find_columns(name, row) for name in channels)
+        return named and not _numeric_columns(row)
+
+    n = len(rows) - (len(rows) > 1 and all(map(_is_unit, rows[-1])))
+    is_last = n > 1 and bool(channels) and is_header(rows[n - 1])
+    return n - 1 if is_last and not any(map(is_header, rows[: n - 1])) else None
 
 
 def _header_among(
@@ -1257,7 +1275,8 @@ def read_recording(
     UnreadableError, with the line if it is known, for a cell, a row, a clock or a text that cannot
     be read, a channel that is not there, and no samples.
     """
-    table = _of_one_signal(read_table(path, options, decimal), channels)
+    table = read_table(path, replace(options, channels=tuple(channels)), decimal)
+    table = _of_one_signal(table, channels)
     header = list(table.frame.columns)
     places = [column_place(name, header, table.line, table.preamble) for name in channels]
     for fault in table.faults:

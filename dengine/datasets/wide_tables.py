@@ -46,6 +46,7 @@ from .dataset import (
 from .pieces import join_pieces
 from .scales import may_scale, operation, stated_factors
 from .text import (
+    SPREADSHEET_DATE,
     TextTable,
     is_mostly_numbers,
     parse_numbers,
@@ -147,7 +148,7 @@ def _wrong_in_columns(samples: pd.DataFrame, source: str) -> dict[int, Unreadabl
     """
     _, of_lines, _ = parse_numbers(samples)
     for line, message in of_lines.items():
-        if " cells are dates" in message:
+        if any(map(SPREADSHEET_DATE.fullmatch, map(str, samples.loc[line]))):
             raise DataError(f"Cannot read {Fault(source, line, message)}.")
     wrong = {}
     for place, name in enumerate(samples.columns if of_lines else (), start=2):

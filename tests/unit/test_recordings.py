@@ -151,6 +151,10 @@ BROKEN: dict[str, tuple[list[str], int, str]] = {
     "short_row_True.csv": ([*ROWS[:-2], "17.0", ROWS[-1]], 40, "Expected 2 columns, got 1"),
     "long_row_True.csv": ([*ROWS[:5], ROWS[5] + ",1", *ROWS[6:]], 6, "Expected 2 columns, got 3"),
     "header_False.csv": (ROWS[:1], 1, "Expected samples below the header, found none"),
+    "aborted_False.csv": (
+        ["Device,Press 4", "Status,Aborted", "", "Timestamp,FZ_Base", "s,N"],
+        *(4, "Expected samples below the header, found none"),
+    ),
     "back_True.csv": (
         [*ROWS[:20], "", ROWS[19].split(",")[0] + ",7", *ROWS[20:]],
         22,
