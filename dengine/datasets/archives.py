@@ -32,7 +32,7 @@ from .dataset import (
     UnreadableError,
     as_dataset,
 )
-from .text import rows_to_trace
+from .recordings import rows_to_trace
 
 if TYPE_CHECKING:
     import pandas as pd

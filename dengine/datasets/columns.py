@@ -24,10 +24,8 @@ from .dataset import (
     UnreadableError,
     label_map_of,
 )
-from .text import (
-    TextCells,
-    is_mostly_numbers,
-)
+from .headers import TextCells
+from .text import is_mostly_numbers
 
 if TYPE_CHECKING:
     import pandas as pd

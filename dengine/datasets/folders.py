@@ -19,6 +19,7 @@ import numpy as np
 from ..errors import DataError, listed
 from ..traces import is_time_column
 from . import labels, units
+from .cells import fields_beside, split_cells
 from .clocks import (
     place_of_clock,
 )
@@ -57,17 +58,12 @@ from .dataset import (
     as_dataset,
 )
 from .encodings import decode, missing_name
+from .headers import TextCells
 from .long_tables import long_table_advice
 from .numerals import UndecidedError, is_numeral
+from .recordings import read_recording
 from .text import SUFFIXES as TEXTS
-from .text import (
-    TextCells,
-    TextTable,
-    fields_beside,
-    read_recording,
-    read_table,
-    split_cells,
-)
+from .text import TextTable, read_table
 
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 FEW_LISTINGS = 5  # text files for each archive, as lists of its labels

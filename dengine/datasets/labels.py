@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import DataError, instead, listed
 from . import units
+from .cells import fields_beside
 from .clocks import EMPTY_CELLS
 from .containers import PACKED
 from .dataset import (
@@ -43,7 +44,8 @@ from .dataset import (
     expect_data,
     label_map_of,
 )
-from .text import SUFFIXES, column_place, fields_beside, read_table
+from .recordings import column_place
+from .text import SUFFIXES, read_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -56,13 +56,9 @@ from .dataset import (
     as_dataset,
     expect_data,
 )
+from .recordings import column_of_count, rows_to_trace
 from .scales import factors_in_columns
-from .text import (
-    TextTable,
-    column_of_count,
-    is_mostly_numbers,
-    rows_to_trace,
-)
+from .text import TextTable, is_mostly_numbers
 from .windows import Windows, read_windows
 
 if TYPE_CHECKING:

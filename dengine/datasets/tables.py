@@ -33,11 +33,8 @@ from .dataset import (
     as_dataset,
 )
 from .long_tables import concatenate_long, cut_by_windows, from_long, long_table_advice, unwrap_ring
-from .text import (
-    TextTable,
-    cut_note,
-    read_table,
-)
+from .recordings import cut_note
+from .text import TextTable, read_table
 from .wide_tables import turn_table, wide_rows, with_samples_in_columns
 
 if TYPE_CHECKING:

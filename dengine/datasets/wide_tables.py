@@ -45,12 +45,7 @@ from .dataset import (
 )
 from .pieces import join_pieces
 from .scales import may_scale, operation, stated_factors
-from .text import (
-    SPREADSHEET_DATE,
-    TextTable,
-    is_mostly_numbers,
-    parse_numbers,
-)
+from .text import SPREADSHEET_DATE, TextTable, is_mostly_numbers, parse_numbers
 
 if TYPE_CHECKING:
     import pandas as pd
