@@ -34,9 +34,16 @@ RATE_TOLERANCE = 0.03  # of the others' rate: recordings within it have one rate
 ZEROS = 10  # that many samples of 0 at the end of a recording may be no measurements
 MANY = 10  # recordings, among which both labels are expected
 SHORT = 0.7  # of the usual length: recordings below it may be pieces, if they are few
+LONG = 0.95  # of a recording: less of it is read with a note
 FEW = 0.1  # of all recordings
 FAR = 50.0  # times the usual largest value: a recording beyond has another unit or is none
 MAX_RATE_RATIO = 2.0  # a recording at a rate further from the others' is not resampled
+REFERENCE = re.compile(  # in the name of a part with which the station itself is checked
+    r"(?<![^\W\d_])((master|meister|einstell|referen[cz]e?|kalibrier|calibration|grenzmuster|golden)"
+    r"(part|teil|sample|stück|muster|ungs?teil)?|ref|dummy|einstellmeister)(?![^\W\d_])",
+    re.IGNORECASE,
+)
+MAX_REFERENCE_SHARE = 0.25  # of all parts
 UNKNOWN_RATE = (
     "The rate is unknown, for nothing tells it: times are in samples until it is stated,"
     " rate_hz=..."
@@ -643,6 +650,7 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     """
     collector.check_label_words()
     _note_rows(collector)
+    _note_reference_parts(collector)
     leave_out_repeats(collector)
     _cut_padding(collector)
     _scale_counts(collector)
@@ -719,6 +727,15 @@ def _note_rows(collector: RecordingCollector) -> None:
         collector.notes[f"{text}; time={column!r} uses it"] = 1
 
 
+def _note_reference_parts(collector: RecordingCollector) -> None:
+    """Add a note on parts that check the press and not the product, by a few words in names."""
+    names = [recording.part or recording.source for recording in collector.recordings]
+    found = [name for name in names if REFERENCE.search(name)]
+    if 0 < len(found) < MAX_REFERENCE_SHARE * len(names):
+        text = f"By their names these look like reference parts, and are read: {listed(found)}"
+        collector.notes[f"{text}; take them out of the data, if they are"] = 1
+
+
 def leave_out_repeats(collector: RecordingCollector) -> list[int]:
     """Leave out later recordings with the part, label and samples of another; a note names them.
 
@@ -786,7 +803,7 @@ def _fit_odd_lengths(
     """Make faults of the recordings whose length cannot be fitted, or with `keeps_all` fit them.
 
     A shorter one then repeats its last sample, a longer one is cut. Notes say how many there are,
-    which are cut much if `fit` is pad, and if most of those left out are bad.
+    which are cut if `fit` is pad, and if most of those left out are bad.
     """
     recordings = collector.recordings
     lengths = [recording.trace.shape[1] for recording in recordings]
@@ -797,6 +814,11 @@ def _fit_odd_lengths(
         if fit == "pad" and samples < SHORT * n and (keeps_all or i not in odd)
     ]:
         collector.notes[f"Of more samples only the first {samples} are read: {listed(cut)}"] = 1
+    longer = [n for i, n in enumerate(lengths) if samples < LONG * n and i not in odd]
+    if fit == "pad" and longer and not cut:
+        text = f"Recordings that lose their ends: {len(longer)}, {max(longer) - samples}"
+        text = f"{text} samples of {max(longer)} at most; samples={max(longer)} keeps them"
+        collector.notes[text] = 1
     if keeps_all:
         for i in odd:
             positions = np.arange(samples).clip(max=lengths[i] - 1)

@@ -64,6 +64,7 @@ COPY_SUFFIX = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)
 COPY_PREFIX = re.compile(r"^(copy of|kopie von|copie de) ", re.IGNORECASE)
 LEADING_ZEROS = re.compile(r"(?<=_)0+(?=\d)")
 FILE_SUFFIX = re.compile(r"\.[A-Za-z]\w{1,5}$")
+AGAIN = re.compile(r"(.*\w)(?:[._-]\d| ?\(\d+\))((?:\.[^\W\d]\w*)?)")  # SN12.1, SN12 (2).csv
 # A long number as a spreadsheet saves it, without its last digits: 2,40311E+11.
 SHORTENED = re.compile(r"\d([.,]\d{0,8})?[eE]\+(09|[1-9]\d)")
 LAST_WORD = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # without a number
@@ -893,20 +894,10 @@ def labels_in_file(
     if any(len(row.lines) > 1 for row in rows):
         notes[f"{source} names recordings more than once: their labels must be equal"] = 1
     label_column = LabelColumn(column, options.words, notes)
-    rows_by_file = defaultdict[str, list[_LabelRow]](list)
-    for row in rows:
-        rows_by_file[row.words[0]].append(row)
-
-    def is_end(row: _LabelRow, name_words: tuple[str, ...]) -> bool:
-        """Return whether two paths agree as far as both go, from the file on."""
-        return all(a == b for a, b in zip(row.words, name_words, strict=False))
-
     name_words = {name: _path_words(name) for name in names}
-    matches = {
-        name: [row for row in rows_by_file[path_words[0]] if is_end(row, path_words)]
-        for name, path_words in name_words.items()
-    }
+    matches = _matching_rows(rows, name_words)
     n_names = Counter(row for matching in matches.values() for row in matching)
+    times_of = _measured_again(matches)
     for row in rows:
         if not n_names[row]:
             why = ", a number that a spreadsheet has shortened" * bool(
@@ -917,6 +908,9 @@ def labels_in_file(
 
     def find(name: str) -> SourcedLabel:
         """Return the label and the part in the row that names a recording most exactly."""
+        if name in times_of:
+            wanted = f"a row of {source} for each of {listed(times_of[name])}"
+            raise UnreadableError(f"Expected {wanted}, found one: it may be that of any of them")
         if not matches[name]:
             raise UnreadableError(f"Expected a row of {source} that names it, found none")
         path_words = name_words[name]
@@ -947,6 +941,43 @@ def labels_in_file(
         if name != column and name.lower() in LABEL_COLUMNS
     ]
     return labels_that_agree(listing, others, listing.trust)
+
+
+def _matching_rows(
+    rows: Iterable[_LabelRow], name_words: Mapping[str, tuple[str, ...]]
+) -> dict[str, list[_LabelRow]]:
+    """Return the rows of a listing whose path agrees with each recording's, as far as both go, from
+    the file on.
+    """
+    rows_by_file = defaultdict[str, list[_LabelRow]](list)
+    for row in rows:
+        rows_by_file[row.words[0]].append(row)
+
+    def is_end(row: _LabelRow, path_words: tuple[str, ...]) -> bool:
+        return all(a == b for a, b in zip(row.words, path_words, strict=False))
+
+    return {
+        name: [row for row in rows_by_file[path_words[0]] if is_end(row, path_words)]
+        for name, path_words in name_words.items()
+    }
+
+
+def _measured_again(matches: Mapping[str, Sequence[_LabelRow]]) -> dict[str, list[str]]:
+    """Return the recordings whose row in a listing may be that of another one, each with these.
+
+    They are those of one name, with and without a number behind it, as SN12 and SN12.1, of which
+    only the first has a row.
+
+    matches : the rows that match each recording.
+    """
+    times_of = defaultdict[str, list[str]](list)
+    for name, rows in matches.items():
+        again = AGAIN.fullmatch(name)
+        if again and not rows and matches.get(first := again[1] + again[2]):
+            times_of[first] = times_of[first] or [first]
+            times_of[first].append(name)
+            times_of[name] = times_of[first]
+    return dict(times_of)
 
 
 def _leading_zeros_note(source: str, rows: Sequence[_LabelRow]) -> dict[str, int]:

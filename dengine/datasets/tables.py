@@ -159,10 +159,7 @@ def _from_tables(
             if constant:
                 do = f"; if a file is one recording, name its label's column: label={constant[0]!r}"
             raise DataError(f"Expected {wanted}, only one of them has {differing}{do}.")
-    has_rows_of_parts = options.part in frames[first] and frames[first][options.part].is_unique
-    is_wide = has_rows_of_parts or options.part not in frames[first]
-    is_wide = is_wide and _largest_channel(frames[first]) >= MIN_NUMBERED
-    if options.labels is not None and options.time is None and is_wide:
+    if options.labels is not None and options.time is None and _is_wide(frames[first], options):
         return _join_listing(tables, options, collector)
     if options.time is not None or options.labels is not None:
         cut_lines = {(source, table.cut_line) for source, table in tables.items()}
@@ -184,6 +181,12 @@ def _from_tables(
             collector.add(where, read, 0 if column else line)
     _leave_out_repeated_rows(collector)
     return as_dataset(collector, options)
+
+
+def _is_wide(frame: pd.DataFrame, options: LoadOptions) -> bool:
+    """Return whether a table has columns of samples, and a row for most parts."""
+    n_parts = frame[options.part].nunique() if options.part in frame else len(frame)
+    return len(frame) < 2 * n_parts and _largest_channel(frame) >= MIN_NUMBERED
 
 
 def _leave_out_repeated_rows(collector: RecordingCollector) -> None:
@@ -217,9 +220,10 @@ def _join_listing(
 ) -> Dataset:
     """Make a data set of wide tables whose labels are in a file, by the numbers of parts.
 
-    Raises DataError if a table has no column of these, or two rows have one number.
+    The second row of part 7 is called "7 (2)". Raises DataError if a table has no column of parts.
     """
     read_of_part = dict[str, Callable[[], Recording]]()
+    n_rows = Counter[str]()
     for source, table in tables.items():
         if options.part not in table.frame:
             samples = max(numbered_columns(table.frame.columns).values(), key=len)
@@ -228,10 +232,8 @@ def _join_listing(
             wanted = f"the column of parts that the file of labels names, as in part={likely!r}"
             raise DataError(f"Expected {wanted}, found {listed(others.columns)}.")
         for _, part, read in wide_rows(table, options, collector, source):
-            if part in read_of_part:
-                wanted = f"one row for each part, as {options.labels} lists them"
-                raise DataError(f"Expected {wanted}, got {part} twice.")
-            read_of_part[part] = read
+            n_rows[part] += 1
+            read_of_part[part if n_rows[part] == 1 else f"{part} ({n_rows[part]})"] = read
     listed_by = replace(options, part="part")
     listing = labels.labels_in_file(str(options.labels), list(read_of_part), listed_by)
     labels.collect_recordings(read_of_part, lambda read: read(), listing, collector)

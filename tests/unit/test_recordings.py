@@ -3603,3 +3603,49 @@ def test_data_in_quotes_are_not_written_as_options() -> None:
         "Expected numbers, got 'start part=1 label=x'; name parts' numbers, as in part='my nr'"
     )
     assert as_options(message) == message.replace("part='my nr'", "--part 'my nr'")
+
+
+def test_a_row_of_a_listing_judges_no_part_that_was_measured_twice(
+    make_data, tmp_path: Path
+) -> None:
+    data = make_data(21, samples=50)
+    serials = [f"SN{i:02}" for i in range(20)]
+    serials.insert(5, "SN04")
+    listing = tmp_path / "listing.csv"
+    verdicts = {serial: "OK" if i % 3 else "NOK" for i, serial in enumerate(serials)}
+    pd.DataFrame(verdicts.items(), columns=["serial", "verdict"]).to_csv(listing, index=False)
+    rows = pd.DataFrame(data.X).add_prefix("s")
+    rows.assign(serial=serials).to_csv(tmp_path / "rows.csv", index=False)
+    columns = rows.T.set_axis([*serials[:5], "SN04.1", *serials[6:]], axis=1)  # as pandas writes
+    columns.insert(0, "time_s", np.arange(50) / 500)
+    columns.to_csv(tmp_path / "columns.csv", index=False)
+    for file, again in (("rows", "SN04 (2)"), ("columns", "SN04.1")):
+        how = {"part": "serial"} if file == "rows" else {}
+        loaded = load_dataset(tmp_path / f"{file}.csv", labels=listing, rate_hz=500, **how)
+        message = f"Expected a row of listing.csv for each of SN04, {again}, found one"
+        assert [fault.source for fault in loaded.faults] == ["SN04", again]
+        assert all(fault.message.startswith(message) for fault in loaded.faults)
+        np.testing.assert_allclose(loaded.X, np.delete(data.X, [4, 5], axis=0), rtol=1e-6)
+
+
+def test_parts_that_are_called_reference_parts_are_named(make_data, tmp_path: Path) -> None:
+    data = make_data(30, samples=40)
+    for i, (trace, label) in enumerate(zip(data.X, data.y, strict=True)):
+        name = "MASTER-A" if i % 15 == 0 else f"SN{i}"
+        write_csv(tmp_path / f"{i:02}_{name}_{'OK' if label else 'NOK'}.csv", trace)
+    notes = " ".join(load_dataset(tmp_path).notes)
+    assert "look like reference parts, and are read: 00_MASTER-A_" in notes
+    assert "15_MASTER-A_" in notes
+    assert "SN" not in notes
+
+
+@pytest.mark.parametrize(("longest", "is_said"), [(52, False), (54, True)])
+def test_a_note_says_how_many_samples_are_cut_at_the_ends(
+    longest: int, is_said: bool, make_data
+) -> None:
+    data = make_data(30, samples=60)
+    traces = [trace[: longest if i < 3 else 50] for i, trace in enumerate(data.X)]
+    notes = " ".join(load_dataset((traces, data.y)).notes)
+    text = "Recordings that lose their ends: 3, 4 samples of 54 at most; samples=54 keeps them"
+    assert (text in notes) == is_said
+    assert ("lose their ends" in notes) == is_said
