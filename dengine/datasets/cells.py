@@ -90,6 +90,7 @@ def split_cells(text: str, columns: Sequence[str] = (), channels: Sequence[str] 
         split = {i: _split_line(line, delimiter) for i, line in (top | lines).items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
+    n_cut = _cut_touching(lines, split) if delimiter == " " else 0
     rows = _under_one_header({i: row for i, row in split.items() if i > end and any(row)})
     _check_blocks_of_labview(rows)
     if _is_horizontal(rows.values()):
@@ -115,8 +116,47 @@ def split_cells(text: str, columns: Sequence[str] = (), channels: Sequence[str] 
         notes=(
             *_tables_in(list(above.values())),
             *(["Rows below a line that marks the end, as //END, are left out"] if stale else []),
+            *["Rows in which cells touch or are empty are cut where the columns end"] * n_cut,
         ),
     )
+
+
+def _cut_touching(lines: Mapping[int, str], split: dict[int, list[str]]) -> int:
+    """Cut rows of too few cells where the columns of a text of fixed width end, in place.
+
+    So Fortran writes 44.17010026.13 where 10026.13 fills its column. The ends of the columns are
+    those in which the rows of most cells, eight or more, agree. A row is cut if each piece is then
+    as the cell above it, a word or a number of as many decimals, or is empty, or of the stars of
+    an overflow. Returns the number of rows that are cut.
+    """
+    numeric = [i for i in lines if 2 * len(numeric_columns(split[i])) >= len(split[i])]
+    widths = Counter(len(split[i]) for i in numeric)
+    n = max((width for width, n_rows in widths.items() if n_rows >= MIN_TIMES), default=0)
+    full = [i for i in numeric if len(split[i]) == n]
+    all_ends = {tuple(word.end() for word in WORD.finditer(lines[i])) for i in full}
+    if len(all_ends) != 1:
+        return 0
+    ends = all_ends.pop()
+    usual = split[full[0]]
+    n_cut = 0
+
+    def form(cell: str) -> tuple[bool, int]:
+        """Return whether a cell is a number or a time, and its number of decimals."""
+        return is_value(cell), len(cell.replace(",", ".").partition(".")[2])
+
+    for i, line in lines.items():
+        is_short = len(split[i]) < n and "\t" not in line
+        if not (is_short and len(line.rstrip()) <= ends[-1] <= len(line)):
+            continue
+        pieces = [line[begin:end].lstrip() for begin, end in itertools.pairwise((0, *ends))]
+        are_cells = all(
+            not any(map(str.isspace, piece)) and (not piece.strip("*") or form(piece) == form(cell))
+            for piece, cell in zip(pieces, usual, strict=True)
+        )
+        if are_cells and numeric_columns(pieces):
+            split[i] = pieces
+            n_cut += 1
+    return n_cut
 
 
 def _tables_in(above: Sequence[list[str]]) -> list[str]:

@@ -30,7 +30,7 @@ from .containers import as_texts, read_content, read_frame
 from .curves import write_curves
 from .dataset import Fault, LoadOptions, UnreadableError
 from .encodings import decode
-from .headers import NUMBER_AND_UNIT, TextCells, without_trailing_empty
+from .headers import NUMBER_AND_UNIT, TextCells, is_value, without_trailing_empty
 from .numerals import is_numeral, write_as_python
 from .scales import lines_of_factors
 
@@ -53,6 +53,8 @@ SPREADSHEET_DATE = re.compile(
     rf"|\d\d?月(?:\d\d?日)?|(?:{DATE_FORM})(?:[T ]\d\d?:\d\d(?::\d\d)?)?)\s*",
     re.IGNORECASE,
 )
+# Two numbers with decimals or more, as where they fill columns of fixed width.
+TOUCHING = re.compile(r"([+-]?\d+[.,]\d+([eE][+-]\d+)?){2,}")
 MOST = 0.8  # of a column's cells are numbers: the others are lost samples
 
 
@@ -169,7 +171,7 @@ def read_table(
     rows = _pad_rows(cells.rows, n)
     complete = {i: row[:n] for i, row in rows.items() if len(row) >= n and not any(row[n:])}
     wrong = {
-        i: f"Expected {n} columns, got {len(row)}: {listed(row)}"
+        i: f"Expected {n} columns, got {len(row)}: {listed(row)}{_touching_text(row)}"
         for i, row in cells.rows.items()
         if i not in complete
     }
@@ -323,6 +325,14 @@ def _convert_cells(
     return ", ".join(texts), tuple(notes)
 
 
+def _touching_text(row: Sequence[str]) -> str:
+    """Return a text for an error on the first cell of a row in which numbers touch, or ""."""
+    for cell in row:
+        if TOUCHING.fullmatch(cell) and not is_value(cell):
+            return f"; numbers touch in {cell}: export with a mark between the columns"
+    return ""
+
+
 def _find_cut_row(
     text: str, cells: TextCells, complete: Mapping[int, Sequence[str]], wrong: dict[int, str]
 ) -> int:
@@ -388,6 +398,7 @@ def parse_numbers(
             is_date = SPREADSHEET_DATE.fullmatch(cell) is not None
             if NUMBER_AND_UNIT.fullmatch(cell) and not is_date:
                 message = f"{message}; export plain numbers, without units"
+            message += "" if is_date else _touching_text([cell])
             wrong.setdefault(index, message)
             if is_date:
                 dates[index] += 1

@@ -3649,3 +3649,92 @@ def test_a_note_says_how_many_samples_are_cut_at_the_ends(
     text = "Recordings that lose their ends: 3, 4 samples of 54 at most; samples=54 keeps them"
     assert (text in notes) == is_said
     assert ("lose their ends" in notes) == is_said
+
+
+def write_fixed_width(folder: Path, forces: np.ndarray, head: str, form: str) -> Path:
+    """A file for each part: number, time, a stroke near -40, and force by a format as of Fortran."""
+    folder.mkdir(exist_ok=True)
+    for k, force in enumerate(forces):
+        rows = [
+            form.format(i + 1, 0.004 * i, -40 - i / 100, f)
+            for i, f in enumerate(np.round(force, 2))
+        ]
+        label = "OK" if k % 2 else "NOK"
+        (folder / f"run_{k}_{label}.dat").write_text("\n".join([head, *rows, ""]))
+    return folder
+
+
+FORTRAN = "{:5d}{:9.4f}{:8.3f}{:8.2f}"
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "   NO  TIME(S)  STROKE(MM) FORCE OF THE RAM(N)",
+        "NO,TIME,STROKE,FORCE(N)".replace(",", " "),
+        " RUN : 7\n STATUS : ACCEPT\n COLUMNS : NO 1-5  TIME(S) 6-14  STROKE(MM) 15-22  FORCE 23-30",
+    ],
+)
+@pytest.mark.parametrize("peak", [14000.0, -3000.0])
+def test_numbers_that_touch_in_columns_of_fixed_width_are_cut_with_a_note(
+    head: str, peak: float, tmp_path: Path
+) -> None:
+    forces = peak * np.sin(np.linspace(0, np.pi, 200)) + np.arange(4)[:, None]
+    write_fixed_width(tmp_path / "runs", forces, head, FORTRAN)
+    data = load_dataset(
+        tmp_path / "runs", columns="no,time,stroke,force", channel="force", unit="N"
+    )
+    np.testing.assert_allclose(data.X, np.round(forces, 2), rtol=1e-6)
+    width = np.char.str_len(np.char.mod("%.2f", forces))
+    text = f"cut where the columns end ({(width == 8).sum()} times)"
+    assert any(text in note for note in data.notes)
+
+
+def test_a_cell_of_stars_that_touches_is_a_lost_sample_and_a_blank_one_is_empty(
+    tmp_path: Path,
+) -> None:
+    forces = np.sin(np.arange(4)[:, None] + np.arange(200) / 9)
+    folder = write_fixed_width(tmp_path / "runs", forces, "no time stroke force", FORTRAN)
+    path = folder / "run_0_NOK.dat"
+    lines = path.read_text().split("\n")
+    lines[51] = f"{lines[51][:-8]}{8 * '*'}"
+    lines[61] = lines[61][:14] + 8 * " " + lines[61][22:]
+    lines[71] = lines[71][:-8] + 8 * " "
+    path.write_text("\n".join(lines))
+    data = load_dataset(folder, channel="force")
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(data.X[0])), [50, 70])
+    assert any("********" in note for note in data.notes)
+    assert any("cut where the columns end (3 times)" in note for note in data.notes)
+
+
+@pytest.mark.parametrize("columns", ["", "no,time,stroke,force"])
+def test_numbers_that_touch_and_cannot_be_cut_are_a_fault_that_says_so(
+    columns: str, tmp_path: Path
+) -> None:
+    forces = np.sin(np.arange(4)[:, None] + np.arange(200) / 9)
+    forces[0, 100] = -123456.78
+    folder = write_fixed_width(tmp_path / "runs", forces, "no time stroke force", FORTRAN)
+    data = load_dataset(folder, channel="force", columns=columns or None)
+    assert "numbers touch in -41.000-123456.78" in data.faults[0].message
+    path = folder / "run_0_NOK.dat"
+    text = path.read_text().replace(" -41.000-123456.78", "  41.0123456.789")
+    path.write_text(text)  # as wide as the others, but the point is elsewhere
+    data = load_dataset(folder, channel="force", columns=columns or None)
+    assert "numbers touch in 41.0123456.789" in data.faults[0].message
+    forces[:] = -100
+    write_fixed_width(folder, forces, "no time stroke force", "{:5d}{:9.4f}{:8.3f}{:7.2f}")
+    with pytest.raises(DataError, match=r"numbers touch in -40.000-100.00"):
+        load_dataset(folder, channel="force", columns=columns or None)
+
+
+@pytest.mark.parametrize("n_lost", [2, 4, 9, 10, 25])
+def test_a_last_row_that_is_cut_off_is_not_taken_for_a_cell_that_is_empty(
+    n_lost: int, tmp_path: Path
+) -> None:
+    forces = np.arange(4)[:, None] + 5000 + 50.0 * np.arange(200)
+    folder = write_fixed_width(tmp_path / "runs", forces, "no time stroke force", FORTRAN)
+    path = folder / "run_0_NOK.dat"
+    path.write_text(path.read_text()[:-n_lost])
+    data = load_dataset(folder, channel="force", samples=199, fit="cut")
+    np.testing.assert_allclose(data.X, forces[:, :199])
+    assert any("cut off" in note for note in data.notes)
