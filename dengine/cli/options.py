@@ -487,8 +487,8 @@ _TRIGGER = (
 )
 _TOPIC = "The topic of the wrench in an .mcap file.  [default: the only one]"
 _PART = (
-    "The array or column of part numbers, if any. A part measured again has one vote; a repeat "
-    "with equal samples and label is left out.  "
+    "The array or column of part numbers, or columns to join, as day,nr. A part "
+    "measured again has one vote; a repeat with equal samples and label is left out.  "
     "[default: part]"
 )
 _DATA = (

@@ -166,18 +166,18 @@ def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
     return values, wrong
 
 
-def join_date_and_time(frame: pd.DataFrame) -> None:
+def join_date_and_time(frame: pd.DataFrame) -> str:
     """Join a column of dates and one of times of day, in place, in a table of texts.
 
     Both columns get date and time. A column of milliseconds from 0 to 999, as of `MILLISECONDS`, is
     added to times without a fraction, also to those that have their date in one cell, and gets the
     same. The columns stay as they are if the time passes midnight but the date stays, as that of
-    the first row.
+    the first row. Returns the name of the column of dates, "" if none is joined.
     """
     import pandas as pd
 
     if len(frame) < 2:
-        return
+        return ""
     ends = frame.iloc[[0, -1]].astype(str)
     first, last = ends.to_numpy().astype(str)  # pandas would parse each expression for each column
     cells = list(enumerate(zip(first, last, strict=True)))
@@ -190,13 +190,13 @@ def join_date_and_time(frame: pd.DataFrame) -> None:
         time = frame.iloc[:, times[0]]
         hours = pd.to_numeric(time.str.partition(":")[0], errors="coerce")
         if ((hours.diff() <= -HALF_DAY) & (date == date.shift())).any():
-            return
+            return ""
         joined = date + " " + time
     elif len(stamps) == 1 and not places:
         places = stamps
         joined = frame.iloc[:, stamps[0]]
     else:
-        return
+        return ""
     names = [str(name).lower() for name in frame.columns]
     milliseconds = [i for i, name in enumerate(names) if name in MILLISECONDS][:1]
     has_fraction = joined.iloc[[0, -1]].str.contains(r":\d\d[.,]").any()
@@ -207,6 +207,7 @@ def join_date_and_time(frame: pd.DataFrame) -> None:
             places = [*places, place]
     for place in places:
         frame.isetitem(place, joined)
+    return str(frame.columns[dates[0]]) if dates else ""
 
 
 def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:

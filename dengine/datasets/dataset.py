@@ -10,7 +10,7 @@ import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import PurePosixPath
@@ -341,6 +341,16 @@ class LoadOptions:
         expect_data(valid, wanted, self.thousands)
         with instead(DataError, "Expected the name of an encoding, as 'cp1252'", LookupError):
             codecs.lookup(self.encoding or "utf-8")
+
+    @property
+    def part_columns(self) -> tuple[str, ...]:
+        """The columns that tell the part: `part`, and those that it joins, as "day,number"."""
+        return tuple(dict.fromkeys([self.part, *split_names(self.part)]))
+
+    def has_part(self, columns: Iterable[str]) -> bool:
+        """Return whether `part` is one of the columns, or they are all that it joins."""
+        names = {*columns}
+        return self.part in names or set() < {*split_names(self.part)} <= names
 
 
 def split_names(names: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -234,7 +234,7 @@ def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptio
     if suffix_of(path) in (*NO_TEXTS, *JSON):
         return True
     header = heads.header
-    if options.time is not None and options.part in header:
+    if options.time is not None and options.has_part(header):
         return True
     numbered = [names for names in numbered_columns(header).values() if len(names) >= MIN_NUMBERED]
     if sum(map(len, numbered)) > NUMBERED_SHARE * len(header):
@@ -246,12 +246,12 @@ def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptio
         for name in named:
             source.find(name)
         return False
-    if len(named) > 1 and options.part not in header and _has_label_column(named, heads, options):
+    if len(named) > 1 and not options.has_part(header) and _has_label_column(named, heads, options):
         return False
     has_label = labels.column_among(header, labels.LABEL_COLUMNS) is not None
     if len(named) == 1 or options.time is not None:
         return True
-    if not has_label and options.part not in header:
+    if not has_label and not options.has_part(header):
         return False
     return bool(long_table_advice(_first_readable(named, options)[1].frame, options, ""))
 
@@ -275,7 +275,7 @@ def _check_encoding(paths: Sequence[Path], options: LoadOptions) -> None:
 
     Also if some files have a name of the options, as of a channel, only in another encoding.
     """
-    columns = (options.label, options.part, options.time)
+    columns = (options.label, *options.part_columns, options.time)
     names = [*options.channels, *options.words, *filter(None, columns)]
     if not all(map(str.isascii, names)):
         for path in paths[:: max(len(paths) // TRIED, 1)]:

@@ -240,13 +240,16 @@ def from_long(
         frame = frame[~is_repeated]
     frame, n_repeated = _without_repeats(frame, options)
     frame = _pivot_signals(frame, [options.part, time, *label_columns], options)
-    others = [name for name in frame.columns if name not in (options.part, time, *label_columns)]
+    others = [
+        name for name in frame.columns if name not in (*options.part_columns, time, *label_columns)
+    ]
     check = partial(check_labels, all_rows, label_source, collector.name)
     collector.channels = _channels_of_long(frame, others, options, check)
     seconds, form = _times_of_long(frame[time], column_units.get(time, ""), collector)
     rows_of_part = _rows_by_part(frame, seconds, options)
     stations = [name for name in others if name not in collector.channels]
-    _check_single_station(rows_of_part, stations, collector.channels)
+    _check_numbers_once(rows_of_part, stations, first.date, options.part)
+    _check_single_station(rows_of_part, stations, collector.channels, options.part)
     has_dates = holds_dates(frame[time])
     if not has_dates:
         _check_together(rows_of_part, collector, has_clock=time != ROW_COLUMN)
@@ -263,8 +266,10 @@ def from_long(
         channel_units = single_units(stated_units, rows.index) or tuple(
             column_units.get(name) or units.split(name)[1] for name in collector.channels
         )
-        clock = timed.reading.clock.replace(ANY_ORDER, form)  # a part's rows may not tell it
-        reading = timed.reading._replace(numbers=first.numbers, clock=clock)
+        reading = timed.reading._replace(
+            numbers=first.numbers,
+            clock=timed.reading.clock.replace(ANY_ORDER, form),  # a part's rows may not tell it
+        )
         factors = {**first.factors, **factors_in_columns(rows.drop(columns=[*collector.channels]))}
         return timed._replace(
             units=channel_units,
@@ -378,37 +383,57 @@ def _rows_by_part(
     """Return the rows of each part of a long table, by its number, in order of first appearance.
 
     The rows have two more columns: `SECONDS_COLUMN`, their times, and `RUN_COLUMN`, the number of
-    the run that they are in. A run ends where the next row is of another part or earlier. Raises
-    DataError if many parts' numbers were used again later.
+    the run that they are in. A run ends where the next row is of another part or earlier.
     """
     part = frame[options.part]
     is_new = (part != part.shift()).to_numpy() | np.r_[False, np.diff(seconds) < 0]
     with_seconds = frame.assign(**{SECONDS_COLUMN: seconds, RUN_COLUMN: np.cumsum(is_new)})
     groups = with_seconds.groupby(options.part, sort=False)
-    rows_of_part = {str(part): rows for part, rows in groups}
-    _check_numbers_once(rows_of_part)
-    return rows_of_part
+    return {str(part): rows for part, rows in groups}
 
 
-def _check_numbers_once(rows_of_part: Mapping[str, pd.DataFrame]) -> None:
+def _check_numbers_once(
+    rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str], date: str, part_column: str
+) -> None:
     """Raise DataError if many parts' numbers were used again, as where each shift counts from 1.
 
-    Many are two or more, and at least a fifth of all (`FEW_AGAIN`); fewer are not looked at here. A
-    number was used again if its rows stand in several runs, other parts between them, and each
-    pause is longer than all of its rows would take at their median step.
+    Many are two or more, and at least a fifth of all (`FEW_AGAIN`); fewer are not looked at here.
+    The error names a column that makes the numbers unique, if there is one.
+
+    columns : that may do so. date : the column of dates to which times of day were joined, or "".
     """
-    again = []
-    for part, rows in rows_of_part.items():
-        starts = np.flatnonzero(rows[RUN_COLUMN].diff().to_numpy() > 1)
-        steps = np.abs(np.diff(rows[SECONDS_COLUMN].to_numpy()))
-        if len(starts) and steps[starts - 1].min() > len(rows) * np.median(steps):
-            again.append((part, rows.index[starts[0]]))
+    lines = {part: _line_of_next(rows) for part, rows in rows_of_part.items()}
+    again = [part for part, line in lines.items() if line]
     if len(again) < 2 or len(again) < FEW_AGAIN * len(rows_of_part):
         return
-    part, line = again[0]
     wanted = f"one recording for each part, {len(again)} of {len(rows_of_part)} numbers come again"
     do = "make the parts' numbers unique, as day (or station) and number in one column"
-    raise DataError(f"Expected {wanted} later, as {part} in line {line}; {do}.")
+    whole = [name for name in columns if _are_whole(rows_of_part[again[0]][name])]
+    for name in filter(None, [date, *whole]):
+        all_cells = (rows[name].astype(str) for rows in rows_of_part.values())
+        keys = (cells.str.partition(" ")[0] if name == date else cells for cells in all_cells)
+        if all(map(_are_single, rows_of_part.values(), keys)):
+            do = f"make them unique, part='{name},{part_column}'"
+            break
+    raise DataError(f"Expected {wanted} later, as {again[0]} in line {lines[again[0]]}; {do}.")
+
+
+def _are_single(rows: pd.DataFrame, keys: pd.Series) -> bool:
+    """Return whether a part's number was used once with each key, and a key is of all its rows."""
+    is_of_runs = keys.nunique() <= rows[RUN_COLUMN].nunique()
+    return is_of_runs and not any(_line_of_next(own) for _, own in rows.groupby(keys))
+
+
+def _line_of_next(rows: pd.DataFrame) -> int:
+    """Return the line in which a part's number was used again; 0 if it was used once.
+
+    It was used again if its rows stand in several runs, other parts between them, and each pause is
+    longer than all of its rows would take at their median step.
+    """
+    starts = np.flatnonzero(rows[RUN_COLUMN].diff().to_numpy() > 1)
+    steps = np.abs(np.diff(rows[SECONDS_COLUMN].to_numpy()))
+    is_again = len(starts) > 0 and steps[starts - 1].min() > len(rows) * np.median(steps)
+    return int(rows.index[starts[0]]) if is_again else 0
 
 
 def _check_together(
@@ -543,7 +568,10 @@ def _labels_of_parts(
 
 
 def _check_single_station(
-    rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str], channels: Sequence[str]
+    rows_of_part: Mapping[str, pd.DataFrame],
+    columns: Sequence[str],
+    channels: Sequence[str],
+    part_column: str,
 ) -> None:
     """Raise DataError if the rows of a part's number are those of several parts, made at the same
     times at different places.
@@ -559,7 +587,7 @@ def _check_single_station(
             if 2 <= rows[name].nunique() <= MAX_STATIONS and _are_stations(rows, name):
                 values = listed(sorted(map(str, rows[name].dropna().unique())))
                 wanted = f"one recording for each part, part {part} has several values of {name}"
-                do = f"make the parts' numbers unique, as {name} and number in one column"
+                do = f"make them unique, part='{name},{part_column}'"
                 raise DataError(f"Expected {wanted} ({values}) at the same time; {do}.")
         runs = rows.groupby(RUN_COLUMN)
         if 2 <= runs.ngroups <= MAX_STATIONS and _are_stations(rows, RUN_COLUMN):

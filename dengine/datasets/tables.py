@@ -34,7 +34,7 @@ from .dataset import (
 )
 from .long_tables import concatenate_long, cut_by_windows, from_long, long_table_advice, unwrap_ring
 from .recordings import cut_note
-from .text import TextTable, read_table
+from .text import TextTable, read_table, with_part
 from .wide_tables import turn_table, wide_rows, with_samples_in_columns
 
 if TYPE_CHECKING:
@@ -67,7 +67,8 @@ def read_tables(named: Mapping[str, Path], name: str, options: LoadOptions) -> D
             unread.append(Fault(source, line, str(error).rstrip(".")))
             continue
         for key, value in PARTITION.findall(source):
-            is_used = key in (options.label, options.part) or key.lower() in labels.LABEL_COLUMNS
+            is_used = key in (options.label, *options.part_columns)
+            is_used = is_used or key.lower() in labels.LABEL_COLUMNS
             if is_used and key not in table.frame:
                 table.frame[key] = "" if value == NO_PARTITION else value
         collector.faults += [replace(fault, source=source) for fault in table.faults]
@@ -143,6 +144,10 @@ def _from_tables(
 
     tables : by the names of their files, or "row" for a DataFrame; the index is the line.
     """
+    tables = {
+        source: table._replace(frame=_with_part(table.frame, options, source))
+        for source, table in tables.items()
+    }
     tables, options = with_samples_in_columns(tables, options, collector)
     turned = {source: turn_table(table, options, source) for source, table in tables.items()}
     if any(table is not tables[source] for source, table in turned.items()):
@@ -187,6 +192,16 @@ def _is_wide(frame: pd.DataFrame, options: LoadOptions) -> bool:
     """Return whether a table has columns of samples, and a row for most parts."""
     n_parts = frame[options.part].nunique() if options.part in frame else len(frame)
     return len(frame) < 2 * n_parts and _largest_channel(frame) >= MIN_NUMBERED
+
+
+def _with_part(frame: pd.DataFrame, options: LoadOptions, source: str) -> pd.DataFrame:
+    """Return a table as `with_part`; raise DataError if it has but some columns that this joins."""
+    missing = [name for name in options.part_columns[1:] if name not in frame]
+    if options.part not in frame and 0 < len(missing) < len(options.part_columns) - 1:
+        wanted = f"columns {options.part} of parts' numbers in {source}"
+        actual = f"{listed(missing)} is none of {listed(frame.columns)}"
+        raise DataError(f"Expected {wanted}, {actual}.")
+    return with_part(frame, options)
 
 
 def _leave_out_repeated_rows(collector: RecordingCollector) -> None:

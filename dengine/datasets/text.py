@@ -96,6 +96,8 @@ class TextTable(NamedTuple):
         The column of the file that each row was, if rows and columns were exchanged.
     wrong : mapping of int to UnreadableError
         What is wrong in such a row, with the line of the file.
+    date : str
+        The column of dates to which times of day were joined; "" for none.
     """
 
     frame: pd.DataFrame
@@ -116,6 +118,7 @@ class TextTable(NamedTuple):
     preamble: str = ""
     column_of: Mapping[int, str] = {}
     wrong: Mapping[int, UnreadableError] = {}
+    date: str = ""
 
 
 def read_table(
@@ -157,7 +160,9 @@ def read_table(
     if (stored := read_frame(path)) is not None:
         frame, odd_lines = stored
         faults = [Fault(path.name, i, message) for i, message in odd_lines.items()]
-        table = TextTable(as_texts(frame) if as_text else frame, faults, 0, [], "")
+        table = TextTable(
+            with_part(as_texts(frame) if as_text else frame, options), faults, 0, [], ""
+        )
         last = max(odd_lines, default=0)
         return table._replace(cut_line=last) if last > max(frame.index) else table
     text, encoding = decode(read_content(path), options.encoding)
@@ -176,10 +181,10 @@ def read_table(
         if i not in complete
     }
     cut_line = _find_cut_row(text, cells, complete, wrong)
-    frame = pd.DataFrame(
-        list(complete.values()), index=list(complete), columns=header, dtype=object
+    frame = with_part(
+        pd.DataFrame(list(complete.values()), list(complete), header, dtype=object), options
     )
-    mark = numbers = ""
+    mark = numbers = date = ""
     notes = cells.notes
     if not as_text:
         write_curves(frame)
@@ -198,7 +203,7 @@ def read_table(
         )
         numbers = ", ".join(filter(None, parts))
         notes += unit_notes
-        join_date_and_time(frame)
+        date = join_date_and_time(frame)
     faults = [Fault(path.name, i, message) for i, message in sorted(wrong.items())]
     frame = frame.drop(index=[i for i in wrong if i in complete])
     column_units = cells.units[:n]
@@ -207,7 +212,27 @@ def read_table(
     _add_stated_units(column_units, header, _lines_above(text, cells.line or begin))
     about = (cells.fields, cells.n_remarks, cells.blocks, *rate_in_preamble(preamble), RATE_ABOVE)
     first = (frame, faults, cells.line, column_units, mark, numbers)
-    return TextTable(*first, *about, notes, cut_line, lines_of_factors(preamble), preamble)
+    return TextTable(
+        *first, *about, notes, cut_line, lines_of_factors(preamble), preamble, date=date
+    )
+
+
+def with_part(frame: pd.DataFrame, options: LoadOptions) -> pd.DataFrame:
+    """Return a table with a last column of parts that joins the columns of `options.part_columns`.
+
+    The columns "day,number" give parts as `2024-03-12_7`; slashes become dashes, for a listing
+    would take them for folders. A table that has a column of parts, or not all that are to be
+    joined, is returned unchanged.
+    """
+    if options.part in frame or not options.has_part(frame) or not frame.columns.is_unique:
+        return frame
+    pieces = frame[list(options.part_columns[1:])]
+    texts = as_texts(pieces).replace({"/": "-", " 00:00:00$": ""}, regex=True)
+    joined = texts.iloc[:, 0]
+    for name in texts.columns[1:]:
+        joined = joined + "_" + texts[name]
+    joined = joined.mask((texts == "").any(axis=1), "").mask(pieces.isna().any(axis=1))
+    return frame.assign(**{options.part: joined})
 
 
 def _lines_above(text: str, line: int) -> str:

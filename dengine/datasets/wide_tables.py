@@ -179,7 +179,7 @@ def wide_rows(
         label_column = choose_label_column(frame, options)
         label_columns = [label_column, *compared_columns(frame, label_column, options)]
     parts = _parts_of_rows(frame, options)
-    others = [name for name in frame.columns if name not in (*label_columns, options.part)]
+    others = [name for name in frame.columns if name not in (*label_columns, *options.part_columns)]
     columns = sample_columns(others, options)
     all_columns = [name for names in columns.values() for name in names]
     values, wrong, _ = parse_numbers(frame[all_columns])

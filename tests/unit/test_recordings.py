@@ -2278,12 +2278,81 @@ def test_numbers_of_parts_that_start_anew_each_day_are_refused_with_advice(
     frame = pd.concat(frames)
     path = tmp_path / "week.csv"
     frame.to_csv(path, index=False)
-    with pytest.raises(DataError, match="6 of 6 numbers come again later, as 1 in line 302"):
-        load_dataset(path, time="time", label="verdict", channel="force")
-    day_and_number = frame["day"].astype(str) + "_" + frame["part"].astype(str)
-    frame.assign(part=day_and_number).to_csv(path, index=False)
-    data = load_dataset(path, time="time", label="verdict", channel="force")
-    np.testing.assert_array_equal(data.X, small.X[:12])
+    again = "6 of 6 numbers come again later, as 1 in line 302; make them unique, part='day,part'"
+    options = {"time": "time", "label": "verdict", "channel": "force"}
+    with pytest.raises(DataError, match=again):
+        load_dataset(path, **options)
+    for source in (path, frame):
+        data = load_dataset(source, **options, part="day,part")
+        np.testing.assert_array_equal(data.X, small.X[:12])
+        assert (data.source == [f"{14 + i // 6}_{i % 6 + 1}" for i in range(12)]).all()
+
+
+@pytest.mark.parametrize("date", ["%d.%m.%Y", "%m/%d/%Y", "%Y-%m-%d"])
+@pytest.mark.parametrize("has_listing", [False, True])
+def test_a_date_and_a_number_tell_the_part_also_where_the_time_of_day_has_its_own_column(
+    date: str, has_listing: bool, small: Dataset, tmp_path: Path
+) -> None:
+    frames = list[pd.DataFrame]()
+    for i, (x, word) in enumerate(zip(small.X[:12], words(small), strict=False)):
+        start = pd.Timestamp("2026-03-14 06:00") + pd.Timedelta(days=i // 6, minutes=i % 6)
+        times = pd.date_range(start, periods=50, freq="2ms")
+        about = {"Datum": times.strftime(date), "Uhrzeit": times.strftime("%H:%M:%S.%f").str[:-3]}
+        frames.append(pd.DataFrame({**about, "Nr": i % 6 + 1, "Kraft_N": x, "Bewertung": word}))
+    frame = pd.concat(frames)
+    path = tmp_path / "press.csv"
+    frame.to_csv(path, index=False)
+    options: dict[str, Any] = {"time": "Uhrzeit", "channel": "Kraft_N", "label": "Bewertung"}
+    with pytest.raises(DataError, match=r"6 of 6 .* make them unique, part='Datum,Nr'"):
+        load_dataset(path, **options, part="Nr")
+    with pytest.raises(DataError, match=r"press.csv, No is none of Datum, Uhrzeit, Nr, Kraft_N"):
+        load_dataset(path, **options, part="Datum,No")
+    if has_listing:
+        listing = frame[["Datum", "Nr", "Bewertung"]].drop_duplicates()
+        listing.to_csv(tmp_path.parent / "l.csv", index=False)
+        frame.drop(columns="Bewertung").to_csv(path, index=False)
+        options["labels"] = tmp_path.parent / "l.csv"
+    data = load_dataset(path, **options, part="Datum,Nr")
+    np.testing.assert_allclose(data.X, small.X[:12], rtol=1e-6)
+    np.testing.assert_array_equal(data.y, small.y[:12])
+    assert data.rate_hz == 500
+
+
+def test_several_columns_tell_the_part_of_a_wide_table_and_of_a_listing(
+    few: Path, small: Dataset, tmp_path: Path
+) -> None:
+    columns = {"day": np.repeat(["14.03.2026", "15.03.2026"], 12), "nr": [*range(1, 13)] * 2}
+    parts = [f"{day}_{nr}" for day, nr in zip(*columns.values(), strict=True)]
+    table = small.to_frame().assign(**columns)
+    table.to_csv(tmp_path / "wide.csv", index=False)
+    table.to_parquet(tmp_path / "wide.parquet")
+    for source in (table, tmp_path / "wide.csv", tmp_path / "wide.parquet"):
+        data = load_dataset(source, part="day,nr")
+        assert data.part is not None
+        assert data.part.tolist() == parts
+        assert not any(note.startswith("Not read") for note in data.notes)
+    files = sorted(few.glob("*.csv"))
+    listing = tmp_path / "listing.csv"
+    rows = {
+        "file": [file.name for file in files],
+        "label": "ok",
+        **{k: v[: len(files)] for k, v in columns.items()},
+    }
+    pd.DataFrame(rows).to_csv(listing, index=False)
+    data = load_dataset(few, labels=listing, label="label", part="day,nr")
+    assert data.part is not None
+    assert data.part.tolist() == parts[: len(files)]
+
+
+def test_parts_of_two_stations_at_the_same_time_are_told_apart_by_the_columns_of_the_error(
+    small: Dataset,
+) -> None:
+    tables = [long_table(small, lambda i: 10.0 * i).assign(station=name) for name in "AB"]
+    table = pd.concat(tables).sort_values("time", kind="stable")
+    table.loc[table["station"] == "B", "FZ"] += 1
+    with pytest.raises(DataError, match="make them unique, part='station,part'"):
+        load_dataset(table, time="time", channel="FZ")
+    assert len(load_dataset(table, time="time", channel="FZ", part="station,part")) == 48
 
 
 def test_names_above_values_are_read_as_such(small: Dataset, tmp_path: Path) -> None:
