@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from ..datasets import Dataset
 from ..errors import OutputError, instead
 from ..files import write_output
-from ..history.explain import Bound, Explanation
+from ..history.explain import Explanation
+from ..history.sentences import Bound
 from ..records import Action
 from ..reducers import has_own_unit
 from ..traces import as_traces

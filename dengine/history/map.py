@@ -14,7 +14,7 @@ from ..records import Action
 from ..reducers import has_own_unit
 from ..store.records import StoredDecision
 from ..store.views import HistoryFilter
-from .explain import load_past_version
+from .past_versions import load_past_version
 
 if TYPE_CHECKING:
     from ..store.sql import SqlStore

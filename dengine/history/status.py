@@ -515,7 +515,7 @@ def read_watch(store: SqlStore, recipe: Recipe) -> Watch | None:
     restored. In a safe mode that novel traces began, each is 0.
     """
     from ..decision.member_rules import MemberRule  # torch
-    from .explain import load_rule
+    from .past_versions import load_rule
 
     if recipe.policy.guarantee == "local" and recipe.policy.stops != "all":
         return None

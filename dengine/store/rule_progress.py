@@ -1,7 +1,7 @@
 """How far the decision rule of a stored version was updated. A rule is updated with the outcome of
 one part after another. `read_rule_progress` returns a `RuleProgress`: which outcomes the stored
 rule already includes, so that none is counted twice and none is missed. It is called when an engine
-resumes, and by `history.explain.load_rule`, which needs no engine.
+resumes, and by `history.past_versions.load_rule`, which needs no engine.
 """
 
 from __future__ import annotations

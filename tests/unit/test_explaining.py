@@ -12,7 +12,9 @@ import torch
 
 from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, SqlStore, TraceSpec
 from dengine.errors import ReportError, StoreError
-from dengine.history.explain import WHY, Circumstances, Explanation, bound_of, envelope_of, explain
+from dengine.history.envelope import envelope_of
+from dengine.history.explain import Explanation, explain
+from dengine.history.sentences import WHY, Circumstances, bound_of
 from tests.support.driving import Counting, drive, easy_parts
 from tests.support.stores import execute
 

@@ -1,0 +1,260 @@
+"""Restores a model version as it was at a decision, `load_past_version`, and the present decision
+rule, `load_rule`, from a store and without an engine.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ..decision.member_rules import MemberRule
+from ..decision.novelty import NoveltyGate
+from ..decision.policy import RULES, Policy
+from ..decision.references import RadiusIndex
+from ..decision.rule import DecisionRule
+from ..decision.scripting import arrays_with_prefix, restore
+from ..errors import StoreError
+from ..folds import fold_of
+from ..recipe import Recipe
+from ..records import Reason, Source
+from ..store.records import ModelVersion, OutcomeRecord, StoredDecision, VersionError
+from ..store.rule_progress import read_rule_progress
+from ..store.views import PastLabel
+
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
+
+MAX_LABELS = 100_000  # read after a version at most, for a cell that never retrains again
+# Accepted where lower >= the first, rejected where 1 - upper >= the second.
+Thresholds = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PastVersion:
+    """A model version as it was at a moment in the past.
+
+    Attributes
+    ----------
+    index : RadiusIndex
+        Its references.
+    labels : list of PastLabel or None
+        The label of each reference, in the order of the index; None if it is unknown.
+    thresholds : (float, float) or None
+        That a decision had to reach: accepted where lower >= the first, rejected where 1 - upper >=
+        the second. None if they are not kept.
+    last_seq : int
+        Number of the newest label that it could know.
+    novelty : Novelty or None
+        Of the trace that it found novel; None for any other.
+    """
+
+    index: RadiusIndex
+    labels: list[PastLabel | None]
+    thresholds: Thresholds | None
+    last_seq: int
+    novelty: Novelty | None
+
+
+def load_past_version(
+    store: SqlStore, version: int, recipe: Recipe, item: StoredDecision | None
+) -> PastVersion | None:
+    """Load a model version from the store as it was when a decision was made.
+
+    Its references and its rule include this cell's labels that had come by then, as they were
+    reported: later corrections are not applied.
+
+    Parameters
+    ----------
+    store : SqlStore
+    version : int
+    recipe : Recipe
+        Of that moment.
+    item : StoredDecision or None
+        The decision, with its trace; None: the version with all labels that came until the next
+        one.
+
+    Returns
+    -------
+    PastVersion or None
+        None if there is no such version, or its references are damaged or not kept, as of a
+        baseline.
+    """
+    try:
+        stored = store.load_version(version)
+    except VersionError:
+        return None
+    if "points" not in stored.state:  # a baseline keeps no references
+        return None
+    later_retrains = [
+        retrain.last_seq
+        for retrain in store.versions(cell_only=True)
+        if retrain.report.accepted and retrain.report.version > version
+    ]
+    last = min([*later_retrains[:1], stored.last_seq + MAX_LABELS])
+    later = store.past_labels(stored.last_seq, last)
+    if item is not None:
+        stops_all = recipe.policy.stops == "all"
+        later = [label for label in later if _was_known(label, item, stops_all)]
+    before = store.past_labels(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
+    by_number = {label.seq: label for label in (*before, *later) if not label.quarantined}
+    added = [label for label in later if label.model_version == version]
+    index = _restore_index(stored, added, recipe)
+    return PastVersion(
+        index=index,
+        labels=[by_number.get(number) for number in index.column("numbers").tolist()],
+        thresholds=_restore_thresholds(stored, later, recipe.policy),
+        last_seq=max(by_number, default=stored.last_seq),
+        novelty=_score_novelty(stored, item),
+    )
+
+
+def _was_known(label: PastLabel, item: StoredDecision, stops_all: bool) -> bool:
+    """Return whether the engine knew a label when it made the decision `item`; never its own label.
+
+    A label is known from its time on. Under `stops="all"` a label from silence is known from the
+    next decision on, before it is stored.
+    """
+    if stops_all and label.source is Source.CONFIRMED:
+        return label.decided < item.time
+    return label.time <= item.time and label.decision_id != item.decision.id
+
+
+def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
+    """Return the index of a stored version's references, with the labels `added` later.
+
+    A label without a point is left out; any other replaces the oldest reference of a full index.
+    """
+    n = stored.state["points"].shape[1]
+    spaces = len(stored.state["scale"])
+    is_full = int(stored.state["total"]) > n
+    index = RadiusIndex.from_state(stored.state, n if is_full else max(n, recipe.window))
+    for label in added:
+        if label.point is not None:
+            fold = int(fold_of(np.array([label.content_hash], dtype=np.int64), spaces)[0])
+            point = torch.from_numpy(label.point)
+            index.add_one(point, float(label.success), fold, label.content_hash, label.seq)
+    return index
+
+
+def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty | None:
+    """Compute the novelty scores of a decision that was novel, with its version's gate.
+
+    None for any other decision, and if the gate cannot be restored.
+    """
+    if item is None or item.decision.reason is not Reason.NOVEL:
+        return None
+    gate = NoveltyGate(*(int(n) for n in stored.state["trace_shape"]))
+    gate.disabled = False
+    try:
+        restore(gate, arrays_with_prefix(stored.state, "novelty."))
+    except StoreError:  # the gate of another version of dengine
+        return None
+    with torch.inference_mode():
+        return Novelty(*gate.scores(torch.from_numpy(item.trace)).tolist())
+
+
+def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
+    """Return the decision rule of a policy with the state that a version stored.
+
+    None if the state lacks what the rule has learned, has another rule than the policy's, or was
+    stored while stale, and if the rule is a class of the user's that is not imported. A rule that
+    learns nothing needs no state.
+    """
+    if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
+        # Nothing is imported because a store names it; a running engine has imported it.
+        return None
+    rule = policy.rule()
+    try:
+        restore(rule, arrays_with_prefix(stored.state, "rule."))
+    except StoreError:
+        return None
+    return rule
+
+
+def _restore_thresholds(
+    stored: ModelVersion, later: list[PastLabel], policy: Policy
+) -> Thresholds | None:
+    """Return the thresholds of a version's rule after it was updated with later labels.
+
+    They are (accept, reject): a part was accepted where lower >= the first, rejected where 1 -
+    upper >= the second. Labels of quarantined traces and of inspected rejects do not update the
+    rule. The rule "local" with stops="some" learns nothing: both are the policy's lower bound.
+    Otherwise None if the state is not kept, or the rule has no such thresholds.
+    """
+    has_state = bool(arrays_with_prefix(stored.state, "rule."))
+    if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
+        return policy.lower_bound, policy.lower_bound  # the paper's rule learns nothing
+    rule = _restore_rule(stored, policy)
+    if not isinstance(rule, MemberRule):
+        return None
+    for label in later:
+        if not label.quarantined and label.source is not Source.INSPECTION:
+            _update_rule(rule, label)
+    return float(rule.evidence.thresholds[0]), float(rule.evidence.thresholds[1])
+
+
+def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
+    """Return the decision rule as it is now: the stored rule, updated with all outcomes since.
+
+    Where the stored rule cannot be continued (`RuleProgress.last_seq` is 0, for example after a
+    correction or by an overdue check), it is rebuilt from all outcomes. The store does not change.
+
+    Parameters
+    ----------
+    store : SqlStore
+    policy : Policy
+
+    Returns
+    -------
+    DecisionRule or None
+        None before the first version, and if its rule cannot be restored from what is stored: its
+        state is not kept (a peer's never is) or is stale, or its class is not imported.
+    """
+    stored = store.last_version()
+    settings = store.settings()
+    if stored is None or (rule := _restore_rule(stored, policy)) is None:
+        return None
+    since = int(settings.get("evidence_since", 0))
+    began_in = int(settings.get("began_in", 0))
+    policy_since = int(settings.get("policy_since", 0))
+    progress = read_rule_progress(store, stored, since, policy.label_within, policy_since)
+    if not progress.last_seq:  # rebuilt from all outcomes, as when an engine is opened
+        rule = rule.clone()
+        rule.start_in_safe_mode(began_in)
+    for outcome in store.outcomes_since(progress.last_seq, since, progress.overdue_to):
+        _update_rule(rule, outcome)
+    return rule
+
+
+def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
+    """Update a rule, in place, with one part's outcome and the unreported accepts before it."""
+    rule.observe(outcome.silent, outcome.novel)
+    rule.update(
+        outcome.lower,
+        outcome.upper,
+        outcome.success,
+        outcome.predicted,
+        outcome.inclusion_probability,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Novelty:
+    """How novel a trace was, in four respects.
+
+    Each is the squared distance to the nearest reference over its limit; a trace with one above 1
+    is novel.
+    """
+
+    level: float
+    texture: float
+    distortion: float
+    gaps: float
+
+    def __str__(self) -> str:
+        rest = f"texture {self.texture:.2f}, distortion {self.distortion:.2f}, gaps {self.gaps:.2f}"
+        return f"in level {self.level:.2f} times the limit, {rest}"

@@ -1,0 +1,394 @@
+"""The reason of a decision, in sentences and as a bound with its threshold.
+
+`explain_in_words` writes the sentences, `bound_of` returns the `Bound`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..decision.intervals import SORTING_GUARANTEES, interval_error_level
+from ..decision.members import CLOSED
+from ..decision.policy import RULES, Policy
+from ..folds import COIN_BITS, audit_salt, content_hash, toss
+from ..recipe import Recipe
+from ..records import Action, Decision, Reason, TraceSpec
+from ..store.records import StoredDecision
+from ..traces import LARGEST, ForceLimitsGate
+from .past_versions import Novelty, Thresholds
+
+MAX_NEEDED = 20_000  # more labels within the radius than that are not considered
+BOUNDED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
+DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "verified"}
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """The bounds of a decision and the thresholds that they had to reach.
+
+    Attributes
+    ----------
+    n_success, n_failure : int
+        Labels within the radius, as recorded.
+    lower, upper : float
+        Bounds of the success rate, as recorded.
+    accept_threshold : float or None
+        Accepted where lower >= accept_threshold. None if nothing could be accepted, or unknown.
+    reject_threshold : float or None
+        Rejected where upper <= reject_threshold. None if nothing could be rejected, or unknown.
+    origin : str
+        Where the thresholds come from, in words.
+    successes_needed : int or None
+        So many more successes within the radius, and no failure, would have made it accepted; 0 if
+        it reached the threshold, None if no number would do.
+    failures_needed : int or None
+        The same of failures, for a reject.
+    """
+
+    n_success: int
+    n_failure: int
+    lower: float
+    upper: float
+    accept_threshold: float | None
+    reject_threshold: float | None
+    origin: str
+    successes_needed: int | None
+    failures_needed: int | None
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What a decision is explained by: the engine's settings and state at that moment.
+
+    Attributes
+    ----------
+    recipe : Recipe
+        With the policy of that moment.
+    spec : TraceSpec
+    model : str or None
+        Name of a model that was handed in; None: the recipe describes the model.
+    seed : int
+        Of the engine.
+    thresholds : (float, float) or None
+        As in `PastVersion`; None if they are not kept.
+    novelty : Novelty or None
+        As in `Explanation`.
+    safe_mode : str
+        Why everything was verified; "" outside safe mode.
+    """
+
+    recipe: Recipe
+    spec: TraceSpec
+    model: str | None = None
+    seed: int = 0
+    thresholds: Thresholds | None = None
+    novelty: Novelty | None = None
+    safe_mode: str = ""
+
+    @property
+    def baseline(self) -> str:
+        """Name of a handed-in model that decides by its own method; "" for any other model."""
+        return self.model if self.model is not None and self.thresholds is None else ""
+
+
+def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
+    """Return a decision's bounds with their thresholds and what more evidence it would have needed.
+
+    Returns None if no bound was computed: for every reason but CERTAIN, UNCERTAIN, AUDIT and
+    SAFE_MODE, and for a decision that was lost.
+    """
+    if decision.reason not in BOUNDED or _was_lost(decision):
+        return None
+    policy = circumstances.recipe.policy
+    accept_threshold, reject_threshold, origin = _find_thresholds(circumstances)
+    return Bound(
+        n_success=decision.n_success,
+        n_failure=decision.n_failure,
+        lower=decision.lower,
+        upper=decision.upper,
+        accept_threshold=accept_threshold,
+        reject_threshold=reject_threshold,
+        origin=origin,
+        successes_needed=_count_needed(policy, decision, accept_threshold, 1),
+        failures_needed=_count_needed(policy, decision, reject_threshold, 0),
+    )
+
+
+def _was_lost(decision: Decision) -> bool:
+    """Return whether a decision was lost, and recorded again when its part stopped the line.
+
+    Such a decision is an accept with the bounds 0 and 1.
+    """
+    fields = (decision.reason, decision.action, decision.lower, decision.upper)
+    return fields == (Reason.CERTAIN, Action.ACCEPT, 0.0, 1.0)
+
+
+def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float | None, str]:
+    """Return accept threshold (of lower), reject threshold (of upper), and their origin in words.
+
+    A part was accepted where lower >= the first, rejected where upper <= the second. A threshold is
+    None if it is unknown, or if nothing could pass on that side.
+    """
+    policy = circumstances.recipe.policy
+    if circumstances.baseline or policy.guarantee not in RULES:
+        return None, None, f"{circumstances.baseline or policy.guarantee} decides by its own rule"
+    if policy.guarantee == "local" and not circumstances.safe_mode:
+        return policy.lower_bound, 1.0 - policy.lower_bound, "LB, of the neighbourhood of the part"
+    if circumstances.thresholds is None:
+        return None, None, "the thresholds of that time are not kept"
+    accept_score, reject_score = circumstances.thresholds
+    sorts = policy.guarantee in SORTING_GUARANTEES
+    origin = "the lowest level that held then" if sorts else "what held in safe mode"
+    accept_threshold = accept_score if accept_score < CLOSED else None
+    reject_threshold = 1.0 - reject_score if reject_score < CLOSED else None
+    return accept_threshold, reject_threshold, origin
+
+
+def is_score(policy: Policy, decision: Decision) -> bool:
+    """Return whether a decision's `lower` and `upper` are one score of the heads, and no interval.
+
+    The heads are the reducer's classifiers; their score is a probability of success. It is so under
+    the guarantees "pooled" and "cost", where lower equals upper.
+    """
+    return policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper
+
+
+def _count_needed(
+    policy: Policy, decision: Decision, threshold: float | None, success: int
+) -> int | None:
+    """Return how many more labels of one kind within the radius would have reached a threshold.
+
+    `success` is 1 for successes and `lower`, 0 for failures and `upper`. 0 if the threshold was
+    reached; None if no number up to MAX_NEEDED would do, if there is no threshold, and if it was
+    missed by a score, which does not depend on counts.
+    """
+    if threshold is None:
+        return None
+    if is_score(policy, decision):  # it does not depend on counts
+        is_reached = decision.lower >= threshold if success else decision.upper <= threshold
+        return 0 if is_reached else None
+    more = np.arange(MAX_NEEDED + 1)
+    n_success = decision.n_success + success * more
+    n_failure = decision.n_failure + (1 - success) * more
+    lower, upper = policy.bound(n_success, n_failure)
+    enough = np.flatnonzero(lower >= threshold if success else upper <= threshold)
+    return int(enough[0]) if len(enough) else None
+
+
+def explain_in_words(
+    item: StoredDecision, bound: Bound | None, circumstances: Circumstances
+) -> Iterator[str]:
+    """Yield the sentences that explain a decision: its reason, its bounds, its outcome.
+
+    Without a bound the sentences on bounds are left out.
+    """
+    decision = item.decision
+    reason = (
+        ": the decision was lost, and recorded again from its line stop; its evidence is unknown."
+    )
+    if not _was_lost(decision):
+        reason = WHY[decision.reason](decision, item.trace, circumstances)
+    yield DID[decision.action].capitalize() + reason
+    if bound is not None:
+        yield from _bound_sentences(decision, bound, circumstances)
+    if item.success is None:
+        yield "Nothing was reported of the part."
+    else:
+        source = "" if item.source is None else f" ({item.source.value})"
+        yield f"The part turned out {item.label}{source}."
+
+
+def _explain_audit(
+    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
+) -> str:
+    """Return the rest of the sentence on an audit: what the model alone would have done, the coin.
+
+    The coin is computed again from the trace and the engine's seed.
+    """
+    (coin,) = toss(content_hash(trace[None]), audit_salt(circumstances.seed)).tolist()
+    alone = f" as an audit: the model alone would have {DID[decision.predicted]} it"
+    coin_fell = (
+        f"The audits' coin fell on {coin / 2**COIN_BITS:.4f}, below the audit rate "
+        f"{decision.propensity:g}"
+    )
+    return f"{alone}. {coin_fell}; it is a function of the trace and the seed."
+
+
+def _explain_saturated(
+    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
+) -> str:
+    """Return the rest of the sentence on a saturated trace.
+
+    It has the number of samples that touch the sensor's range, and the time in seconds and the
+    channel of the first.
+    """
+    spec = circumstances.spec
+    touching: NDArray[Any] = np.zeros((0, 2))
+    if spec.limit is not None:
+        touching = np.argwhere(np.abs(trace) >= spec.limit)
+    if not len(touching):
+        return ": the trace touched the sensor's range."
+    channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
+    first = f"first after {sample / spec.rate_hz:.3f} s (channel {channel + 1})"
+    return (
+        f": {len(touching)} samples touch the sensor's range of {spec.limit:g} "
+        f"{spec.units[channel]}, {first}."
+    )
+
+
+def _explain_not_finite(
+    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
+) -> str:
+    """Return the rest of the sentence on a trace with NaN or infinity, with their number."""
+    n = int((~np.isfinite(trace)).sum())
+    return (
+        f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded "
+        "too far is."
+    )
+
+
+def _explain_outside(
+    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
+) -> str:
+    """Return the rest of the sentence on a trace outside an operator's limits: which it leaves."""
+    x = torch.from_numpy(trace)
+    windows = circumstances.recipe.policy.windows
+    left = [str(limits) for limits in windows if ForceLimitsGate([limits], circumstances.spec)(x)]
+    return (
+        f": it leaves an operator's window, {' and '.join(left) or 'which is not known'}, "
+        "whatever the model says."
+    )
+
+
+# For each reason the rest of the sentence that begins with what was done.
+WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]] = {
+    Reason.CERTAIN: lambda *_: ": the bound meets the policy.",
+    Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
+    Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was verified.",
+    Reason.AUDIT: _explain_audit,
+    Reason.NOT_FINITE: _explain_not_finite,
+    Reason.CONSTANT: lambda decision, trace, circumstances: (
+        f": every sample is {trace.flat[0]:g} {circumstances.spec.units[0]}: a dead sensor."
+    ),
+    Reason.SATURATED: _explain_saturated,
+    Reason.TOO_LARGE: lambda decision, trace, circumstances: (
+        f": a sample of {np.abs(trace).max():g} "
+        f"{circumstances.spec.units[np.abs(trace).max(axis=1).argmax()]}; beyond "
+        f"{LARGEST:g} nothing can be computed from it."
+    ),
+    Reason.MODEL_ERROR: lambda *_: ": the model raised an error; see the log of that time.",
+    Reason.NOVEL: lambda decision, trace, circumstances: (
+        ": unlike all traces that were learned "
+        f"from{'' if circumstances.novelty is None else f': {circumstances.novelty}'}. "
+        "The labels of its neighbours do not count then."
+    ),
+    Reason.SAFE_MODE: lambda decision, trace, circumstances: (
+        " in safe mode, in which every part is verified: "
+        f"{circumstances.safe_mode or 'its reason is not kept'}."
+    ),
+    Reason.NO_STORE: lambda *_: (
+        ": the disk or the store did not respond in time, so the decision could not be recorded, "
+        "or its id could not be looked up, and the model was not asked."
+    ),
+    Reason.LATE: lambda *_: (
+        ": the caller timed out and verified the part, so the model was not asked."
+    ),
+    Reason.OUTSIDE: _explain_outside,
+}
+
+
+def _bound_sentences(
+    decision: Decision, bound: Bound, circumstances: Circumstances
+) -> Iterator[str]:
+    """Yield the sentences on a decision's evidence, its bounds, and what it would have needed.
+
+    The last is said of the action that the model alone would have done; if that is to verify, of
+    the action that needed fewer labels. If nothing could pass, or the thresholds are unknown, it
+    says so instead. For a model that decides by its own method there is one sentence, with its
+    counts and bounds.
+    """
+    n = decision.n_success + decision.n_failure
+    interval = f"{decision.lower:.3f} to {decision.upper:.3f}"
+    if circumstances.baseline:
+        counts = f"{decision.n_success} successes, {decision.n_failure} failures"
+        yield f"{circumstances.baseline} gives {counts}, bound {interval}."
+        return
+    policy = circumstances.recipe.policy
+    within = f"within the radius {circumstances.recipe.radius:g}"
+    counts = (
+        f"{decision.n_success} of {n} labels {within} are successes" if n else f"No label {within}"
+    )
+    if is_score(policy, decision):
+        yield (
+            f"{counts}; the heads give it {decision.lower:.3f}, the mean of what each says "
+            "of its success."
+        )
+    else:
+        name = policy.interval.replace("_", "-").capitalize()
+        error_level = interval_error_level(policy.alpha, policy.guarantee)
+        yield f"{counts}; {name} at alpha {error_level:g} bounds the success rate by {interval}."
+    if bound.accept_threshold is None and bound.reject_threshold is None:
+        why = circumstances.safe_mode
+        if not why and circumstances.thresholds is not None:
+            why = "no level of evidence held yet"
+        yield (
+            f"Nothing could pass, whatever the bound: {why}."
+            if why
+            else f"What it had to reach: {bound.origin}."
+        )
+        return
+    # An uncertain decision is explained by the action that it was nearer to.
+    successes = MAX_NEEDED + 1 if bound.successes_needed is None else bound.successes_needed
+    failures = MAX_NEEDED + 1 if bound.failures_needed is None else bound.failures_needed
+    is_uncertain = decision.predicted is Action.VERIFY
+    if decision.predicted is Action.ACCEPT or (is_uncertain and successes <= failures):
+        condition = f"lower must be at least {{:.4g}} ({bound.origin}); it is {decision.lower:.3f}"
+        kinds = ("success", "successes", "failure")
+        yield _needed_sentence(
+            "accept", condition, bound.accept_threshold, bound.successes_needed, kinds
+        )
+    else:
+        condition = f"upper must be at most {{:.4g}} ({bound.origin}); it is {decision.upper:.3f}"
+        kinds = ("failure", "failures", "success")
+        yield _needed_sentence(
+            "reject", condition, bound.reject_threshold, bound.failures_needed, kinds
+        )
+
+
+def _needed_sentence(
+    action: str,
+    condition: str,
+    threshold: float | None,
+    needed: int | None,
+    kinds: tuple[str, str, str],
+) -> str:
+    """Return the sentence on what an accept or a reject would have needed.
+
+    Parameters
+    ----------
+    action : {"accept", "reject"}
+    condition : str
+        What had to hold, with a field {} for the threshold.
+    threshold : float or None
+        None: nothing could pass.
+    needed : int or None
+        Number of labels that were missing; 0: it was enough, None: no number would do.
+    kinds : (str, str, str)
+        The word for one label of the kind that is needed, for several, and for one of the other
+        kind.
+    """
+    if threshold is None:
+        return f"To {action}: no level held, so nothing could be {action}ed."
+    if needed == 0:
+        return f"To {action}, {condition.format(threshold)}, enough."
+    single, several, other = kinds
+    more = "no number of labels"
+    if needed is not None:
+        more = f"{needed} more {single if needed == 1 else several} and no {other}"
+    return f"To {action}, {condition.format(threshold)}: {more} would do."
