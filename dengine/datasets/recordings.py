@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,6 +48,13 @@ from .text import RATE_ABOVE, TextTable, parse_numbers, read_table
 if TYPE_CHECKING:
     import pandas as pd
 
+MAX_LOST = 4  # samples on end that are interpolated: a longer gap may hold the peak
+# A word for a sample beyond the range of its sensor or amplifier, as OVERFLOW, OL or +++++++.
+OVER_RANGE = re.compile(
+    r"over|ov[fl]|\bo\.?[lvf]\b|exceed|range|satur|clip|[üu]e?ber(lauf|last|steuer|schr)|bereich"
+    r"|d[ée]passement|fuori scala|^[+>]+$",
+    re.IGNORECASE,
+)
 SUMMARY_SHARE = 10  # samples for each row of a summary below them, at least
 
 
@@ -297,7 +306,7 @@ def rows_to_trace(
         rows = rows[~is_again]
         timed = rows_to_trace(rows, places, options, notes, units_row, rate_hz)
         return timed._replace(repeated=int(is_again.sum()))
-    rows, values = _measured(rows, places, options, notes)
+    rows, values = _measured(rows, places, options, notes, units_row)
     trace = np.ascontiguousarray(values.T)
     try:
         clock = clock_of(rows, options.time, units_row)
@@ -355,12 +364,17 @@ def _trace_by_clock(
 
 
 def _measured(
-    rows: pd.DataFrame, places: Sequence[int], options: LoadOptions, notes: Counter[str]
+    rows: pd.DataFrame,
+    places: Sequence[int],
+    options: LoadOptions,
+    notes: Counter[str],
+    units_row: Sequence[str],
 ) -> tuple[pd.DataFrame, NDArray[np.float32]]:
     """Return the rows of a recording and their samples (T, C), with a note on lost samples.
 
-    A text in place of a number is a lost sample; with `fit="resample"` its row is left out. Raises
-    UnreadableError for a damaged number, and if too many samples are lost.
+    A text in place of a number is a lost sample. With `fit="resample"` these are interpolated, and
+    left out at the ends. Raises UnreadableError for a damaged number, if too many samples are lost,
+    and if more than `MAX_LOST` on end are to be interpolated.
     """
     values, wrong, lost = parse_numbers(rows.iloc[:, places])
     is_few = len(lost) <= MAX_MISSING * len(rows) + 1 < len(rows)
@@ -368,17 +382,55 @@ def _measured(
         line = min(damaged)
         count = f", and {len(lost)} of {len(rows)} rows are such" if line in lost else ""
         raise UnreadableError(f"{wrong[line]}{count}", line)
-    do = "NaN; fit='resample' interpolates single ones"
-    if lost and options.fit == "resample":
-        do = "interpolated"
-        is_measured = ~(rows.index.isin(list(lost)) & np.isnan(values).any(axis=1))
-        rows = rows[is_measured]
-        values = values[is_measured]
+    if not lost:
+        return rows, values
+    is_lost = rows.index.isin(list(lost))
+    runs = np.flatnonzero(np.diff(np.pad(is_lost.astype(np.int8), 1))).reshape(-1, 2)
+    first, n_longest = max(((a, b - a) for a, b in runs), key=itemgetter(1))
+    is_resampled = options.fit == "resample"
+    if is_resampled and n_longest > MAX_LOST:
+        line = rows.index[first]
+        do = f"fit='resample' interpolates {MAX_LOST} at most; fit='strict' keeps them as NaN"
+        raise UnreadableError(f"{wrong[line]}, in {n_longest} rows on end; {do}", line)
+    do = "in recordings with more on end than fit='resample' interpolates"
+    if n_longest <= MAX_LOST:
+        do = f"fit='resample' interpolates these, {MAX_LOST} on end at most"
     for cell in lost.values():
-        notes[
-            f"Samples are lost where a text is in place of a number, {cell!r}: they are {do}"
-        ] += 1
+        text = f"Samples are lost where a text is in place of a number, {cell!r}"
+        is_over = OVER_RANGE.search(cell) is not None
+        text += ", for the range of the sensor was exceeded" if is_over else ""
+        if is_resampled:
+            notes[f"{text}: they are interpolated"] += 1
+        else:
+            notes[f"{text}: they are NaN" + ("" if is_over else f"; {do}")] += 1
+    if is_resampled:
+        _interpolate(values, is_lost, _times(rows, options, units_row))
+        kept = np.flatnonzero(~is_lost)
+        ends = slice(kept[0], kept[-1] + 1)
+        return rows.iloc[ends], values[ends]
     return rows, values
+
+
+def _interpolate(
+    values: NDArray[np.float32], is_lost: NDArray[np.bool_], times: NDArray[np.float64]
+) -> None:
+    """Put samples (T, C) that are lost, and NaN, between those before and after them, in place."""
+    order = np.argsort(times)
+    for column in values.T:
+        is_gap = is_lost & np.isnan(column)
+        known = order[~is_gap[order]]
+        column[is_gap] = np.interp(times[is_gap], times[known], column[known])
+
+
+def _times(
+    rows: pd.DataFrame, options: LoadOptions, units_row: Sequence[str]
+) -> NDArray[np.float64]:
+    """Return the time of each row, by its clock, or its number if that does not tell it."""
+    with suppress(UnreadableError):
+        clock = clock_of(rows, options.time, units_row)
+        if clock is not None and not np.isnan(clock.seconds).any():
+            return clock.seconds
+    return np.arange(len(rows), dtype=np.float64)
 
 
 def _trace_at_rate(

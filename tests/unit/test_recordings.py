@@ -2448,6 +2448,51 @@ def test_a_status_in_place_of_a_number_is_a_lost_sample_that_is_noted(
     np.testing.assert_allclose(evenly[3, 7], (small.X[3, 6] + small.X[3, 8]) / 2, rtol=1e-3)
 
 
+def lose_samples(folder: Path, data: Dataset, lost: dict[int, tuple[str, int]]) -> Path:
+    """Recordings with a text in some samples on end from the 21st on: the text and their number."""
+    for i, (trace, label) in enumerate(zip(data.X, data.y, strict=True)):
+        cells = [str(v) for v in trace]
+        text, n = lost.get(i, ("", 0))
+        cells[20 : 20 + n] = [text] * n
+        path = folder / f"{i:02}_{'OK' if label else 'NOK'}.csv"
+        path.parent.mkdir(exist_ok=True)
+        rows = [f"{k / 500};{cell}" for k, cell in enumerate(cells)]
+        path.write_text("\n".join(["Time (s);Force (N)", *rows, ""]))
+    return folder
+
+
+def test_the_advice_to_interpolate_counts_the_samples_that_it_would_repair(
+    make_data, tmp_path: Path
+) -> None:
+    data = make_data(20, samples=400)
+    lost = {1: ("Bad Input", 3), 2: ("Bad Input", 5), 3: ("OVERFLOW", 11), 4: ("+++++++", 2)}
+    folder = lose_samples(tmp_path / "parts", data, lost)
+    notes = load_dataset(folder).notes
+    by_word = {key: [n for n in notes if key in n] for key in ("'Bad", "'OVER", "'+++")}
+    short, long = by_word["'Bad"]
+    assert short.endswith("fit='resample' interpolates these, 4 on end at most (3 times).")
+    assert long.endswith("more on end than fit='resample' interpolates (5 times).")
+    for key in ("'OVER", "'+++"):
+        assert "the range of the sensor was exceeded: they are NaN" in by_word[key][0]
+        assert "resample" not in by_word[key][0]
+
+
+@pytest.mark.parametrize("rate_hz", [None, 500])
+def test_few_lost_samples_on_end_are_interpolated_and_more_are_a_fault_that_names_the_word(
+    rate_hz: float | None, make_data, tmp_path: Path
+) -> None:
+    data = make_data(20, samples=400)
+    lost = {1: ("Bad Input", 4), 2: ("Bad Input", 5), 3: ("OVERFLOW", 11)}
+    folder = lose_samples(tmp_path / "parts", data, lost)
+    loaded = load_dataset(folder, fit="resample", rate_hz=rate_hz)
+    expected = data.X.copy()
+    expected[1, 20:24] = np.interp(np.arange(20, 24), [19, 24], data.X[1, [19, 24]])
+    np.testing.assert_allclose(loaded.X, np.delete(expected, [2, 3], axis=0), rtol=1e-4)
+    texts = [fault.message for fault in loaded.faults]
+    assert "got 'Bad Input', in 5 rows on end; fit='resample' interpolates 4" in texts[0]
+    assert "got 'OVERFLOW', in 11 rows on end" in texts[1]
+
+
 def test_a_damaged_number_is_no_status(small: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "long.csv"
     write_rows(path, long_rows(small, lambda v, i, k: "1x2.5" if (i, k) == (3, 7) else str(v)))
