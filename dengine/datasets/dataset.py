@@ -664,8 +664,8 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     leave_out_repeats(collector)
     _cut_padding(collector)
     _scale_counts(collector)
-    as_read = {recording.source: recording for recording in collector.recordings}
     unit = _convert_to_one_unit(collector, options)
+    whole = {recording.source: recording for recording in collector.recordings}
     _leave_out_overflows(collector)
     options, rate = _bring_to_one_rate(collector, options)
     lengths = np.array([r.trace.shape[1] for r in collector.recordings], dtype=np.int64)
@@ -686,11 +686,8 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     if not rate:
         notes.append(UNKNOWN_RATE)
     notes += odd_labels_note(sum(recording.label for recording in recordings), len(recordings))
-    first = as_read[recordings[0].source]
+    first = whole[recordings[0].source]
     channel_units = split_unit(unit, len(first.trace))
-    channel_units = [
-        a or b for a, b in zip(first.units or channel_units, channel_units, strict=True)
-    ]
     # A recording without a number is a part of its own.
     parts = [recording.part or recording.source for recording in recordings]
     has_parts = any(recording.part is not None for recording in recordings)

@@ -2493,6 +2493,20 @@ def test_few_lost_samples_on_end_are_interpolated_and_more_are_a_fault_that_name
     assert "got 'OVERFLOW', in 11 rows on end" in texts[1]
 
 
+@pytest.mark.parametrize("unit", ["N", "kN", None])
+def test_the_first_recording_is_described_in_the_unit_of_the_set(
+    unit: str | None, small: Dataset, tmp_path: Path
+) -> None:
+    for i, trace in enumerate(small.X):  # most are in newtons, but the first is in kN
+        name = "Force [kN]" if i < 3 else "Force [N]"
+        write_csv(tmp_path / f"{i:02}_OK.csv", trace / (1000 if i < 3 else 1), (name,))
+    data = load_dataset(tmp_path, channel="Force", unit=unit)
+    first, last = data.X[0, [0, -1]]
+    assert data.unit == (unit or "N")
+    text = f"Force {first:.6g} to {last:.6g} {data.unit} in 50 samples"
+    assert data.reading["first"].endswith(text)
+
+
 def test_a_damaged_number_is_no_status(small: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "long.csv"
     write_rows(path, long_rows(small, lambda v, i, k: "1x2.5" if (i, k) == (3, 7) else str(v)))
