@@ -184,6 +184,8 @@ def _json_rows(text: str) -> tuple[dict[int, dict[str, Any]], dict[int, str]]:
         lists = [value for value in rows.values() if isinstance(value, list)]
         if lists and any(isinstance(value, str) for value in rows.values()):
             pieces = next(name for name, value in rows.items() if value in lists)
+            if not any(lists):
+                raise ValueError(f"the list {pieces} is empty")
             do = 'write one list of its samples, as in "force": [0.1, 0.2]'
             raise ValueError(f"it is one part in {len(rows[pieces])} pieces, {pieces}; {do}")
         named = [

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import excerpt
 from ..traces import is_time_column
 from . import units
 from .clocks import clock_of, rate_of
@@ -98,6 +99,8 @@ class Expanded(NamedTuple):
         Columns of curves that were left out.
     wrong : dict
         Why rows were left out, by their lines.
+    damaged : dict
+        Why other rows are no samples, by their lines.
     notes : list of str
         Which columns are read as one.
     """
@@ -107,6 +110,7 @@ class Expanded(NamedTuple):
     clock: str = ""
     unread: Sequence[str] = ()
     wrong: Mapping[int, str] = {}
+    damaged: Mapping[int, str] = {}
     notes: Sequence[str] = ()
 
 
@@ -114,8 +118,8 @@ def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
     """Return a table with a numbered column for each sample of its curves, FZ_0, FZ_1, ...
 
     Only the stated channels are expanded, if all of them are curves. A shorter curve is filled with
-    NaN; a cell without numbers becomes a text, which is a fault when it is read. A row whose curves
-    differ in length, or whose clock differs from those of most by more than 3 %, is left out.
+    NaN. A row whose curves differ in length, or whose clock differs from those of most by more than
+    3 %, is left out.
     """
     import pandas as pd
 
@@ -132,19 +136,12 @@ def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
     others = frame.drop(columns=list(renamed))
     lists = [str(name) for name, cells in others.items() if any(map(_is_list, cells))]
     blocks = [others.drop(columns=[*curves, *lists])]
+    damaged = dict[int, str]()
     for name in channels:
-        block = np.full((len(frame), longest[name]), np.nan)
-        odd = dict[tuple[int, int], str]()
-        for i, curve in enumerate(curves[name]):
-            samples, wrong = _numbers(curve)
-            block[i, : len(samples)] = samples
-            odd |= {(i, k): cell for k, cell in wrong.items()}
+        block, odd = _samples_of(curves[name], name)
+        damaged |= {frame.index[i]: why for i, why in odd.items()}
         columns = [f"{name}_{k}" for k in range(longest[name])]
-        wide = pd.DataFrame(block, index=frame.index, columns=columns)
-        for (i, k), cell in odd.items():
-            wide[columns[k]] = wide[columns[k]].astype(object)
-            wide.iloc[i, k] = cell
-        blocks.append(wide)
+        blocks.append(pd.DataFrame(block, index=frame.index, columns=columns))
     rate = None
     has_clock = bool(clocks) and options.rate_hz is None
     compared = [*clocks[:has_clock], *(channels if stated and all(stated) else channels[:1])]
@@ -164,7 +161,8 @@ def expand_curves(frame: pd.DataFrame, options: LoadOptions) -> Expanded:
         name for name in {**curves, **dict.fromkeys(lists)} if name not in (*channels, *clocks[:1])
     ]
     wide = pd.concat(blocks, axis=1).drop(index=list(wrong))
-    return Expanded(wide, rate, clocks[0] if rate else "", unread, wrong, [*renamed.values()])
+    clock = clocks[0] if rate else ""
+    return Expanded(wide, rate, clock, unread, wrong, damaged, [*renamed.values()])
 
 
 def _join_renamed(curves: dict[str, list[Any]]) -> dict[str, str]:
@@ -197,17 +195,25 @@ def _is_list(cell: Any) -> bool:
     return hasattr(cell, "__len__") and not isinstance(cell, str)
 
 
-def _numbers(curve: Sequence[Any] | NDArray[Any] | None) -> tuple[list[float], dict[int, str]]:
-    """Return the samples of a curve, NaN for null, and each item that is no number by its place."""
-    wrong = dict[int, str]()
-    samples = list[float]()
-    for k, item in enumerate(["no samples"] if curve is None or not len(curve) else curve):
-        try:
-            samples.append(np.nan if item in (None, "null", "None") else float(item))
-        except (TypeError, ValueError):
-            samples.append(np.nan)
-            wrong[k] = str(item)
-    return samples, wrong
+def _samples_of(
+    curves: Sequence[Sequence[Any] | None], name: str
+) -> tuple[NDArray[np.float64], dict[int, str]]:
+    """Return the samples of a column's curves, shape (n, samples of the longest), and by its place
+    what is wrong with a curve that is empty or has an item that is no number. NaN stands for null.
+    """
+    samples = np.full((len(curves), max(0 if c is None else len(c) for c in curves)), np.nan)
+    damaged = dict[int, str]()
+    for i, curve in enumerate(curves):
+        if curve is None or not len(curve):
+            damaged[i] = f"Expected a curve in column {name}, it is empty"
+            continue
+        for k, item in enumerate(curve):
+            try:
+                samples[i, k] = np.nan if item in (None, "null", "None") else float(item)
+            except (TypeError, ValueError):
+                what = f"a number as item {k + 1} of the curve in column {name}"
+                damaged.setdefault(i, f"Expected {what}, got {excerpt(str(item))}")
+    return samples, damaged
 
 
 def _rate_of_curves(

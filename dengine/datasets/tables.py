@@ -35,7 +35,7 @@ from .dataset import (
 from .long_tables import concatenate_long, cut_by_windows, from_long, long_table_advice, unwrap_ring
 from .recordings import cut_note
 from .text import TextTable, read_table, with_part
-from .wide_tables import turn_table, wide_rows, with_samples_in_columns
+from .wide_tables import place_of_part, turn_table, wide_rows, with_samples_in_columns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -180,9 +180,9 @@ def _from_tables(
         actual = f"a row a sample: {columns}"
         raise DataError(f"Expected a row an insertion, got {actual}; a long table needs {advice}.")
     for source, table in tables.items():
-        for line, _, read in wide_rows(table, options, collector, source):
+        for line, part, read in wide_rows(table, options, collector, source):
             column = table.column_of.get(line)
-            where = source if column is None else f"{source}, column {column}"
+            where = f"{source}, column {column}" if column else place_of_part(source, part)
             collector.add(where, read, 0 if column else line)
     _leave_out_repeated_rows(collector)
     return as_dataset(collector, options)

@@ -60,25 +60,40 @@ def with_samples_in_columns(
     Raises DataError if no row is left.
     """
     result = dict[str, TextTable]()
+    plain = list[str]()
     tables = join_pieces(tables, options, collector)
     for source, table in tables.items():
-        frame, rate, name, unread, wrong, notes = expand_curves(table.frame, options)
-        if frame is table.frame:
-            return tables, options
-        collector.faults += [Fault(source, line, why) for line, why in wrong.items()]
-        collector.notes.update(notes)
-        if frame.empty:
+        expanded = expand_curves(table.frame, options)
+        if expanded.frame is table.frame:
+            plain.append(source)
             continue
-        if unread:
-            collector.notes[f"Not read: the columns {listed(unread)}"] = 1
-        if rate is not None:
-            clock = f"column {name}, in which each cell has all times"
-            table = table._replace(rate_hz=rate, clock=clock)
+        part_of = dict(zip(table.frame.index, _parts_of_rows(table.frame, options), strict=True))
+        for line, why in expanded.wrong.items():
+            collector.faults.append(Fault(place_of_part(source, part_of[line]), line, why))
+        collector.notes.update(expanded.notes)
+        if expanded.frame.empty:
+            continue
+        if expanded.unread:
+            collector.notes[f"Not read: the columns {listed(expanded.unread)}"] = 1
+        if expanded.rate_hz is not None:
+            clock = f"column {expanded.clock}, in which each cell has all times"
+            table = table._replace(rate_hz=expanded.rate_hz, clock=clock)
+        wrong = {line: UnreadableError(why) for line, why in expanded.damaged.items()}
         numbers = table.numbers.replace("whole numbers", "curves in cells")
-        result[source] = table._replace(frame=frame, units=[], numbers=numbers)
+        frame = expanded.frame
+        result[source] = table._replace(frame=frame, units=[], numbers=numbers, wrong=wrong)
+    if len(plain) == len(tables):
+        return tables, options
+    why = "Expected a curve in a cell, as in other files, got none or an empty one"
+    collector.faults += [Fault(source, 0, why) for source in plain]
     if not result:
         raise DataError(f"Cannot read {collector.faults[-1]}.")
     return result, replace(options, time=None)
+
+
+def place_of_part(source: str, part: str) -> str:
+    """Return the file of a row, with its part if that is known, for a fault."""
+    return f"{source}, part {part}" if part else source
 
 
 def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable:
@@ -182,7 +197,7 @@ def wide_rows(
     others = [name for name in frame.columns if name not in (*label_columns, *options.part_columns)]
     columns = sample_columns(others, options)
     all_columns = [name for names in columns.values() for name in names]
-    values, wrong, _ = parse_numbers(frame[all_columns])
+    values, odd_cells, _ = parse_numbers(frame[all_columns])
     traces = values.reshape(len(frame), len(columns), -1)
     collector.channels = tuple(filter(None, columns))
     _check_single_signal(frame, others, options)
@@ -201,8 +216,8 @@ def wide_rows(
 
     def read(line: int, trace: NDArray[np.float32], words: Sequence[Any], part: str) -> Recording:
         """Return a row as a recording; raise UnreadableError for a bad cell or label."""
-        if line in wrong:
-            raise table.wrong.get(line) or UnreadableError(wrong[line])
+        if line in odd_cells or line in table.wrong:
+            raise table.wrong.get(line) or UnreadableError(odd_cells[line])
         rate = None if options.rate_hz else stated.rate_of.get(line)
         place = f"column {table.column_of[line]}" if table.column_of else f"line {line}"
         is_stated = len(columns) == 1 and line in stated.unit_of

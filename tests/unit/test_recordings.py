@@ -2637,7 +2637,9 @@ def test_lists_in_cells_are_traces_with_the_rate_of_the_times_beside_them(
     data = load_dataset(source, part="serial")
     np.testing.assert_array_equal(data.X[3:], small.X[4:])
     assert (data.rate_hz, data.lengths[2]) == (100.0, 45)
-    assert [(fault.line, fault.message[-12:]) for fault in data.faults] == [(4, "'no samples'")]
+    place = f"{'row' if form == 'frame' else path.name}, part P3, line 4"
+    texts = [str(fault) for fault in data.faults]
+    assert texts == [f"{place}: Expected a curve in column force, it is empty"]
     frame = pd.DataFrame(rows)
     frame[["serial", "verdict"]][6:].to_csv(tmp_path / "results.csv", index=False)
     listed = load_dataset(
@@ -2648,8 +2650,33 @@ def test_lists_in_cells_are_traces_with_the_rate_of_the_times_beside_them(
     rows[5]["t"] = [k / 50 for k in range(50)]
     data = load_dataset(pd.DataFrame(rows), part="serial")
     (fault, _) = data.faults
-    assert re.match(r"row, line 6: Expected times in column t at 100 Hz.*got 50 Hz", str(fault))
+    assert re.match(
+        r"row, part P5, line 6: Expected times in column t at 100 Hz.*got 50 Hz", str(fault)
+    )
     np.testing.assert_array_equal(data.X[3:], small.X[[4, *range(6, len(small))]])
+
+
+@pytest.mark.parametrize("empty", [[], None])
+def test_a_file_whose_curve_is_empty_is_a_fault_among_others(
+    empty: Any, small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        row = {"id": f"P{i}", "fs_hz": 100, "verdict": word, "force": empty if i == 4 else [*x]}
+        (tmp_path / f"{i:02}.json").write_text(json.dumps(row, default=float))
+    data = load_dataset(tmp_path, channel="force", label="verdict")
+    np.testing.assert_array_equal(data.X, np.delete(small.X, 4, axis=0))
+    (fault,) = data.faults
+    assert fault.source == "04.json"
+    assert "empty" in fault.message
+
+
+def test_an_item_of_a_curve_that_is_no_number_is_named_as_the_file_has_it(small: Dataset) -> None:
+    frame = pd.DataFrame({"force_N": [*small.X.tolist()], "verdict": words(small), "part": "A"})
+    frame["part"] = [f"A{i}" for i in range(len(frame))]
+    frame.loc[3, "force_N"][7] = "ERR"
+    (fault,) = load_dataset(frame, rate_hz=100).faults
+    text = "row, part A3, line 4: Expected a number as item 8 of the curve in column force_N"
+    assert str(fault) == f"{text}, got 'ERR'"
 
 
 def test_a_curve_whose_name_changed_by_its_unit_is_one_channel(
