@@ -21,6 +21,7 @@ from ..errors import DataError, listed
 from ..files import read_archive, read_errors
 from ..traces import is_time_column
 from . import labels
+from .clocks import UNSURE_RATE, rate_of_scalar
 from .columns import choose_channels
 from .dataset import (
     Dataset,
@@ -130,14 +131,22 @@ def read_archive_each(named: Mapping[str, Path], name: str, options: LoadOptions
         places = [rows.columns.get_loc(column) for column in channels]
         timed = rows_to_trace(rows, places, options, collector.notes)
         unit = (str(arrays["unit"]),) * len(channels) if "unit" in arrays else ()
-        rate = float(arrays["rate_hz"]) if "rate_hz" in arrays else timed.rate_hz
-        if "rate_hz" in arrays and not options.rate_hz:
-            timed = timed._replace(reading=Reading(clock="none, an array tells the rate"))
-        return timed._replace(rate_hz=None if options.rate_hz else rate, units=unit)
+        rate = _stated_rate(arrays)
+        if rate and not options.rate_hz:
+            reading = Reading(clock="none, an array tells the rate")
+            timed = timed._replace(rate_hz=rate, reading=reading)
+        return timed._replace(rate_hz=None if options.rate_hz else timed.rate_hz, units=unit)
 
     collector.order = "by name, numbers by size"
     labels.collect_recordings(named, read, _label_source(named, options), collector)
     return as_dataset(collector, options)
+
+
+def _stated_rate(arrays: Mapping[str, NDArray[Any]]) -> float | None:
+    """Return the rate in hertz that an array of one number states; None without one."""
+    named = ((name, x) for name, x in arrays.items() if not UNSURE_RATE.fullmatch(name.lower()))
+    rates = (rate_of_scalar(name, x) for name, x in named)
+    return next(filter(None, rates), None)
 
 
 def _other_length(arrays: Mapping[str, NDArray[Any]], options: LoadOptions) -> str:
@@ -153,7 +162,7 @@ def _other_length(arrays: Mapping[str, NDArray[Any]], options: LoadOptions) -> s
         if x.ndim == 1 and x.size > 1 and x.dtype.kind in "iufMm"
     }
     clocks = {name for name in lengths if name == options.time or is_time_column(name)}
-    if options.rate_hz or "rate_hz" in arrays or options.time == "none" or clocks & {*frame}:
+    if options.rate_hz or _stated_rate(arrays) or options.time == "none" or clocks & {*frame}:
         clocks = set()
     others = [name for name in (*options.channels, *clocks) if name in lengths]
     others = [name for name in others if lengths[name] != len(frame)]

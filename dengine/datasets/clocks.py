@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +47,20 @@ EPOCHS = (
     *((1.0, 0.0), (1e-3, 0.0), (1e-6, 0.0), (1e-9, 0.0)),
     *((1e-7, 11_644_473_600.0), (1e-7, 62_135_596_800.0)),
 )
-# What the sampling rate, or the time from sample to sample, is called above a header or as an array
-# of an archive, in lower case, without blanks and marks.
-RATE_NAMES = (
-    *("fs", "fshz", "rate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency"),
-    *("sampleratehz", "samplingratehz", "abtastrate", "abtastfrequenz", "messrate", "messfrequenz"),
-    "datarate",
+# What the sampling rate is called above a header, as a column, or as an array of an archive: the
+# words of the name in lower case. Some are rates of samples only in hertz, or of something else.
+RATE_NAME = re.compile(
+    r"fs|f_s|f_?(sample|sampling|abtast)|samples_(per_)?s(ec|econd)?"
+    r"|(.*_)?(samples?|sampling|abtast|mess|acq|acquisition|daq|erfassungs|aufzeichnungs)_?"
+    r"(rate|freq|frequency|frequenz)"
+    r"|(.*_)?(rate|freq|frequency|fréquence|frequence|frecuencia|frequenza)_(d|de|di|of)_"
+    r"(samples?|sampling|[ée]chantillonnage|muestreo|campionamento)"
 )
+IN_HERTZ = re.compile(
+    r"(.*_)?(samples?|sampling|abtast|(scan|log|logging|record|recording)_?rate)|(data_?)?rate|sr"
+)
+UNSURE_RATE = re.compile(r"(data_?)?rate|sr|frequency|frequenz|freq")
+# What the time from sample to sample is called, without blanks and marks.
 STEP_NAMES = (
     *("dt", "deltat", "timestep", "timestampstep", "sampletime", "sampleinterval", "sampleperiod"),
     *(
@@ -68,9 +75,6 @@ STEP_NAMES = (
         "samplestep",
     ),
 )
-SAMPLE_RATES = ("samplerate", "samplingrate", "samplefrequency", "samplingfrequency", "abtastrate")
-UNSURE_RATES = ("rate", "datarate")  # of samples only in hertz
-FREQUENCIES = ("frequency", "frequenz", "freq")  # of samples, or of something else
 # A line above a header that states one of these: Sample rate: 500 Hz, dt [ms];2, # fs = 500
 RATE_LINE = re.compile(
     r"[#%\s\"']*(?P<name>[^\W\d][^\d:;=,|\[(]*?)\s*([\[(](?P<bracketed>\w+)[\])])?[\"']?"
@@ -720,29 +724,70 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     return float(f"{rate:.4g}")
 
 
+def stated_rate(name: str, number: float, unit: str = "") -> tuple[float, bool] | None:
+    """Return the sampling rate in hertz that a name states with a number, and whether it surely
+    does; None for a name of something else.
+
+    The unit may stand at the end of the name. A rate without one is in hertz; a time from sample to
+    sample without one may be in seconds, if it is below 1. A rate of 0 is not known.
+    """
+    words = "_".join(units.words_in(name)).replace("_k_hz", "_khz").replace("_m_hz", "_mhz")
+    bare, _, last = words.rpartition("_")
+    is_in_name = not unit and RATE_NAME.fullmatch(words) is None
+    is_in_name = is_in_name and (last in HERTZ or units.seconds_in(last) is not None)
+    if is_in_name:
+        words, unit = bare, last
+    unit = unit.lower()
+    hertz = HERTZ.get(unit or "hz", 0.0)
+    if RATE_NAME.fullmatch(words) or (unit in HERTZ and IN_HERTZ.fullmatch(words)):
+        return number * hertz, True
+    if UNSURE_RATE.fullmatch(words):
+        return number * hertz, is_in_name and hertz > 0
+    if words.replace("_", "") not in STEP_NAMES or number <= 0:
+        return None
+    if not unit and words != "delta_x":  # LabVIEW's is in seconds
+        return (1.0 / number if number < 1 else 0.0), False
+    second = units.seconds_in(unit or "s") or 0.0
+    return (1.0 / (number * second) if second else 0.0), True
+
+
+def is_rate_column(name: str) -> bool:
+    """Return whether a column surely states a rate of samples, by its name; `fs` may be a force."""
+    stated = stated_rate(name, 1.0)
+    return stated is not None and stated[1] and "".join(units.words_in(name)) != "fs"
+
+
+def rate_in_cell(name: str, cell: object) -> float | None:
+    """Return the rate in hertz that a cell of a column states, as 500 of `Sample Rate (Hz)`."""
+    return rate_in_preamble(f"{name.rpartition('.')[2]}: {cell}")[0]
+
+
+def rate_of_scalar(name: str, value: NDArray[Any]) -> float | None:
+    """Return the rate in hertz that an array of one number states by its name; None for none.
+
+    A rate without a unit is in hertz, a time from sample to sample in seconds.
+    """
+    is_number = value.size == 1 and value.dtype.kind in "iuf"
+    stated = stated_rate(name, float(value.reshape(()))) if is_number else None
+    return stated[0] if stated and stated[0] > 0 else None
+
+
 def rate_in_preamble(text: str) -> tuple[float | None, str]:
     """Return the sampling rate in hertz that a line of the text above a header states, and a note.
 
-    The line is a name in `RATE_NAMES` with a number, in hertz if it has no unit (`fs = 500`), or a
-    name in `STEP_NAMES` with a number and its unit (`dt [ms];2`). Lines whose rate is not from 1 Hz
-    to 1 MHz are passed over. The rate is rounded to four digits; None if no line states one. Then
-    the note offers a line that may state it, as `Rate: 5` or `Frequency: 500 Hz`; "" for none.
+    The line is a name with a number, as `stated_rate` reads them: `fs = 500`, `dt [ms];2`. Lines
+    whose rate is not from 1 Hz to 1 MHz are passed over. The rate is rounded to four digits; None
+    if no line states one. Then the note offers a line that may state it, as `Rate: 5` or
+    `Frequency: 500 Hz`; "" for none.
     """
     offer = ""
     for match in filter(None, map(RATE_LINE.fullmatch, text.splitlines())):
-        name = re.sub(r"[\W_]", "", match["name"].lower())
         number = float(match["number"].replace(",", "."))
-        unit = (match["bracketed"] or match["unit"]).lower()
-        names = (*RATE_NAMES, *FREQUENCIES)
-        is_rate = name in names or name.endswith(SAMPLE_RATES)  # RDT Sample Rate
-        rate = number * HERTZ.get(unit or "hz", 0.0) if is_rate else 0.0
-        in_seconds = units.seconds_in("s" if name == "deltax" else unit) or 0.0  # LabVIEW's Delta_X
-        step = number * in_seconds if name in STEP_NAMES else 0.0
-        rate = 1.0 / step if step else rate
-        is_unsure = name in FREQUENCIES or (name in UNSURE_RATES and not unit)
-        if RATES[0] <= rate <= RATES[1] and not is_unsure:
+        stated = stated_rate(match["name"], number, match["bracketed"] or match["unit"])
+        rate, is_sure = stated or (0.0, True)
+        if is_sure and RATES[0] <= rate <= RATES[1]:
             return float(f"{rate:.4g}"), ""
-        if is_unsure or (name in STEP_NAMES and not unit):
+        if not is_sure:
             do = f"rate_hz={rate:.4g}" if rate else "state it, rate_hz=..."
             offer = f"A line says {match[0].strip()!r}: if that is of the samples, {do}"
     return None, offer

@@ -21,6 +21,7 @@ from ..traces import is_time_column
 from . import labels, units
 from .cells import fields_beside, split_cells
 from .clocks import (
+    is_rate_column,
     place_of_clock,
 )
 from .columns import (
@@ -698,6 +699,5 @@ def _columns_without_clock(
     with suppress(UnreadableError):
         frame = pd.DataFrame(complete, columns=header, dtype=object)
         clock = place_of_clock(frame, options.time)
-    return tuple(
-        name for i, name in enumerate(header) if name and i != clock and not is_time_column(name)
-    )
+    others = (name for i, name in enumerate(header) if name and i != clock)
+    return tuple(name for name in others if not (is_time_column(name) or is_rate_column(name)))

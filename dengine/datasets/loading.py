@@ -26,7 +26,7 @@ from ..traces import as_trace, as_traces, is_time_column, spec_of
 from . import units
 from .archives import find_whole, hold_one_each, read_archive_each
 from .bags import is_stream, read_bag
-from .clocks import RATE_NAMES, STEP_NAMES, clock_of, rate_of
+from .clocks import clock_of, rate_of, rate_of_scalar, stated_rate
 from .columns import FORCE
 from .containers import HEAD, JSON, NPZ, PARQUET, binary_kind, is_text, suffix_of
 from .dataset import (
@@ -374,6 +374,7 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         about: dict[str, Any] = {"part": arrays.get(options.part), "cause": arrays.get("cause")}
         if "rate_hz" in arrays:
             about["rate_hz"] = float(arrays["rate_hz"])
+        about["rates"] = arrays.get("rates")
         names = tuple(map(str, arrays.get("channels", ())))
         stated_units = map(str, np.atleast_1d(arrays.get("unit", "")).tolist())
         about["unit"] = ", ".join(stated_units) or guess_unit(names or channels)
@@ -410,26 +411,30 @@ def _without_padding(
 def _refit_without_padding(data: Dataset, options: LoadOptions, *, has_unit: bool) -> Dataset:
     """Return a data set as `refit` does, whose traces end before the NaN behind their last number.
 
-    If some do, a note says so, and all are brought to one length as recordings are; those that
-    cannot be are among its faults.
+    If some do, or have rates of their own, all are brought to one length as recordings are; those
+    that cannot be are among its faults.
     """
     X: NDArray[np.float32] = as_traces(data.X)
     is_nan = np.all(np.isnan(X), axis=1)
     n_padded = int((is_nan[:, -1] & ~is_nan.all(axis=1)).sum())
-    if not n_padded:
+    if not n_padded and data.rates is None:
         return refit(data, options, has_unit=has_unit)
     about = refit(data, replace(options, samples=None, fit=None), has_unit=has_unit)
     collector = RecordingCollector(data.name, about.channels)
-    collector.notes[
-        f"{n_padded} of {len(data)} traces end before their row, by NaN or an array of lengths"
-    ] = 1
+    if n_padded:
+        text = f"{n_padded} of {len(data)} traces end before their row"
+        collector.notes[f"{text}, by NaN or an array of lengths"] = 1
+    rates = [about.rate_hz] * len(data)
+    if data.rates is not None and options.rate_hz is None:
+        rates = data.rates.tolist()
     traces = as_traces(about.X)
     channel_units = tuple(split_unit(about.unit, traces.shape[1]))
     parts = [None] * len(data) if data.part is None else map(str, data.part)
-    for i, (trace, label, part) in enumerate(zip(traces, data.y, parts, strict=True), start=1):
+    rows = zip(traces, data.y, parts, rates, strict=True)
+    for i, (trace, label, part, rate) in enumerate(rows, start=1):
         recording = Recording(
             without_trailing_nan(trace),
-            about.rate_hz,
+            rate,
             channel_units,
             label=int(label),
             source=f"trace {i}",
@@ -470,14 +475,14 @@ def _arrays_by_meaning(
     lengths = set(stored[traces[0]].shape) - {n} if traces else set()
     result = dict[str, NDArray[Any]]()
     for key, x in stored.items():
-        bare = key.lower().replace("_", "")
         if x.ndim == 1 and len(x) in lengths and x.dtype.kind in "US":
             is_unit = all(units.parse(units.spelling(text)) for text in map(str, x.tolist()))
             result |= {"unit" if is_unit else "channels": x, key: x}
-        elif x.size == 1 and bare in (*RATE_NAMES, "frequency"):
-            result |= {"rate_hz": x.reshape(()), key: x}
-        elif x.size == 1 and bare in STEP_NAMES and x.dtype.kind == "f" and 0 < x < 1:  # seconds
-            result |= {"rate_hz": 1 / x.reshape(()), key: x}
+        elif rate := rate_of_scalar(key, x):
+            result |= {"rate_hz": np.array(rate), key: x}
+        elif x.shape == (n,) and x.dtype.kind in "iuf" and (stated_rate(key, 1.0) or (0, 0))[1]:
+            rates = np.array([rate_of_scalar(key, number) for number in x], dtype=np.float64)
+            result |= {"rates": rates, key: x}
         elif x.ndim == 1 and len(x) in lengths and is_time_column(key) and x.dtype.kind in "iuf":
             with suppress(UnreadableError):
                 clock = clock_of(pd.DataFrame({key: x}))
@@ -728,7 +733,7 @@ def _from_arrays(
         expect_data(bool(is_labelled.any()), f"labelled traces in {name}", actual)
         note = f"{collector.unlabelled_text(len(labels), 'traces')}: they are left out."
         about |= {"notes": (*about["notes"], note), "unlabelled": collector.unlabelled}
-        for key in ("part", "cause"):
+        for key in ("part", "cause", "rates"):
             if about.get(key) is not None:
                 about[key] = np.asarray(about[key])[is_labelled]
         X = X[is_labelled]
@@ -738,11 +743,11 @@ def _from_arrays(
     data = make_dataset(X, labels, name=name, **{"unit": "", **about})
     data, kept = _without_repeats(data, numbers)
     words = words[kept]
-    clock = "none, an array tells the rate" if data.rate_hz and not options.rate_hz else ""
+    has_rate = (data.rate_hz or data.rates is not None) and not options.rate_hz
+    clock = "none, an array tells the rate" if has_rate else ""
     place = f"{'column' if options.labels else 'array'} {label}"
     readings = [Reading(place, str(word), clock) for word in words.tolist()]
-    stated = options.rate_hz
-    reading = describe_reading(readings, data.y.tolist(), "as the rows", rate_hz=stated)
+    reading = describe_reading(readings, data.y.tolist(), "as the rows", rate_hz=options.rate_hz)
     return replace(data, reading=reading)
 
 
@@ -759,7 +764,7 @@ def _without_repeats(data: Dataset, numbers: NDArray[np.int64]) -> tuple[Dataset
         collector.recordings.append(Recording(trace, label=int(label), source=source, part=part))
     kept = leave_out_repeats(collector)
     columns = dict[str, Any]()
-    for key in ("X", "y", "part", "cause"):
+    for key in ("X", "y", "part", "cause", "rates"):
         column = getattr(data, key)
         columns[key] = None if column is None else column[kept]
     notes = (*data.notes, *(f"{note}." for note in collector.notes))

@@ -23,6 +23,7 @@ from .clocks import (
     Clock,
     floats,
     holds_dates,
+    is_rate_column,
     is_rising,
     place_of_clock,
     same_time_text,
@@ -370,7 +371,7 @@ def _channels_of_long(
     A column without a name is none: R writes row numbers so. If they must be named, DataError is
     raised, which also says what `check_labels` finds wrong.
     """
-    named = filter(None, names)
+    named = [name for name in names if name and not is_rate_column(name)]
     try:
         return choose_channels([name for name in named if is_mostly_numbers(frame[name])], options)
     except DataError as error:

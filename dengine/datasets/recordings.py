@@ -29,9 +29,11 @@ from .clocks import (
     clock_of,
     floats,
     in_order_of_time,
+    is_rate_column,
     lost_rows_text,
     place_of_clock,
     rate_contradiction,
+    rate_in_cell,
     rate_of,
     resample_evenly,
     rising_columns,
@@ -317,6 +319,10 @@ def rows_to_trace(
     if clock is None:
         if options.rate_hz is None and rate_hz is not None:
             return Recording(trace, rate_hz, reading=Reading(clock=RATE_ABOVE))
+        if options.rate_hz is None and (name := _rate_column(rows, places)):
+            rate_hz = rate_in_cell(name, rows[name].iloc[0])
+            reading = Reading(clock=f"none, column {name} states the rate")
+            return Recording(trace, rate_hz, reading=reading)
         if options.rate_hz is None:
             _offer_clock(rows, places, notes)
         return Recording(trace, goes_back=_column_that_goes_back(rows, options))
@@ -325,6 +331,18 @@ def rows_to_trace(
     except UnreadableError as error:
         same_time = same_time_text(trace, clock, rows.index)
         raise UnreadableError(f"{error}{same_time}", error.line) from error
+
+
+def _rate_column(rows: pd.DataFrame, places: Sequence[int]) -> str:
+    """Return the column of a recording that states its rate, by its name and one value; else "".
+
+    places : positions of the channels.
+    """
+    for name in rows.columns.delete(list(places)):
+        cells = set(rows[name]) if is_rate_column(str(name)) else set()
+        if len(cells) == 1 and rate_in_cell(str(name), *cells):
+            return str(name)
+    return ""
 
 
 def _trace_by_clock(

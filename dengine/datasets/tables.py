@@ -19,6 +19,7 @@ import numpy as np
 
 from ..errors import DataError, listed
 from . import labels
+from .clocks import rate_in_cell
 from .columns import MIN_NUMBERED, numbered_columns
 from .containers import (
     number_rows,
@@ -155,6 +156,7 @@ def _from_tables(
         options = replace(options, time=None)
     frames = {source: table.frame for source, table in tables.items()}
     first = next(iter(frames))
+    options = _without_rate_column(frames[first], options)
     for source, frame in frames.items():
         _check_columns(frame, source)
         if differing := listed(sorted(_column_forms(frame) ^ _column_forms(frames[first]))):
@@ -186,6 +188,12 @@ def _from_tables(
             collector.add(where, read, 0 if column else line)
     _leave_out_repeated_rows(collector)
     return as_dataset(collector, options)
+
+
+def _without_rate_column(frame: pd.DataFrame, options: LoadOptions) -> LoadOptions:
+    """Return options without a column of times that states the rate of each row of a wide table."""
+    is_rate = rate_in_cell(options.time or "", 1) is not None
+    return replace(options, time=None) if is_rate and _is_wide(frame, options) else options
 
 
 def _is_wide(frame: pd.DataFrame, options: LoadOptions) -> bool:

@@ -17,9 +17,10 @@ from ..errors import DataError, listed
 from ..traces import is_time_column
 from . import labels, units
 from .clocks import (
+    NO_CLOCK,
     clock_of,
     is_rising,
-    rate_in_preamble,
+    rate_in_cell,
     rate_of,
 )
 from .columns import (
@@ -57,7 +58,7 @@ def with_samples_in_columns(
     """Return tables with a column for each sample where a cell holds a curve, and their options.
 
     Pieces of a curve are joined. Rows whose curves or clocks contradict each other are faults.
-    Raises DataError if no row is left.
+    Raises DataError if no row is left, or the column of times that the user stated is not there.
     """
     result = dict[str, TextTable]()
     plain = list[str]()
@@ -73,6 +74,7 @@ def with_samples_in_columns(
         collector.notes.update(expanded.notes)
         if expanded.frame.empty:
             continue
+        _check_clock(table.frame, expanded.frame, options.time, source, collector)
         if expanded.unread:
             collector.notes[f"Not read: the columns {listed(expanded.unread)}"] = 1
         if expanded.rate_hz is not None:
@@ -94,6 +96,25 @@ def with_samples_in_columns(
 def place_of_part(source: str, part: str) -> str:
     """Return the file of a row, with its part if that is known, for a fault."""
     return f"{source}, part {part}" if part else source
+
+
+def _check_clock(
+    frame: pd.DataFrame,
+    expanded: pd.DataFrame,
+    time: str | None,
+    source: str,
+    collector: RecordingCollector,
+) -> None:
+    """Add a note if a stated column of times has one value for each curve, and states no rate.
+
+    Raises DataError if it is not there. `expanded` is the table without its columns of curves.
+    """
+    if time not in (None, NO_CLOCK, *frame):
+        wanted = f"a column {time} of times in {source}"
+        raise DataError(f"Expected {wanted}, found {listed(frame.columns)}.")
+    if time in expanded and rate_in_cell(str(time), 1) is None:
+        text = f"Column {time} has one value for each curve, and is no clock of samples"
+        collector.notes[text] = 1
 
 
 def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable:
@@ -307,19 +328,12 @@ def _stated_in_rows(frame: pd.DataFrame, table: TextTable) -> StatedByRow:
         rate_of = dict.fromkeys(table.frame.index, rate_hz)
         return StatedByRow(unit_of, rate_of, clock, list(in_units))
     for name, cells in filled.items():
-        rates = {line: _stated_rate(name, cell) for line, cell in cells.items()}
+        rates = {line: rate_in_cell(name, cell) for line, cell in cells.items()}
         rate_of = {line: rate for line, rate in rates.items() if rate is not None}
         if len(rate_of) == len(cells) > 0:
             clock = f"none, column {name} states the rate"
             return StatedByRow(unit_of, rate_of, clock, [name, *in_units])
     return StatedByRow(unit_of, {}, "", list(in_units))
-
-
-def _stated_rate(name: str, cell: object) -> float | None:
-    """Return the rate in hertz that a cell of a column states, as 500 of `Sample Rate (Hz)`."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.rpartition(".")[2])  # SampleTimeMs
-    quantity, unit = units.split(words.lower())
-    return rate_in_preamble(f"{quantity}: {cell} {unit}")[0]
 
 
 def _parts_of_rows(frame: pd.DataFrame, options: LoadOptions) -> list[str]:

@@ -2070,6 +2070,10 @@ def test_a_counter_of_16_bits_that_starts_anew_is_a_clock(small: Dataset, tmp_pa
         "Sampling interval;0,002;s",
         "Abtastrate [kHz];0,5",
         "dt\t2 ms",
+        "# sampling_hz: 500",
+        "rate_hz=500",
+        "Fréquence d'échantillonnage: 0.5 kHz",
+        "samples per second;500",
     ],
 )
 def test_a_line_above_the_header_tells_the_rate_of_samples_without_a_clock(
@@ -2990,6 +2994,80 @@ def test_a_line_states_the_rate_only_if_it_is_that_of_samples_else_it_is_offered
     assert (load_dataset(lone).channels, load_dataset(lone).rate_hz) == (("FZ",), data.rate_hz)
     stated = load_dataset(folder, channel="FZ", rate_hz=100.0)
     assert not any("A line says" in note for note in stated.notes)
+
+
+RATE_COLUMNS = (
+    *("sampling_hz", "sample_rate", "sampling_rate_hz", "SampleRate", "fs", "fs_hz", "rate_hz"),
+    *("Abtastrate", "freq_hz", "meta.samplingRateHz", "acq_rate_hz", "Abtastfrequenz [Hz]"),
+)
+
+
+def two_rates(name: str, small: Dataset) -> pd.DataFrame:
+    """A row for each of 24 curves; the last eight were recorded at twice the rate."""
+    curves = [np.repeat(x, 1 + (i > 15)).tolist() for i, x in enumerate(small.X)]
+    rates = np.where(np.arange(24) > 15, 1000, 500)
+    return pd.DataFrame({"serial": range(24), name: rates, "force": curves, "ok": small.y})
+
+
+@pytest.mark.parametrize("name", RATE_COLUMNS)
+def test_a_column_whose_name_states_a_rate_tells_that_of_each_row(
+    name: str, small: Dataset
+) -> None:
+    table = two_rates(name, small)
+    data = load_dataset(table, label="ok")
+    assert (len(data), data.rate_hz) == (16, 500.0)
+    assert "Expected timestamps at 500 Hz, as the others have, got 1000 Hz" in str(data.faults[0])
+    for time in (None, name):
+        data = load_dataset(table, label="ok", fit="resample", time=time, samples=50)
+        assert (len(data), data.rate_hz) == (24, 500.0)
+        np.testing.assert_array_equal(data.X, small.X)
+        assert data.reading["clock"] == f"none, column {name} states the rate"
+
+
+def test_a_stated_column_of_times_is_not_ignored_in_a_table_of_curves(small: Dataset) -> None:
+    table = two_rates("frequency", small)
+    with pytest.raises(DataError, match="Expected a column t of times in row, found serial, freq"):
+        load_dataset(table, label="ok", time="t")
+    data = load_dataset(table, label="ok", time="frequency")
+    note = "Column frequency has one value for each curve, and is no clock of samples."
+    assert note in data.notes
+    assert data.rate_hz is None
+
+
+@pytest.mark.parametrize("form", ["wide", "recordings", "long", "archive", "archives"])
+def test_each_form_states_the_rate_of_each_recording_by_a_name(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    table = two_rates("sampling_hz", small)
+    options: dict[str, Any] = {}
+    source: Any = tmp_path / "x.npz"
+    X = np.stack([np.pad(x, (0, 100 - len(x)), constant_values=np.nan) for x in table["force"]])
+    if form in ("recordings", "archives"):
+        source = tmp_path / "cell"
+        source.mkdir()
+        for i, row in enumerate(table.itertuples()):
+            path = source / f"{i:02}_{'OK' if row.ok else 'NOK'}"
+            if form == "archives":
+                np.savez(path.with_suffix(".npz"), force=row.force, sampling_hz=row.sampling_hz)
+            else:
+                rows = pd.DataFrame({"force": row.force, "sampling_hz": row.sampling_hz})
+                rows.to_csv(path.with_suffix(".csv"), index=False)
+    elif form == "archive":
+        np.savez(source, X=X, y=small.y, sampling_hz=table["sampling_hz"])
+    elif form == "wide":
+        source = (
+            pd.DataFrame(X).add_prefix("F_").assign(sampling_hz=table["sampling_hz"], y=small.y)
+        )
+        options = {"time": "sampling_hz"}
+    else:
+        source = table.explode("force").astype({"force": float}).reset_index(drop=True)
+        options = {"part": "serial", "label": "ok", "time": "none"}
+    data = load_dataset(source, **options)
+    assert (len(data), len(data.faults), data.rate_hz) == (16, 8, 500.0)
+    data = load_dataset(source, **options, fit="resample")
+    assert (len(data), data.rate_hz) == (24, 500.0)
+    np.testing.assert_array_equal(data.X, small.X)
+    assert load_dataset(source, **options, rate_hz=250.0, fit="pad-all").rate_hz == 250.0
 
 
 @pytest.mark.parametrize(
