@@ -691,6 +691,9 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
     # A recording without a number is a part of its own.
     parts = [recording.part or recording.source for recording in recordings]
     has_parts = any(recording.part is not None for recording in recordings)
+    if again := [part for part, n in Counter(parts).items() if n > 1]:
+        plural = "parts have" if len(again) > 1 else "part has"
+        notes.append(f"{len(again)} {plural} several recordings: {listed(again)}.")
     lengths_read = [recording.length or recording.trace.shape[1] for recording in recordings]
     return make_dataset(
         X[:, 0] if X.shape[1] == 1 else X,

@@ -252,9 +252,19 @@ def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptio
     has_label = labels.column_among(header, labels.LABEL_COLUMNS) is not None
     if len(named) == 1 or options.time is not None:
         return True
-    if not has_label and not options.has_part(header):
+    if (not has_label and not options.has_part(header)) or _have_one_part(named, options):
         return False
     return bool(long_table_advice(_first_readable(named, options)[1].frame, options, ""))
+
+
+def _have_one_part(named: Mapping[str, Path], options: LoadOptions) -> bool:
+    """Return whether the column of parts that the user stated has one value in each file."""
+    names = [options.part] if options.part != "part" else []
+    paths = list(named.values())[:: max(len(named) // TRIED, 1)]
+    heads = [_first_rows(path, options) for path in paths if names]
+    return bool(heads) and all(
+        names[0] in cells.header and len(set(cells_of(cells, names[0]))) == 1 for cells in heads
+    )
 
 
 def _first_readable(named: Mapping[str, Path], options: LoadOptions) -> tuple[str, TextTable]:
@@ -333,9 +343,8 @@ def read_folder(
     DataError
         If no recording can be read, or most have no label; the error then says what to try.
     """
-    if options.labels is None and options.part != "part":
-        wanted = f"a file of labels with a column {options.part}"
-        raise DataError(f"Expected {wanted}: a folder's names tell no parts' numbers.")
+    if options.labels is None:
+        _check_part(heads, options)
     others = _of_other_channels(named, options.channels, options)
     named = {name: path for name, path in named.items() if name not in others}
     source, label_columns = _label_source(named, heads, options)
@@ -375,6 +384,16 @@ def read_folder(
     _leave_out_copies(collector)
     collector.order_by_start()
     return as_dataset(collector, options)
+
+
+def _check_part(heads: FolderHeads, options: LoadOptions) -> None:
+    """Raise DataError if no column and no line of the files tells the part, as the user stated."""
+    if options.part == "part" or options.has_part(heads.label_places):
+        return
+    names = options.part_columns[1:] or (options.part,)
+    missing = listed(name for name in names if name not in heads.label_places)
+    wanted = f"a file of labels with a column {missing}, or such a column or line in each file"
+    raise DataError(f"Expected {wanted}, found {listed(heads.label_places)}.")
 
 
 def _of_other_channels(

@@ -1393,7 +1393,8 @@ def collect_recordings(
             raise
         recording = read(place)
         reading = recording.reading._replace(place=label.reading.place, word=label.word)
-        return recording._replace(label=label.label, source=name, part=label.part, reading=reading)
+        part = label.part or recording.part
+        return recording._replace(label=label.label, source=name, part=part, reading=reading)
 
     for name, place in places.items():
         collector.add(name, partial(read_labelled, name, place))

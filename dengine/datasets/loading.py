@@ -114,8 +114,9 @@ def load_dataset(
         whole trace is interpolated.
     part : str, default "part"
         Name of the array or column of parts' numbers, texts or whole numbers, or of columns that
-        tell them together, "day,number"; for a folder a column of `labels`. Without a `part` every
-        trace is a part of its own. In a long table it says which rows are one insertion.
+        tell them together, "day,number"; for a folder a column or a line of its files, or a column
+        of `labels`. Without a `part` every trace is a part of its own. In a long table it says
+        which rows are one insertion.
     channel : str or sequence of str, optional
         "FZ_Base", or several, "FZ_Base,FX_Base", which give (n, C, T). None: FZ_Base, or the only
         channel that there is.

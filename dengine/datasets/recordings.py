@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..errors import listed
 from ..traces import is_time_column
 from . import units
-from .cells import CELL_MARK
+from .cells import CELL_MARK, fields_beside
 from .clocks import (
     MAX_MISSING,
     NO_CLOCK,
@@ -74,6 +74,7 @@ def read_recording(
     be read, a channel that is not there, and no samples.
     """
     table = read_table(path, replace(options, channels=tuple(channels)), decimal)
+    part = _part_in(table, path, options, notes)
     table = _of_one_signal(table, channels)
     header = list(table.frame.columns)
     places = [column_place(name, header, table.line, table.preamble) for name in channels]
@@ -120,9 +121,34 @@ def read_recording(
     return timed._replace(
         units=channel_units,
         start=start,
+        part=part,
         reading=reading,
         factors={**table.factors, **factors_in_columns(rows.iloc[:, others])},
     )
+
+
+def _part_in(table: TextTable, path: Path, options: LoadOptions, notes: Counter[str]) -> str | None:
+    """Return the part that a column or a line of a recording states, or a small file beside it.
+
+    None with a note if it is not there or empty; also if the user did not state where the part is,
+    or a file of labels tells it. Raises UnreadableError if the column has several.
+    """
+    if options.part == "part" or options.labels is not None:
+        return None
+    fields = {**table.fields, **fields_beside(path)}
+    columns = {*fields, *table.frame}
+    names = [options.part] if options.part in columns else options.part_columns[1:]
+    texts = list[str]()
+    for name in names:
+        cells = table.frame[name] if name in table.frame else [fields.get(name, "")]
+        filled = sorted({str(cell).strip() for cell in cells} - {""})
+        if len(filled) > 1:
+            raise UnreadableError(f"Expected one part in column {name}, got {listed(filled)}")
+        texts += filled
+    if len(texts) == len(names) > 0:
+        return "_".join(texts)
+    notes[f"No {options.part} is stated: the recording is a part of its own"] += 1
+    return None
 
 
 def _check_blocks(rows: pd.DataFrame, table: TextTable, options: LoadOptions) -> str:

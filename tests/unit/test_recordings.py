@@ -2996,6 +2996,51 @@ def test_a_line_states_the_rate_only_if_it_is_that_of_samples_else_it_is_offered
     assert not any("A line says" in note for note in stated.notes)
 
 
+@pytest.mark.parametrize("form", ["line", "column", "column beside a label", "file beside"])
+def test_what_a_recording_states_of_its_part_tells_parts_with_several_recordings(
+    form: str, small: Dataset, tmp_path: Path
+) -> None:
+    parts = [f"SN{min(i, 22)}" for i in range(24)]
+    for i, (x, part, word) in enumerate(zip(small.X, parts, words(small), strict=True)):
+        rows = pd.DataFrame({"time": np.arange(50) / 500, "force": x})
+        path = tmp_path / f"{i:02}_{word}.csv"
+        if form == "column beside a label":
+            path = tmp_path / f"{i:02}.csv"
+            rows = rows.assign(Status=word)
+        if form.startswith("column"):
+            rows = rows.assign(Identifier=part)
+        text = rows.to_csv(index=False)
+        path.write_text(f"# Identifier: {part}\n{text}" if form == "line" else text)
+        if form == "file beside":
+            path.with_suffix(".txt").write_text(f"Identifier: {part}\nLine: 3\n")
+    data = load_dataset(tmp_path, channel="force", part="Identifier")
+    assert data.part is not None
+    assert data.part.tolist() == parts
+    np.testing.assert_array_equal(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
+    assert "1 part has several recordings: SN22." in data.notes
+
+
+def test_a_recording_that_states_no_part_or_two_is_named(few: Path, small: Dataset) -> None:
+    for i, path in enumerate(sorted(few.iterdir())):
+        parts = [f"# Nr: {i}", "# Nr:"][i == 2]
+        path.write_text(f"# Line: 7\n{parts}\n{path.read_text()}")
+    data = load_dataset(few, part="Nr")
+    assert data.part is not None
+    assert data.part.tolist() == ["0", "1", str(data.source[2]), "3"]
+    assert "No Nr is stated: the recording is a part of its own." in data.notes
+    joined = load_dataset(few, part="Line,Nr").part
+    assert joined is not None
+    assert joined[3] == "7_3"
+    with pytest.raises(DataError, match="column No, or such a column or line in each file, found"):
+        load_dataset(few, part="Line,No")
+    first = min(few.iterdir())
+    rows = pd.read_csv(first, comment="#").assign(Nr=["A", *"B" * 49])
+    rows.to_csv(first, index=False)
+    (fault,) = load_dataset(few, part="Nr").faults
+    assert "Expected one part in column Nr, got A, B" in str(fault)
+
+
 RATE_COLUMNS = (
     *("sampling_hz", "sample_rate", "sampling_rate_hz", "SampleRate", "fs", "fs_hz", "rate_hz"),
     *("Abtastrate", "freq_hz", "meta.samplingRateHz", "acq_rate_hz", "Abtastfrequenz [Hz]"),
