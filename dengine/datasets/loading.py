@@ -7,7 +7,7 @@ It finds out what a source is and calls its reader: in `tables`, in `bags`, or b
 import os
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -387,7 +387,24 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         data = _from_arrays(X, arrays[label], options, name, label_column, **about)
         data = _refit_without_padding(data, options, has_unit="unit" in arrays)
     read = {label, *traces, options.part, *lengths, *ARRAYS, *SIMULATED, *arrays}
-    return replace(data, notes=(*data.notes, *_archive_notes(data, all_names, read)))
+    notes = _turned_notes(next(iter(named.values())), read, label, arrays[label])
+    return replace(data, notes=(*data.notes, *notes, *_archive_notes(data, all_names, read)))
+
+
+def _turned_notes(path: Path, read: Collection[str], label: str, labels: NDArray[Any]) -> list[str]:
+    """Return a note on each array in an archive whose first axis is not that of the parts.
+
+    read : names of the arrays that are read. labels : those of all parts, if the archive has none.
+    """
+    stored, _ = read_archive(path, tuple(read))
+    labels = stored.get(label, labels)
+    turned = {key: _parts_first(x, labels) for key, x in stored.items()}
+    return [
+        f"Array {key} {stored[key].shape} is read as {len(x)} traces of {x.shape[-1]} samples, "
+        f"for there are {len(x)} labels."
+        for key, x in turned.items()
+        if x.ndim > 1 and len(x) != len(stored[key])
+    ]
 
 
 def _without_padding(

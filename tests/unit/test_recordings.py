@@ -1736,6 +1736,28 @@ def test_an_empty_cell_is_the_good_one_where_the_user_says_so(
     np.testing.assert_array_equal(data.y, small.y)
 
 
+@pytest.mark.parametrize("is_turned", [True, False])
+@pytest.mark.parametrize("form", ["force", "channels", "listing"])
+def test_a_note_says_that_the_axis_of_the_parts_is_found_by_the_number_of_labels(
+    form: str, is_turned: bool, small: Dataset, tmp_path: Path
+) -> None:
+    X = np.stack([small.X, -small.X], axis=2) if form == "channels" else small.X
+    X = X.swapaxes(0, 1) if is_turned else X
+    how: dict[str, Any] = {"channel": "fx" if form == "channels" else "force", "label": "ok"}
+    arrays = {"ok": small.y, "names": np.array(["fx", "fy"])}
+    if form == "listing":
+        arrays = {"serial": np.array([f"S{i}" for i in range(24)])}
+        listing = pd.DataFrame({"serial": arrays["serial"], "ok": words(small)})
+        listing.to_csv(tmp_path / "labels.csv", index=False)
+        how |= {"labels": tmp_path / "labels.csv"}
+    np.savez(tmp_path / "run.npz", force=X, fs=500, **arrays)
+    data = load_dataset(tmp_path / "run.npz", **how)
+    np.testing.assert_array_equal(data.X, small.X)
+    shape = ", ".join(map(str, X.shape))
+    text = f"Array force ({shape}) is read as 24 traces of 50 samples, for there are 24 labels."
+    assert (text in data.notes) == is_turned
+
+
 @pytest.mark.parametrize("axes", [(0, 1, 2), (0, 2, 1)])
 def test_an_archive_names_its_channels_in_an_array_of_texts(
     axes: tuple[int, ...], small: Dataset, tmp_path: Path
