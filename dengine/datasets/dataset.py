@@ -443,7 +443,8 @@ def label_map_of(
     """Return a label map that users may take, as "heil=good,Riss=bad", for words without meaning.
 
     The most frequent is good, and all others bad, unless one is another with something before it:
-    then this is bad. Beside labels of one side all words are of the other.
+    then this is bad. Beside labels of one side all words are of the other, of whole numbers beside
+    bad ones only the most frequent.
 
     Parameters
     ----------
@@ -459,8 +460,10 @@ def label_map_of(
     no_fault = {word: (unlabelled or {}).get(word, 0) for word in ("-", "") if not labels}
     words = words + Counter({word: n for word, n in no_fault.items() if n > words.total()})
     ordered = [word for word, _ in words.most_common()]
-    if len(set(labels)) == 1:
-        bad = set(ordered) if 1 in labels else set()
+    if 1 in labels and 0 not in labels:
+        bad = set(ordered)
+    elif 0 in labels and 1 not in labels:  # of codes one means that there is no fault
+        bad = set(ordered[1:]) if all(map(str.isdigit, ordered)) else set()
     else:
         bad = {w for w in ordered if any(v and w != v and w.endswith(v) for v in ordered)}
         bad = bad or set(ordered[1:])

@@ -704,7 +704,7 @@ def suggest_label_sources(
     caller tries whether it finds labels.
     """
     with_digits = {"1": True, "0": False} | dict(words)
-    pairs = (f"{word}={'good' if good else 'bad'}" for word, good in with_digits.items())
+    pairs = ["1=good"] * ("1" not in words) + ["0=bad"] * ("0" not in words)
     source = labels_in_names(None, with_digits)
     yield "if 1 and 0 at its end are labels", f"label_map={','.join(pairs)!r}", source
     patterns = {"if 1 and 0 are the folders of its labels": "(?:^|/)([01])/"}

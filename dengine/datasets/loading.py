@@ -5,6 +5,7 @@ It finds out what a source is and calls its reader: in `tables`, in `bags`, or b
 """
 
 import os
+import re
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -74,6 +75,7 @@ Files = Mapping[str, Path]
 TABLES = (*TEXTS, *JSON, *PARQUET)
 MIN_PADDING = 5  # zeros at the end of a trace that are no measurement
 FORMS = ".npz, .csv, .tsv, .txt, .dat, .json, .jsonl, .parquet or .mcap"
+LABEL_MAP = re.compile(r"\blabel_map=['\"]")  # in an error, before the pairs to type
 
 
 def load_dataset(
@@ -199,6 +201,26 @@ def load_dataset(
         thousands=thousands,
         encoding=encoding,
     )
+    try:
+        return _load(source, options)
+    except DataError as error:
+        if not label_map or "label_map=" not in str(error):
+            raise
+        raise DataError(_with_own_words(str(error), label_map)) from error
+
+
+def _with_own_words(message: str, label_map: Mapping[str, Any] | str) -> str:
+    """Return an error's message in which the label map to type begins with the user's own pairs."""
+    pairs = label_map
+    if isinstance(pairs, Mapping):
+        words = parse_label_map(pairs)
+        verdicts = {True: "good", False: "bad", None: ""}
+        pairs = ",".join(f"{word}={verdicts[good]}" for word, good in words.items())
+    return LABEL_MAP.sub(lambda match: f"{match[0]}{pairs.rstrip(',')},", message)
+
+
+def _load(source: Any, options: LoadOptions) -> Dataset:
+    """Load a data set as `load_dataset` does, whose options these are."""
     title, accepted, read = _find_reader(source, options)
     optional = ("label", "labels", "trigger", "topic", "time", *TEXT_FORMAT)
     stated = [name for name in optional if getattr(options, name) not in (None, ())]

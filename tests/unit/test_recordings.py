@@ -2,6 +2,7 @@
 named and alone is lost.
 """
 
+import itertools
 import json
 import re
 import tempfile
@@ -1734,6 +1735,41 @@ def test_an_empty_cell_is_the_good_one_where_the_user_says_so(
     label_map = "=good,E12 force too high=bad"
     data = load_dataset(tmp_path / "wide.csv", label="fault_text", label_map=label_map)
     np.testing.assert_array_equal(data.y, small.y)
+
+
+@pytest.mark.parametrize(
+    ("form", "own"),
+    [
+        *itertools.product(["column", "names", "a listing"], ["0=good", "0=good,99=", {0: True}]),
+        *itertools.product(["column", "a listing"], ["14=bad,21=bad"]),
+    ],
+)
+def test_the_label_map_that_an_error_prints_begins_with_the_users_own_and_works_as_it_stands(
+    form: str, own: Any, make_data, tmp_path: Path
+) -> None:
+    data = make_data(24, samples=50)
+    codes = [0 if good else (14, 21, 33)[i % 3] for i, good in enumerate(data.y)]
+    how: dict[str, Any] = {"rate_hz": 500}
+    rows = pd.DataFrame(data.X).add_prefix("F_")
+    if form == "column":
+        rows.assign(errorCode=codes).to_csv(tmp_path / "rows.csv", index=False)
+        source, how["label"] = tmp_path / "rows.csv", "errorCode"
+    elif form == "names":
+        source, how["label"] = tmp_path / "parts", r"_(\d+)\.csv"
+        for i, (trace, code) in enumerate(zip(data.X, codes, strict=True)):
+            write_csv(source / f"{i:03}_{code}.csv", trace)
+        how = {"label": how["label"]}
+    else:
+        rows.assign(serial=range(24)).to_csv(tmp_path / "rows.csv", index=False)
+        listing = pd.DataFrame({"serial": range(24), "errorCode": codes})
+        listing.to_csv(tmp_path / "listing.csv", index=False)
+        source, how["part"] = tmp_path / "rows.csv", "serial"
+        how |= {"labels": tmp_path / "listing.csv", "label": "errorCode"}
+    with pytest.raises(DataError) as raised:
+        load_dataset(source, label_map=own, **how)
+    label_map = re.search("label_map='(.*?)'", str(raised.value))[1]
+    assert label_map.startswith("0=good," if isinstance(own, dict) else f"{own},")
+    np.testing.assert_array_equal(load_dataset(source, label_map=label_map, **how).y, data.y)
 
 
 @pytest.mark.parametrize("is_turned", [True, False])
