@@ -682,12 +682,14 @@ def as_dataset(collector: RecordingCollector, options: LoadOptions) -> Dataset:
         collector.notes[f"Recordings of {text}: the rate is that of their median length"] = 1
     X = np.stack([_fit_array(recording.trace, samples, fit) for recording in recordings])
     rates = np.array([recording.rate_hz or np.nan for recording in recordings])
-    notes = [f"{text}{f' ({n} times)' if n > 1 else ''}." for text, n in collector.notes.items()]
+    texts = [f"{text} ({n} times)" if n > 1 else text for text, n in collector.notes.items()]
+    notes = [f"{text.removesuffix('.')}." for text in texts]
     if collector.unlabelled:
         n = len(recordings) + len(collector.faults) + collector.unlabelled
         notes.append(f"{collector.unlabelled_text(n)}: they are left out.")
     if not rate:
         notes.append(UNKNOWN_RATE)
+    notes += unknown_unit_note(unit, collector.channels)
     notes += odd_labels_note(sum(recording.label for recording in recordings), len(recordings))
     first = whole[recordings[0].source]
     channel_units = split_unit(unit, len(first.trace))
@@ -1028,6 +1030,18 @@ def _with_guesses(stated: Sequence[str], collector: RecordingCollector) -> str:
             do = "none is assumed, unit=... states it"
             collector.notes[f"The name {name} may tell a unit, {word}: {do}"] = 1
     return ", ".join(guesses if len(set(guesses)) > 1 else guesses[:1])
+
+
+def unknown_unit_note(unit: str, channels: Sequence[str]) -> list[str]:
+    """Return a note if the unit of channels is unknown, and no name may tell it."""
+    channel_units = split_unit(unit, max(len(channels), 1))
+    if "" not in channel_units or any(map(units.maybe_unit, channels)):
+        return []
+    names = [
+        name for name, of_channel in zip(channels, channel_units, strict=False) if not of_channel
+    ]
+    of_channels = f" of {listed(names)}" if 0 < len(names) < len(channel_units) else ""
+    return [f"The unit{of_channels} is unknown: unit=... states it."]
 
 
 def odd_labels_note(n_good: int, n: int) -> list[str]:

@@ -51,6 +51,7 @@ from .dataset import (
     refit,
     split_names,
     split_unit,
+    unknown_unit_note,
 )
 from .folders import are_tables, find_recordings, read_folder, read_heads
 from .labels import (
@@ -483,7 +484,8 @@ def _refit_without_padding(data: Dataset, options: LoadOptions, *, has_unit: boo
         collector.recordings.append(recording)
     fitted = as_dataset(collector, replace(options, unit=about.unit))
     reading = {**about.reading, "first": fitted.reading["first"]}
-    fitting_notes = [note for note in fitted.notes if note != UNKNOWN_RATE]
+    general = (UNKNOWN_RATE, *unknown_unit_note(fitted.unit, fitted.channels))
+    fitting_notes = [note for note in fitted.notes if note not in general]
     faults = (*about.faults, *fitted.faults)
     notes = (*about.notes, *fitting_notes)
     return replace(fitted, notes=notes, faults=faults, reading=reading)
@@ -553,7 +555,7 @@ def _archive_notes(data: Dataset, names: Sequence[str], read: set[str]) -> list[
     notes += [note for note in odd_labels if note not in data.notes]
     if data.rate_hz is None:
         notes.append(UNKNOWN_RATE)
-    return notes
+    return [*notes, *unknown_unit_note(data.unit, data.channels)]
 
 
 def _read_archives(

@@ -265,7 +265,8 @@ def from_long(
         units_row = [column_units.get(name, "") for name in rows.columns]
         timed = rows_to_trace(rows, places, options, collector.notes, units_row)
         channel_units = single_units(stated_units, rows.index) or tuple(
-            column_units.get(name) or units.split(name)[1] for name in collector.channels
+            column_units.get(name) or units.split(name)[1] or units.of_field(rows, len(places))
+            for name in collector.channels
         )
         reading = timed.reading._replace(
             numbers=first.numbers,

@@ -95,7 +95,10 @@ def read_recording(
     header = list(frame.columns)
     notes.update(table.notes)
     rows = _without_unfilled(_without_summary(frame, options, notes), places, options, notes)
-    channel_units = tuple(table.units[i] or units.split(str(header[i]))[1] for i in places)
+    channel_units = tuple(
+        table.units[i] or units.split(str(header[i]))[1] or units.of_field(rows, len(places))
+        for i in places
+    )
     joined = _check_blocks(rows, table, options) if table.blocks else ""
     try:
         timed = rows_to_trace(rows, places, options, notes, table.units, table.rate_hz)

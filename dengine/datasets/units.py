@@ -10,6 +10,10 @@ import re
 import tomllib
 from collections.abc import Sequence
 from importlib.resources import files
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 TABLES = tomllib.loads((files("dengine") / "data" / "units.toml").read_text("utf-8"))
 PREFIXES: dict[str, float] = TABLES["prefixes"]
@@ -43,6 +47,10 @@ MAYBE_UNIT = re.compile(
 )
 # Dimensions that a sensor of force has none of.
 NO_FORCE = ("m", "s", "Hz", "rad", "W", "K", "Nm", "°", "deg", "°C", "in", "inch", "ft")
+# A column that names the signal of each row, as InfluxDB's _field.
+FIELD_COLUMN = re.compile(
+    r"_?field|(signal|channel|var(iable)?|kanal|quantity)([ _]?name)?", re.IGNORECASE
+)
 COMMENT_MARK = re.compile(r"^\s*[#%]+\s*")  # by which other programs know a comment
 
 
@@ -171,6 +179,18 @@ def factor(unit: str, other: str) -> float | None:
 def seconds_in(unit: str) -> float | None:
     """Return the seconds in one unit of a clock, in any case; None for what is no unit of time."""
     return SECONDS.get(unit.lower())
+
+
+def of_field(frame: pd.DataFrame, n: int = 1) -> str:
+    """Return the unit that the names of signals in a column tell, as force_N in `_field`.
+
+    "" for several units, and for several channels, n.
+    """
+    for column in filter(FIELD_COLUMN.fullmatch, map(str, frame.columns) if n == 1 else ()):
+        guesses = set(map(guess, map(str, frame[column].unique())))
+        if len(guesses) == 1:
+            return guesses.pop()
+    return ""
 
 
 def split(name: str) -> tuple[str, str]:

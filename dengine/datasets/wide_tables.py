@@ -226,7 +226,13 @@ def wide_rows(
     stated = _stated_in_rows(frame[unread], table)
     unread = [name for name in unread if name not in stated.columns]
     in_rows = frame[[name for name in unread if may_scale(name)]].to_dict("index")
-    _note_unread(frame[unread], list(columns), not (values % 1 > 0).any(), collector)
+    _note_unread(
+        frame[unread],
+        list(columns),
+        collector,
+        is_whole=not (values % 1 > 0).any(),
+        what="rows" if table.column_of else "columns",
+    )
     label_cells = [
         labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
     ]
@@ -269,11 +275,18 @@ def wide_rows(
 
 
 def _note_unread(
-    frame: pd.DataFrame, channels: Sequence[str], is_whole: bool, collector: RecordingCollector
+    frame: pd.DataFrame,
+    channels: Sequence[str],
+    collector: RecordingCollector,
+    *,
+    is_whole: bool,
+    what: str,
 ) -> None:
     """Add a note on the columns that were not read, but for the factors of whole numbers.
 
     Of these `as_dataset` says what it did with them.
+
+    what : "columns", or "rows" if these are the columns of a table that was transposed.
     """
     n = len(channels)
     unread = [
@@ -282,7 +295,7 @@ def _note_unread(
         if not (is_whole and any(operation(name, channel, n) for channel in channels))
     ]
     if unread:
-        collector.notes[f"Not read: the columns {listed(unread)}"] = 1
+        collector.notes[f"Not read: the {what} {listed(unread)}"] = 1
 
 
 class StatedByRow(NamedTuple):

@@ -1772,6 +1772,48 @@ def test_the_label_map_that_an_error_prints_begins_with_the_users_own_and_works_
     np.testing.assert_array_equal(load_dataset(source, label_map=label_map, **how).y, data.y)
 
 
+@pytest.mark.parametrize(
+    ("field", "unit"), [("force_N", "N"), ("Presse_Kraft_kN", "kN"), ("force", "N"), ("y2", "")]
+)
+@pytest.mark.parametrize("form", ["long", "folder"])
+def test_the_name_of_a_signal_in_a_column_tells_the_unit(
+    form: str, field: str, unit: str, small: Dataset, tmp_path: Path
+) -> None:
+    head = ["_time", "_value", "_field", "part_id", "verdict"]
+    parts = [
+        [[str(k / 100), str(v), field, f"B{i}", word] for k, v in enumerate(x)]
+        for i, (x, word) in enumerate(zip(small.X, words(small), strict=True))
+    ]
+    how = {"channel": "_value", "label": "verdict", "time": "_time"}
+    if form == "long":
+        source = write_rows(tmp_path / "query.csv", [head, *itertools.chain(*parts)])
+        how["part"] = "part_id"
+    else:
+        source = tmp_path
+        for i, rows in enumerate(parts):
+            write_rows(tmp_path / f"part_{i:02}.csv", [head, *rows])
+    data = load_dataset(source, **how)
+    np.testing.assert_allclose(data.X, small.X)
+    assert data.unit == unit
+    assert ("The unit is unknown: unit=... states it." in data.notes) == (not unit)
+    assert (
+        "The unit is unknown: unit=... states it."
+        not in load_dataset(source, **how, unit="N").notes
+    )
+
+
+def test_the_note_on_unknown_units_names_the_channels_that_have_none(
+    small: Dataset, tmp_path: Path
+) -> None:
+    for i, (x, word) in enumerate(zip(small.X, words(small), strict=True)):
+        write_csv(tmp_path / f"{i:02}_{word}.csv", np.stack([x, -x]), ("Force", "aux"))
+    notes = load_dataset(tmp_path, channels=["Force", "aux"]).notes
+    assert "The unit of aux is unknown: unit=... states it." in notes
+    np.savez(tmp_path / "set.npz", X=small.X, y=small.y, rate_hz=100)
+    notes = load_dataset(tmp_path / "set.npz").notes
+    assert notes == ("The unit is unknown: unit=... states it.",)
+
+
 @pytest.mark.parametrize("is_turned", [True, False])
 @pytest.mark.parametrize("form", ["force", "channels", "listing"])
 def test_a_note_says_that_the_axis_of_the_parts_is_found_by_the_number_of_labels(
@@ -1841,6 +1883,18 @@ def test_a_table_with_a_column_for_each_part_is_read(
     parts = data.source if form == "a listing" else data.part
     assert parts is not None
     assert list(parts) == names
+
+
+def test_statistics_below_a_column_for_each_part_are_rows_that_are_not_read(
+    small: Dataset, tmp_path: Path
+) -> None:
+    names = [f"P{i:03} {word}" for i, word in enumerate(words(small))]
+    rows = [[f"{k * 2}", *map(str, column)] for k, column in enumerate(small.X.T)]
+    statistics = {"Minimum": np.min, "Mean": np.mean, "Std. dev.": np.std}
+    rows += [[name, *map(str, of(small.X, axis=1))] for name, of in statistics.items()]
+    data = load_dataset(write_rows(tmp_path / "a.csv", [["t [ms]", *names], *rows]))
+    np.testing.assert_array_equal(data.X, small.X)
+    assert "Not read: the rows Minimum, Mean, Std. dev." in data.notes
 
 
 def test_serials_that_rise_evenly_are_no_clock_of_a_table_with_a_listing(
