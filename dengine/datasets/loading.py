@@ -395,17 +395,16 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         X = np.stack(blocks, axis=1) if len(channels) > 1 else blocks[0]
         if "scale" in arrays:
             X = X.astype(np.float32) * arrays["scale"].astype(np.float32)
-        about: dict[str, Any] = {"part": arrays.get(options.part), "cause": arrays.get("cause")}
+        about: dict[str, Any] = {key: arrays.get(key) for key in ("cause", "rates")}
         if "rate_hz" in arrays:
             about["rate_hz"] = float(arrays["rate_hz"])
-        about["rates"] = arrays.get("rates")
         names = tuple(map(str, arrays.get("channels", ())))
         stated_units = map(str, np.atleast_1d(arrays.get("unit", "")).tolist())
         about["unit"] = ", ".join(stated_units) or guess_unit(names or channels)
         if len(channels) == 1 and X.ndim == 3:  # it is the name of an array of several channels
             channels = ()
             options = replace(options, channels=())
-        about["channels"] = channels or names
+        about |= {"channels": channels or names, "part": arrays.get(options.part)}
         X, lengths = _without_padding(X, stored)
         data = _from_arrays(X, arrays[label], options, name, label_column, **about)
         data = _refit_without_padding(data, options, has_unit="unit" in arrays)
