@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import as_options, listed
+from ..errors import as_options
 from . import options
 from .options import DataChoice, RecipeChoice, fault_lines, short_name, verb
 from .output import (
@@ -58,9 +58,6 @@ def data(source: DataChoice, out: Out | None) -> None:
     if not survey.unit:
         rows.append(("unit", "unknown"))
     parts: list[Any] = [table_of_rows(survey.name, rows), *map(as_options, dataset.notes)]
-    if survey.not_finite_in:
-        files = listed(survey.not_finite_in)
-        parts.append(f"Not finite, because cells are empty or hold no number: {files}.")
     parts.append(table_of_rows("How it was read", dataset.reading.items()))
     if dataset.ordered:
         drifts = map(_drift_row, survey.drift)

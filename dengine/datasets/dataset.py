@@ -43,6 +43,7 @@ REFERENCE = re.compile(  # in the name of a part with which the station itself i
     r"(part|teil|sample|stück|muster|ungs?teil)?|ref|dummy|einstellmeister)(?![^\W\d_])",
     re.IGNORECASE,
 )
+FORCE_AXIS = re.compile(r"f[xyz]([_ ]base)?", re.IGNORECASE)
 MAX_REFERENCE_SHARE = 0.25  # of all parts
 UNKNOWN_RATE = (
     "The rate is unknown, for nothing tells it: times are in samples until it is stated,"
@@ -1020,7 +1021,7 @@ def _convert_to_one_unit(collector: RecordingCollector, options: LoadOptions) ->
 def _with_guesses(stated: Sequence[str], collector: RecordingCollector) -> str:
     """Return the unit of all channels, or one for each; by their names where none is stated.
 
-    A note names each channel whose name may tell a unit.
+    A note names each channel whose name may tell a unit, or is a word for a force.
     """
     names = [*collector.channels, *[""] * (len(stated) - len(collector.channels))]
     guesses = [units.guess(name) for name in names]
@@ -1029,7 +1030,23 @@ def _with_guesses(stated: Sequence[str], collector: RecordingCollector) -> str:
         if not unit and (word := units.maybe_unit(name)):
             do = "none is assumed, unit=... states it"
             collector.notes[f"The name {name} may tell a unit, {word}: {do}"] = 1
+    given = [*stated, *[""] * len(names)]
+    assumed = [name for name, unit in zip(names, given, strict=False) if not unit]
+    for note in assumed_unit_notes(assumed):
+        collector.notes[note] = 1
     return ", ".join(guesses if len(set(guesses)) > 1 else guesses[:1])
+
+
+def assumed_unit_notes(channels: Iterable[str]) -> list[str]:
+    """Return notes on channels whose unit is a guess by a word for a force, as Force or Kraft.
+
+    The axes of a robot, as FZ_Base, are in newtons.
+    """
+    return [
+        f"The unit N of {name} is assumed: unit='kN' would state another"
+        for name in channels
+        if units.guess(name) == "N" and not units.split(name)[1] and not FORCE_AXIS.fullmatch(name)
+    ]
 
 
 def unknown_unit_note(unit: str, channels: Sequence[str]) -> list[str]:

@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import zlib
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path, PurePosixPath
@@ -69,6 +70,8 @@ from .text import TextTable, read_table
 NUMBERED_SHARE = 0.75  # of a wide table's columns are numbered
 FEW_LISTINGS = 5  # text files for each archive, as lists of its labels
 FEW_ROWS = 5  # a text file of as few tells of a recording, and is none
+NUMBER_IN_NAME = re.compile(r"(?<![^\W_])([^\W\d_]+[-_ ]?)(\d+)(?![^\W_])")  # SN0008, part_42
+MAX_REPEATED = 0.2  # of the numbers of parts stand in several names
 HIDDEN = (".", "~$")  # begin the names of files that no user wrote, as Excel's locks
 NO_TEXTS = (*PARQUET, NPZ)
 SUFFIXES = (*TEXTS, *NO_TEXTS, *JSON)
@@ -364,6 +367,8 @@ def read_folder(
     collector.ordered = sorted(named, key=natural_key) == in_order
     collector.order = "by name, numbers by size"
     collector.notes.update(_unread_files_notes(folder, named, others, options))
+    if options.part == "part":
+        _note_repeated_numbers(named, collector.notes)
     common_mark = cache(partial(_common_decimal_mark, list(named.values()), options))
 
     def read(path: Path) -> Recording:
@@ -387,13 +392,34 @@ def read_folder(
 
 
 def _check_part(heads: FolderHeads, options: LoadOptions) -> None:
-    """Raise DataError if no column and no line of the files tells the part, as the user stated."""
+    """Raise DataError if no column, no line and no pattern tells the part, as the user stated."""
     if options.part == "part" or options.has_part(heads.label_places):
         return
+    with suppress(re.error):
+        if re.compile(options.part).groups == 1:
+            return
     names = options.part_columns[1:] or (options.part,)
     missing = listed(name for name in names if name not in heads.label_places)
     wanted = f"a file of labels with a column {missing}, or such a column or line in each file"
-    raise DataError(f"Expected {wanted}, found {listed(heads.label_places)}.")
+    do = "or give a pattern of the names, as 'SN(\\d+)'"
+    raise DataError(f"Expected {wanted}, found {listed(heads.label_places)}; {do}.")
+
+
+def _note_repeated_numbers(names: Iterable[str], notes: Counter[str]) -> None:
+    """Add a note if two files of a folder have a number that is another one in most of its files.
+
+    It stands behind a word in their names, as the 8 in SN0008_0807_OK.csv and SN0008_0815_OK.csv.
+    """
+    files_of = defaultdict[str, defaultdict[tuple[str, str], list[str]]](partial(defaultdict, list))
+    for name in names:
+        path = PurePosixPath(name)
+        for word, number in NUMBER_IN_NAME.findall(path.stem):
+            files_of[word][str(path.parent), number].append(path.name)
+    for word, files in files_of.items():
+        repeated = [group for group in files.values() if len(group) > 1]
+        if 0 < len(repeated) < MAX_REPEATED * len(files):
+            do = f"part='{word}(\\d+)' takes them as of one part"
+            notes[f"One number stands in the names of {listed(repeated[0])}: {do}"] = 1
 
 
 def _of_other_channels(

@@ -41,6 +41,7 @@ from .dataset import (
     UnlabelledError,
     UnreadableError,
     as_dataset,
+    assumed_unit_notes,
     describe_ends,
     describe_reading,
     expect_data,
@@ -230,11 +231,25 @@ def _load(source: Any, options: LoadOptions) -> Dataset:
         options_text = " or ".join(unused)
         raise DataError(f"Expected no {options_text} for {title}, which has none; leave it out.")
     data = read()
-    if "first" in data.reading or isinstance(source, Dataset):
+    if isinstance(source, Dataset):
+        return data
+    data = replace(data, notes=(*data.notes, *_not_finite_note(data)))
+    if "first" in data.reading:
         return data
     trace = as_traces(data.X)[0]
     first = describe_ends("trace 1", trace, data.channels, split_unit(data.unit, len(trace)))
     return replace(data, reading={**data.reading, "first": first})
+
+
+def _not_finite_note(data: Dataset) -> list[str]:
+    """Return a note on the recordings in which a sample is no finite number, if there are any."""
+    is_missing = ~np.isfinite(data.X.reshape(len(data), -1))
+    rows = np.flatnonzero(is_missing.any(axis=1))
+    if not len(rows):
+        return []
+    names = [f"trace {i + 1}" for i in rows] if data.source is None else data.source[rows]
+    text = f"{int(is_missing.sum())} samples are not finite, for cells are empty or hold no number"
+    return [f"{text}, in {len(rows)} of {len(data)} recordings: {listed(names)}."]
 
 
 def _find_reader(
@@ -396,11 +411,9 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         if "scale" in arrays:
             X = X.astype(np.float32) * arrays["scale"].astype(np.float32)
         about: dict[str, Any] = {key: arrays.get(key) for key in ("cause", "rates")}
-        if "rate_hz" in arrays:
-            about["rate_hz"] = float(arrays["rate_hz"])
+        about["rate_hz"] = float(arrays["rate_hz"]) if "rate_hz" in arrays else None
         names = tuple(map(str, arrays.get("channels", ())))
-        stated_units = map(str, np.atleast_1d(arrays.get("unit", "")).tolist())
-        about["unit"] = ", ".join(stated_units) or guess_unit(names or channels)
+        about["unit"] = _unit_in(arrays) or guess_unit(names or channels)
         if len(channels) == 1 and X.ndim == 3:  # it is the name of an array of several channels
             channels = ()
             options = replace(options, channels=())
@@ -409,8 +422,22 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         data = _from_arrays(X, arrays[label], options, name, label_column, **about)
         data = _refit_without_padding(data, options, has_unit="unit" in arrays)
     read = {label, *traces, options.part, *lengths, *ARRAYS, *SIMULATED, *arrays}
-    notes = _turned_notes(next(iter(named.values())), read, label, arrays[label])
-    return replace(data, notes=(*data.notes, *notes, *_archive_notes(data, all_names, read)))
+    turned = _turned_notes(next(iter(named.values())), read, label, arrays[label])
+    notes = (*data.notes, *turned, *_unit_notes(arrays, options, data.channels))
+    return replace(data, notes=(*notes, *_archive_notes(data, all_names, read)))
+
+
+def _unit_in(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Return the unit that an archive states, or one for each channel; "" for none."""
+    return ", ".join(map(str, np.atleast_1d(arrays.get("unit", "")).tolist()))
+
+
+def _unit_notes(
+    arrays: Mapping[str, NDArray[Any]], options: LoadOptions, channels: Sequence[str]
+) -> list[str]:
+    """Return notes on the channels whose unit nobody stated, and a word for a force tells."""
+    is_stated = bool(options.unit or _unit_in(arrays))
+    return [] if is_stated else [f"{note}." for note in assumed_unit_notes(channels)]
 
 
 def _turned_notes(path: Path, read: Collection[str], label: str, labels: NDArray[Any]) -> list[str]:

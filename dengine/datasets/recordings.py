@@ -131,7 +131,8 @@ def read_recording(
 
 
 def _part_in(table: TextTable, path: Path, options: LoadOptions, notes: Counter[str]) -> str | None:
-    """Return the part that a column or a line of a recording states, or a small file beside it.
+    """Return the part that a column or a line of a recording states, a small file beside it, or the
+    group of a pattern in its path.
 
     None with a note if it is not there or empty; also if the user did not state where the part is,
     or a file of labels tells it. Raises UnreadableError if the column has several.
@@ -139,6 +140,8 @@ def _part_in(table: TextTable, path: Path, options: LoadOptions, notes: Counter[
     if options.part == "part" or options.labels is not None:
         return None
     fields = {**table.fields, **fields_beside(path)}
+    if match := re.search(options.part, path.as_posix()) if "(" in options.part else None:
+        return match[1]
     columns = {*fields, *table.frame}
     names = [options.part] if options.part in columns else options.part_columns[1:]
     texts = list[str]()

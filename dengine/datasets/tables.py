@@ -251,7 +251,7 @@ def _join_listing(
         if options.part not in table.frame:
             samples = max(numbered_columns(table.frame.columns).values(), key=len)
             others = table.frame.drop(columns=[name for _, name in samples])
-            likely = next((name for name in others if others[name].is_unique), "Serial")
+            likely = _column_in_listing(others, str(options.labels))
             wanted = f"the column of parts that the file of labels names, as in part={likely!r}"
             raise DataError(f"Expected {wanted}, found {listed(others.columns)}.")
         for _, part, read in wide_rows(table, options, collector, source):
@@ -261,6 +261,16 @@ def _join_listing(
     listing = labels.labels_in_file(str(options.labels), list(read_of_part), listed_by)
     labels.collect_recordings(read_of_part, lambda read: read(), listing, collector)
     return as_dataset(collector, options)
+
+
+def _column_in_listing(frame: pd.DataFrame, listing: str) -> str:
+    """Return the column with most values that a listing names too, without leading zeros."""
+    rows = read_table(Path(listing), LoadOptions(), as_text=True).frame
+    names = {str(cell).lstrip("0") for cell in rows.to_numpy(dtype=object).ravel()}
+    n_named = {
+        column: sum(str(cell).lstrip("0") in names for cell in frame[column]) for column in frame
+    }
+    return max(n_named, key=n_named.__getitem__, default="Serial")
 
 
 def _check_columns(frame: pd.DataFrame, source: str) -> None:

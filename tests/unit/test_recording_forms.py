@@ -713,9 +713,9 @@ def test_what_is_not_finite_is_named_by_its_file(tmp_path: Path) -> None:
         cells = texts()
         cells[5] = "" if name == "b_OK.csv" else cells[5]
         write(tmp_path / name, ["time", "FZ"], times(), cells)
-    assert "Not finite, because cells are empty or hold no number: b_OK.csv." in " ".join(
-        dengine("data", tmp_path).stdout.split()
-    )
+    note = "1 samples are not finite, for cells are empty or hold no number, in 1 of 2 recordings:"
+    assert f"{note} b_OK.csv." in " ".join(dengine("data", tmp_path).stdout.split())
+    assert f"{note} b_OK.csv." in load_dataset(tmp_path).notes
 
 
 WRITERS: dict[str, Callable[[Path], object]] = {

@@ -2660,7 +2660,7 @@ def test_a_long_table_whose_times_cannot_be_read_is_read_without_them(
     path = write_rows(tmp_path / "long.csv", rows)
     with pytest.raises(DataError, match="time='none' and a stated rate"):
         load_dataset(path, **LONG)
-    data = load_dataset(path, part="part", time="none", rate_hz=100)
+    data = load_dataset(path, part="part", time="none", rate_hz=100, unit="N")
     np.testing.assert_array_equal(data.X, small.X)
     assert data.notes == ()
 
@@ -3636,7 +3636,7 @@ def test_parts_stay_in_order_where_summer_time_ends_within_or_between_them(
         data = load_dataset(source, **NIGHT)
         assert (data.rate_hz, data.faults) == (100.0, ())
         np.testing.assert_allclose(data.X, small.X)
-        assert len(data.notes) == 1
+        assert len(data.notes) == 2  # the other says that newtons are assumed
         assert re.search(r"an hour later from line \d+ on, where summer time ends", data.notes[0])
 
 
@@ -4128,3 +4128,33 @@ def test_a_last_row_that_is_cut_off_is_not_taken_for_a_cell_that_is_empty(
     data = load_dataset(folder, channel="force", samples=199, fit="cut")
     np.testing.assert_allclose(data.X, forces[:, :199])
     assert any("cut off" in note for note in data.notes)
+
+
+def test_files_with_one_number_in_their_names_are_named_and_may_be_one_part(
+    make_data, tmp_path: Path
+) -> None:
+    data = make_data(20, samples=40)
+    for i, (trace, label) in enumerate(zip(data.X, data.y, strict=True)):
+        serial = 7 if i == 8 else i
+        write_csv(tmp_path / f"SN{serial:04}_08{i:02}_{'OK' if label else 'NOK'}.csv", trace)
+    notes = " ".join(load_dataset(tmp_path).notes)
+    assert "One number stands in the names of SN0007_0807_" in notes
+    assert r"part='SN(\d+)' takes them as of one part" in notes
+    loaded = load_dataset(tmp_path, part=r"SN(\d+)")
+    assert loaded.part is not None
+    assert (loaded.part == "0007").sum() == 2
+    assert "1 part has several recordings: 0007." in loaded.notes
+
+
+@pytest.mark.parametrize(("channel", "is_assumed"), [("Kraft", True), ("FZ_Base", False)])
+def test_a_note_says_that_newtons_are_assumed_for_a_word_for_a_force(
+    channel: str, is_assumed: bool, make_data, tmp_path: Path
+) -> None:
+    data = make_data(8, samples=40)
+    for i, (trace, label) in enumerate(zip(data.X, data.y, strict=True)):
+        path = write_csv(tmp_path / f"{i}_{bool(label)}.csv", trace)
+        path.write_text(path.read_text().replace("FZ_Base", channel))
+    loaded = load_dataset(tmp_path)
+    assert loaded.unit == "N"
+    assert any("N of Kraft is assumed" in note for note in loaded.notes) == is_assumed
+    assert not any("assumed" in note for note in load_dataset(tmp_path, unit="kN").notes)
