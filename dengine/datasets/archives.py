@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..errors import DataError, listed
 from ..files import read_archive, read_errors
 from ..traces import is_time_column
-from . import labels
+from . import label_names, labels, listings
 from .clocks import UNSURE_RATE, rate_of_scalar
 from .columns import choose_channels
 from .dataset import (
@@ -84,7 +84,7 @@ def hold_one_each(named: Mapping[str, Path], options: LoadOptions) -> bool:
     dimensions = max(np.squeeze(x).ndim for x in traces)
     has_label = label is not None
     with suppress(UnreadableError):
-        labels.labels_in_names(None, options.words).find(next(iter(named)))
+        label_names.labels_in_names(None, options.words).find(next(iter(named)))
         has_label = True
     return dimensions == 1 or (dimensions == 2 and has_label)
 
@@ -208,13 +208,13 @@ def _label_source(named: Mapping[str, Path], options: LoadOptions) -> labels.Lab
     """
     others = []
     if options.label is None:
-        others = [labels.labels_in_names(None, options.words)]
+        others = [label_names.labels_in_names(None, options.words)]
     if options.labels is not None:
-        listing = labels.labels_in_file(options.labels, list(named), options)
+        listing = listings.labels_in_file(options.labels, list(named), options)
         return labels.labels_that_agree(listing, others, listing.trust)
     array = options.label or LABEL
     if array not in read_archive(next(iter(named.values())), ())[1]:
-        return labels.labels_in_names(options.label, options.words)
+        return label_names.labels_in_names(options.label, options.words)
     notes = Counter[str]()
     column = labels.LabelColumn(array, options.words, notes)
     place = f"its array {array}"

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, listed
 from ..files import UNREADABLE, check_size, read_errors
-from . import labels
+from . import labels, listings
 from .columns import natural_key
 from .dataset import (
     Dataset,
@@ -431,7 +431,7 @@ def _cut_dataset(
         options = replace(options, part="part")
     insertions = dict(zip(names, cuts, strict=True))
     if options.labels is not None:
-        source = labels.labels_in_file(options.labels, names, options)
+        source = listings.labels_in_file(options.labels, names, options)
     else:
         source = _labels_in_topic(options, messages, cuts, names)
     collector = RecordingCollector(name, channels, order="as in the bag")

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import DataError, listed
 from ..traces import is_time_column
-from . import labels, units
+from . import label_names, labels, listings, units
 from .cells import fields_beside, split_cells
 from .clocks import (
     is_rate_column,
@@ -246,7 +246,7 @@ def are_tables(named: Mapping[str, Path], heads: FolderHeads, options: LoadOptio
     if options.labels is not None:
         return False
     with suppress(DataError):
-        source = labels.labels_in_names(options.label, options.words)
+        source = label_names.labels_in_names(options.label, options.words)
         for name in named:
             source.find(name)
         return False
@@ -455,7 +455,7 @@ def _leave_out_copies(collector: RecordingCollector) -> None:
     reasons = {}
     for i, recording in enumerate(collector.recordings):
         path = PurePosixPath(recording.source)
-        stem = labels.COPY_PREFIX.sub("", labels.COPY_SUFFIX.sub("", path.stem))
+        stem = labels.COPY_PREFIX.sub("", label_names.COPY_SUFFIX.sub("", path.stem))
         name = str(path.with_stem(stem or path.stem))
         original = recordings.get(name, recording)
         is_copy = original is not recording and original.label == recording.label
@@ -494,7 +494,7 @@ def _check_words_in_names(named: Mapping[str, Path], options: LoadOptions) -> No
     """Raise DataError if the names of a folder's files have label words of unknown meaning."""
     if options.labels is None:
         collector = RecordingCollector("the files' names", ())
-        source = labels.labels_in_names(options.label, options.words)
+        source = label_names.labels_in_names(options.label, options.words)
         with suppress(DataError):
             labels.collect_recordings(named, read_nothing, source, collector)
         collector.check_label_words()
@@ -513,21 +513,21 @@ def _label_source(
     All columns are returned, also if the source is another one. Only where `options.label` is the
     source it is that column alone, or none for a pattern.
     """
-    in_names = labels.labels_in_names(None, options.words)
+    in_names = label_names.labels_in_names(None, options.words)
     if options.labels is not None:
-        listing = labels.labels_in_file(options.labels, list(named), options)
+        listing = listings.labels_in_file(options.labels, list(named), options)
         columns = _verdict_columns(named, heads, options)
         if options.label is not None:
             return listing, columns
         sources = [labels.labels_in_column(named, column, options) for column in columns]
         # Numbers among the user's words are the listing's, not the numbers of files.
         words = {word: good for word, good in options.words.items() if not word.isdecimal()}
-        sources.append(labels.labels_in_names(None, words))
+        sources.append(label_names.labels_in_names(None, words))
         return labels.labels_that_agree(listing, sources, listing.trust), columns
     if options.label in heads.label_places:
         return labels.labels_in_column(named, options.label, options), [options.label]
     if options.label is not None:
-        return labels.labels_in_names(options.label, options.words), []
+        return label_names.labels_in_names(options.label, options.words), []
     columns = _verdict_columns(named, heads, options)
     has_names = not set(count_labels(named, in_names)) <= {None, ""}
     if not has_names:
@@ -588,7 +588,7 @@ def _label_file_advice(folder: Path, named: Mapping[str, Path], options: LoadOpt
         if words.isdisjoint(stems - {path.stem.lower()}):
             continue
         with suppress(DataError):
-            source = labels.labels_in_file(path, list(named), options)
+            source = listings.labels_in_file(path, list(named), options)
             if look_like_labels(count_labels(named, source)):
                 return f"{path.name} names files: give it, labels={str(path)!r}"
     return None
@@ -606,7 +606,7 @@ def _label_advice(
     """
     suggestions = [
         (count_labels(named, source), f"{condition}, say so: {do}")
-        for condition, do, source in labels.suggest_label_sources(list(named), options.words)
+        for condition, do, source in label_names.suggest_label_sources(list(named), options.words)
     ]
     counts, advice = max(suggestions, key=lambda suggestion: -suggestion[0][None])
     if look_like_labels(counts) and counts[0] and counts[1]:

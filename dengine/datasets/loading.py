@@ -55,13 +55,8 @@ from .dataset import (
     unknown_unit_note,
 )
 from .folders import are_tables, find_recordings, read_folder, read_heads
-from .labels import (
-    LabelColumn,
-    label_of,
-    listing_to_trust,
-    parse_label_map,
-    read_ordered_labels,
-)
+from .labels import LabelColumn, label_of, parse_label_map
+from .listings import listing_to_trust, read_ordered_labels
 from .tables import from_frame, read_tables
 from .text import SUFFIXES as TEXTS
 from .triggers import Trigger

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
-from . import labels, units
+from . import labels, listings, units
 from .clocks import (
     ANY_ORDER,
     HEAD,
@@ -546,7 +546,7 @@ def _label_source_of_parts(
     if options.labels is not None:
         listed_by = replace(options, part="part")
         listing = (
-            labels.labels_in_file(options.labels, list(rows_of_part), listed_by)
+            listings.labels_in_file(options.labels, list(rows_of_part), listed_by)
             if windows is None
             else windows.label_source()
         )
@@ -784,7 +784,7 @@ def _parts_file_advice(parts: pd.Series, label_file: str, options: LoadOptions) 
     names = [str(part) for part in parts.unique()]
     with suppress(DataError):
         listed_by = replace(options, part="part", label=None)
-        source = labels.labels_in_file(label_file, names, listed_by)
+        source = listings.labels_in_file(label_file, names, listed_by)
         if look_like_labels(count_labels(names, source)):
             return f"labels={label_file!r}, a file of parts and labels"
     return "and a CSV file of parts and labels (labels)"

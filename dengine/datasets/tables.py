@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import DataError, listed
-from . import labels
+from . import labels, listings
 from .clocks import rate_in_cell
 from .columns import MIN_NUMBERED, numbered_columns
 from .containers import (
@@ -258,7 +258,7 @@ def _join_listing(
             n_rows[part] += 1
             read_of_part[part if n_rows[part] == 1 else f"{part} ({n_rows[part]})"] = read
     listed_by = replace(options, part="part")
-    listing = labels.labels_in_file(str(options.labels), list(read_of_part), listed_by)
+    listing = listings.labels_in_file(str(options.labels), list(read_of_part), listed_by)
     labels.collect_recordings(read_of_part, lambda read: read(), listing, collector)
     return as_dataset(collector, options)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, listed
 from ..traces import is_time_column
-from . import labels, units
+from . import label_names, labels, units
 from .clocks import (
     NO_CLOCK,
     clock_of,
@@ -138,7 +138,7 @@ def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable
     if not is_rising(times.to_numpy(dtype=np.float64)) or not numbers[is_sample].any().all():
         return table
     about = frame[~is_sample].set_index(first).T
-    in_names = labels.labels_in_names(None, options.words)
+    in_names = label_names.labels_in_names(None, options.words)
     label_counts = count_labels(frame.columns[1:], in_names)
     has_names = label_counts[None] < len(about) / 2
     unique = about.loc[:, about.columns.duplicated(keep=False) ^ True]

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from ..errors import DataError, listed
 from .clocks import DATE, HOUR, TIME_OF_DAY, join_date_and_time, times_of
 from .dataset import LoadOptions, UnreadableError
-from .labels import LISTS, LabelSource, labels_in_file, normalized
+from .labels import LISTS, LabelSource, normalized
+from .listings import labels_in_file
 from .text import read_table
 
 if TYPE_CHECKING:

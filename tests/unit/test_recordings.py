@@ -16,7 +16,8 @@ import pytest
 
 from dengine import DataEngine, Dataset, TraceSpec, load_dataset
 from dengine.datasets.importing import import_labelled
-from dengine.datasets.labels import labels_in_names, means_bad, parse_label_map
+from dengine.datasets.label_names import labels_in_names
+from dengine.datasets.labels import means_bad, parse_label_map
 from dengine.errors import DataError, TraceError, as_options
 from tests.support.command_line import document, line_of
 from tests.support.recording_forms import LABEL_FORMS, NOT_CHECKED_NAMES
