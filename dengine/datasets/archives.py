@@ -21,18 +21,11 @@ from ..errors import DataError, listed
 from ..files import read_archive, read_errors
 from ..traces import is_time_column
 from . import label_names, labels, listings
+from .assembly import as_dataset
 from .clocks import UNSURE_RATE, rate_of_scalar
+from .collector import Reading, Recording, RecordingCollector
 from .columns import choose_channels
-from .dataset import (
-    Dataset,
-    Fault,
-    LoadOptions,
-    Reading,
-    Recording,
-    RecordingCollector,
-    UnreadableError,
-    as_dataset,
-)
+from .dataset import Dataset, Fault, LoadOptions, UnreadableError
 from .recordings import rows_to_trace
 
 if TYPE_CHECKING:

@@ -22,18 +22,10 @@ from numpy.typing import NDArray
 from ..errors import DataError, listed
 from ..files import UNREADABLE, check_size, read_errors
 from . import labels, listings
+from .assembly import as_dataset
+from .collector import Reading, Recording, RecordingCollector
 from .columns import natural_key
-from .dataset import (
-    Dataset,
-    Fault,
-    LoadOptions,
-    Reading,
-    Recording,
-    RecordingCollector,
-    UnreadableError,
-    as_dataset,
-    expect_data,
-)
+from .dataset import Dataset, Fault, LoadOptions, UnreadableError, expect_data
 from .triggers import MAX_STEP, Active, Start, StartFinder, Trigger, as_trigger, place
 from .windows import Windows, read_windows
 

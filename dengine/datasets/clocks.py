@@ -29,6 +29,7 @@ NO_CLOCK = "none"  # what the user states as the clock of recordings whose times
 MAX_GAP = 5.0  # median steps: a longer pause is no late message
 EVEN_TOLERANCE = 0.1  # steps: times that are less off even ones are read as even
 WRONG_RATE = 1.2  # times longer or shorter than by the clock: then the stated rate is wrong
+MAX_LOST = 4  # samples on end that are interpolated: a longer gap may hold the peak
 MAX_MISSING = 0.03  # of the rows of a recording whose samples are taken as even
 LONG_STEP = 3.0  # median steps: a message of a regular clock comes less late
 MIN_LONG = 3  # such steps at least, where values are stored on a change

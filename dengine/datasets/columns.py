@@ -14,16 +14,8 @@ import numpy as np
 from ..errors import DataError, listed
 from ..traces import is_time_column
 from . import labels, units
-from .dataset import (
-    MAX_LABEL_WORDS,
-    LoadOptions,
-    Recording,
-    RecordingCollector,
-    UnknownWordError,
-    UnlabelledError,
-    UnreadableError,
-    label_map_of,
-)
+from .collector import MAX_LABEL_WORDS, Recording, RecordingCollector, label_map_of
+from .dataset import LoadOptions, UnknownWordError, UnlabelledError, UnreadableError
 from .headers import TextCells
 from .text import is_mostly_numbers
 
@@ -48,6 +40,7 @@ STATION = re.compile(
 UNIT_COLUMN = re.compile(
     r"(.*\W)?\w*(units?|einheit|uom|unit[éà]|unidad|単位|单位|단위)", re.IGNORECASE
 )
+UNIT_WORD = re.compile(r"[^\W\d_]{1,6}([ .·*/-]?[^\W\d_]{1,6}){0,2}")
 
 
 def read_nothing(_place: Any) -> Recording:
@@ -160,7 +153,8 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 def unit_columns(frame: pd.DataFrame) -> dict[str, dict[int, str]]:
     """Return the column that states units, with the unit of each line that it is filled in.
 
-    The result is empty if no column does, and if several do, for these are of several signals.
+    In a column of units of a force or torque, any short word is one. The result is empty if no
+    column states units, and if several do, for these are of several signals.
     """
     result = {
         str(name): cells[cells.notna() & (cells != "")].astype(str).to_dict()
@@ -170,7 +164,11 @@ def unit_columns(frame: pd.DataFrame) -> dict[str, dict[int, str]]:
     result = {
         name: cells
         for name, cells in result.items()
-        if cells and all(map(units.parse, cells.values()))
+        if cells
+        and (
+            all(map(units.parse, cells.values()))
+            or (units.is_force(name) and all(map(UNIT_WORD.fullmatch, cells.values())))
+        )
     }
     return result if len(result) == 1 else {}
 

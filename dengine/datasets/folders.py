@@ -20,11 +20,13 @@ import numpy as np
 from ..errors import DataError, listed
 from ..traces import is_time_column
 from . import label_names, labels, listings, units
+from .assembly import as_dataset
 from .cells import fields_beside, split_cells
 from .clocks import (
     is_rate_column,
     place_of_clock,
 )
+from .collector import Recording, RecordingCollector
 from .columns import (
     FORCE,
     MIN_NUMBERED,
@@ -50,15 +52,7 @@ from .containers import (
     suffix_of,
     unpack_errors,
 )
-from .dataset import (
-    Dataset,
-    LoadOptions,
-    Recording,
-    RecordingCollector,
-    UnlabelledError,
-    UnreadableError,
-    as_dataset,
-)
+from .dataset import Dataset, LoadOptions, UnlabelledError, UnreadableError
 from .encodings import decode, missing_name
 from .headers import TextCells
 from .long_tables import long_table_advice

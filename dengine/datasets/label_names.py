@@ -13,6 +13,7 @@ from ..errors import DataError, instead
 from .dataset import UnknownWordError, UnlabelledError, UnreadableError, expect_data
 from .labels import (
     BAD,
+    FILE_SUFFIX,
     GOOD,
     NO_WORDS,
     NOT,
@@ -85,9 +86,13 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
     wanted = "one group in the label's pattern, as in '_(OK|NOK)_'"
     expect_data(expression.groups == 1, wanted, pattern)
 
+    def search(name: str) -> re.Match[str] | None:
+        """Search a path, and without a match the path without its suffix."""
+        return expression.search(name) or expression.search(FILE_SUFFIX.sub("", name))
+
     def find(name: str) -> SourcedLabel:
         """Return the label that the pattern finds in a path."""
-        match = expression.search(name)
+        match = search(name)
         if match is None or match[1] is None:
             wanted = f"a label where the pattern {pattern} finds it"
             raise UnreadableError(f"Expected {wanted}, found none")
@@ -95,7 +100,7 @@ def labels_in_names(pattern: str | None = None, words: LabelMap = NO_WORDS) -> L
 
     def without_label(name: str) -> str:
         """Return a path without what the pattern finds in it."""
-        match = expression.search(name)
+        match = search(name)
         if match is None or match[1] is None:
             return name
         return name[: match.start(1)] + name[match.end(1) :]

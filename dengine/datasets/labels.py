@@ -29,19 +29,21 @@ from ..errors import DataError, listed
 from . import units
 from .cells import fields_beside
 from .clocks import EMPTY_CELLS
-from .dataset import (
+from .collector import (
     MAX_LABEL_WORDS,
     MEANINGS,
-    Fault,
-    LoadOptions,
     Reading,
     Recording,
     RecordingCollector,
+    label_map_of,
+)
+from .dataset import (
+    Fault,
+    LoadOptions,
     UnknownWordError,
     UnlabelledError,
     UnreadableError,
     expect_data,
-    label_map_of,
 )
 from .recordings import column_place
 from .text import read_table
@@ -54,6 +56,7 @@ MEANING = {
     **dict.fromkeys((*GOOD, "yes", "io", "1"), True),
     **dict.fromkeys((*BAD, "no", "0"), False),
 }
+FILE_SUFFIX = re.compile(r"\.[A-Za-z]\w{1,5}$")
 UNCHECKED = (*EMPTY_CELLS, *LISTS["unchecked"])
 COPY_PREFIX = re.compile(r"^(copy of|kopie von|copie de) ", re.IGNORECASE)
 NOT = r"(?P<not>(?i:not|non|no|nicht)[\W_]*)?"

@@ -14,16 +14,11 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import DataError, listed
+from .collector import MAX_LABEL_WORDS
 from .containers import PACKED
-from .dataset import (
-    MAX_LABEL_WORDS,
-    Fault,
-    LoadOptions,
-    UnknownWordError,
-    UnlabelledError,
-    UnreadableError,
-)
+from .dataset import Fault, LoadOptions, UnknownWordError, UnlabelledError, UnreadableError
 from .labels import (
+    FILE_SUFFIX,
     LABEL_COLUMNS,
     LISTS,
     LabelColumn,
@@ -41,7 +36,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEADING_ZEROS = re.compile(r"(?<=_)0+(?=\d)")
-FILE_SUFFIX = re.compile(r"\.[A-Za-z]\w{1,5}$")
 AGAIN = re.compile(r"(.*\w)(?:[._-]\d| ?\(\d+\))((?:\.[^\W\d]\w*)?)")  # SN12.1, SN12 (2).csv
 # A long number as a spreadsheet saves it, without its last digits: 2,40311E+11.
 SHORTENED = re.compile(r"\d([.,]\d{0,8})?[eE]\+(09|[1-9]\d)")

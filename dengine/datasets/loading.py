@@ -26,33 +26,32 @@ from ..records import stored_trace_spec
 from ..traces import as_trace, as_traces, is_time_column, spec_of
 from . import units
 from .archives import find_whole, hold_one_each, read_archive_each
-from .bags import is_stream, read_bag
-from .clocks import clock_of, rate_of, rate_of_scalar, stated_rate
-from .columns import FORCE
-from .containers import HEAD, JSON, NPZ, PARQUET, binary_kind, is_text, suffix_of
-from .dataset import (
+from .assembly import (
     UNKNOWN_RATE,
-    Dataset,
-    LoadOptions,
-    Reading,
-    Recording,
-    RecordingCollector,
-    UnknownWordError,
-    UnlabelledError,
-    UnreadableError,
     as_dataset,
     assumed_unit_notes,
     describe_ends,
-    describe_reading,
-    expect_data,
     guess_unit,
     leave_out_repeats,
-    make_dataset,
     odd_labels_note,
     refit,
+    unknown_unit_note,
+)
+from .bags import is_stream, read_bag
+from .clocks import clock_of, rate_of, rate_of_scalar, stated_rate
+from .collector import Reading, Recording, RecordingCollector, describe_reading
+from .columns import FORCE
+from .containers import HEAD, JSON, NPZ, PARQUET, binary_kind, is_text, suffix_of
+from .dataset import (
+    Dataset,
+    LoadOptions,
+    UnknownWordError,
+    UnlabelledError,
+    UnreadableError,
+    expect_data,
+    make_dataset,
     split_names,
     split_unit,
-    unknown_unit_note,
 )
 from .folders import are_tables, find_recordings, read_folder, read_heads
 from .labels import LabelColumn, label_of, parse_label_map

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, listed
 from . import labels, listings, units
+from .assembly import as_dataset
 from .clocks import (
     ANY_ORDER,
     HEAD,
@@ -30,6 +31,7 @@ from .clocks import (
     seconds_of,
     times_of,
 )
+from .collector import Recording, RecordingCollector
 from .columns import (
     MAX_STATIONS,
     STATION,
@@ -47,16 +49,7 @@ from .columns import (
     unit_columns,
     with_label_error,
 )
-from .dataset import (
-    Dataset,
-    Fault,
-    LoadOptions,
-    Recording,
-    RecordingCollector,
-    UnreadableError,
-    as_dataset,
-    expect_data,
-)
+from .dataset import Dataset, Fault, LoadOptions, UnreadableError, expect_data
 from .recordings import column_of_count, rows_to_trace
 from .scales import factors_in_columns
 from .text import TextTable, is_mostly_numbers

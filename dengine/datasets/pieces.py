@@ -17,8 +17,9 @@ import numpy as np
 from ..errors import DataError, listed
 from . import labels, units
 from .clocks import EMPTY_CELLS, floats
+from .collector import RecordingCollector
 from .curves import curve_columns, split_curve
-from .dataset import Fault, LoadOptions, RecordingCollector
+from .dataset import Fault, LoadOptions
 from .text import TextTable
 
 if TYPE_CHECKING:

@@ -20,6 +20,7 @@ from ..traces import is_time_column
 from . import units
 from .cells import CELL_MARK, fields_beside
 from .clocks import (
+    MAX_LOST,
     MAX_MISSING,
     NO_CLOCK,
     SUMMER_TIME,
@@ -42,7 +43,8 @@ from .clocks import (
     start_of,
     varies_all_along,
 )
-from .dataset import Fault, LoadOptions, Reading, Recording, UnreadableError
+from .collector import Reading, Recording
+from .dataset import Fault, LoadOptions, UnreadableError
 from .headers import COUNTER_NAME, is_value
 from .scales import factors_in_columns
 from .text import RATE_ABOVE, TextTable, parse_numbers, read_table
@@ -50,7 +52,6 @@ from .text import RATE_ABOVE, TextTable, parse_numbers, read_table
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_LOST = 4  # samples on end that are interpolated: a longer gap may hold the peak
 # A word for a sample beyond the range of its sensor or amplifier, as OVERFLOW, OL or +++++++.
 OVER_RANGE = re.compile(
     r"over|ov[fl]|\bo\.?[lvf]\b|exceed|range|satur|clip|[üu]e?ber(lauf|last|steuer|schr)|bereich"
@@ -139,9 +140,12 @@ def _part_in(table: TextTable, path: Path, options: LoadOptions, notes: Counter[
     """
     if options.part == "part" or options.labels is not None:
         return None
+    if "(" in options.part:
+        match = re.search(options.part, path.stem) or re.search(options.part, path.as_posix())
+        if match is None:
+            notes[f"No part is where {options.part} finds it: each such file is one"] += 1
+        return match[1] if match else None
     fields = {**table.fields, **fields_beside(path)}
-    if match := re.search(options.part, path.as_posix()) if "(" in options.part else None:
-        return match[1]
     columns = {*fields, *table.frame}
     names = [options.part] if options.part in columns else options.part_columns[1:]
     texts = list[str]()

@@ -19,20 +19,14 @@ import numpy as np
 
 from ..errors import DataError, listed
 from . import labels, listings
+from .assembly import as_dataset
 from .clocks import rate_in_cell
+from .collector import Recording, RecordingCollector
 from .columns import MIN_NUMBERED, numbered_columns
 from .containers import (
     number_rows,
 )
-from .dataset import (
-    Dataset,
-    Fault,
-    LoadOptions,
-    Recording,
-    RecordingCollector,
-    UnreadableError,
-    as_dataset,
-)
+from .dataset import Dataset, Fault, LoadOptions, UnreadableError
 from .long_tables import concatenate_long, cut_by_windows, from_long, long_table_advice, unwrap_ring
 from .recordings import cut_note
 from .text import TextTable, read_table, with_part

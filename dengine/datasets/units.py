@@ -162,6 +162,11 @@ def _quantity(channel: str) -> str:
     return "N" if FORCE_NAME.fullmatch(channel) else ""
 
 
+def is_force(name: str) -> bool:
+    """Return whether a name has a word for a force or a torque, in one of several languages."""
+    return any(word in name.lower() for word in FORCES)
+
+
 def factor(unit: str, other: str) -> float | None:
     """Return the factor that converts numbers in one unit to another; None if there is none.
 

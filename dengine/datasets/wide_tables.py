@@ -23,6 +23,7 @@ from .clocks import (
     rate_in_cell,
     rate_of,
 )
+from .collector import MAX_LABEL_WORDS, Reading, Recording, RecordingCollector
 from .columns import (
     MAX_STATIONS,
     MIN_NUMBERED,
@@ -35,15 +36,7 @@ from .columns import (
     unit_columns,
 )
 from .curves import expand_curves
-from .dataset import (
-    MAX_LABEL_WORDS,
-    Fault,
-    LoadOptions,
-    Reading,
-    Recording,
-    RecordingCollector,
-    UnreadableError,
-)
+from .dataset import Fault, LoadOptions, UnreadableError
 from .pieces import join_pieces
 from .scales import may_scale, operation, stated_factors
 from .text import SPREADSHEET_DATE, TextTable, is_mostly_numbers, parse_numbers

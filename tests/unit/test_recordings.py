@@ -4159,3 +4159,72 @@ def test_a_note_says_that_newtons_are_assumed_for_a_word_for_a_force(
     assert loaded.unit == "N"
     assert any("N of Kraft is assumed" in note for note in loaded.notes) == is_assumed
     assert not any("assumed" in note for note in load_dataset(tmp_path, unit="kN").notes)
+
+
+def write_json(folder: Path, data: Dataset, **fields: Any) -> None:
+    for i, (trace, label) in enumerate(zip(data.X, data.y, strict=True)):
+        record = {
+            "serial": f"T{i:03}",
+            "torque": trace.tolist(),
+            "result": "OK" if label else "NOK",
+        }
+        for key, values in fields.items():
+            record[key] = values[i % len(values)]
+        (folder / f"{i:03}.json").write_text(json.dumps(record))
+
+
+def test_a_torque_in_pounds_is_converted_and_one_in_an_unknown_unit_is_left_out(
+    make_data, tmp_path: Path
+) -> None:
+    data = make_data(20, samples=40)
+    write_json(tmp_path, data, torqueUnit=["Nm", "Nm", "lbf.in", "Nm"], rate_hz=[500])
+    loaded = load_dataset(tmp_path, channel="torque")
+    of_pounds = np.arange(20) % 4 == 2
+    assert loaded.unit == "Nm"
+    np.testing.assert_allclose(loaded.X[of_pounds], data.X[of_pounds] * 0.1129848, rtol=1e-5)
+    np.testing.assert_array_equal(loaded.X[~of_pounds], data.X[~of_pounds])
+    write_json(tmp_path, data, torqueUnit=["Nm", "Nm", "foo", "Nm"], rate_hz=[500])
+    for unit in (None, "Nm"):
+        loaded = load_dataset(tmp_path, channel="torque", unit=unit)
+        assert len(loaded) == 15
+        assert all(re.search("in Nm, as .*, got foo$", fault.message) for fault in loaded.faults)
+
+
+def test_recordings_at_half_the_rate_of_the_others_are_put_on_it(make_data, tmp_path: Path) -> None:
+    data = make_data(12, samples=80)
+    for i, (trace, label) in enumerate(zip(data.X, data.y, strict=True)):
+        step = 2 if i % 3 == 0 else 1
+        # 1 / 600 with six decimals is a bit more: less than half of 1,200 Hz
+        rows = [f"{k / 1200:.6f},{trace[k]}" for k in range(0, 80, step)]
+        name = f"{i:02}_{bool(label)}.csv"
+        (tmp_path / name).write_text("\n".join(["Timestamp,FZ_Base", *rows]) + "\n")
+    loaded = load_dataset(tmp_path, fit="resample")
+    assert (len(loaded), loaded.rate_hz, loaded.faults) == (12, 1200.0, ())
+    faults = load_dataset(tmp_path).faults
+    assert len(faults) == 4
+    assert all("fit='resample' puts all on one rate" in fault.message for fault in faults)
+
+
+def test_resampling_fills_short_gaps_between_samples_and_no_long_ones(make_data) -> None:
+    data = make_data(6, samples=60)
+    X = data.X.copy()
+    X[0, 10:14] = X[1, 10:15] = X[2, :3] = np.nan
+    frame = pd.DataFrame(X).add_prefix("FZ_").assign(y=data.y)
+    loaded = load_dataset(frame, fit="resample")
+    line = np.interp(np.arange(10, 14), [9, 14], X[0, [9, 14]])
+    np.testing.assert_allclose(loaded.X[0, 10:14], line, rtol=1e-6)
+    assert np.isnan(loaded.X).sum(axis=1).tolist() == [0, 5, 3, 0, 0, 0]
+    assert "4 missing samples are interpolated, up to 4 on end." in loaded.notes
+    assert np.isnan(load_dataset(frame).X).sum() == 12
+
+
+def test_patterns_of_labels_and_parts_search_the_name_without_its_suffix(
+    make_data, tmp_path: Path
+) -> None:
+    data = make_data(8, samples=40)
+    for i, (trace, label) in enumerate(zip(data.X, data.y, strict=True)):
+        write_csv(tmp_path / f"A{i // 2}_{i}_{'OK' if label else 'NOK'}.csv", trace)
+    loaded = load_dataset(tmp_path, label="_(OK|NOK)$", part=r"^(A\d)_")
+    assert loaded.part is not None
+    assert loaded.part.tolist() == [f"A{i // 2}" for i in range(8)]
+    np.testing.assert_array_equal(loaded.y, data.y)
