@@ -687,8 +687,8 @@ def _stated_unit(name: str, unit: str) -> float | None:
 def rate_of(clock: Clock, lines: pd.Index) -> float:
     """Return the sampling rate in hertz, to four digits, by a clock's usual step.
 
-    That is the median step. If the mean of the steps that are not late differs from it by 0.5 % or
-    more, as for a clock of whole milliseconds, it is this mean.
+    That is the median step, or the mean of the steps that are not late, if these have two lengths,
+    as those of a clock of whole milliseconds, or their mean differs from it by 0.5 % or more.
 
     Parameters
     ----------
@@ -712,8 +712,10 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
     if len(gaps):
         raise _gap_error(clock, step, steps[gaps[0]], lines[int(gaps[0]) + 1])
     # A clock of whole milliseconds steps 4, 4, 5: its mean step tells the rate.
-    mean = float(steps[steps <= LATE_STEP * step].mean())
-    rate = 1.0 / (step if abs(mean - step) < 0.005 * step else mean)
+    in_time = steps[steps <= LATE_STEP * step]
+    mean = float(in_time.mean())
+    is_rounded = len(np.unique(in_time.round(9))) == 2
+    rate = 1.0 / (mean if is_rounded or abs(mean - step) >= 0.005 * step else step)
     span = float(clock.seconds[-1])
     if not (RATES[0] <= rate <= RATES[1] and SPANS[0] <= span <= SPANS[1]):
         rates = f"{RATES[0]:g} Hz to {RATES[1] / 1e6:g} MHz"

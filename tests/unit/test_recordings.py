@@ -4228,3 +4228,15 @@ def test_patterns_of_labels_and_parts_search_the_name_without_its_suffix(
     assert loaded.part is not None
     assert loaded.part.tolist() == [f"A{i // 2}" for i in range(8)]
     np.testing.assert_array_equal(loaded.y, data.y)
+
+
+@pytest.mark.parametrize(("rate_hz", "digits"), [(600, 5), (450, 4), (1200, 6), (300, 3), (500, 3)])
+def test_the_rate_of_a_clock_with_rounded_times_is_that_of_the_whole_recording(
+    rate_hz: int, digits: int, make_data, tmp_path: Path
+) -> None:
+    data = make_data(4, samples=200)
+    for i, (trace, label) in enumerate(zip(data.X, data.y, strict=True)):
+        rows = [f"{k / rate_hz:.{digits}f},{sample}" for k, sample in enumerate(trace)]
+        text = "\n".join(["Timestamp,FZ_Base", *rows]) + "\n"
+        (tmp_path / f"{i}_{bool(label)}.csv").write_text(text)
+    assert load_dataset(tmp_path).rate_hz == pytest.approx(rate_hz, rel=1e-3)
