@@ -402,7 +402,7 @@ def _check_numbers_once(
     if len(again) < 2 or len(again) < FEW_AGAIN * len(rows_of_part):
         return
     wanted = f"one recording for each part, {len(again)} of {len(rows_of_part)} numbers come again"
-    do = "make the parts' numbers unique, as day (or station) and number in one column"
+    do = "add a column of days (or stations), and join it: part='day,number'"
     whole = [name for name in columns if _are_whole(rows_of_part[again[0]][name])]
     for name in filter(None, [date, *whole]):
         all_cells = (rows[name].astype(str) for rows in rows_of_part.values())

@@ -143,6 +143,7 @@ def _from_tables(
         source: table._replace(frame=_with_part(table.frame, options, source))
         for source, table in tables.items()
     }
+    _note_headers(tables, collector)
     tables, options = with_samples_in_columns(tables, options, collector)
     turned = {source: turn_table(table, options, source) for source, table in tables.items()}
     if any(table is not tables[source] for source, table in turned.items()):
@@ -188,6 +189,14 @@ def _without_rate_column(frame: pd.DataFrame, options: LoadOptions) -> LoadOptio
     """Return options without a column of times that states the rate of each row of a wide table."""
     is_rate = rate_in_cell(options.time or "", 1) is not None
     return replace(options, time=None) if is_rate and _is_wide(frame, options) else options
+
+
+def _note_headers(tables: Mapping[str, TextTable], collector: RecordingCollector) -> None:
+    """Add a note on each table in which the header comes again."""
+    for source, table in tables.items():
+        if lines := list(table.blocks)[1:]:
+            text = f"The header of {source} comes again, and is left out there: line"
+            collector.notes[f"{text} {listed(lines)}"] = 1
 
 
 def _is_wide(frame: pd.DataFrame, options: LoadOptions) -> bool:

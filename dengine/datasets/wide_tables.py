@@ -132,7 +132,8 @@ def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable
         return table
     about = frame[~is_sample].set_index(first).T
     in_names = label_names.labels_in_names(None, options.words)
-    label_counts = count_labels(frame.columns[1:], in_names)
+    parts, channel_units = _names_and_units(list(map(str, frame.columns[1:])), table.units[1:])
+    label_counts = count_labels(parts, in_names)
     has_names = label_counts[None] < len(about) / 2
     unique = about.loc[:, about.columns.duplicated(keep=False) ^ True]
     rows = [
@@ -150,9 +151,11 @@ def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable
         return table
     wrong = _wrong_in_columns(frame[is_sample].iloc[:, 1:], source)
     samples = frame[is_sample].iloc[:, 1:].T.set_axis(list(map(str, range(len(times)))), axis=1)
-    wide = pd.concat([about, samples], axis=1).assign(**{options.part: frame.columns[1:]})
+    wide = pd.concat([about, samples], axis=1).assign(**{options.part: parts})
+    if any(channel_units):
+        wide["unit"] = channel_units
     if has_names and not rows:
-        wide["label"] = [_word_in_name(name, in_names) for name in frame.columns[1:]]
+        wide["label"] = [_word_in_name(name, in_names) for name in parts]
     elif rows and options.label is None:
         wide = wide.rename(columns={rows[0]: "label"})
     rate = None
@@ -163,6 +166,20 @@ def turn_table(table: TextTable, options: LoadOptions, source: str) -> TextTable
     clock_text = "the first column, a column for each part"
     table = table._replace(frame=wide, units=[], rate_hz=rate, clock=clock_text)
     return table._replace(column_of=dict(enumerate(frame.columns[1:], start=2)), wrong=wrong)
+
+
+def _names_and_units(
+    columns: Sequence[str], row_of_units: Sequence[str]
+) -> tuple[Sequence[str], list[str]]:
+    """Return the parts that columns are named after, and the unit of each, "" without one.
+
+    A unit stands in a row of units or in the name, as in `P-1001 (N)`, from which it is taken.
+    """
+    bare = [units.split(name)[0] for name in columns]
+    in_names = [units.split(name)[1] for name in columns]
+    if not all(in_names) or len(set(bare)) < len(bare):
+        return columns, list(row_of_units)
+    return bare, in_names
 
 
 def _wrong_in_columns(samples: pd.DataFrame, source: str) -> dict[int, UnreadableError]:

@@ -4240,3 +4240,29 @@ def test_the_rate_of_a_clock_with_rounded_times_is_that_of_the_whole_recording(
         text = "\n".join(["Timestamp,FZ_Base", *rows]) + "\n"
         (tmp_path / f"{i}_{bool(label)}.csv").write_text(text)
     assert load_dataset(tmp_path).rate_hz == pytest.approx(rate_hz, rel=1e-3)
+
+
+def test_a_header_that_comes_again_in_a_long_table_is_left_out_with_a_note(
+    small: Dataset, tmp_path: Path
+) -> None:
+    rows = long_rows(small, lambda v, i, k: str(v))
+    rows.insert(101, rows[0])
+    data = load_dataset(write_rows(tmp_path / "long.csv", rows), **LONG)
+    np.testing.assert_array_equal(data.X, small.X)
+    assert "The header of long.csv comes again, and is left out there: line 102." in data.notes
+
+
+@pytest.mark.parametrize("is_row", [True, False])
+def test_the_unit_of_a_table_with_a_column_per_part_is_in_its_header(
+    is_row: bool, make_data, tmp_path: Path
+) -> None:
+    data = make_data(20, samples=50)
+    names = [f"P{i:02}_{'OK' if label else 'NOK'}" for i, label in enumerate(data.y)]
+    header = ["time_s", *(names if is_row else [f"{name} (kN)" for name in names])]
+    rows = [header, *([["s", *["kN"] * 20]] if is_row else [])]
+    rows += [[str(k / 500), *map(str, data.X[:, k])] for k in range(50)]
+    loaded = load_dataset(write_rows(tmp_path / "columns.csv", rows))
+    assert (loaded.unit, loaded.rate_hz) == ("kN", 500.0)
+    assert loaded.part is not None
+    assert loaded.part.tolist() == names
+    np.testing.assert_array_equal(loaded.X, data.X)
