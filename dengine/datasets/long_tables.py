@@ -52,7 +52,7 @@ from .columns import (
 from .dataset import Dataset, Fault, LoadOptions, UnreadableError, expect_data
 from .recordings import column_of_count, rows_to_trace
 from .scales import factors_in_columns
-from .text import TextTable, is_mostly_numbers
+from .text import TextTable, days_in, is_mostly_numbers
 from .windows import Windows, read_windows
 
 if TYPE_CHECKING:
@@ -242,9 +242,9 @@ def from_long(
     seconds, form = _times_of_long(frame[time], column_units.get(time, ""), collector)
     rows_of_part = _rows_by_part(frame, seconds, options)
     stations = [name for name in others if name not in collector.channels]
-    _check_numbers_once(rows_of_part, stations, first.date, options.part)
-    _check_single_station(rows_of_part, stations, collector.channels, options.part)
     has_dates = holds_dates(frame[time])
+    _check_numbers_once(rows_of_part, stations, first.date or time * has_dates, options.part)
+    _check_single_station(rows_of_part, stations, collector.channels, options.part)
     if not has_dates:
         _check_together(rows_of_part, collector, has_clock=time != ROW_COLUMN)
     places = [frame.columns.get_loc(name) for name in collector.channels]
@@ -388,14 +388,14 @@ def _rows_by_part(
 
 
 def _check_numbers_once(
-    rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str], date: str, part_column: str
+    rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str], dates: str, part_column: str
 ) -> None:
     """Raise DataError if many parts' numbers were used again, as where each shift counts from 1.
 
     Many are two or more, and at least a fifth of all (`FEW_AGAIN`); fewer are not looked at here.
     The error names a column that makes the numbers unique, if there is one.
 
-    columns : that may do so. date : the column of dates to which times of day were joined, or "".
+    columns : that may do so. dates : the column of dates, whose days may do so, or "".
     """
     lines = {part: _line_of_next(rows) for part, rows in rows_of_part.items()}
     again = [part for part, line in lines.items() if line]
@@ -404,9 +404,8 @@ def _check_numbers_once(
     wanted = f"one recording for each part, {len(again)} of {len(rows_of_part)} numbers come again"
     do = "add a column of days (or stations), and join it: part='day,number'"
     whole = [name for name in columns if _are_whole(rows_of_part[again[0]][name])]
-    for name in filter(None, [date, *whole]):
-        all_cells = (rows[name].astype(str) for rows in rows_of_part.values())
-        keys = (cells.str.partition(" ")[0] if name == date else cells for cells in all_cells)
+    for name in filter(None, [dates, *whole]):
+        keys = (days_in(rows[name]) for rows in rows_of_part.values())
         if all(map(_are_single, rows_of_part.values(), keys)):
             do = f"make them unique, part='{name},{part_column}'"
             break

@@ -220,19 +220,24 @@ def read_table(
 def with_part(frame: pd.DataFrame, options: LoadOptions) -> pd.DataFrame:
     """Return a table with a last column of parts that joins the columns of `options.part_columns`.
 
-    The columns "day,number" give parts as `2024-03-12_7`; slashes become dashes, for a listing
-    would take them for folders. A table that has a column of parts, or not all that are to be
-    joined, is returned unchanged.
+    The columns "day,number" give parts as `2024-03-12_7`. Of dates with a time of day the day
+    counts. Slashes become dashes, for a listing would take them for folders. A table that has a
+    column of parts, or not all that are to be joined, is returned unchanged.
     """
     if options.part in frame or not options.has_part(frame) or not frame.columns.is_unique:
         return frame
     pieces = frame[list(options.part_columns[1:])]
-    texts = as_texts(pieces).replace({"/": "-", " 00:00:00$": ""}, regex=True)
+    texts = as_texts(pieces).apply(days_in).replace("/", "-", regex=True)
     joined = texts.iloc[:, 0]
     for name in texts.columns[1:]:
         joined = joined + "_" + texts[name]
     joined = joined.mask((texts == "").any(axis=1), "").mask(pieces.isna().any(axis=1))
     return frame.assign(**{options.part: joined})
+
+
+def days_in(cells: pd.Series) -> pd.Series:
+    """Return the days of a column of dates with times of day; others stay as they are."""
+    return cells.astype(str).replace(rf"^({DATE_FORM})[T ]+\d.*$", r"\1", regex=True)
 
 
 def _lines_above(text: str, line: int) -> str:
