@@ -2,8 +2,8 @@
 type it; only smaller.
 
 Each page has a desk, stores and folders of its own, and runs from top to bottom. A long command
-gets options behind its own, of which the last counts. `make test` runs a page, `make test-merge`
-README and three others, `make test-all` every one.
+gets options behind its own, of which the last counts. `make test` runs two pages, `make test-merge`
+README and two others in one folder, `make test-all` every one.
 """
 
 import json
@@ -23,8 +23,7 @@ import pytest
 
 REPO = Path(__file__).resolve().parents[2]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
-QUICK = "docs/howto/parts.md"
-FOR_MERGE = "docs/howto/own_reducer.md"
+QUICK = {"docs/howto/own_reducer.md", "docs/howto/parts.md"}
 
 SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data insertion": "--repeats 1 --cycles 120",
@@ -202,11 +201,10 @@ def snippet(block: Block, desk: Path) -> None:
 
 
 def typed_pages() -> list:
-    """The pages with something to type; all but one are slow."""
+    """The pages with something to type; those that are not quick are slow."""
     marks = {
-        page: () if name(page) == QUICK else (pytest.mark.slow,) for page in PAGES if blocks(page)
+        page: () if name(page) in QUICK else (pytest.mark.slow,) for page in PAGES if blocks(page)
     }
-    marks[REPO / FOR_MERGE] = (pytest.mark.slow, pytest.mark.merge)
     return [pytest.param(page, marks=mark, id=name(page)) for page, mark in marks.items()]
 
 
