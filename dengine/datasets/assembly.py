@@ -37,7 +37,7 @@ REFERENCE = re.compile(  # in the name of a part with which the station itself i
     r"(part|teil|sample|stück|muster|ungs?teil)?|ref|dummy|einstellmeister)(?![^\W\d_])",
     re.IGNORECASE,
 )
-FORCE_AXIS = re.compile(r"f[xyz]([_ ]base)?", re.IGNORECASE)
+FORCE_AXIS = re.compile(r"f[xyz]([_ ]base)?|.*\bforce[._][xyz]|.*tcp_force(_\d)?", re.IGNORECASE)
 MAX_REFERENCE_SHARE = 0.25  # of all parts
 UNKNOWN_RATE = (
     "The rate is unknown, for nothing tells it: times are in samples until it is stated,"
@@ -473,7 +473,7 @@ def _with_guesses(stated: Sequence[str], collector: RecordingCollector) -> str:
 def assumed_unit_notes(channels: Iterable[str]) -> list[str]:
     """Return notes on channels whose unit is a guess by a word for a force, as Force or Kraft.
 
-    The axes of a robot, as FZ_Base, are in newtons.
+    The axes of a robot, as FZ_Base or wrench.force.z, are in newtons.
     """
     return [
         f"The unit N of {name} is assumed: unit='kN' would state another"

@@ -4148,7 +4148,10 @@ def test_files_with_one_number_in_their_names_are_named_and_may_be_one_part(
     assert "1 part has several recordings: 0007." in loaded.notes
 
 
-@pytest.mark.parametrize(("channel", "is_assumed"), [("Kraft", True), ("FZ_Base", False)])
+@pytest.mark.parametrize(
+    ("channel", "is_assumed"),
+    [("Kraft", True), ("FZ_Base", False), ("actual_TCP_force_2", False), ("wrench.force.z", False)],
+)
 def test_a_note_says_that_newtons_are_assumed_for_a_word_for_a_force(
     channel: str, is_assumed: bool, make_data, tmp_path: Path
 ) -> None:
