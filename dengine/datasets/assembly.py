@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -33,11 +34,10 @@ FEW = 0.1  # of all recordings
 FAR = 50.0  # times the usual largest value: a recording beyond has another unit or is none
 MAX_RATE_RATIO = 5.0  # a recording at a rate further from the others' is not resampled
 REFERENCE = re.compile(  # in the name of a part with which the station itself is checked
-    r"(?<![^\W\d_])((master|meister|einstell|referen[cz]e?|kalibrier|calibration|grenzmuster|golden)"
-    r"(part|teil|sample|stück|muster|ungs?teil)?|ref|dummy|einstellmeister)(?![^\W\d_])",
+    r"(?<![^\W\d_])((master|meister|einstell|referen[cz]e?|kalibrier|calibration|grenzmuster"
+    r"|golden)(part|teil|sample|stück|muster|ungs?teil)?|ref|dummy|einstellmeister)(?![^\W\d_])",
     re.IGNORECASE,
 )
-FORCE_AXIS = re.compile(r"f[xyz]([_ ]base)?|.*\bforce[._][xyz]|.*tcp_force(_\d)?", re.IGNORECASE)
 MAX_REFERENCE_SHARE = 0.25  # of all parts
 UNKNOWN_RATE = (
     "The rate is unknown, for nothing tells it: times are in samples until it is stated,"
@@ -157,9 +157,9 @@ def _note_rows(collector: RecordingCollector) -> None:
 def _note_reference_parts(collector: RecordingCollector) -> None:
     """Add a note on parts that check the press and not the product, by a few words in names."""
     names = [recording.part or recording.source for recording in collector.recordings]
-    found = [name for name in names if REFERENCE.search(name)]
-    if 0 < len(found) < MAX_REFERENCE_SHARE * len(names):
-        text = f"By their names these look like reference parts, and are read: {listed(found)}"
+    references = [name for name in names if REFERENCE.search(name)]
+    if 0 < len(references) < MAX_REFERENCE_SHARE * len(names):
+        text = f"By their names these look like reference parts, and are read: {listed(references)}"
         collector.notes[f"{text}; take them out of the data, if they are"] = 1
 
 
@@ -292,14 +292,17 @@ def _cut_padding(collector: RecordingCollector) -> None:
 
 
 def _interpolate_gaps(collector: RecordingCollector, options: LoadOptions) -> None:
-    """Interpolate up to `MAX_LOST` missing samples on end, between others; a note counts them.
+    """Interpolate gaps of up to `MAX_LOST` consecutive NaN linearly, if `fit="resample"`.
 
-    Only with `fit="resample"`.
+    Each channel is filled by itself. Longer gaps, and those at an end, stay NaN. The recordings of
+    the collector are replaced, and a note counts the filled values.
     """
     if options.fit != "resample":
         return
     n_filled = 0
     for i, recording in enumerate(collector.recordings):
+        if not np.isnan(recording.trace).any():
+            continue
         trace = recording.trace.copy()
         for row in trace:
             edges = np.diff(np.isnan(row), prepend=False, append=False)
@@ -463,34 +466,39 @@ def _with_guesses(stated: Sequence[str], collector: RecordingCollector) -> str:
         if not unit and (word := units.maybe_unit(name)):
             do = "none is assumed, unit=... states it"
             collector.notes[f"The name {name} may tell a unit, {word}: {do}"] = 1
-    given = [*stated, *[""] * len(names)]
-    assumed = [name for name, unit in zip(names, given, strict=False) if not unit]
+    assumed = [name for name, unit in zip_longest(names, stated) if not unit]
     for note in assumed_unit_notes(assumed):
         collector.notes[note] = 1
     return ", ".join(guesses if len(set(guesses)) > 1 else guesses[:1])
 
 
 def assumed_unit_notes(channels: Iterable[str]) -> list[str]:
-    """Return notes on channels whose unit is a guess by a word for a force, as Force or Kraft.
+    """Return a note for each channel whose unit N is assumed from a word, as Force or Kraft.
 
-    The axes of a robot, as FZ_Base or wrench.force.z, are in newtons.
+    There is none for a channel that states its unit, nor for a robot's axis, as FZ_Base or
+    wrench.force.z: these are in newtons.
     """
     return [
-        f"The unit N of {name} is assumed: unit='kN' would state another"
+        f"The unit N of {name} is assumed: unit='kN' would state another."
         for name in channels
-        if units.guess(name) == "N" and not units.split(name)[1] and not FORCE_AXIS.fullmatch(name)
+        if units.guess(name) == "N"
+        and not units.split(name)[1]
+        and not units.FORCE_AXIS.fullmatch(name)
     ]
 
 
 def unknown_unit_note(unit: str, channels: Sequence[str]) -> list[str]:
-    """Return a note if the unit of channels is unknown, and no name may tell it."""
+    """Return a note that names the channels without a unit, as a list; empty if there is none.
+
+    It is empty too if the name of any channel has a word that may be a unit, as kN_force.
+    """
     channel_units = split_unit(unit, max(len(channels), 1))
     if "" not in channel_units or any(map(units.maybe_unit, channels)):
         return []
     names = [
         name for name, of_channel in zip(channels, channel_units, strict=False) if not of_channel
     ]
-    of_channels = f" of {listed(names)}" if 0 < len(names) < len(channel_units) else ""
+    of_channels = f" of {listed(names)}" if len(names) < len(channels) else ""
     return [f"The unit{of_channels} is unknown: unit=... states it."]
 
 
@@ -532,11 +540,10 @@ def _bring_to_one_rate(
     if is_strict or (has_one_rate and (has_one_length or options.samples is not None)):
         wanted = f"timestamps at {usual:g} Hz, as the others have"
         do = "; fit='resample' puts all on one rate by their own times"
-        others = np.flatnonzero(np.abs(rates - usual) > RATE_TOLERANCE * usual).tolist()
         is_helped = is_strict & ~_is_far(rates, usual)
-        collector.leave_out(
-            {i: f"Expected {wanted}, got {rates[i]:g} Hz{do * int(is_helped[i])}" for i in others}
-        )
+        others = np.flatnonzero(np.abs(rates - usual) > RATE_TOLERANCE * usual).tolist()
+        reasons = {i: f"Expected {wanted}, got {rates[i]:g} Hz" for i in others}
+        collector.leave_out({i: why + (do if is_helped[i] else "") for i, why in reasons.items()})
         kept = [recording.rate_hz for recording in collector.recordings if recording.rate_hz]
         return options, float(np.median(kept))
     # Two digits, so that recordings that are added change neither the rate nor all samples.

@@ -38,6 +38,7 @@ from .headers import (
 BESIDE = (".txt", ".json", ".ini", ".yaml", ".yml", ".meta", ".info", ".log")
 SMALL = 2**14  # bytes of a file that tells of a recording
 # Of equally good ones the first is taken. " ": any blanks; "": one column.
+MIN_FULL_ROWS = 8  # that show where the columns of fixed width end
 DELIMITERS = ("\t", ";", "|", ",", " ", "")
 SAMPLED_LINES = 30  # from the end, by which the delimiter is found
 SAMPLED_CELLS = 40  # of each of these lines
@@ -122,22 +123,25 @@ def split_cells(text: str, columns: Sequence[str] = (), channels: Sequence[str] 
 
 
 def _cut_touching(lines: Mapping[int, str], split: dict[int, list[str]]) -> int:
-    """Cut rows of too few cells where the columns of a text of fixed width end, in place.
+    """Cut cells that touch in a text of fixed-width columns; return the number of rows cut.
 
-    So Fortran writes 44.17010026.13 where 10026.13 fills its column. The ends of the columns are
-    those in which the rows of most cells, eight or more, agree. A row is cut if each piece is then
-    as the cell above it, a word or a number of as many decimals, or is empty, or of the stars of
-    an overflow. Returns the number of rows that are cut.
+    Fortran writes 44.17010026.13 where 10026.13 fills its column. The full rows are those with the
+    largest number of cells that `MIN_FULL_ROWS` numeric rows have. Nothing is cut unless all of
+    them have the same ends of columns. A row with fewer cells is cut at these ends if each piece is
+    like that of the first full row (a word, or a number of as many decimals), or is empty, or has
+    the stars of an overflow alone.
+
+    lines : the text of each line. split : the cells of each line, changed in place.
     """
     numeric = [i for i in lines if 2 * len(numeric_columns(split[i])) >= len(split[i])]
     widths = Counter(len(split[i]) for i in numeric)
-    n = max((width for width, n_rows in widths.items() if n_rows >= MIN_TIMES), default=0)
+    n = max((width for width, n_rows in widths.items() if n_rows >= MIN_FULL_ROWS), default=0)
     full = [i for i in numeric if len(split[i]) == n]
     all_ends = {tuple(word.end() for word in WORD.finditer(lines[i])) for i in full}
     if len(all_ends) != 1:
         return 0
     ends = all_ends.pop()
-    usual = split[full[0]]
+    first_full = split[full[0]]
     n_cut = 0
 
     def form(cell: str) -> tuple[bool, int]:
@@ -151,7 +155,7 @@ def _cut_touching(lines: Mapping[int, str], split: dict[int, list[str]]) -> int:
         pieces = [line[begin:end].lstrip() for begin, end in itertools.pairwise((0, *ends))]
         are_cells = all(
             not any(map(str.isspace, piece)) and (not piece.strip("*") or form(piece) == form(cell))
-            for piece, cell in zip(pieces, usual, strict=True)
+            for piece, cell in zip(pieces, first_full, strict=True)
         )
         if are_cells and numeric_columns(pieces):
             split[i] = pieces

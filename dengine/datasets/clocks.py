@@ -728,11 +728,14 @@ def rate_of(clock: Clock, lines: pd.Index) -> float:
 
 
 def stated_rate(name: str, number: float, unit: str = "") -> tuple[float, bool] | None:
-    """Return the sampling rate in hertz that a name states with a number, and whether it surely
-    does; None for a name of something else.
+    """Return the sampling rate in hertz that a name and a number state, and whether it is sure.
 
-    The unit may stand at the end of the name. A rate without one is in hertz; a time from sample to
-    sample without one may be in seconds, if it is below 1. A rate of 0 is not known.
+    The rate is 0.0 if it cannot be told, as for an unknown unit. None if the name is none of a rate
+    or of a time between samples, or if that time is not above 0.
+
+    The unit may end the name, as in dt_ms. A rate without a unit is in hertz. A time between
+    samples without one may be in seconds if it is below 1, which is not sure; LabVIEW's delta_x
+    surely is. A frequency is not sure, unless its unit ends the name.
     """
     words = "_".join(units.words_in(name)).replace("_k_hz", "_khz").replace("_m_hz", "_mhz")
     bare, _, last = words.rpartition("_")

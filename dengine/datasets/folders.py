@@ -400,9 +400,11 @@ def _check_part(heads: FolderHeads, options: LoadOptions) -> None:
 
 
 def _note_repeated_numbers(names: Iterable[str], notes: Counter[str]) -> None:
-    """Add a note if two files of a folder have a number that is another one in most of its files.
+    """Add a note if a few files of a folder share a number that may be that of a part.
 
-    It stands behind a word in their names, as the 8 in SN0008_0807_OK.csv and SN0008_0815_OK.csv.
+    A number stands behind a word in a file's name, as 0008 in SN0008_0807.csv and SN0008_0815.csv.
+    There is a note for a word if some of its numbers, but fewer than `MAX_REPEATED` of them, occur
+    in several files of one folder. It names the first of these.
     """
     files_of = defaultdict[str, defaultdict[tuple[str, str], list[str]]](partial(defaultdict, list))
     for name in names:

@@ -161,18 +161,20 @@ def find_header(
 
 
 def _header_at_end(rows: Sequence[list[str]], channels: Sequence[str]) -> int | None:
-    """Return the position of a header with no row below it but units; None if there is none.
+    """Return the position of the header of a text without data; None if it has none such.
 
-    It is the only row that names the stated channels, and has no numbers.
+    The header is the last row, or the last but one above a row of units. It names all of
+    `channels`, has no numbers, and is the only such row. At least one row stands above it. None if
+    `channels` is empty.
     """
 
     def is_header(row: list[str]) -> bool:
         named = all(units.find_columns(name, row) for name in channels)
         return named and not numeric_columns(row)
 
-    n = len(rows) - (len(rows) > 1 and all(map(_is_unit, rows[-1])))
-    is_last = n > 1 and bool(channels) and is_header(rows[n - 1])
-    return n - 1 if is_last and not any(map(is_header, rows[: n - 1])) else None
+    n_rows = len(rows) - (len(rows) > 1 and all(map(_is_unit, rows[-1])))  # without that of units
+    is_last = n_rows > 1 and bool(channels) and is_header(rows[n_rows - 1])
+    return n_rows - 1 if is_last and not any(map(is_header, rows[: n_rows - 1])) else None
 
 
 def _header_among(

@@ -101,7 +101,7 @@ def labels_in_file(
     name_words = {name: _path_words(name) for name in names}
     matches = _matching_rows(rows, name_words)
     n_names = Counter(row for matching in matches.values() for row in matching)
-    times_of = _measured_again(matches)
+    group_of = _measured_again(matches)
     for row in rows:
         if not n_names[row]:
             why = ", a number that a spreadsheet has shortened" * bool(
@@ -112,8 +112,8 @@ def labels_in_file(
 
     def find(name: str) -> SourcedLabel:
         """Return the label and the part in the row that names a recording most exactly."""
-        if name in times_of:
-            wanted = f"a row of {source} for each of {listed(times_of[name])}"
+        if name in group_of:
+            wanted = f"a row of {source} for each of {listed(group_of[name])}"
             raise UnreadableError(f"Expected {wanted}, found one: it may be that of any of them")
         if not matches[name]:
             raise UnreadableError(f"Expected a row of {source} that names it, found none")
@@ -167,21 +167,21 @@ def _matching_rows(
 
 
 def _measured_again(matches: Mapping[str, Sequence[_LabelRow]]) -> dict[str, list[str]]:
-    """Return the recordings whose row in a listing may be that of another one, each with these.
+    """Return recordings that may be repeated measurements of one row of a listing.
 
-    They are those of one name, with and without a number behind it, as SN12 and SN12.1, of which
-    only the first has a row.
+    SN12, SN12.1 and SN12 (2) are repeats if only SN12 has a row: the row may be of any of them.
+    Each name in such a group is a key; its value is the list of all names in the group.
 
     matches : the rows that match each recording.
     """
-    times_of = defaultdict[str, list[str]](list)
+    group_of = dict[str, list[str]]()
     for name, rows in matches.items():
-        again = AGAIN.fullmatch(name)
-        if again and not rows and matches.get(first := again[1] + again[2]):
-            times_of[first] = times_of[first] or [first]
-            times_of[first].append(name)
-            times_of[name] = times_of[first]
-    return dict(times_of)
+        match = AGAIN.fullmatch(name)
+        first = match[1] + match[2] if match else ""
+        if not rows and matches.get(first):
+            group_of[name] = group_of.setdefault(first, [first])
+            group_of[name].append(name)
+    return group_of
 
 
 def _leading_zeros_note(source: str, rows: Sequence[_LabelRow]) -> dict[str, int]:

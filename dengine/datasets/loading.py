@@ -8,7 +8,7 @@ import os
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -112,9 +112,10 @@ def load_dataset(
         whole trace is interpolated.
     part : str, default "part"
         Name of the array or column of parts' numbers, texts or whole numbers, or of columns that
-        tell them together, "day,number"; for a folder a column or a line of its files, or a column
-        of `labels`. Without a `part` every trace is a part of its own. In a long table it says
-        which rows are one insertion.
+        tell them together, "day,number"; for a folder a column or a line of its files, a regular
+        expression whose one group finds it in a file's name, or a column of `labels`. Without a
+        `part` every trace is a part of its own. In a long table it says which rows are one
+        insertion.
     channel : str or sequence of str, optional
         "FZ_Base", or several, "FZ_Base,FX_Base", which give (n, C, T). None: FZ_Base, or the only
         channel that there is.
@@ -381,8 +382,8 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
     DataError if arrays are missing or do not fit together.
     """
     label = label_column = options.label or "y"
-    arrays, all_names = _read_archives(named, options)
-    stored, _ = _read_archives(named, options, every=True)
+    arrays, all_names, _ = _read_archives(named, options)
+    stored, _, turned = _read_archives(named, options, every=True)
     if options.labels is not None:
         label = "y"
         keys = _keys_of_traces(stored)
@@ -399,9 +400,10 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         wanted = f"an array {options.part} in {', '.join(named)}"
         raise DataError(f"Expected {wanted}, found {listed(all_names)}.")
     with read_errors(name, "an .npz file of plain arrays"):
-        blocks = [_parts_first(arrays[key], arrays[label]) for key in traces]
-        _check_rows(dict(zip(traces, blocks, strict=True)), arrays, stored, label, options)
-        X = np.stack(blocks, axis=1) if len(channels) > 1 else blocks[0]
+        blocks = {key: _parts_first(arrays[key], arrays[label]) for key in traces}
+        turned |= _turned_notes(arrays, blocks)
+        _check_rows(blocks, arrays, stored, label, options)
+        X = np.stack([*blocks.values()], axis=1) if len(channels) > 1 else blocks[traces[0]]
         if "scale" in arrays:
             X = X.astype(np.float32) * arrays["scale"].astype(np.float32)
         about: dict[str, Any] = {key: arrays.get(key) for key in ("cause", "rates")}
@@ -416,9 +418,9 @@ def _read_npz(named: Files, name: str, options: LoadOptions) -> Dataset:
         data = _from_arrays(X, arrays[label], options, name, label_column, **about)
         data = _refit_without_padding(data, options, has_unit="unit" in arrays)
     read = {label, *traces, options.part, *lengths, *ARRAYS, *SIMULATED, *arrays}
-    turned = _turned_notes(next(iter(named.values())), read, label, arrays[label])
-    notes = (*data.notes, *turned, *_unit_notes(arrays, options, data.channels))
-    return replace(data, notes=(*notes, *_archive_notes(data, all_names, read)))
+    notes = (*data.notes, *(note for key, note in turned.items() if key in read))
+    assumed = () if options.unit or _unit_in(arrays) else assumed_unit_notes(data.channels)
+    return replace(data, notes=(*notes, *assumed, *_archive_notes(data, all_names, read)))
 
 
 def _unit_in(arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -426,28 +428,19 @@ def _unit_in(arrays: Mapping[str, NDArray[Any]]) -> str:
     return ", ".join(map(str, np.atleast_1d(arrays.get("unit", "")).tolist()))
 
 
-def _unit_notes(
-    arrays: Mapping[str, NDArray[Any]], options: LoadOptions, channels: Sequence[str]
-) -> list[str]:
-    """Return notes on the channels whose unit nobody stated, and a word for a force tells."""
-    is_stated = bool(options.unit or _unit_in(arrays))
-    return [] if is_stated else [f"{note}." for note in assumed_unit_notes(channels)]
+def _turned_notes(
+    stored: Mapping[str, NDArray[Any]], turned: Mapping[str, NDArray[Any]]
+) -> dict[str, str]:
+    """Return a note by the name of each array whose first axis is another than it was stored with.
 
-
-def _turned_notes(path: Path, read: Collection[str], label: str, labels: NDArray[Any]) -> list[str]:
-    """Return a note on each array in an archive whose first axis is not that of the parts.
-
-    read : names of the arrays that are read. labels : those of all parts, if the archive has none.
+    turned : the arrays as `_parts_first` returns them.
     """
-    stored, _ = read_archive(path, tuple(read))
-    labels = stored.get(label, labels)
-    turned = {key: _parts_first(x, labels) for key, x in stored.items()}
-    return [
-        f"Array {key} {stored[key].shape} is read as {len(x)} traces of {x.shape[-1]} samples, "
-        f"for there are {len(x)} labels."
+    return {
+        key: f"Array {key} {stored[key].shape} is read as {len(x)} traces of {x.shape[-1]} samples,"
+        f" for there are {len(x)} labels."
         for key, x in turned.items()
         if x.ndim > 1 and len(x) != len(stored[key])
-    ]
+    }
 
 
 def _without_padding(
@@ -552,7 +545,7 @@ def _arrays_by_meaning(
                     result |= {"rate_hz": np.array(rate_of(clock, pd.RangeIndex(len(x)))), key: x}
     names = set(map(str, result.get("channels", ())))
     if blocks and "X" not in arrays and options.channels and names.issuperset(options.channels):
-        whole, _ = _read_archives(named, replace(options, channels=(blocks[0],)))
+        whole, *_ = _read_archives(named, replace(options, channels=(blocks[0],)))
         result |= {"X": whole[blocks[0]], blocks[0]: whole[blocks[0]]}
     return {key: x for key, x in result.items() if key not in arrays}
 
@@ -580,8 +573,9 @@ def _archive_notes(data: Dataset, names: Sequence[str], read: set[str]) -> list[
 
 def _read_archives(
     named: Files, options: LoadOptions, every: bool = False
-) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Return the arrays of archives that the options and `ARRAYS` name, and the names of all.
+) -> tuple[dict[str, NDArray[Any]], list[str], dict[str, str]]:
+    """Return the arrays of archives that the options and `ARRAYS` name, the names of all, and the
+    `_turned_notes` on those of the first archive.
 
     Archives that hold different arrays are read as one. Those of one form are concatenated; an
     array that is not one of parts must be the same in all. With `every` all arrays are returned, to
@@ -601,8 +595,10 @@ def _read_archives(
     first = next(iter(named))
     arrays = dict[str, NDArray[Any]]()
     all_names = list[str]()
+    turned = dict[str, str]()
     for source, (stored, names) in zip(named, contents, strict=True):
         new = {key: _parts_first(x, stored.get(label)) for key, x in stored.items()}
+        turned = turned if all_names else _turned_notes(stored, new)
         if set(all_names).isdisjoint(names):
             arrays = arrays | new
             all_names = all_names + names
@@ -616,7 +612,7 @@ def _read_archives(
             elif not np.array_equal(old, other):
                 actual = f"{old.shape or old} and {other.shape or other}"
                 raise DataError(f"Expected {key} alike in {first} and {source}, got {actual}.")
-    return arrays, all_names
+    return arrays, all_names, turned
 
 
 def _object_arrays_advice(path: Path, options: LoadOptions) -> str:
@@ -715,7 +711,7 @@ def _missing_arrays(named: Files, options: LoadOptions) -> str:
     An array of two or three dimensions may hold the traces; one of one dimension, as long as an
     axis of the traces, the labels; so may a CSV file beside the archive, which is named then.
     """
-    arrays, all_names = _read_archives(named, options, every=True)
+    arrays, all_names, _ = _read_archives(named, options, every=True)
     traces = [name for name, x in arrays.items() if x.ndim in (2, 3) and len(x)]
     lengths = arrays[traces[0]].shape if traces else ()
     single = [name for name, x in arrays.items() if x.ndim == 1 and len(x) in lengths]

@@ -243,7 +243,9 @@ def from_long(
     rows_of_part = _rows_by_part(frame, seconds, options)
     stations = [name for name in others if name not in collector.channels]
     has_dates = holds_dates(frame[time])
-    _check_numbers_once(rows_of_part, stations, first.date or time * has_dates, options.part)
+    _check_numbers_once(
+        rows_of_part, stations, first.date or (time if has_dates else ""), options.part
+    )
     _check_single_station(rows_of_part, stations, collector.channels, options.part)
     if not has_dates:
         _check_together(rows_of_part, collector, has_clock=time != ROW_COLUMN)
@@ -390,12 +392,14 @@ def _rows_by_part(
 def _check_numbers_once(
     rows_of_part: Mapping[str, pd.DataFrame], columns: Sequence[str], dates: str, part_column: str
 ) -> None:
-    """Raise DataError if many parts' numbers were used again, as where each shift counts from 1.
+    """Raise DataError if many parts share a number, as where each shift counts from 1 again.
 
-    Many are two or more, and at least a fifth of all (`FEW_AGAIN`); fewer are not looked at here.
-    The error names a column that makes the numbers unique, if there is one.
+    Many are two or more, and at least `FEW_AGAIN` of all numbers. `_line_of_next` tells which
+    numbers are used again. The error proposes a column that makes them unique, if one does.
 
-    columns : that may do so. dates : the column of dates, whose days may do so, or "".
+    rows_of_part : as `_rows_by_part` returns them.
+    columns : names of columns that may make the numbers unique.
+    dates : name of a column of dates, whose days are tried first; "" for none.
     """
     lines = {part: _line_of_next(rows) for part, rows in rows_of_part.items()}
     again = [part for part, line in lines.items() if line]
@@ -415,7 +419,7 @@ def _check_numbers_once(
 def _are_single(rows: pd.DataFrame, keys: pd.Series) -> bool:
     """Return whether a part's number was used once with each key, and a key is of all its rows."""
     is_of_runs = keys.nunique() <= rows[RUN_COLUMN].nunique()
-    return is_of_runs and not any(_line_of_next(own) for _, own in rows.groupby(keys))
+    return is_of_runs and not any(_line_of_next(group) for _, group in rows.groupby(keys))
 
 
 def _line_of_next(rows: pd.DataFrame) -> int:

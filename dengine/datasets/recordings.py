@@ -132,21 +132,27 @@ def read_recording(
 
 
 def _part_in(table: TextTable, path: Path, options: LoadOptions, notes: Counter[str]) -> str | None:
-    """Return the part that a column or a line of a recording states, a small file beside it, or the
-    group of a pattern in its path.
+    """Return the part that a recording states, or None.
 
-    None with a note if it is not there or empty; also if the user did not state where the part is,
-    or a file of labels tells it. Raises UnreadableError if the column has several.
+    If `options.part` is no column and has a group, as SN([0-9]+), it is a pattern: its group is
+    searched for in the name of the file, then in those of its folder and the file. Else it names a
+    column, a line of the file, or a line of a small file beside it, or lists several, which are
+    joined.
+
+    None with a note if this is missing or empty. None without a note if `options.part` is the
+    default, or a file of labels is given. Raises UnreadableError for a column of several parts.
     """
     if options.part == "part" or options.labels is not None:
         return None
-    if "(" in options.part:
-        match = re.search(options.part, path.stem) or re.search(options.part, path.as_posix())
-        if match is None:
-            notes[f"No part is where {options.part} finds it: each such file is one"] += 1
-        return match[1] if match else None
     fields = {**table.fields, **fields_beside(path)}
     columns = {*fields, *table.frame}
+    if "(" in options.part and options.part not in columns:
+        in_folder = f"{path.parent.name}/{path.stem}"
+        match = re.search(options.part, path.stem) or re.search(options.part, in_folder)
+        part = match and match[1]
+        if not part:
+            notes[f"No part is where {options.part} finds it: each such file is one"] += 1
+        return part or None
     names = [options.part] if options.part in columns else options.part_columns[1:]
     texts = list[str]()
     for name in names:

@@ -140,7 +140,7 @@ def _from_tables(
     tables : by the names of their files, or "row" for a DataFrame; the index is the line.
     """
     tables = {
-        source: table._replace(frame=_with_part(table.frame, options, source))
+        source: table._replace(frame=_join_part_columns(table.frame, options, source))
         for source, table in tables.items()
     }
     _note_headers(tables, collector)
@@ -205,8 +205,8 @@ def _is_wide(frame: pd.DataFrame, options: LoadOptions) -> bool:
     return len(frame) < 2 * n_parts and _largest_channel(frame) >= MIN_NUMBERED
 
 
-def _with_part(frame: pd.DataFrame, options: LoadOptions, source: str) -> pd.DataFrame:
-    """Return a table as `with_part`; raise DataError if it has but some columns that this joins."""
+def _join_part_columns(frame: pd.DataFrame, options: LoadOptions, source: str) -> pd.DataFrame:
+    """Join the columns of parts by `with_part`; raise DataError if some of them are missing."""
     missing = [name for name in options.part_columns[1:] if name not in frame]
     if options.part not in frame and 0 < len(missing) < len(options.part_columns) - 1:
         wanted = f"columns {options.part} of parts' numbers in {source}"

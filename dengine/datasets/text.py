@@ -218,11 +218,12 @@ def read_table(
 
 
 def with_part(frame: pd.DataFrame, options: LoadOptions) -> pd.DataFrame:
-    """Return a table with a last column of parts that joins the columns of `options.part_columns`.
+    """Return a table with a last column `options.part` that joins the columns it lists.
 
-    The columns "day,number" give parts as `2024-03-12_7`. Of dates with a time of day the day
-    counts. Slashes become dashes, for a listing would take them for folders. A table that has a
-    column of parts, or not all that are to be joined, is returned unchanged.
+    The columns "day,number" give parts as `2024-03-12_7`. The time of day of a date is dropped.
+    Slashes become dashes, as a listing takes them for folders. If a cell is empty the part is "",
+    and if it is missing, so is the part. The table is returned unchanged if it has such a column,
+    if a column to be joined is missing, or if two columns have one name.
     """
     if options.part in frame or not options.has_part(frame) or not frame.columns.is_unique:
         return frame

@@ -41,6 +41,8 @@ FORCE_NAME = re.compile(r"f[xyz]?([_ ].*)?|.*(force|kraft|last|load).*", re.IGNO
 # Of a torque whose unit nobody knows, and of one that robots and sensors give in N·m: MuZ_Base.
 TORQUE_NAME = re.compile(r"m[d]?([_ ].*)?|.*(torque|moment|couple|torsion).*", re.IGNORECASE)
 TORQUE_AXIS = re.compile(r"(mu?|t)[xyz](_.*)?", re.IGNORECASE)
+# Axes of a robot's or a sensor's force, which is in newtons: FZ_Base, wrench.force.z.
+FORCE_AXIS = re.compile(r"f[xyz]([_ ]base)?|.*\bforce[._][xyz]|.*tcp_force(_\d)?", re.IGNORECASE)
 # Words of a force's name that may be its unit, beside those in `SPELLINGS`.
 MAYBE_UNIT = re.compile(
     r"%|V|g|(?i:percent|pct|.*(newton|pound|kilogram|gram)s?)|.*([a-z]m|[A-Z]k)N"
@@ -254,8 +256,7 @@ def likely_channel(names: Sequence[str]) -> str:
     def score(name: str) -> int:
         """Return 2 for a name of a force, more with such a unit, less with that of another."""
         dimension, _ = parse(split(name)[1]) or ("", 1.0)
-        words = name.lower()
-        is_named = _quantity(name) != "" or any(word in words for word in FORCES)
+        is_named = _quantity(name) != "" or is_force(name)
         is_other = dimension in NO_FORCE and dimension != "Nm"
         return 2 * is_named + (dimension != "") - 4 * is_other
 

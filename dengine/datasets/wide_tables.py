@@ -241,7 +241,7 @@ def wide_rows(
         list(columns),
         collector,
         is_whole=not (values % 1 > 0).any(),
-        what="rows" if table.column_of else "columns",
+        kind="rows" if table.column_of else "columns",
     )
     label_cells = [
         labels.LabelColumn(name, options.words, collector.notes) for name in label_columns
@@ -290,13 +290,13 @@ def _note_unread(
     collector: RecordingCollector,
     *,
     is_whole: bool,
-    what: str,
+    kind: str,
 ) -> None:
     """Add a note on the columns that were not read, but for the factors of whole numbers.
 
     Of these `as_dataset` says what it did with them.
 
-    what : "columns", or "rows" if these are the columns of a table that was transposed.
+    kind : "columns", or "rows" if these are the columns of a table that was transposed.
     """
     n = len(channels)
     unread = [
@@ -305,7 +305,7 @@ def _note_unread(
         if not (is_whole and any(operation(name, channel, n) for channel in channels))
     ]
     if unread:
-        collector.notes[f"Not read: the {what} {listed(unread)}"] = 1
+        collector.notes[f"Not read: the {kind} {listed(unread)}"] = 1
 
 
 class StatedByRow(NamedTuple):

@@ -4270,3 +4270,15 @@ def test_the_unit_of_a_table_with_a_column_per_part_is_in_its_header(
     assert loaded.part is not None
     assert loaded.part.tolist() == names
     np.testing.assert_array_equal(loaded.X, data.X)
+
+
+def test_a_column_of_parts_may_have_brackets_in_its_name(make_data, tmp_path: Path) -> None:
+    data = make_data(8, samples=40)
+    for i, (trace, label) in enumerate(zip(data.X, data.y, strict=True)):
+        path = write_csv(tmp_path / f"{i}_{bool(label)}.csv", trace)
+        header, *rows = path.read_text().splitlines()
+        cells = [f"{header},Part (ID)", *(f"{row},P{i // 2}" for row in rows)]
+        path.write_text("\n".join(cells) + "\n")
+    loaded = load_dataset(tmp_path, channel="FZ_Base", part="Part (ID)")
+    assert loaded.part is not None
+    assert loaded.part.tolist() == [f"P{i // 2}" for i in range(8)]
