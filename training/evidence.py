@@ -39,7 +39,7 @@ from dengine.experiments.grid import KeptReplays, Task, iterate_replays
 from dengine.experiments.paper import ALPHAS, INTERVALS, LOWER_BOUNDS
 from dengine.experiments.replay import Contender
 from dengine.experiments.tables import write_csv
-from dengine.reducers import ConvReducer
+from dengine.reducers import ConvReducer, RocketReducer
 from dengine.reducers.base import StopRule
 
 # Seconds of a core that a replay takes, for the estimate at the start.
@@ -77,11 +77,24 @@ SUMMARY = [
 ]
 
 
+class DishonestRocket(RocketReducer):
+    """Drawn kernels with heads that all learn from the labels of every fold."""
+
+    def training_masks(self, folds: np.ndarray) -> np.ndarray:
+        """Return a mask (K, n) that leaves no label out."""
+        return np.ones_like(super().training_masks(folds))
+
+
 class DishonestReducer(ConvReducer):
     """conv with members that all learn from the labels of every fold, which are then counted.
 
     For comparison only: it shows what honest counting costs.
     """
+
+    def _build(self, channels: int, samples: int, average: int) -> None:
+        super()._build(channels, samples, average)
+        self.drawn_ = DishonestRocket(**self.drawn_.get_params())
+        self.drawn_.build(channels, samples, average)
 
     def fit_loop(
         self, x: torch.Tensor, y: torch.Tensor, folds: np.ndarray, stop: StopRule, steps: int

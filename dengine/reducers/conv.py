@@ -1,5 +1,6 @@
 """The 1-D convolutional network that embeds traces, `ConvNetwork`, and `ConvReducer`, the reducer
-"conv", which trains it as `TorchReducer` trains any network.
+"conv", which trains it as `TorchReducer` trains any network, and averages its logit with that of
+`RocketReducer`.
 
     x (B, 2C, L)               preprocessed traces: each signal and its differences in time
     conv 15, stride 4           8 channels per signal
@@ -21,16 +22,25 @@ classification using multi-channels deep convolutional neural networks, WAIM: se
 for each signal.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any, Self
 
 import torch
+from numpy.typing import NDArray
+from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 
-from .encoder import NetworkFactory
+from ..decision.scripting import arrays_with_prefix, incompatible_model_error
+from .base import Floats, Ints, StopRule
+from .encoder import Encoder, NetworkFactory
+from .rocket import FeatureEmbedding, RocketReducer
 from .torch_reducer import TorchReducer
 
 N_REGIONS = 3  # early, middle and late: when a force rises tells as much as how far
+SMALLEST_PROBABILITY = 1e-6
+HEAD_STEPS = 4  # Newton steps of the heads in a retrain; the next one goes on from there
 MIN_SAMPLES_OF_STRIDE_4 = 160  # on shorter traces the first convolution has a stride of 2
 
 
@@ -114,11 +124,64 @@ def conv_layers(
     return [convolution, nn.BatchNorm1d(groups * outputs), nn.ReLU()]
 
 
+class ConvEncoder(nn.Module):
+    """Embed raw traces by the network and by drawn kernels, whose logits are averaged.
+
+    Parameters
+    ----------
+    network : Encoder
+        Of the network.
+    drawn : FeatureEmbedding
+        Of `RocketReducer`, with one coordinate: the probability of success.
+    """
+
+    def __init__(self, network: Encoder, drawn: FeatureEmbedding) -> None:
+        super().__init__()
+        self.network = network
+        self.drawn = drawn
+        self.dim = network.dim
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Raw traces (B, C, T) -> (B, K, dim)."""
+        return average_logits(self.network(x), self.drawn(x))
+
+
+def average_logits(
+    points: Tensor, probabilities: Tensor, smallest: float = SMALLEST_PROBABILITY
+) -> Tensor:
+    """Replace the first coordinate by the probability whose logit is the mean of both logits.
+
+    Parameters
+    ----------
+    points : Tensor of float32, shape (..., dim)
+        Embedding; its first coordinate is a probability.
+    probabilities : Tensor of float32, shape (..., 1)
+        The other probability of each point.
+    smallest : float, default 1e-6
+        Probabilities are clipped to this value and one minus it before their logits are taken.
+
+    Returns
+    -------
+    Tensor of float32, shape (..., dim)
+    """
+    logits = points.narrow(-1, 0, 1).logit(smallest)
+    other_logits = probabilities.logit(smallest)
+    mean = 0.5 * (logits + other_logits)
+    return torch.cat([mean.sigmoid(), points.narrow(-1, 1, points.size(-1) - 1)], -1)
+
+
 @dataclass(eq=False, repr=False, kw_only=True)
 class ConvReducer(TorchReducer):
     """Embed traces by a convolutional network that is trained on the CPU, a bit at each retrain.
 
-    It is `TorchReducer` with `ConvNetwork`; the parameters are those of `TorchReducer`.
+    It is `TorchReducer` with `ConvNetwork`; the parameters are those of `TorchReducer`. The
+    probability of success has the mean of two logits: that of the network, and that of the kernels
+    and heads of `RocketReducer`, which are better with few labels. Nothing is fitted to mix them.
+
+    Attributes
+    ----------
+    drawn_ : RocketReducer
+        The drawn kernels and their heads.
 
     Examples
     --------
@@ -129,3 +192,61 @@ class ConvReducer(TorchReducer):
     """
 
     network: NetworkFactory = field(init=False, default=ConvNetwork)
+
+    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
+        """Compute the features of drawn kernels, and cache them for the next `train`.
+
+        They are those of traces (n, C, T), and are found again by `numbers`; without these nothing
+        is cached. It does nothing with fewer than `min_traces` traces. No label is read.
+        """
+        if len(X) >= self.min_traces:
+            traces = self._check_and_start(X)
+            self.drawn_.precompute(traces, numbers)
+
+    def _start(self, traces: Floats) -> None:
+        super()._start(traces)
+        self.drawn_.start(traces)
+
+    def _build(self, channels: int, samples: int, average: int) -> None:
+        self.drawn_ = RocketReducer(n_components=1, folds=self.folds, max_iter=HEAD_STEPS)
+        self.drawn_.build(channels, samples, average)
+        super()._build(channels, samples, average)
+        self.drawn_.random_state = self.seed_
+
+    def _train(
+        self,
+        traces: Floats,
+        labels: Ints,
+        folds: Ints,
+        stop: StopRule,
+        steps: int,
+        numbers: Ints | None = None,
+    ) -> Floats:
+        """Train the heads on the drawn kernels, then the network, which has the rest of the time.
+
+        `numbers` (n,) identify the traces; see `RocketReducer.train`.
+        """
+        probabilities = self.drawn_.train_heads(traces, labels, folds, stop, numbers)  # (n, 1)
+        points = super()._train(traces, labels, folds, stop, steps)
+        both = average_logits(torch.from_numpy(points), torch.from_numpy(probabilities))
+        return both.numpy()
+
+    def embed(self, X: Floats) -> Floats:
+        points = torch.from_numpy(super().embed(X))
+        return average_logits(points, torch.from_numpy(self.drawn_.embed(X))).numpy()
+
+    def module(self) -> ConvEncoder:
+        check_is_fitted(self, "encoder_")
+        return ConvEncoder(self.encoder_, self.drawn_.module()).eval()
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        drawn = {f"drawn.{name}": value for name, value in self.drawn_.get_state().items()}
+        return super().get_state() | drawn
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        drawn = arrays_with_prefix(state, "drawn.")
+        if not drawn:  # of the first conv, the network alone
+            raise incompatible_model_error("conv has no drawn kernels")
+        super().set_state(state)
+        self.drawn_.set_state(drawn)
+        return self

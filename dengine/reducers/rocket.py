@@ -333,7 +333,8 @@ class RocketReducer(Reducer):
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
         folds = folds_of(traces, self.folds, folds)
-        self._start(traces)
+        self.start(traces)
+        check_classes(labels, self.training_masks(folds))
         self._fit_heads(self.raw_features(traces), labels, folds)
         return self
 
@@ -355,8 +356,24 @@ class RocketReducer(Reducer):
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
-        raw = self.raw_features(self._check_and_start(X), numbers)
+        traces = self._check_and_start(X)
         labels = binary_labels(y, len(X), type(self).__name__)
+        check_classes(labels, self.training_masks(folds))
+        return self.train_heads(traces, labels, folds, stop, numbers)
+
+    def train_heads(
+        self,
+        traces: Floats,
+        labels: Ints,
+        folds: Ints,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
+    ) -> Floats:
+        """Do what `train` does, after `start`, and without its checks; return the points (n, d).
+
+        A head whose rows are all of one class predicts that class.
+        """
+        raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
         with torch.inference_mode():
             points = apply_in_chunks(self._embed_raw, raw, 16 * CHUNK)
@@ -389,32 +406,34 @@ class RocketReducer(Reducer):
         The first ones set the shape, the scales and the kernels.
         """
         if "net_" not in vars(self):
-            self._start(self.check_traces(X, reset=True))
+            self.start(self.check_traces(X, reset=True))
         return self.check_traces(X)
 
-    def _start(self, traces: Floats) -> None:
+    def start(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
 
-        It also sets `average_`, the number of samples that are averaged to one. No label is read.
+        No label is read.
         Earlier fits are forgotten. Raises SettingError for a parameter out of its range or fewer
         than 2 samples.
         """
         x = torch.from_numpy(traces)
-        self.average_ = averaging(x)
-        self._build(*self.trace_shape_)
+        self.build(traces.shape[1], traces.shape[2], averaging(x))
         self.net_.encoder.learn(x, np.random.default_rng(seed_of(self.random_state)))
 
-    def _build(self, channels: int, samples: int) -> None:
+    def build(self, channels: int, samples: int, average: int) -> None:
         """Set a module `net_` whose kernels and heads are 0, and an empty state, for this shape.
 
-        The number of samples that are averaged, `average_`, must be set. Raises SettingError for a
+        `average` is the number of samples that are averaged to one. Raises SettingError for a
         parameter out of its range or fewer than 2 samples.
         """
         self.check()
+        self.trace_shape_ = (channels, samples)
+        self.n_features_in_ = channels * samples
+        self.average_ = average
         encoder = RocketEncoder(
             channels,
             samples,
-            self.average_,
+            average,
             self.kernels,
             self.dilations,
             self.regions,
@@ -441,8 +460,7 @@ class RocketReducer(Reducer):
         raw (n, P) are raw features. The heads start from their present weights. Principal
         components are computed anew at the first fit, at every twentieth, and when the traces are
         half as many again as at the last time. Of more than 4000 rows 4000 are used. It sets
-        `towers_`, `n_iter_`, `holdout_losses_`, `n_fits_` and `note_`. Raises SettingError if the
-        rows outside a fold have a single class.
+        `towers_`, `n_iter_`, `holdout_losses_`, `n_fits_` and `note_`.
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -454,11 +472,9 @@ class RocketReducer(Reducer):
                 raw = raw[rows]
                 labels = labels[rows]
                 folds = folds[rows]
-            masks = self.training_masks(folds)
-            check_classes(labels, masks)
             f = self.net_.encoder.scale_features(raw)
             y = torch.from_numpy(labels)
-            outside = torch.from_numpy(masks)
+            outside = torch.from_numpy(self.training_masks(folds))
             towers = []
             left_out = []
             at_base_rate = []  # by tower, the heads that predict it
@@ -632,7 +648,7 @@ class RocketReducer(Reducer):
         """Raw features (n, P) -> (n, K, d)."""
         return self.net_.embed_features(self.net_.encoder.scale_features(raw))
 
-    def module(self) -> nn.Module:
+    def module(self) -> FeatureEmbedding:
         check_is_fitted(self, "net_")
         return self.net_
 
@@ -664,10 +680,7 @@ class RocketReducer(Reducer):
         """
         channels, samples = (int(value) for value in state["shape"])
         average, n_fits, n_component_traces, n_iter = (int(value) for value in state["counts"])
-        self.trace_shape_ = (channels, samples)
-        self.n_features_in_ = channels * samples
-        self.average_ = average
-        self._build(channels, samples)
+        self.build(channels, samples, average)
         restore(self.net_, arrays_with_prefix(state, "net."))
         fields = [arrays_with_prefix(state, f"{name}.").values() for name in Tower._fields]
         for arrays in zip(*fields, strict=True):

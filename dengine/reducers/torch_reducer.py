@@ -227,14 +227,10 @@ class TorchReducer(Reducer):
         float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20 traces in
         the first training, and for fewer than two outside a fold.
         """
-        if "members_" not in vars(self):
-            do = "verify more parts first"
-            expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
-            self._start(self.check_traces(X, reset=True))
-        traces = self.check_traces(X)
+        traces = self._check_and_start(X)
         labels = binary_labels(y, len(X), type(self).__name__)
-        x = self._train(traces, labels, folds, stop or StopRule(), self.n_steps_due(len(traces)))
-        return self._embed_in_fold_space(x, folds)
+        steps = self.n_steps_due(len(traces))
+        return self._train(traces, labels, folds, stop or StopRule(), steps, numbers)
 
     def n_steps_due(self, n_labels: int) -> int:
         """Return the number of steps that the next retrain takes on `n_labels` labels."""
@@ -245,6 +241,17 @@ class TorchReducer(Reducer):
     def _n_steps_wanted(self, n_labels: int) -> int:
         """Return the number of steps, over all trainings, that make training complete."""
         return int(min(self.fit_steps, INITIAL_STEPS + STEPS_PER_LABEL * n_labels))
+
+    def _check_and_start(self, X: Floats) -> Floats:
+        """Check traces and return them as (n, C, T); the first ones start the reducer.
+
+        Raises SettingError if these are fewer than 20.
+        """
+        if "members_" not in vars(self):
+            do = "verify more parts first"
+            expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
+            self._start(self.check_traces(X, reset=True))
+        return self.check_traces(X)
 
     def _start(self, traces: Floats) -> None:
         """Build preprocessor and members anew for traces (n, C, T); no label is read.
@@ -288,13 +295,20 @@ class TorchReducer(Reducer):
         self.encoder_ = self._new_encoder()
 
     def _train(
-        self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule, steps: int
-    ) -> Tensor:
+        self,
+        traces: Floats,
+        labels: Ints,
+        folds: Ints,
+        stop: StopRule,
+        steps: int,
+        numbers: Ints | None = None,
+    ) -> Floats:
         """Take `steps` steps on traces (n, C, T), or fewer if `stop` ends them; replace `encoder_`.
 
         The averaged members, with new statistics of batch normalisation, become `encoder_`. It sets
         `n_steps_left_`: 0 if `stop` limits the number of steps, else those that are missing to
-        complete training. Returns the preprocessed traces (n, C', L).
+        complete training. `numbers` is not read. Returns the points of the traces, float32 (n, d),
+        row i in space ``folds[i]``.
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -304,7 +318,7 @@ class TorchReducer(Reducer):
         self.n_steps_left_ = max(0, n_missing) if stop.max_steps is None else 0
         self.estimate_statistics(x)
         self.encoder_ = self._new_encoder()
-        return x
+        return self._embed_in_fold_space(x, folds)
 
     def fit_loop(self, x: Tensor, y: Tensor, folds: Ints, stop: StopRule, steps: int) -> None:
         """Take AdamW steps, member k on the rows outside fold k.
@@ -456,7 +470,7 @@ class TorchReducer(Reducer):
     def warm_up(self) -> None:
         warm_optimizer()
 
-    def untrained_module(self, X: Floats) -> Encoder | None:
+    def untrained_module(self, X: Floats) -> nn.Module | None:
         """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
 
         After a training it is the present `encoder_` itself; before, that of a clone with initial
@@ -468,7 +482,7 @@ class TorchReducer(Reducer):
         untrained._build(X.shape[1], X.shape[2], averaging(torch.from_numpy(X)))
         return untrained.module()
 
-    def module(self) -> Encoder | None:
+    def module(self) -> nn.Module | None:
         check_is_fitted(self, "encoder_")
         shape = self.preprocessor_.channels, self.preprocessor_.samples
         return self.encoder_ if can_compile(self.network, *shape) else None

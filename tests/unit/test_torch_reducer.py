@@ -9,16 +9,16 @@ import torch
 from sklearn.base import clone
 from torch import nn
 
-from dengine import ConvReducer, DataEngine, Dataset, Recipe, TorchReducer
+from dengine import ConvReducer, DataEngine, Dataset, Recipe, RocketReducer, TorchReducer
 from dengine.datasets.importing import import_labelled
 from dengine.decision.scripting import script
 from dengine.engine.engine import core_of
-from dengine.errors import SettingError
+from dengine.errors import SettingError, StoreError
 from dengine.folds import content_fold
 from dengine.reducers import torch_reducer
 from dengine.reducers.base import StopRule
 from dengine.reducers.checkpoints import load_checkpoint, save_checkpoint
-from dengine.reducers.conv import ConvNetwork
+from dengine.reducers.conv import HEAD_STEPS, ConvNetwork
 from dengine.reducers.encoder import Members
 from dengine.reducers.torch_reducer import Augmentation, draw_batches
 from dengine.testing import check_reducer, labels_of_a_fold_move_nothing_in_its_space, toy_traces
@@ -132,10 +132,41 @@ def test_after_training_good_parts_have_a_higher_probability_than_bad_ones_never
 def test_no_step_begins_after_the_deadline_and_the_reducer_answers_all_the_same() -> None:
     X, y = toy_traces(60)
     ticks = iter(range(1000))
-    reducer, folds = quick(), content_fold(X, 3)
+    reducer, folds = own_reducer(), content_fold(X, 2)
     reducer.train(X, y, folds, StopRule(deadline=2.0, clock=lambda: float(next(ticks))))
     assert reducer.report.n_steps == 2
     assert np.isfinite(reducer.embed(X)).all()
+
+
+def test_conv_averages_the_logits_of_its_network_and_of_rocket() -> None:
+    X, y = toy_traces(60)
+    folds = content_fold(X, 3)
+    conv = quick(random_state=3).fit(X, y, folds=folds)
+    network = TorchReducer(network=ConvNetwork, folds=3, steps=4, fit_steps=30, random_state=3)
+    rocket = RocketReducer(folds=3, random_state=3, max_iter=HEAD_STEPS)
+    logits = [
+        np.log(p / (1 - p))
+        for reducer in (network, rocket)
+        for p in [reducer.fit(X, y, folds=folds).embed(X)[:, :, 0].astype(float)]
+    ]
+    expected = 1 / (1 + np.exp(-np.mean(logits, axis=0)))
+    np.testing.assert_allclose(conv.embed(X)[:, :, 0], expected, atol=1e-5)
+    np.testing.assert_array_equal(conv.embed(X)[:, :, 1], network.embed(X)[:, :, 1])
+
+
+def test_a_conv_that_was_stored_without_drawn_kernels_is_refused_with_what_to_do() -> None:
+    X, y = toy_traces(60)
+    state = quick().fit(X, y).get_state()
+    old = {name: array for name, array in state.items() if not name.startswith("drawn.")}
+    with pytest.raises(StoreError, match="learn from them anew, by `dengine train"):
+        quick().set_state(old)
+
+
+def test_conv_trains_on_labels_of_one_class_alone() -> None:
+    X, _ = toy_traces(60)
+    reducer = quick()
+    reducer.train(X, np.ones(60, dtype=np.int64), content_fold(X, 3))
+    assert (reducer.embed(X)[:, :, 0] > 0.5).all()
 
 
 def test_a_retrain_takes_its_steps_and_twice_as_many_where_training_is_behind() -> None:
@@ -187,7 +218,8 @@ def test_traces_of_any_shape_are_embedded_finitely_and_alike_when_scripted(
     module = script(reducer.module())
     for x in torch.from_numpy(X[:3]):
         with torch.inference_mode():
-            assert torch.equal(module(x[None]), reducer.module()(x[None]))
+            scripted = module(x[None])
+            torch.testing.assert_close(scripted, reducer.module()(x[None]), rtol=0, atol=1e-6)
 
 
 def test_dead_channels_and_huge_values_are_embedded_finitely() -> None:
