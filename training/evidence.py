@@ -78,7 +78,7 @@ SUMMARY = [
 
 
 class DishonestRocket(RocketReducer):
-    """Drawn kernels with heads that all learn from the labels of every fold."""
+    """rocket with heads that all learn from the labels of every fold."""
 
     def training_masks(self, folds: np.ndarray) -> np.ndarray:
         """Return a mask (K, n) that leaves no label out."""
@@ -93,8 +93,8 @@ class DishonestReducer(ConvReducer):
 
     def _build(self, channels: int, samples: int, average: int) -> None:
         super()._build(channels, samples, average)
-        self.drawn_ = DishonestRocket(**self.drawn_.get_params())
-        self.drawn_.build(channels, samples, average)
+        self.rocket_ = DishonestRocket(**self.rocket_.get_params())
+        self.rocket_.build(channels, samples, average)
 
     def fit_loop(
         self, x: torch.Tensor, y: torch.Tensor, folds: np.ndarray, stop: StopRule, steps: int

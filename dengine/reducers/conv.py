@@ -125,25 +125,25 @@ def conv_layers(
 
 
 class ConvEncoder(nn.Module):
-    """Embed raw traces by the network and by drawn kernels, whose logits are averaged.
+    """Embed raw traces by the network and by `RocketReducer`, whose logits are averaged.
 
     Parameters
     ----------
     network : Encoder
-        Of the network.
-    drawn : FeatureEmbedding
-        Of `RocketReducer`, with one coordinate: the probability of success.
+        Preprocessor and trained members.
+    rocket : FeatureEmbedding
+        With one coordinate, the probability of success.
     """
 
-    def __init__(self, network: Encoder, drawn: FeatureEmbedding) -> None:
+    def __init__(self, network: Encoder, rocket: FeatureEmbedding) -> None:
         super().__init__()
         self.network = network
-        self.drawn = drawn
+        self.rocket = rocket
         self.dim = network.dim
 
     def forward(self, x: Tensor) -> Tensor:
         """Raw traces (B, C, T) -> (B, K, dim)."""
-        return average_logits(self.network(x), self.drawn(x))
+        return average_logits(self.network(x), self.rocket(x))
 
 
 def average_logits(
@@ -174,14 +174,14 @@ def average_logits(
 class ConvReducer(TorchReducer):
     """Embed traces by a convolutional network that is trained on the CPU, a bit at each retrain.
 
-    It is `TorchReducer` with `ConvNetwork`; the parameters are those of `TorchReducer`. The
-    probability of success has the mean of two logits: that of the network, and that of the kernels
-    and heads of `RocketReducer`, which are better with few labels. Nothing is fitted to mix them.
+    It is `TorchReducer` with `ConvNetwork`; the parameters are those of `TorchReducer`. The logit
+    of success is the mean of two: that of the network, and that of a `RocketReducer`, which is
+    better with few labels. Nothing is fitted to mix them.
 
     Attributes
     ----------
-    drawn_ : RocketReducer
-        The drawn kernels and their heads.
+    rocket_ : RocketReducer
+        It is trained on the same labels and folds.
 
     Examples
     --------
@@ -194,24 +194,29 @@ class ConvReducer(TorchReducer):
     network: NetworkFactory = field(init=False, default=ConvNetwork)
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute the features of drawn kernels, and cache them for the next `train`.
+        """Compute the features of `rocket_`, and cache them for the next `train`.
 
         They are those of traces (n, C, T), and are found again by `numbers`; without these nothing
         is cached. It does nothing with fewer than `min_traces` traces. No label is read.
         """
         if len(X) >= self.min_traces:
             traces = self._check_and_start(X)
-            self.drawn_.precompute(traces, numbers)
+            self.rocket_.precompute(traces, numbers)
 
     def _start(self, traces: Floats) -> None:
         super()._start(traces)
-        self.drawn_.start(traces)
+        self.rocket_.draw_kernels(traces)
 
     def _build(self, channels: int, samples: int, average: int) -> None:
-        self.drawn_ = RocketReducer(n_components=1, folds=self.folds, max_iter=HEAD_STEPS)
-        self.drawn_.build(channels, samples, average)
+        # Before `encoder_`, by which other threads see that there is a module.
+        self.rocket_ = RocketReducer(
+            n_components=1,
+            folds=self.folds,
+            max_iter=HEAD_STEPS,
+            random_state=self.random_state,
+        )
+        self.rocket_.build(channels, samples, average)
         super()._build(channels, samples, average)
-        self.drawn_.random_state = self.seed_
 
     def _train(
         self,
@@ -222,31 +227,32 @@ class ConvReducer(TorchReducer):
         steps: int,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Train the heads on the drawn kernels, then the network, which has the rest of the time.
+        """Train the heads of `rocket_`, then the network, which has the rest of the time.
 
         `numbers` (n,) identify the traces; see `RocketReducer.train`.
         """
-        probabilities = self.drawn_.train_heads(traces, labels, folds, stop, numbers)  # (n, 1)
+        probabilities = self.rocket_.train_heads(traces, labels, folds, stop, numbers)  # (n, 1)
         points = super()._train(traces, labels, folds, stop, steps)
-        both = average_logits(torch.from_numpy(points), torch.from_numpy(probabilities))
-        return both.numpy()
+        averaged = average_logits(torch.from_numpy(points), torch.from_numpy(probabilities))
+        return averaged.numpy()
 
     def embed(self, X: Floats) -> Floats:
-        points = torch.from_numpy(super().embed(X))
-        return average_logits(points, torch.from_numpy(self.drawn_.embed(X))).numpy()
+        traces = self.check_traces(X)
+        points = torch.from_numpy(super().embed(traces))
+        return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
 
     def module(self) -> ConvEncoder:
         check_is_fitted(self, "encoder_")
-        return ConvEncoder(self.encoder_, self.drawn_.module()).eval()
+        return ConvEncoder(self.encoder_, self.rocket_.module()).eval()
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        drawn = {f"drawn.{name}": value for name, value in self.drawn_.get_state().items()}
-        return super().get_state() | drawn
+        rocket = {f"rocket.{name}": value for name, value in self.rocket_.get_state().items()}
+        return super().get_state() | rocket
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        drawn = arrays_with_prefix(state, "drawn.")
-        if not drawn:  # of the first conv, the network alone
-            raise incompatible_model_error("conv has no drawn kernels")
+        rocket = arrays_with_prefix(state, "rocket.")
+        if not rocket:  # stored when conv was its network alone
+            raise incompatible_model_error("conv has no rocket beside its network")
         super().set_state(state)
-        self.drawn_.set_state(drawn)
+        self.rocket_.set_state(rocket)
         return self

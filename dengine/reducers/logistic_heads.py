@@ -125,7 +125,7 @@ def fit_heads(
     y : Tensor of int64, shape (n,)
         Labels, 1 or 0.
     outside : Tensor of bool, shape (K, n)
-        Which rows train head k. Each head needs rows of both classes.
+        Which rows train head k.
     w : Tensor of float64, shape (K, W + 1)
         Where the heads start, the bias last; it is not changed.
     l2 : float
@@ -213,6 +213,7 @@ def base_rate_if_better(
         The heads that were set to it.
     """
     rate = torch.logit((mask @ y) / mask.sum(1))[:, None].expand_as(left_out)
+    # Of rows of one class, the rate has an infinite logit and a loss of NaN: the head stays.
     worse = masked_loss(left_out, y, mask) > masked_loss(rate, y, mask)
     w = torch.where(worse[:, None], 0.0, w)
     w[worse, -1] = rate[worse, 0]

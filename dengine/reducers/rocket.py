@@ -369,9 +369,9 @@ class RocketReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Do what `train` does, after `start`, and without its checks; return the points (n, d).
+        """Fit the heads to checked traces, whose labels may be of one class; return points (n, d).
 
-        A head whose rows are all of one class predicts that class.
+        The kernels must have been drawn.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
@@ -412,13 +412,16 @@ class RocketReducer(Reducer):
     def start(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
 
-        No label is read.
-        Earlier fits are forgotten. Raises SettingError for a parameter out of its range or fewer
-        than 2 samples.
+        No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its
+        range or fewer than 2 samples.
         """
-        x = torch.from_numpy(traces)
-        self.build(traces.shape[1], traces.shape[2], averaging(x))
-        self.net_.encoder.learn(x, np.random.default_rng(seed_of(self.random_state)))
+        self.build(traces.shape[1], traces.shape[2], averaging(torch.from_numpy(traces)))
+        self.draw_kernels(traces)
+
+    def draw_kernels(self, traces: Floats) -> None:
+        """Set channel scales and kernels of the module that was built from traces (n, C, T)."""
+        generator = np.random.default_rng(seed_of(self.random_state))
+        self.net_.encoder.learn(torch.from_numpy(traces), generator)
 
     def build(self, channels: int, samples: int, average: int) -> None:
         """Set a module `net_` whose kernels and heads are 0, and an empty state, for this shape.

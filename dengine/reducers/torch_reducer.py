@@ -1,6 +1,7 @@
 """`TorchReducer`: train any PyTorch network on the CPU, a few steps at every retrain. The file also
 holds `Augmentation`, which changes the traces of a batch, `draw_batches`, and `can_compile`, which
-says whether a network can be exported. `conv` is this class with its own network.
+says whether a network can be exported. `conv` is a subclass with a network of its own, whose logit
+it averages with that of `rocket`.
 
     >>> reducer = TorchReducer(network=MyNetwork)  # MyNetwork(channels, samples) is an nn.Module
     >>> DataEngine(reducer=reducer)
@@ -247,7 +248,7 @@ class TorchReducer(Reducer):
 
         Raises SettingError if these are fewer than 20.
         """
-        if "members_" not in vars(self):
+        if not vars(self).get("is_started_"):
             do = "verify more parts first"
             expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
             self._start(self.check_traces(X, reset=True))
@@ -267,6 +268,7 @@ class TorchReducer(Reducer):
         if self.checkpoint:
             load_checkpoint(self.members_, self.checkpoint)
             self.averaged_members_.load_state_dict(self.members_.state_dict())
+        self.is_started_ = True
 
     def _build(self, channels: int, samples: int, average: int) -> None:
         """Set initial weights and an empty state for traces of this shape; no trace is read.
@@ -288,6 +290,7 @@ class TorchReducer(Reducer):
             self.members_ = Members(self.network, *shape, self.folds)
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
+        self.is_started_ = False  # until scales and checkpoint are read
         self.n_steps_ = 0
         self.n_steps_left_ = 0
         self.n_new_steps_ = 0
@@ -473,7 +476,7 @@ class TorchReducer(Reducer):
     def untrained_module(self, X: Floats) -> nn.Module | None:
         """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
 
-        After a training it is the present `encoder_` itself; before, that of a clone with initial
+        After a training it is the present `module()`; before, that of a clone with initial
         weights. None, with a warning in the log, if TorchScript cannot compile the network.
         """
         if "encoder_" in vars(self):
@@ -549,6 +552,7 @@ class TorchReducer(Reducer):
             i, key = name.split(".")
             moments = self.optimizer_state_.setdefault(int(i), {})
             moments[key] = torch.from_numpy(np.array(value))
+        self.is_started_ = True
         self.encoder_ = self._new_encoder()
         return self
 

@@ -154,19 +154,12 @@ def test_conv_averages_the_logits_of_its_network_and_of_rocket() -> None:
     np.testing.assert_array_equal(conv.embed(X)[:, :, 1], network.embed(X)[:, :, 1])
 
 
-def test_a_conv_that_was_stored_without_drawn_kernels_is_refused_with_what_to_do() -> None:
+def test_a_conv_that_was_stored_without_rocket_is_refused_with_what_to_do() -> None:
     X, y = toy_traces(60)
     state = quick().fit(X, y).get_state()
-    old = {name: array for name, array in state.items() if not name.startswith("drawn.")}
+    old = {name: array for name, array in state.items() if not name.startswith("rocket.")}
     with pytest.raises(StoreError, match="learn from them anew, by `dengine train"):
         quick().set_state(old)
-
-
-def test_conv_trains_on_labels_of_one_class_alone() -> None:
-    X, _ = toy_traces(60)
-    reducer = quick()
-    reducer.train(X, np.ones(60, dtype=np.int64), content_fold(X, 3))
-    assert (reducer.embed(X)[:, :, 0] > 0.5).all()
 
 
 def test_a_retrain_takes_its_steps_and_twice_as_many_where_training_is_behind() -> None:
@@ -229,6 +222,17 @@ def test_dead_channels_and_huge_values_are_embedded_finitely() -> None:
     reducer.train(X, y, content_fold(X, 3))
     X[0, 0, 5] = 3e38
     assert np.isfinite(reducer.embed(X)).all()
+
+
+def test_a_checkpoint_that_is_missing_is_named_at_every_training() -> None:
+    X, y = toy_traces(60)
+    reducer = quick(checkpoint="missing.pt")
+    folds = content_fold(X, 3)
+    for _ in range(2):
+        with pytest.raises(SettingError, match="missing"):
+            reducer.precompute(X, np.arange(60))
+        with pytest.raises(SettingError, match="missing"):
+            reducer.train(X, y, folds)
 
 
 def test_labels_of_one_class_are_learned_from() -> None:
