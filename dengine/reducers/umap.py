@@ -13,8 +13,9 @@ A training takes these steps; each line says what differs from the library umap-
 4. `spectral_start` places the traces of a first training, as in umap-learn. Later trainings go on
    from the last embedding, and new traces begin where step 6 puts them.
 5. `optimize_layout` moves the points by attraction and repulsion.
-6. `UmapEncoder` puts a new trace at the mean of its nearest references' points, weighted by their
-   membership strengths. umap-learn starts there and goes on with stochastic steps.
+6. `UmapEncoder` starts a new trace at the mean of its nearest references' points, weighted by their
+   membership strengths, and moves it to where their attraction balances. umap-learn starts there
+   and goes on with stochastic steps of attraction and repulsion.
 
 References
 ----------
@@ -46,23 +47,25 @@ from .umap_graph import (
     fuzzy_simplicial_set,
     membership_strengths,
 )
-from .umap_layout import NOISE, optimize_layout, spectral_start
+from .umap_layout import NOISE, find_ab_params, optimize_layout, spectral_start
 
 FIRST_EPOCHS = 200  # that a layout needs from a spectral start, in one training or in several
 MIN_EPOCHS = 60  # of a later training
 MAX_EPOCHS = 200
 WORK = 240_000  # traces times epochs of a later training, between these two
 MAX_WORK = 400_000  # traces times epochs of any training, which bounds its time
+PULLS = 5  # by which a new trace comes to where attraction balances; 20 decide hardly more parts
+SMALLEST_SQUARE = 1e-3  # of a distance between points, at which attraction is infinite
 MIN_SLOTS = 256  # for references in an encoder: many versions share one compiled module
 
 
 class UmapEncoder(nn.Module):
     """Embed raw traces among references: (B, C, T) -> (B, 1, dim).
 
-    A trace lies at the mean of its nearest references' points, weighted by their membership
-    strengths. The strengths of the `n_neighbors` nearest references sum to ``log2(n_neighbors)``;
-    that of the nearest one is 1. sigma is interpolated between fixed multiples of the mean
-    distance, where a training bisects.
+    A trace starts at the mean of its nearest references' points, weighted by their membership
+    strengths, and is pulled from there to where their attraction balances. The strengths of the
+    `n_neighbors` nearest references sum to ``log2(n_neighbors)``; that of the nearest one is 1.
+    sigma is interpolated between fixed multiples of the mean distance, where a training bisects.
 
     Parameters
     ----------
@@ -73,6 +76,8 @@ class UmapEncoder(nn.Module):
         Embedding of the references.
     n_neighbors : int
         Less than n.
+    min_dist : float
+        Of the layout: it determines how attraction depends on the distance.
 
     Notes
     -----
@@ -91,10 +96,14 @@ class UmapEncoder(nn.Module):
         references: Tensor,
         points: Tensor,
         n_neighbors: int,
+        min_dist: float,
     ) -> None:
         super().__init__()
         self.make_frames = make_frames
         self.n_neighbors = n_neighbors
+        self.a, self.b = find_ab_params(min_dist)
+        self.pulls = PULLS
+        self.smallest_square = SMALLEST_SQUARE
         self.total_strength = log2(n_neighbors)
         self.dim = points.size(1)
         half_norms = 0.5 * references.square().sum(1)
@@ -112,16 +121,22 @@ class UmapEncoder(nn.Module):
     def embed_frames(self, frames: Tensor) -> Tensor:
         """Embed frames (B, F) among the references: (B, dim).
 
-        A trace lies at the mean of the points of its `n_neighbors` nearest references, weighted by
-        their membership strengths.
+        Each pull moves a trace to the mean of the points of its `n_neighbors` nearest references,
+        weighted by the coefficients of their attraction (see `umap_layout.attraction`).
         """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T
         nearest = half_squared.topk(self.n_neighbors, 1, False, True)[1]
         offsets = self.references[nearest] - frames.unsqueeze(1)
         strengths = self.strengths(offsets.square().sum(2).sqrt())
-        weighted = strengths.unsqueeze(2) * self.points[nearest]
-        return weighted.sum(1) / strengths.sum(1, keepdim=True)
+        points = self.points[nearest]
+        embedded = weighted_mean(points, strengths)
+        for _ in range(self.pulls):
+            squared = (points - embedded.unsqueeze(1)).square().sum(2) + self.smallest_square
+            power = squared.pow(self.b)
+            attraction = strengths * power / (squared * (1.0 + self.a * power))
+            embedded = weighted_mean(points, attraction)
+        return embedded
 
     def strengths(self, distances: Tensor) -> Tensor:
         """Distances to the nearest references (B, n_neighbors) -> membership strengths, same shape.
@@ -141,6 +156,11 @@ class UmapEncoder(nn.Module):
         rate_after = self.rates[after]
         rate = rate_before + share.clamp(0.0, 1.0) * (rate_after - rate_before)
         return torch.exp(-beyond * rate)
+
+
+def weighted_mean(points: Tensor, weights: Tensor) -> Tensor:
+    """Return the weighted means (B, dim) of points (B, n, dim), weights (B, n)."""
+    return (weights.unsqueeze(2) * points).sum(1) / weights.sum(1, keepdim=True)
 
 
 def padded(rows: Tensor, value: float) -> Tensor:
@@ -376,7 +396,9 @@ class UmapReducer(Reducer):
         self.neighbors_ = neighbors
         self.precomputed_neighbors_ = None
         self.embedding_ = points
-        encoder = UmapEncoder(self.make_frames_, neighbors.frames, points, self.n_neighbors)
+        encoder = UmapEncoder(
+            self.make_frames_, neighbors.frames, points, self.n_neighbors, self.min_dist
+        )
         self.encoder_ = encoder.eval()
 
     @torch.inference_mode()
@@ -397,7 +419,7 @@ class UmapReducer(Reducer):
         make_frames = frames_for(X)
         references = torch.zeros(n, make_frames.n_features)
         points = torch.zeros(n, self.n_components)
-        return UmapEncoder(make_frames, references, points, self.n_neighbors).eval()
+        return UmapEncoder(make_frames, references, points, self.n_neighbors, self.min_dist).eval()
 
     def module(self) -> UmapEncoder:
         check_is_fitted(self, "encoder_")
