@@ -37,8 +37,8 @@ from .headers import (
 
 BESIDE = (".txt", ".json", ".ini", ".yaml", ".yml", ".meta", ".info", ".log")
 SMALL = 2**14  # bytes of a file that tells of a recording
-# Of equally good ones the first is taken. " ": any blanks; "": one column.
 MIN_FULL_ROWS = 8  # that show where the columns of fixed width end
+# Of equally good ones the first is taken. " ": any blanks; "": one column.
 DELIMITERS = ("\t", ";", "|", ",", " ", "")
 SAMPLED_LINES = 30  # from the end, by which the delimiter is found
 SAMPLED_CELLS = 40  # of each of these lines

@@ -125,12 +125,15 @@ def conv_layers(
 
 
 class ConvEncoder(nn.Module):
-    """Embed raw traces by the network and by `RocketReducer`, whose logits are averaged.
+    """Embed raw traces in the space of every fold: (B, C, T) -> (B, K, dim).
+
+    The first coordinate is the probability of success whose logit is the mean of those of the
+    network and of `RocketReducer`. The second, if any, is the network's.
 
     Parameters
     ----------
     network : Encoder
-        Preprocessor and trained members.
+        Preprocessor and trained members, one for each fold.
     rocket : FeatureEmbedding
         With one coordinate, the probability of success.
     """
@@ -158,16 +161,14 @@ def average_logits(
     probabilities : Tensor of float32, shape (..., 1)
         The other probability of each point.
     smallest : float, default 1e-6
-        Probabilities are clipped to this value and one minus it before their logits are taken.
+        Probabilities are clipped to [smallest, 1 - smallest] before their logits are taken.
 
     Returns
     -------
     Tensor of float32, shape (..., dim)
     """
-    logits = points.narrow(-1, 0, 1).logit(smallest)
-    other_logits = probabilities.logit(smallest)
-    mean = 0.5 * (logits + other_logits)
-    return torch.cat([mean.sigmoid(), points.narrow(-1, 1, points.size(-1) - 1)], -1)
+    logits = 0.5 * (points.narrow(-1, 0, 1).logit(smallest) + probabilities.logit(smallest))
+    return torch.cat([logits.sigmoid(), points.narrow(-1, 1, points.size(-1) - 1)], -1)
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -194,10 +195,11 @@ class ConvReducer(TorchReducer):
     network: NetworkFactory = field(init=False, default=ConvNetwork)
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute the features of `rocket_`, and cache them for the next `train`.
+        """Compute the features of traces (n, C, T) for `rocket_`, and cache them for `train`.
 
-        They are those of traces (n, C, T), and are found again by `numbers`; without these nothing
-        is cached. It does nothing with fewer than `min_traces` traces. No label is read.
+        They are found again by `numbers`; without these they are not kept. The first call with
+        `min_traces` traces also builds the network and draws the kernels; with fewer nothing is
+        done. No label is read.
         """
         if len(X) >= self.min_traces:
             traces = self._check_and_start(X)
@@ -205,7 +207,7 @@ class ConvReducer(TorchReducer):
 
     def _start(self, traces: Floats) -> None:
         super()._start(traces)
-        self.rocket_.draw_kernels(traces)
+        self.rocket_.init_encoder(traces)
 
     def _build(self, channels: int, samples: int, average: int) -> None:
         # Before `encoder_`, by which other threads see that there is a module.
@@ -227,14 +229,14 @@ class ConvReducer(TorchReducer):
         steps: int,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Train the heads of `rocket_`, then the network, which has the rest of the time.
+        """Fit the heads of `rocket_`, then train the network in the time that is left.
 
-        `numbers` (n,) identify the traces; see `RocketReducer.train`.
+        `numbers` (n,) identify the traces; see `RocketReducer.train`. Returns the points of the
+        traces, float32 (n, d), with averaged logits, row i in space ``folds[i]``.
         """
         probabilities = self.rocket_.train_heads(traces, labels, folds, stop, numbers)  # (n, 1)
         points = super()._train(traces, labels, folds, stop, steps)
-        averaged = average_logits(torch.from_numpy(points), torch.from_numpy(probabilities))
-        return averaged.numpy()
+        return average_logits(torch.from_numpy(points), torch.from_numpy(probabilities)).numpy()
 
     def embed(self, X: Floats) -> Floats:
         traces = self.check_traces(X)

@@ -333,7 +333,7 @@ class RocketReducer(Reducer):
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
         folds = folds_of(traces, self.folds, folds)
-        self.start(traces)
+        self._start(traces)
         check_classes(labels, self.training_masks(folds))
         self._fit_heads(self.raw_features(traces), labels, folds)
         return self
@@ -369,9 +369,11 @@ class RocketReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Fit the heads to checked traces, whose labels may be of one class; return points (n, d).
+        """Fit the logistic heads, without checking the input, and return the held-out embedding.
 
-        The kernels must have been drawn.
+        `init_encoder` must have been called: kernels that were not drawn are 0, and no error is
+        raised. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. The other
+        parameters and the result, float32 (n, d), are those of `train`.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
@@ -406,20 +408,23 @@ class RocketReducer(Reducer):
         The first ones set the shape, the scales and the kernels.
         """
         if "net_" not in vars(self):
-            self.start(self.check_traces(X, reset=True))
+            self._start(self.check_traces(X, reset=True))
         return self.check_traces(X)
 
-    def start(self, traces: Floats) -> None:
+    def _start(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
 
         No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its
         range or fewer than 2 samples.
         """
         self.build(traces.shape[1], traces.shape[2], averaging(torch.from_numpy(traces)))
-        self.draw_kernels(traces)
+        self.init_encoder(traces)
 
-    def draw_kernels(self, traces: Floats) -> None:
-        """Set channel scales and kernels of the module that was built from traces (n, C, T)."""
+    def init_encoder(self, traces: Floats) -> None:
+        """Set the channel scales, the random kernels and their thresholds from traces (n, C, T).
+
+        `build` must have been called. No label is read.
+        """
         generator = np.random.default_rng(seed_of(self.random_state))
         self.net_.encoder.learn(torch.from_numpy(traces), generator)
 

@@ -244,9 +244,9 @@ class TorchReducer(Reducer):
         return int(min(self.fit_steps, INITIAL_STEPS + STEPS_PER_LABEL * n_labels))
 
     def _check_and_start(self, X: Floats) -> Floats:
-        """Check traces and return them as (n, C, T); the first ones start the reducer.
+        """Check traces and return them as (n, C, T); the first call starts the reducer.
 
-        Raises SettingError if these are fewer than 20.
+        Raises SettingError if the first call has fewer than 20 traces.
         """
         if not vars(self).get("is_started_"):
             do = "verify more parts first"

@@ -47,14 +47,20 @@ from .umap_graph import (
     fuzzy_simplicial_set,
     membership_strengths,
 )
-from .umap_layout import NOISE, find_ab_params, optimize_layout, spectral_start
+from .umap_layout import (
+    NOISE,
+    attraction_coefficients,
+    find_ab_params,
+    optimize_layout,
+    spectral_start,
+)
 
 FIRST_EPOCHS = 200  # that a layout needs from a spectral start, in one training or in several
 MIN_EPOCHS = 60  # of a later training
 MAX_EPOCHS = 200
 WORK = 240_000  # traces times epochs of a later training, between these two
 MAX_WORK = 400_000  # traces times epochs of any training, which bounds its time
-PULLS = 5  # by which a new trace comes to where attraction balances; 20 decide hardly more parts
+N_ITERATIONS = 5  # that move a new trace to where attraction balances; 20 decide hardly more parts
 SMALLEST_SQUARE = 1e-3  # of a distance between points, at which attraction is infinite
 MIN_SLOTS = 256  # for references in an encoder: many versions share one compiled module
 
@@ -63,7 +69,7 @@ class UmapEncoder(nn.Module):
     """Embed raw traces among references: (B, C, T) -> (B, 1, dim).
 
     A trace starts at the mean of its nearest references' points, weighted by their membership
-    strengths, and is pulled from there to where their attraction balances. The strengths of the
+    strengths, and moves from there to where their attraction balances. The strengths of the
     `n_neighbors` nearest references sum to ``log2(n_neighbors)``; that of the nearest one is 1.
     sigma is interpolated between fixed multiples of the mean distance, where a training bisects.
 
@@ -102,7 +108,7 @@ class UmapEncoder(nn.Module):
         self.make_frames = make_frames
         self.n_neighbors = n_neighbors
         self.a, self.b = find_ab_params(min_dist)
-        self.pulls = PULLS
+        self.n_iterations = N_ITERATIONS
         self.smallest_square = SMALLEST_SQUARE
         self.total_strength = log2(n_neighbors)
         self.dim = points.size(1)
@@ -121,8 +127,9 @@ class UmapEncoder(nn.Module):
     def embed_frames(self, frames: Tensor) -> Tensor:
         """Embed frames (B, F) among the references: (B, dim).
 
-        Each pull moves a trace to the mean of the points of its `n_neighbors` nearest references,
-        weighted by the coefficients of their attraction (see `umap_layout.attraction`).
+        A trace starts at the mean of its nearest references' points, weighted by their membership
+        strengths. Five fixed-point iterations then replace the weights of the same references by
+        the coefficients of their attraction, at the distances from where the trace is.
         """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T
@@ -131,11 +138,10 @@ class UmapEncoder(nn.Module):
         strengths = self.strengths(offsets.square().sum(2).sqrt())
         points = self.points[nearest]
         embedded = weighted_mean(points, strengths)
-        for _ in range(self.pulls):
+        for _ in range(self.n_iterations):
             squared = (points - embedded.unsqueeze(1)).square().sum(2) + self.smallest_square
-            power = squared.pow(self.b)
-            attraction = strengths * power / (squared * (1.0 + self.a * power))
-            embedded = weighted_mean(points, attraction)
+            coefficients = attraction_coefficients(strengths, squared, self.a, self.b)
+            embedded = weighted_mean(points, coefficients)
         return embedded
 
     def strengths(self, distances: Tensor) -> Tensor:

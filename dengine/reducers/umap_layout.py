@@ -189,6 +189,15 @@ class Edges:
         return torch.segment_reduce(values, "sum", lengths=lengths, axis=1)
 
 
+def attraction_coefficients(strengths: Tensor, squared: Tensor, a: float, b: float) -> Tensor:
+    """Compute ``strength * d^(2b - 2) / (1 + a d^(2b))`` from squared distances d^2 above 0.
+
+    Strengths and squared distances may have any shape, the same for both, which the result has.
+    """
+    power = squared.pow(b)
+    return strengths * power / (squared * (1.0 + a * power))
+
+
 def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor, Tensor]:
     """Compute the pull of each point towards its neighbours.
 
@@ -218,8 +227,7 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
     """
     offsets = points.index_select(1, edges.tail) - points.index_select(1, edges.head)
     squared = offsets.square().sum(0).clamp(min=1e-8)
-    power = squared.pow(b)
-    coefficient = (4.0 * a * b) * edges.strength * power / (squared * (1.0 + a * power))
+    coefficient = attraction_coefficients((4.0 * a * b) * edges.strength, squared, a, b)
     sums = edges.sum_by_head(torch.cat([offsets * coefficient, coefficient.unsqueeze(0)]))
     return sums[:-1], sums[-1]
 

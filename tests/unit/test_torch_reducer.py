@@ -129,12 +129,16 @@ def test_after_training_good_parts_have_a_higher_probability_than_bad_ones_never
     assert probability[labels == 1].mean() > probability[labels == 0].mean() + 0.4
 
 
-def test_no_step_begins_after_the_deadline_and_the_reducer_answers_all_the_same() -> None:
+@pytest.mark.parametrize(("make", "n_steps"), [(quick, 0), (own_reducer, 2)])  # of the network
+def test_no_step_begins_after_the_deadline_and_the_reducer_answers_all_the_same(
+    make: Any, n_steps: int
+) -> None:
     X, y = toy_traces(60)
     ticks = iter(range(1000))
-    reducer, folds = own_reducer(), content_fold(X, 2)
+    reducer = make()
+    folds = content_fold(X, reducer.folds)
     reducer.train(X, y, folds, StopRule(deadline=2.0, clock=lambda: float(next(ticks))))
-    assert reducer.report.n_steps == 2
+    assert reducer.report.n_steps == n_steps
     assert np.isfinite(reducer.embed(X)).all()
 
 
@@ -208,11 +212,12 @@ def test_traces_of_any_shape_are_embedded_finitely_and_alike_when_scripted(
     reducer.train(X, np.arange(24) % 2, np.arange(24) % 3)
     embedded = reducer.embed(X)
     assert np.isfinite(embedded).all()
-    module = script(reducer.module())
+    eager = reducer.module()
+    module = script(eager)
     for x in torch.from_numpy(X[:3]):
         with torch.inference_mode():
-            scripted = module(x[None])
-            torch.testing.assert_close(scripted, reducer.module()(x[None]), rtol=0, atol=1e-6)
+            assert torch.equal(module.network(x[None]), eager.network(x[None]))
+            torch.testing.assert_close(module(x[None]), eager(x[None]), rtol=0, atol=1e-6)
 
 
 def test_dead_channels_and_huge_values_are_embedded_finitely() -> None:
