@@ -20,6 +20,13 @@ from dengine import Dataset, load_dataset
 N_PARTS = 1000  # of a generated set
 N_SAMPLES = 400  # of a generated trace
 TRANSIENT = 200  # samples of a resonance that are dropped, until it has forgotten its start
+# Engine noise: the share of good parts, the resonances in cycles per sample, how much a frequency
+# scatters around its resonance, the poles' distance from zero, and the noise over it.
+GOOD_SHARE = 0.6
+RESONANCES = {"good": 0.1, "bad": 0.115}
+SCATTER = 0.03
+POLE_RADIUS = 0.97
+NOISE = 0.6
 SHORT_SECONDS = 1.2  # of the traces of `insertion 1.2 s`
 
 Floats = NDArray[np.float64]
@@ -31,12 +38,13 @@ def oscillation(rng: np.random.Generator) -> Dataset:
 
     White noise lies over the resonance.
     """
-    good = rng.random(N_PARTS) < 0.6
-    X = rng.normal(0.0, 0.6, (N_PARTS, N_SAMPLES))
-    frequencies = np.where(good, 0.1, 0.115) * rng.normal(1.0, 0.03, N_PARTS)  # cycles per sample
+    good = rng.random(N_PARTS) < GOOD_SHARE
+    X = rng.normal(0.0, NOISE, (N_PARTS, N_SAMPLES))
+    resonance = np.where(good, RESONANCES["good"], RESONANCES["bad"])
+    frequencies = resonance * rng.normal(1.0, SCATTER, N_PARTS)  # cycles per sample
     for i, angle in enumerate(2.0 * np.pi * frequencies):
         excitation = rng.normal(size=N_SAMPLES + TRANSIENT)
-        denominator = [1.0, -1.94 * np.cos(angle), 0.97**2]
+        denominator = [1.0, -2.0 * POLE_RADIUS * np.cos(angle), POLE_RADIUS**2]
         ringing = lfilter([1.0], denominator, excitation)[TRANSIENT:]
         X[i] += ringing / ringing.std()
     return to_dataset(X, good)

@@ -198,8 +198,10 @@ def train(
         core_of(engine).wait_until_warm()  # or the first retrain's time would include that
         with progress_bar("training", None):
             reports = [engine.retrain()]
-            while reports[-1].accepted and engine.model.report.n_steps_left:
+            while reports[-1].accepted and reports[-1].n_steps and engine.model.report.n_steps_left:
                 reports.append(engine.retrain())
+        budget = engine.recipe.budget
+        n_steps_left = engine.model.report.n_steps_left
         report = reports[-1]
         n_labels = engine.store.status()["labels"]
     answers = "No version answers yet: every part is verified."
@@ -213,3 +215,8 @@ def train(
     )
     if not report.accepted:
         raise click.ClickException(f"The retrain was {report.reason}.")
+    if n_steps_left:
+        raise click.ClickException(
+            f"{n_steps_left} training steps are missing, and a retrain has no time for one in its "
+            f"budget of {budget:g} s. Set a larger budget or fewer labels (window) in the recipe."
+        )

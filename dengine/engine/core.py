@@ -172,11 +172,15 @@ class EngineCore:
         What it imports is loaded then, what it needs of stored traces is computed, and the code
         that will decide is compiled.
         """
-        if self._warm_up.ident is not None:
-            self._warm_up.join()
+        self._join_warm_up()
         if self.new_labels and not self.live.version:
             self.learner.precompute()
         self.learner.wait_until_precomputed()
+
+    def _join_warm_up(self) -> None:
+        """Wait until what a retrain imports is loaded."""
+        if self._warm_up.ident is not None:
+            self._warm_up.join()
 
     def resume(self) -> None:
         """Restore what a used store holds: version, references, rule, labels and pending checks.
@@ -457,6 +461,7 @@ class EngineCore:
         """Retrain in this thread and return the report, as `DataEngine.retrain`."""
         self.outbox.check_usable()
         with self.exclusive:
+            self._join_warm_up()
             return self.learner.retrain()
 
     def start_retrain(self) -> RetrainReport | None:

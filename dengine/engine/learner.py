@@ -271,11 +271,15 @@ class Learner:
     def _lacks_steps(self) -> bool:
         """Whether the answering version lacks training steps, as after a large import.
 
-        It is False after a dropped retrain, whose labels wait for the next one, and where cells
-        share a product: each of them would train the same version.
+        It is False after a dropped retrain, whose labels wait for the next one, after one that had
+        no time for a step, and where cells share a product: each of them would train the same
+        version.
         """
         is_alone = self._peers is None and self.live.answering is not None
-        return is_alone and self._was_accepted and self.live.newest.report.n_steps_left > 0
+        if not (is_alone and self._was_accepted):
+            return False
+        report = self.live.newest.report
+        return report.n_steps > 0 and report.n_steps_left > 0
 
     @property
     def is_swapping(self) -> bool:

@@ -7,6 +7,7 @@ import re
 from io import BytesIO
 from pathlib import Path
 from pickle import UnpicklingError
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,27 +40,50 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
     Raises
     ------
     SettingError
-        If the file cannot be read, or is of another network; the members are unchanged then.
+        If the file cannot be read, is of another network, or has values that are not finite; the
+        members are unchanged then.
     """
-    unreadable = OSError, RuntimeError, ValueError, EOFError, UnpicklingError
-    with instead(SettingError, f"The checkpoint {path} cannot be read", *unreadable):
-        weights = torch.load(path, map_location="cpu", weights_only=True)
+    weights = read_tensors(path)
     state = members.state_dict()
     names = {name: SEPARATE.sub(r"\g<1>0.", name) for name in state}  # in the checkpoint
-    shapes = {
-        names[name]: shape_of_member(name, value, members.count) for name, value in state.items()
+    expected = {
+        names[name]: tuple(shape_of_member(name, value, members.count))
+        for name, value in state.items()
     }
-    is_state = isinstance(weights, dict)
-    if not is_state or {name: value.shape for name, value in weights.items()} != shapes:
-        raise SettingError(
-            "Expected a checkpoint of this network for traces of this many channels, "
-            f"{path} is of another; train one with training/train_encoder.py."
-        )
+    actual = {name: tuple(value.shape) for name, value in weights.items()}
+    for name in [*expected, *actual]:
+        if expected.get(name) != actual.get(name):
+            raise SettingError(
+                "Expected a checkpoint of this network for traces of this many channels, "
+                f"{path} is of another: {name} has shape {actual.get(name)}, not "
+                f"{expected.get(name)}; train one with training/train_encoder.py."
+            )
+    is_finite = all(bool(torch.isfinite(value).all()) for value in weights.values())
+    expect(is_finite, f"finite weights in {path}", "NaN or infinite ones", "train it again")
     with torch.no_grad():
         for name, value in state.items():
             weight = weights[names[name]]
             n_copies = value.shape[0] // weight.shape[0] if value.dim() else 1
             value.copy_(torch.cat([weight] * n_copies) if n_copies > 1 else weight)
+
+
+def read_tensors(path: str | Path) -> dict[str, Tensor]:
+    """Return the tensors of a file by name.
+
+    Raises SettingError if it cannot be read, or does not hold named tensors alone.
+    """
+    with instead(SettingError, f"The checkpoint {path} cannot be read", OSError):
+        content = Path(path).read_bytes()
+    try:
+        weights: Any = torch.load(BytesIO(content), map_location="cpu", weights_only=True)
+    except (RuntimeError, ValueError, EOFError, UnpicklingError):
+        weights = None  # torch's own text advises to run the file's code
+    if isinstance(weights, dict) and all(isinstance(value, Tensor) for value in weights.values()):
+        return dict(weights)
+    raise SettingError(
+        f"Expected a checkpoint of named tensors alone, {path} is none; write one with "
+        "training/train_encoder.py."
+    )
 
 
 def shape_of_member(name: str, value: Tensor, count: int) -> torch.Size:

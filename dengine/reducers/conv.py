@@ -34,7 +34,7 @@ from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentatio
 
 from ..decision.scripting import arrays_with_prefix, incompatible_model_error
 from .base import Floats, Ints, StopRule
-from .encoder import Encoder, NetworkFactory
+from .encoder import Encoder, FoldableSequential, NetworkFactory
 from .rocket import FeatureEmbedding, RocketReducer
 from .torch_reducer import TorchReducer
 
@@ -57,7 +57,7 @@ class ConvNetwork(nn.Module):
         convolutions keep the members apart.
     width : int, default 8
         Outputs of the first convolution for each signal; the others have twice as many. With many
-        signals it is reduced, to a third at least, so that the time of a step hardly grows.
+        signals it is reduced, down to `width` // 3, so that the time of a step hardly grows.
     features : int, default 32
         Outputs of each member.
     """
@@ -70,7 +70,7 @@ class ConvNetwork(nn.Module):
         width = max(width // 3, min(width, 2 * width // signals))
         groups = members * signals  # a convolution sees one signal; the hidden layer sees all
         strides = (4 if samples >= MIN_SAMPLES_OF_STRIDE_4 else 2, 2, 2)
-        self.convolutions = nn.Sequential(
+        self.convolutions = FoldableSequential(
             *conv_layers(groups, 2, width, kernel=15, stride=strides[0]),
             *conv_layers(groups, width, 2 * width, kernel=9, stride=strides[1]),
             *conv_layers(groups, 2 * width, 2 * width, kernel=9, stride=strides[2]),

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
-from ..errors import SettingError
+from ..errors import SettingError, expect, instead
 from .preprocessing import Preprocessor
 
 # network(channels, samples) returns a module from (B, channels, samples) to (B, features).
@@ -48,19 +48,26 @@ class Members(nn.Module):
     Raises
     ------
     SettingError
-        If the output of the module has another number of dimensions.
+        If `network` is a module instead of its class, or the module does not give features.
     """
 
     def __init__(self, network: NetworkFactory, channels: int, samples: int, count: int) -> None:
         super().__init__()
         self.count = count
+        is_factory = callable(network) and not isinstance(network, nn.Module)
+        wanted = "network to be a class or function that returns a module"
+        expect(is_factory, wanted, f"an instance of {type(network).__name__}", "pass its class")
         grouped = "members" in signature(network).parameters
-        self.networks: nn.Module = (
-            Grouped(network, channels, samples, count)
-            if grouped
-            else Separate([network(channels, samples) for _ in range(count)])
-        )
-        features = count_features(self.networks, count, channels, samples)
+        shape = f"(B, {channels}, {samples}) to (B, features)"
+        if grouped:
+            shape = f"(B, {count * channels}, {samples}) to (B, {count} * features), by `members`"
+        with instead(SettingError, f"Expected a network that maps {shape}", Exception):
+            self.networks: nn.Module = (
+                Grouped(network, channels, samples, count)
+                if grouped
+                else Separate([network(channels, samples) for _ in range(count)])
+            )
+            features = count_features(self.networks, count, channels, samples)
         bound = features**-0.5
         self.weight = nn.Parameter(torch.empty(count, features, 2).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(count, 2))
@@ -106,6 +113,13 @@ class Separate(nn.Module):
         return torch.stack([network(x[:, k]) for k, network in enumerate(self.networks)], 1)
 
 
+class FoldableSequential(nn.Sequential):
+    """Layers whose batch normalisations `fold_batch_norms` may fold.
+
+    They must be called in this order alone, as `Sequential` does it.
+    """
+
+
 class Encoder(nn.Module):
     """Embed raw traces in the space of every member: (B, C, T) -> (B, K, dim).
 
@@ -147,16 +161,16 @@ class Encoder(nn.Module):
 
 
 def fold_batch_norms(module: nn.Module) -> nn.Module:
-    """Return the module with each batch normalisation in a `Sequential` folded into a convolution.
+    """Fold the batch normalisations of each `FoldableSequential` of a module into convolutions.
 
-    That is the `Conv1d` right before it; others stay. The module must be in evaluation mode. Its
-    children are replaced in place; a `Sequential` itself is returned as a new one. Folding is done
-    once, before anything is compiled, so that the engine and an exported file compute with the same
-    numbers.
+    Each is folded into the `Conv1d` right before it; others stay. The module must be in evaluation
+    mode. Its children are replaced in place, and it is returned; for a `FoldableSequential` itself
+    a new `Sequential` is returned. Folding is done once, before anything is compiled, so that the
+    engine and an exported file compute with the same numbers.
     """
     for name, child in module.named_children():
         setattr(module, name, fold_batch_norms(child))
-    if not isinstance(module, nn.Sequential):
+    if not isinstance(module, FoldableSequential):
         return module
     layers: list[nn.Module] = []
     for layer in module:
@@ -168,19 +182,17 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
 
 
 def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:
-    """Return the number of features of each member, by embedding two traces of zeros.
+    """Return the number of features of each member, by embedding three traces of zeros.
 
     They are embedded in evaluation mode, so that no statistics change; afterwards the networks are
-    in training mode. Raises SettingError if their output does not have three dimensions,
-    (B, K, features).
+    in training mode. Raises ValueError if their output is not (3, K, features), and what the
+    networks raise.
     """
     networks.eval()
     with torch.no_grad():
-        features = networks(torch.zeros(2, count, channels, samples))
+        features = networks(torch.zeros(3, count, channels, samples))
     networks.train()
-    if features.dim() != 3:
-        raise SettingError(
-            f"Expected a network that maps (B, {channels}, {samples}) to (B, features), "
-            f"got one that gives {features.dim() - 1} dimensions; flatten its output."
-        )
+    if features.dim() != 3 or len(features) != 3 or not features.size(2):
+        shape = tuple(features.select(1, 0).shape) if features.dim() > 1 else ()
+        raise ValueError(f"for three traces it gives {shape}; flatten its output")
     return int(features.size(2))

@@ -24,6 +24,7 @@ import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from os import PathLike
 from typing import Any, Self
 
 import numpy as np
@@ -33,10 +34,11 @@ from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
+from torch.nn.modules.batchnorm import _BatchNorm
 
-from ..decision.scripting import arrays_with_prefix, restore, script
+from ..decision.scripting import arrays_with_prefix, incompatible_model_error, restore, script
 from ..errors import SettingError, expect
-from ..records import is_whole
+from ..records import is_number, is_whole
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, folds_of, seed_of
 from .checkpoints import load_checkpoint
 from .encoder import Encoder, Members, NetworkFactory, fold_batch_norms
@@ -51,6 +53,7 @@ STEPS_PER_LABEL = 1.2  # that training must have had before it is called complet
 INITIAL_STEPS = 36  # on top of these
 MANY_LABELS = 4000  # labels beyond which embedding them leaves no time for more steps
 CATCH_UP_FACTOR = 2  # times the steps of a retrain, as long as training is behind
+SAME_POINTS = 1e-3  # by which the points of one trace may differ between two machines
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +122,8 @@ class TorchReducer(Reducer):
     network : callable
         ``network(channels, samples)`` returns an `nn.Module` from preprocessed traces
         (B, channels, samples) to features (B, features). Of each channel of a trace it sees two:
-        the averaged, standardised trace and its differences.
+        the averaged, standardised trace and its differences. A factory that also takes `members`
+        returns all members in one module, see `dengine.reducers.encoder.Members`.
     n_components : {1, 2}, default 2
         1 leaves the second axis out.
     folds : int, default 5
@@ -149,8 +153,9 @@ class TorchReducer(Reducer):
     n_steps_ : int
         Steps of all trainings so far.
     n_steps_left_ : int
-        Steps that are missing to complete training, after many labels came at once; 0 in normal
-        production.
+        Steps that are missing to complete training: many after many labels came at once, some after
+        the first retrains and where `steps` are few for the labels between two retrains. While
+        there are any, an engine retrains after every part.
     loss_ : float
         Mean training loss of the last retrain, in nats; NaN where it took no step.
     """
@@ -290,6 +295,7 @@ class TorchReducer(Reducer):
             self.members_ = Members(self.network, *shape, self.folds)
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
+        self.can_compile_: bool | None = None  # until it was tried
         self.is_started_ = False  # until scales and checkpoint are read
         self.n_steps_ = 0
         self.n_steps_left_ = 0
@@ -415,10 +421,13 @@ class TorchReducer(Reducer):
         """Set the averaged members' statistics of batch normalisation from traces x (n, C', L).
 
         At most 256 of these preprocessed traces, drawn at random but the same for the same n, are
-        used. The averaged members are in evaluation mode afterwards.
+        used. All other buffers are those of the trained members. The averaged members are in
+        evaluation mode afterwards.
         """
         members = self.averaged_members_.eval()
-        norms = [module for module in members.modules() if isinstance(module, nn.BatchNorm1d)]
+        for buffer, trained in zip(members.buffers(), self.members_.buffers(), strict=True):
+            buffer.copy_(trained)
+        norms = [module for module in members.modules() if isinstance(module, _BatchNorm)]
         for norm in norms:
             norm.reset_running_stats()
             norm.momentum = None  # the mean over all batches
@@ -488,7 +497,9 @@ class TorchReducer(Reducer):
     def module(self) -> nn.Module | None:
         check_is_fitted(self, "encoder_")
         shape = self.preprocessor_.channels, self.preprocessor_.samples
-        return self.encoder_ if can_compile(self.network, *shape) else None
+        if self.can_compile_ is None:  # copies of the reducer, which an engine trains, keep it
+            self.can_compile_ = can_compile(self.network, *shape)
+        return self.encoder_ if self.can_compile_ else None
 
     @property
     def report(self) -> FitReport:
@@ -508,7 +519,8 @@ class TorchReducer(Reducer):
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
         They are shape, counters, loss, and tensors of preprocessor, members, averaged members and
-        optimiser, so that training can go on. Raises NotFittedError before a fit.
+        optimiser, so that training can go on, and the points of one trace, by which `set_state`
+        tells another network. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
@@ -517,6 +529,7 @@ class TorchReducer(Reducer):
             "shape": np.array(self.trace_shape_),
             "counts": np.array(counts),
             "loss": np.array(self.loss_),
+            "points": self._embed_ramp(),
         }
         tensors: dict[str, Mapping[str, Tensor]] = {
             "preprocessor": self.preprocessor_.state_dict(),
@@ -533,7 +546,8 @@ class TorchReducer(Reducer):
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
-        Raises StoreError if the sizes are not those of the parameters.
+        Raises StoreError if the sizes are not those of the parameters, and if the network embeds a
+        trace at another place.
         """
         channels, samples = (int(value) for value in state["shape"])
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
@@ -554,7 +568,17 @@ class TorchReducer(Reducer):
             moments[key] = torch.from_numpy(np.array(value))
         self.is_started_ = True
         self.encoder_ = self._new_encoder()
+        points = state.get("points")
+        if points is not None and not np.allclose(points, self._embed_ramp(), atol=SAME_POINTS):
+            raise incompatible_model_error("network has the same sizes and is another one")
         return self
+
+    @torch.inference_mode()
+    def _embed_ramp(self) -> Floats:
+        """Embed a preprocessed trace that rises from -1 to 1, (1, K, d)."""
+        channels, samples = self.preprocessor_.channels, self.preprocessor_.samples
+        ramp = torch.linspace(-1.0, 1.0, samples).expand(1, self.folds, channels, samples)
+        return self.encoder_.embed(ramp).numpy()
 
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
@@ -569,10 +593,16 @@ class TorchReducer(Reducer):
         expect(is_whole(self.fit_steps, 1, 10**6), "fit_steps >= 1, an integer", self.fit_steps)
         expect(is_whole(self.batch_size, 2, 10**6), "batch_size >= 2, an integer", self.batch_size)
         expect(is_whole(self.shift, 0, 10**6), "shift >= 0 frames, an integer", self.shift)
+        numbers = "learning_rate", "weight_averaging", "weight_decay", "gain", "noise", "mixup"
+        for name in numbers:
+            value = getattr(self, name)
+            expect(is_number(value), f"{name}, a number", value)
         expect(self.learning_rate > 0.0, "learning_rate > 0", self.learning_rate)
+        is_path = isinstance(self.checkpoint, str | PathLike)
+        expect(is_path, 'checkpoint, the name of a file, or ""', self.checkpoint)
         is_share = 0.0 <= self.weight_averaging < 1.0
         expect(is_share, "weight_averaging from 0 to below 1", self.weight_averaging)
-        for name in ("weight_decay", "gain", "noise", "mixup"):
+        for name in numbers[2:]:
             value = getattr(self, name)
             expect(0.0 <= value < float("inf"), f"{name} >= 0", value)
 

@@ -1,6 +1,7 @@
 """The trainer of PyTorch networks, with the shipped network and with a user's own."""
 
 import logging
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -306,30 +307,152 @@ def test_a_reducer_that_starts_from_a_checkpoint_learns_something_else_than_from
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"no checkpoint", "cannot be read"),
+        (b"no checkpoint", "of named tensors alone"),
         (None, "cannot be read"),
-        ("other", "of this network for traces"),
+        ("other", r"of this network for traces .* has shape \(.*\), not \("),
+        ("a whole training", "of named tensors alone"),
+        ("NaN", "finite weights"),
     ],
 )
 def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(
     tmp_path: Any, content: Any, message: str
 ) -> None:
     path = tmp_path / "encoder.pt"
+    state = Members(ConvNetwork, 2, 120, 1).state_dict()
     if content == "other":
         save_checkpoint(Members(ConvNetwork, 6, 120, 1), path)
+    elif content == "a whole training":
+        torch.save({"epoch": 3, "model": state}, path)
+    elif content == "NaN":
+        torch.save(state | {"bias": torch.full((1, 2), float("nan"))}, path)
     elif content is not None:
         path.write_bytes(content)
     with pytest.raises(SettingError, match=message):
         load_checkpoint(Members(ConvNetwork, 2, 120, 3), path)
 
 
-def test_a_network_of_another_shape_is_refused_in_a_sentence() -> None:
+class LayersInAnotherOrder(SmallNetwork):
+    """Calls the layers of a Sequential one by one, and batch normalisation after the ReLU."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        convolution, norm, relu, pool, flatten = self.layers
+        features: torch.Tensor = flatten(pool(norm(relu(convolution(x)))))
+        return features
+
+
+class Residual(nn.Sequential):
+    """A Sequential with a `forward` of its own."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = x.mean(2).repeat(1, 12) + super().forward(x)
+        return features
+
+
+def residual(channels: int, samples: int) -> nn.Module:
+    return Residual(*SmallNetwork(channels, samples).layers)
+
+
+@pytest.mark.parametrize("network", [LayersInAnotherOrder, residual])
+def test_a_users_network_answers_as_its_own_forward_says(network: Any) -> None:
+    X, y = toy_traces(60)
+    reducer = own_reducer(network).fit(X, y)
+    x = reducer.preprocessor_(torch.from_numpy(X)).unsqueeze(1).expand(-1, 2, -1, -1)
+    with torch.no_grad():
+        expected = reducer.averaged_members_(x).sigmoid()  # trained, and never compiled
+    np.testing.assert_allclose(reducer.embed(X)[:, :, 0], expected, atol=1e-5)
+
+
+class ImageNorm(nn.BatchNorm2d):
+    """Batch normalisation of images, on traces as images of one row."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return super().forward(x.unsqueeze(2)).squeeze(2)
+
+
+class ImageNormNetwork(SmallNetwork):
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self.layers[1] = ImageNorm(6)
+
+
+def test_batch_normalisation_of_images_answers_with_statistics_of_the_labelled_traces() -> None:
+    X, y = toy_traces(60)
+    points = [own_reducer(n).fit(X, y).embed(X) for n in (SmallNetwork, ImageNormNetwork)]
+    np.testing.assert_allclose(*points, atol=1e-5)
+
+
+class MaximumNetwork(SmallNetwork):
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self.layers[3] = nn.AdaptiveMaxPool1d(4)
+
+
+def test_another_network_with_weights_of_the_same_sizes_is_not_restored() -> None:
+    X, y = toy_traces(60)
+    state = own_reducer().fit(X, y).get_state()
+    with pytest.raises(StoreError, match="the same sizes and is another one"):
+        own_reducer(MaximumNetwork).set_state(state)
+
+
+def gives(output: Any) -> Any:
+    """A network whose output is a function of its input."""
+
+    class Network(nn.Module):
+        def __init__(self, channels: int, samples: int) -> None:
+            super().__init__()
+
+        def forward(self, x: torch.Tensor) -> Any:
+            return output(x)
+
+    return Network
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        (gives(lambda x: x), r"for three traces it gives \(3, 2, 120\); flatten its output"),
+        (gives(lambda x: x.sum()), "maps"),
+        (gives(lambda x: (x, x)), "got tuple"),
+        (gives(lambda x: x.mean(0)), r"for three traces it gives \(2, 120\)"),
+        (gives(lambda x: x[:, 0, :0]), r"it gives \(3, 0\)"),
+        (lambda channels, samples: None, "NoneType"),
+        (SmallNetwork(2, 120), "an instance of SmallNetwork.*pass its class"),
+        ("SmallNetwork", "an instance of str"),
+        (lambda channels, samples, members=1: SmallNetwork(channels, samples), "by `members`"),
+    ],
+)
+def test_what_is_no_network_of_features_is_refused_in_a_sentence(
+    network: Any, message: str
+) -> None:
     X, y = toy_traces(30)
-    with pytest.raises(
-        SettingError,
-        match=r"maps \(B, 2, 120\) to \(B, features\), got one that gives 3 dimensions",
-    ):
-        own_reducer(lambda channels, samples: nn.Conv1d(channels, 3, 5)).fit(X, y)
+    with pytest.raises(SettingError, match=message):
+        own_reducer(network).fit(X, y)
+
+
+def test_a_retrain_does_not_try_again_whether_a_partial_network_compiles(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    X, y = toy_traces(60)
+    engine = DataEngine(reducer=own_reducer(partial(PythonNetwork)), replaying=True, radius=0.07)
+    with caplog.at_level(logging.WARNING):
+        for n, (x, good) in enumerate(zip(X, y, strict=True)):
+            engine.report(engine.decide(x).id, bool(good))
+            if n == 30:
+                caplog.clear()
+        assert engine.version > 2
+    assert "cannot be compiled" not in caplog.text
+
+
+def test_a_retrain_without_time_for_a_step_is_not_repeated_at_every_part(tmp_path: Any) -> None:
+    X, y = toy_traces(140, seed=3)
+    recipe = Recipe("conv", {"folds": 2}, retrain_every=1000, budget=1e-3)
+    url = str(tmp_path / "cell.db")
+    import_labelled(url, Dataset(X[:100, 0], y[:100].astype(np.int8)), recipe)
+    with DataEngine.open(url) as engine:
+        assert engine.retrain().n_steps == 0
+        for x, good in zip(X[100:], y[100:], strict=True):
+            engine.report(engine.decide(x).id, bool(good))
+        assert engine.version == 1
 
 
 def test_a_network_that_does_not_compile_answers_in_python_and_says_so(

@@ -1,0 +1,173 @@
+"""Play scores that no reducer can learn from its own labels, to see what is left to gain.
+
+    python training/ideal_score.py --seeds 100:110 --n-jobs 2
+    python training/ideal_score.py --screw screw_driving.npz  # as make_screw_driving.py writes it
+
+A score stands in for the reducer from the first part on, in the same loop:
+
+- on `oscillation`, each trace's probability of success by Bayes' rule. The generator is known, and
+  no embedding tells more of a part;
+- on a recorded set, the probability by a `conv` that was trained beforehand on all labels of the
+  set. It is cross-fitted: no part is scored by a member that saw its label.
+
+The table compares them with `conv` and `rocket` on the same parts in the same order, and gives the
+95 % interval of the mean difference from `rocket`.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Self
+
+import joblib
+import numpy as np
+import pandas as pd
+from common import options, print_table
+from evidence_page import mean_difference
+from evidence_sets import (
+    GENERATORS,
+    GOOD_SHARE,
+    NOISE,
+    POLE_RADIUS,
+    RESONANCES,
+    SCATTER,
+    load_set,
+)
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
+
+from dengine import Dataset, Policy, Recipe, replay
+from dengine.reducers import ConvReducer
+from dengine.reducers.base import Reducer
+from dengine.traces import as_traces
+
+FREQUENCIES = np.linspace(0.08, 0.14, 241)  # of the resonance, cycles per sample
+N_FOLDS = 10
+N_TRAININGS = 10  # each of STEPS steps
+STEPS = 240
+N_CYCLES = 1503  # of a replay, at most
+
+Traces = NDArray[np.float32]  # (n, C, T)
+Floats = NDArray[np.float64]
+Score = Callable[[Traces], Floats]
+
+
+class KnownScore(Reducer):
+    """Embed a trace by a function (n, C, T) -> (n,) that gives the probability of success."""
+
+    scores = True
+    own_unit = True
+    min_traces = ConvReducer.min_traces
+    default_radius = ConvReducer.default_radius
+    default_retrain_every = ConvReducer.default_retrain_every
+
+    def __init__(self, score: Score) -> None:
+        self.score = score
+
+    def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
+        """Remember the shape of the traces; there is nothing to learn."""
+        self.check_traces(X, reset=True)
+        return self
+
+    def transform(self, X: ArrayLike) -> NDArray[np.float32]:
+        """Return the probabilities, (n, 1)."""
+        return self.score(self.check_traces(X))[:, None].astype(np.float32)
+
+
+def oscillation_posterior(traces: Traces) -> Floats:
+    """Return the probability that a part of `evidence_sets.oscillation` is good, (n,).
+
+    By Bayes' rule over the resonance's frequency, with Whittle's likelihood (1953): the values of
+    the periodogram are independent and exponential, with the spectrum as their means.
+    """
+    n_samples = traces.shape[2]
+    bins = np.arange(1, n_samples // 2)
+    periodogram = np.abs(np.fft.rfft(traces[:, 0])[:, bins]) ** 2 / n_samples
+    z = np.exp(-2j * np.pi * bins / n_samples)
+    a1 = 2.0 * POLE_RADIUS * np.cos(2.0 * np.pi * FREQUENCIES)[:, None]
+    a2 = -(POLE_RADIUS**2)
+    variance = (1.0 - a2) / ((1.0 + a2) * ((1.0 - a2) ** 2 - a1**2))
+    resonance = 1.0 / np.abs(1.0 - a1 * z - a2 * z**2) ** 2 / variance
+    spectrum = resonance + NOISE**2  # (frequencies, bins)
+    log_likelihood = -np.log(spectrum).sum(axis=1) - periodogram @ (1.0 / spectrum).T
+
+    def log_evidence(mean: float, share: float) -> Floats:
+        log_prior = -0.5 * ((FREQUENCIES - mean) / (SCATTER * mean)) ** 2
+        log_prior -= logsumexp(log_prior)
+        evidence: Floats = logsumexp(log_likelihood + log_prior, axis=1) + np.log(share)
+        return evidence
+
+    good = log_evidence(RESONANCES["good"], GOOD_SHARE)
+    bad = log_evidence(RESONANCES["bad"], 1.0 - GOOD_SHARE)
+    posterior: Floats = np.exp(-np.logaddexp(0.0, bad - good))
+    return posterior
+
+
+def trained_beforehand(data: Dataset) -> Score:
+    """Train conv on all labels of a set, and return the cross-fitted score of its own traces."""
+    traces = as_traces(data.X)
+    folds = np.random.default_rng(0).permutation(len(data)) % N_FOLDS
+    reducer = ConvReducer(folds=N_FOLDS, steps=STEPS, fit_steps=STEPS * N_TRAININGS)
+    for _ in range(N_TRAININGS):
+        points = reducer.train(traces, data.y.astype(np.int64), folds)
+    table = {trace.tobytes(): point[0] for trace, point in zip(traces, points, strict=True)}
+    return lambda x: np.array([table[trace.tobytes()] for trace in x])
+
+
+def play(set_name: str, screw_driving: Path | None, seeds: range, n_jobs: int) -> pd.DataFrame:
+    """Play the known score, conv and rocket; a row for each replay."""
+    policy = Policy(alpha=0.1, lower_bound=0.9)
+    is_generated = set_name in GENERATORS
+    data = {seed: load_set(set_name, seed, screw_driving) for seed in seeds}
+    score = oscillation_posterior if is_generated else trained_beforehand(data[seeds[0]])
+    name = "posterior" if is_generated else "conv, trained beforehand"
+    recipes = {
+        "rocket": Recipe("rocket", policy=policy),
+        "conv": Recipe("conv", policy=policy),
+        name: Recipe(KnownScore(score), policy=policy),
+    }
+
+    def play_one(method: str, seed: int) -> dict[str, object]:
+        cycles = min(N_CYCLES, len(data[seed]))
+        played = replay(
+            data[seed], recipes[method], seed=seed, cycles=cycles, shuffle=not is_generated
+        )
+        return {"set": set_name, "method": method, "seed": seed} | played.summary()
+
+    jobs = (joblib.delayed(play_one)(method, seed) for method in recipes for seed in seeds)
+    return pd.DataFrame(joblib.Parallel(n_jobs)(jobs))
+
+
+def compare(replays: pd.DataFrame) -> list[dict[str, object]]:
+    """Return a row for each method: its means, and the difference from rocket's certain ones."""
+    certain = replays.pivot_table(index="seed", columns="method", values="certain", sort=False)
+    rows = list[dict[str, object]]()
+    for method, group in replays.groupby("method", sort=False):
+        more = mean_difference(certain[method] - certain["rocket"])
+        rows.append(
+            {
+                "set": group["set"].iloc[0],
+                "method": method,
+                "certain": group["certain"].mean(),
+                "bad accepted": group["false_positive"].mean(),
+                "beyond rocket": more.mean,
+                "from": more.low,
+                "to": more.high,
+            }
+        )
+    return rows
+
+
+def main() -> None:
+    parser = options(__doc__, seeds=range(100, 110), n_jobs=1, out=Path("out/ideal_score"))
+    parser.add_argument("--screw", type=Path, help="the screw-driving set, an .npz file")
+    arguments = parser.parse_args()
+    rows = list[dict[str, object]]()
+    for set_name in ("oscillation", "insertion", *["screw driving"] * bool(arguments.screw)):
+        replays = play(set_name, arguments.screw, arguments.seeds, arguments.n_jobs)
+        rows += compare(replays)
+    path = arguments.out / "ideal_score.csv"
+    print_table(rows, f"{len(arguments.seeds)} shuffles, at alpha 0.1, LB 90 %", path)
+
+
+if __name__ == "__main__":
+    main()
