@@ -122,15 +122,10 @@ def busy_cores() -> Iterator[None]:
 
 
 def filled_engine(data: Dataset, recipe: Recipe, executor: Executor | None = None) -> DataEngine:
-    """Return an engine that has decided on the whole set, learned the labels, and retrained.
-
-    A part that it rejected is not among its references, since nobody tells it the label.
-    """
+    """Return an engine that has learned every label of a set, and retrained."""
     engine = DataEngine(recipe=recipe, executor=executor)
     for trace, label in zip(data.X, data.y, strict=True):
-        decision = engine.decide(trace)
-        if decision.action != "reject":
-            engine.report(decision.id, bool(label))
+        engine.report(engine.decide(trace).id, bool(label))
     engine.retrain()
     return engine
 

@@ -3,7 +3,8 @@
 import argparse
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from rich.table import Table
 
 from dengine import Dataset
 from dengine.cli.output import format_value, heading
+from dengine.errors import DengineError
 from dengine.experiments.tables import write_csv
 from dengine.traces import as_traces
 
@@ -58,6 +60,15 @@ def options(description: str | None, **defaults: Any) -> argparse.ArgumentParser
         kind, text = OPTIONS[name]
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=default, help=text)
     return parser
+
+
+@contextmanager
+def message_for_errors() -> Iterator[None]:
+    """Context manager that ends the program with the message of an error of dengine."""
+    try:
+        yield
+    except DengineError as error:
+        raise SystemExit(f"Error: {error}") from error
 
 
 def wall_time(call: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from common import options
+from common import message_for_errors, options
 from numpy.typing import NDArray
 from rich.progress import Progress
 from sklearn.model_selection import GroupShuffleSplit
@@ -36,7 +36,7 @@ from torchmetrics import MeanMetric
 from torchmetrics.classification import BinaryAUROC, BinaryCalibrationError
 
 from dengine import ConvReducer, Dataset, load_dataset
-from dengine.errors import DataError
+from dengine.errors import DataError, OutputError, expect, instead
 from dengine.experiments.figures import BLUE, GREY, LIMIT, blank, finish, save
 from dengine.experiments.tables import write_csv
 from dengine.reducers.checkpoints import save_checkpoint
@@ -96,12 +96,17 @@ def split_parts(data: Dataset, held_out: float, seed: int) -> tuple[TensorDatase
     Raises
     ------
     DataError
-        If one of the sets has labels of one class only.
+        If there are too few parts, if one of the sets has labels of one class only, or for samples
+        that are not finite.
     """
     parts = np.arange(len(data)) if data.part is None else data.part
     splitter = GroupShuffleSplit(n_splits=1, test_size=held_out, random_state=seed)
-    training_rows, held_out_rows = next(splitter.split(data.X, groups=parts))
+    with instead(DataError, "The parts cannot be split", ValueError):
+        training_rows, held_out_rows = next(splitter.split(data.X, groups=parts))
     traces = torch.from_numpy(as_traces(data.X))  # (n, C, T)
+    n_damaged = int((~traces.isfinite()).flatten(1).any(1).sum())
+    actual = f"{n_damaged} with NaN or infinite ones"
+    expect(n_damaged == 0, "traces of finite samples", actual, "leave them out", DataError)
     _, channels, samples = traces.shape
     preprocessor = Preprocessor(channels, samples, averaging(traces[training_rows]))
     preprocessor.learn(traces[training_rows])
@@ -222,15 +227,17 @@ def draw_curve(curve: list[Epoch], base_rate: float, path: Path) -> None:
     epochs = columns["epoch"]
     figure = blank(10.0, 3.2)
     left, middle, right = figure.subplots(1, 3)
-    left.plot(epochs, columns["train_loss"], color=GREY, linestyle="--", label="training")
-    left.plot(epochs, columns["log_loss"], color=BLUE, label="held out")
+    left.plot(epochs, columns["train_loss"], "--", color=GREY, marker=".", label="training")
+    left.plot(epochs, columns["log_loss"], color=BLUE, marker=".", label="held out")
     left.axhline(base_rate, **LIMIT, label="base rate")
     finish(left, legend=0, xlabel="epoch", ylabel="log loss [nats]", ylim=(0.0, None))
     left.legend(frameon=False, loc="best")
-    middle.plot(epochs, columns["auroc"], color=BLUE)
+    middle.plot(epochs, columns["auroc"], color=BLUE, marker=".")
     finish(middle, legend=0, xlabel="epoch", ylabel="AUROC, held out")
-    right.plot(epochs, columns["calibration_error"], color=BLUE)
+    right.plot(epochs, columns["calibration_error"], color=BLUE, marker=".")
     finish(right, legend=0, xlabel="epoch", ylabel="calibration error, held out", ylim=(0.0, None))
+    for axes in (left, middle, right):
+        axes.xaxis.get_major_locator().set_params(integer=True)
     save(figure, path, force=True)
 
 
@@ -280,13 +287,17 @@ def write_card(path: Path, section: str) -> None:
 
 def parse_arguments() -> argparse.Namespace:
     """Parse the command line."""
-    parser = options(__doc__, data="insertion", samples=None, out=Path("models/conv"))
+    parser = options(__doc__, data="insertion", samples=None, out=Path("out/encoder"))
     parser.add_argument("--epochs", type=int, default=40, help="passes over the training set")
     parser.add_argument("--seed", type=int, default=0, help="of the split, weights and batches")
     parser.add_argument("--held-out", type=float, default=0.2, help="share of parts held out")
     arguments = parser.parse_args()
     if arguments.epochs < 1:
         parser.error(f"expected --epochs of at least 1, got {arguments.epochs}")
+    if not 0.0 < arguments.held_out < 1.0:
+        parser.error(f"expected --held-out between 0 and 1, got {arguments.held_out}")
+    if not 0 <= arguments.seed < 2**32:
+        parser.error(f"expected --seed from 0 to 2**32 - 1, got {arguments.seed}")
     return arguments
 
 
@@ -301,7 +312,8 @@ def main() -> None:
     best, curve = train(members, training, held_out, arguments.epochs, arguments.seed)
     chosen = min(curve, key=lambda row: row.log_loss)
     base_rate = base_rate_loss(training, held_out)
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    with instead(OutputError, f"Cannot make the folder {arguments.out}", OSError):
+        arguments.out.mkdir(parents=True, exist_ok=True)
     checkpoint = arguments.out / "encoder.pt"
     save_checkpoint(best, checkpoint)
     write_csv(pd.DataFrame([asdict(row) for row in curve]), arguments.out / "curve.csv", force=True)
@@ -336,12 +348,14 @@ def describe_data(data: Dataset, n_held_out: int) -> str:
     """Describe a data set and its split in two sentences."""
     n_success = int(data.y.sum())
     rate = "an unknown rate" if data.rate_hz is None else f"{data.rate_hz:g} Hz"
+    unit = data.unit or "an unknown unit"
     return (
         f"`{data.name}`: {len(data)} traces of {describe_channels(data)} and {data.spec.samples} "
-        f"samples at\n{rate} in {data.unit}; {n_success} good and "
+        f"samples at\n{rate} in {unit}; {n_success} good and "
         f"{len(data) - n_success} bad parts. {n_held_out} traces were held out."
     )
 
 
 if __name__ == "__main__":
-    main()
+    with message_for_errors():
+        main()

@@ -18,6 +18,7 @@ REPO = Path(__file__).resolve().parents[2]
 COPIED = {  # page or picture of the site -> file of the repository
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
+    "security.md": "SECURITY.md",
     "explanation/insertion.md": "dengine/data/insertion.md",
     "explanation/insertion_causes.png": "dengine/data/insertion_causes.png",
     "explanation/insertion_heights.png": "dengine/data/insertion_heights.png",
@@ -42,10 +43,12 @@ def on_files(files: Files, config: MkDocsConfig, **others: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **others: Any) -> str:
-    """Return a page with the list of cards, and with links to docs/ and notebooks corrected."""
+    """Return a page with the list of cards, and with links into the repository corrected."""
     card_links = [f"- [{path.parent.name}]({path.parent.name}/card.md)" for path in cards()]
     markdown = re.sub(r"\]\(((?:\.\./)*)docs/", r"](\1", markdown)
-    markdown = re.sub(r"\]\((\w+)\.ipynb\)", r"](\1.md)", markdown)
+    markdown = re.sub(r"\]\((?:\.\./\.\./notebooks/)?(\w+)\.ipynb\)", r"](\1.md)", markdown)
+    for page_name, path in COPIED.items():
+        markdown = markdown.replace(f"](../../{path}", f"](../{page_name}")
     return markdown.replace(CARDS, "\n".join(card_links))
 
 

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 from dengine import ConvReducer, load_dataset
+from dengine.errors import DataError
 from dengine.testing import toy_traces
 
 FOLDER = Path(__file__).resolve().parents[2] / "training"
@@ -124,6 +125,26 @@ def test_a_trained_encoder_beats_the_base_rate_and_starts_conv(run: Run, tmp_pat
         folds=2, fit_steps=1, random_state=0, checkpoint=str(out / "encoder.pt")
     ).fit(X, y)
     assert started.loss_ < 0.8 * fresh.loss_
+
+
+def test_a_trace_with_a_nan_is_refused_before_the_training(run: Run, tmp_path: Path) -> None:
+    X, y = toy_traces(60)
+    X[3, 0, 5] = np.nan
+    np.savez(tmp_path / "toy.npz", X=X, y=y)
+    with pytest.raises(DataError, match="1 with NaN"):
+        run("train_encoder", "--data", tmp_path / "toy.npz", "--out", tmp_path / "encoder")
+    assert not (tmp_path / "encoder").exists()
+
+
+def test_the_posterior_of_an_oscillation_tells_the_share_of_good_parts(tmp_path: Path) -> None:
+    sets = load("evidence_sets")
+    data = sets.load_set("oscillation", seed=3)
+    posterior = load("ideal_score").oscillation_posterior(data.X[:, None])
+    for low, high in ((0.0, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 1.0)):
+        chosen = (posterior >= low) & (posterior <= high)
+        error = 4 * np.sqrt(0.25 / chosen.sum())
+        assert data.y[chosen].mean() == pytest.approx(posterior[chosen].mean(), abs=error)
+    assert ((posterior > 0.5) == data.y).mean() > 0.97
 
 
 def test_a_training_replaces_its_section_of_a_card_and_no_other(run: Run, tmp_path: Path) -> None:
