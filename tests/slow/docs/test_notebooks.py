@@ -68,7 +68,7 @@ def printed(cell: Any) -> str:
 
 def test_the_index_names_every_notebook() -> None:
     text = INDEX.read_text(encoding="utf-8")
-    assert [path.stem for path in NOTEBOOKS if f"({path.stem}.md)" not in text] == []
+    assert [path.stem for path in NOTEBOOKS if f"/{path.stem}.ipynb)" not in text] == []
 
 
 @every_notebook
