@@ -23,6 +23,7 @@ from dengine.reducers.conv import HEAD_STEPS, ConvNetwork
 from dengine.reducers.encoder import Members
 from dengine.reducers.torch_reducer import Augmentation, draw_batches
 from dengine.testing import check_reducer, labels_of_a_fold_move_nothing_in_its_space, toy_traces
+from tests.support.command_line import dengine
 
 
 class SmallNetwork(nn.Module):
@@ -507,6 +508,7 @@ def test_an_engine_trains_on_after_an_import_a_retrain_per_cycle_until_its_steps
     left = []
     with DataEngine.open(url, replaying=True) as engine:
         assert engine.retrain().accepted
+        assert "12 steps to go" in dengine("status", url, "--json").output
         for x, good in zip(X[100:], y[100:], strict=True):
             left.append(engine.model.report.n_steps_left)
             engine.report(engine.decide(x).id, bool(good))
