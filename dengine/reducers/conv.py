@@ -10,6 +10,7 @@
                                (B, C * 16 * 8)
     hidden layer               32 features, which see all signals and all regions together
 
+With three signals or more there are fewer channels, and on short traces the first stride is 2.
 Batch normalisation and ReLU follow each convolution. `encoder.Members` puts two units and a logit
 behind the network, and `TorchReducer` trains several members of it side by side, each without the
 labels of one fold.

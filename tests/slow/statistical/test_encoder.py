@@ -1,4 +1,4 @@
-"""What the encoder must give: on traces that oscillate, what others miss."""
+"""What the encoder must give: on traces that oscillate, about as much as the drawn kernels."""
 
 import os
 
