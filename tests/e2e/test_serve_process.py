@@ -24,6 +24,7 @@ from tests.support.exports import trained
 from tests.support.serving import REPO, WAIT, started
 
 SAMPLES = 80
+APPROACH_SECONDS = 0.05  # of a robot, from its call of `begin` to the insertion
 NAMES = "action", "reason", "lower"
 
 
@@ -151,7 +152,11 @@ class Insertions:
         self._over: threading.Event | None = None
 
     def insert(self, trace: np.ndarray) -> None:
-        """Play a trace (T,), and return when it is over."""
+        """Move for some control cycles, play a trace (T,), and return when it is over.
+
+        The recorder sees the register go on only if it was off since the recorder was armed.
+        """
+        time.sleep(APPROACH_SECONDS)
         self._over = threading.Event()
         self._told.put(trace)
         assert self._over.wait(WAIT)
