@@ -538,6 +538,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def retrain(self) -> RetrainReport:
         """Retrain now, in this thread, and return the report.
 
+        It first waits for the imports that began with the engine, some two seconds after its start.
         A version that fails, or cannot be stored, is dropped: the report has `accepted` False then.
         Raises StoreError where the labels before it cannot be stored.
         """
