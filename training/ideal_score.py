@@ -1,12 +1,12 @@
-"""Play scores that no reducer can learn from its own labels, to see what is left to gain.
+"""Replay with scores that are known beforehand, to see how much a better reducer could still gain.
 
     python training/ideal_score.py --seeds 100:110 --n-jobs 2
     python training/ideal_score.py --screw screw_driving.npz  # as make_screw_driving.py writes it
 
-A score stands in for the reducer from the first part on, in the same loop:
+The score stands in for the reducer, in the same engine:
 
-- on `oscillation`, each trace's probability of success by Bayes' rule. The generator is known, and
-  no embedding tells more of a part;
+- on `oscillation`, each trace's probability of success by Bayes' rule. The generator is known, so
+  no embedding can say much more about a part;
 - on a recorded set, the probability by a `conv` that was trained beforehand on all labels of the
   set. It is cross-fitted: no part is scored by a member that saw its label.
 
@@ -18,10 +18,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
-import joblib
 import numpy as np
 import pandas as pd
-from common import options, print_table
+from common import POLICY, options, print_table
 from evidence_page import mean_difference
 from evidence_sets import (
     GENERATORS,
@@ -35,15 +34,17 @@ from evidence_sets import (
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
-from dengine import Dataset, Policy, Recipe, replay
+from dengine import Dataset, Recipe
+from dengine.experiments.grid import Task, iterate_replays
+from dengine.experiments.replay import Contender
 from dengine.reducers import ConvReducer
 from dengine.reducers.base import Reducer
 from dengine.traces import as_traces
 
 FREQUENCIES = np.linspace(0.08, 0.14, 241)  # of the resonance, cycles per sample
 N_FOLDS = 10
-N_TRAININGS = 10  # each of STEPS steps
-STEPS = 240
+N_TRAININGS = 10  # since each takes only a few Newton steps of conv's logistic regressions
+STEPS = 240  # of AdamW in a training; the first ones take up to twice as many
 N_CYCLES = 1503  # of a replay, at most
 
 Traces = NDArray[np.float32]  # (n, C, T)
@@ -76,8 +77,9 @@ class KnownScore(Reducer):
 def oscillation_posterior(traces: Traces) -> Floats:
     """Return the probability that a part of `evidence_sets.oscillation` is good, (n,).
 
-    By Bayes' rule over the resonance's frequency, with Whittle's likelihood (1953): the values of
-    the periodogram are independent and exponential, with the spectrum as their means.
+    Of traces (n, 1, T). By Bayes' rule, over a grid of frequencies of the resonance, with the
+    generator's own priors and Whittle's likelihood (1953): the values of the periodogram are
+    independent and exponential, with the spectrum as their means.
     """
     n_samples = traces.shape[2]
     bins = np.arange(1, n_samples // 2)
@@ -103,7 +105,10 @@ def oscillation_posterior(traces: Traces) -> Floats:
 
 
 def trained_beforehand(data: Dataset) -> Score:
-    """Train conv on all labels of a set, and return the cross-fitted score of its own traces."""
+    """Train conv on all labels of a set, and return a function that looks up held-out scores.
+
+    It raises KeyError for a trace that is not of the set.
+    """
     traces = as_traces(data.X)
     folds = np.random.default_rng(0).permutation(len(data)) % N_FOLDS
     reducer = ConvReducer(folds=N_FOLDS, steps=STEPS, fit_steps=STEPS * N_TRAININGS)
@@ -114,34 +119,38 @@ def trained_beforehand(data: Dataset) -> Score:
 
 
 def play(set_name: str, screw_driving: Path | None, seeds: range, n_jobs: int) -> pd.DataFrame:
-    """Play the known score, conv and rocket; a row for each replay."""
-    policy = Policy(alpha=0.1, lower_bound=0.9)
+    """Play rocket, conv and the known score; return the summary of each replay as a row.
+
+    A seed shuffles a recorded set; of a generated set it makes the parts, in their own order.
+    """
     is_generated = set_name in GENERATORS
-    data = {seed: load_set(set_name, seed, screw_driving) for seed in seeds}
-    score = oscillation_posterior if is_generated else trained_beforehand(data[seeds[0]])
-    name = "posterior" if is_generated else "conv, trained beforehand"
-    recipes = {
-        "rocket": Recipe("rocket", policy=policy),
-        "conv": Recipe("conv", policy=policy),
-        name: Recipe(KnownScore(score), policy=policy),
-    }
-
-    def play_one(method: str, seed: int) -> dict[str, object]:
-        cycles = min(N_CYCLES, len(data[seed]))
-        played = replay(
-            data[seed], recipes[method], seed=seed, cycles=cycles, shuffle=not is_generated
-        )
-        return {"set": set_name, "method": method, "seed": seed} | played.summary()
-
-    jobs = (joblib.delayed(play_one)(method, seed) for method in recipes for seed in seeds)
-    return pd.DataFrame(joblib.Parallel(n_jobs)(jobs))
+    if is_generated:
+        known = Contender("posterior", Recipe(KnownScore(oscillation_posterior)))
+    else:
+        score = trained_beforehand(load_set(set_name, seeds[0], screw_driving))
+        known = Contender("conv, trained beforehand", Recipe(KnownScore(score)))
+    contenders = [
+        contender.with_policy(**POLICY)
+        for contender in (Contender.load("rocket"), Contender.load("conv"), known)
+    ]
+    rows = list[dict[str, object]]()
+    for seed in seeds:
+        data = load_set(set_name, seed, screw_driving)
+        cycles = min(N_CYCLES, len(data))
+        tasks = [Task(contender, seed, cycles, not is_generated) for contender in contenders]
+        played = sorted(iterate_replays(data, tasks, n_jobs=n_jobs), key=lambda one: one.position)
+        rows += [{"set": set_name} | one.replay.summary() for one in played]
+    return pd.DataFrame(rows)
 
 
 def compare(replays: pd.DataFrame) -> list[dict[str, object]]:
-    """Return a row for each method: its means, and the difference from rocket's certain ones."""
-    certain = replays.pivot_table(index="seed", columns="method", values="certain", sort=False)
+    """Return a row for each method of one set: means, and certain decisions beyond rocket's.
+
+    The difference is paired by seed, and has its 95 % interval.
+    """
+    certain = replays.pivot_table(index="seed", columns="recipe", values="certain")
     rows = list[dict[str, object]]()
-    for method, group in replays.groupby("method", sort=False):
+    for method, group in replays.groupby("recipe", sort=False):
         more = mean_difference(certain[method] - certain["rocket"])
         rows.append(
             {

@@ -271,9 +271,9 @@ class Learner:
     def _lacks_steps(self) -> bool:
         """Whether the answering version lacks training steps, as after a large import.
 
-        It is False after a dropped retrain, whose labels wait for the next one, after one that had
-        no time for a step, and where cells share a product: each of them would train the same
-        version.
+        The engine then retrains after every part. False if the last retrain was dropped or took no
+        step, since the next one would fare alike, and in cells that share a product, since each of
+        them would train the same version.
         """
         is_alone = self._peers is None and self.live.answering is not None
         if not (is_alone and self._was_accepted):

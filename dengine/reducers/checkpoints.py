@@ -34,8 +34,7 @@ def save_checkpoint(members: Members, path: str | Path) -> None:
 def load_checkpoint(members: Members, path: str | Path) -> None:
     """Set the weights of every member, in place, to those of a checkpoint of a single member.
 
-    Only tensors are read; no code of the file runs. Buffers, such as the statistics of batch
-    normalisation, are set as well.
+    Buffers, such as the statistics of batch normalisation, are set as well.
 
     Raises
     ------
@@ -68,9 +67,9 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
-    """Return the tensors of a file by name.
+    """Return the dict of tensors that `torch.save` wrote to a file; no code of the file runs.
 
-    Raises SettingError if it cannot be read, or does not hold named tensors alone.
+    Raises SettingError if the file cannot be read, or holds anything but a dict of tensors.
     """
     with instead(SettingError, f"The checkpoint {path} cannot be read", OSError):
         content = Path(path).read_bytes()

@@ -114,9 +114,10 @@ class Separate(nn.Module):
 
 
 class FoldableSequential(nn.Sequential):
-    """Layers whose batch normalisations `fold_batch_norms` may fold.
+    """A `Sequential` whose batch normalisations `fold_batch_norms` folds into convolutions.
 
-    They must be called in this order alone, as `Sequential` does it.
+    Use it only where nothing calls one of its layers alone: a folded convolution gives the output
+    of the batch normalisation after it. A plain `Sequential` is not folded.
     """
 
 
@@ -127,7 +128,7 @@ class Encoder(nn.Module):
     ----------
     preprocessor : Preprocessor
     members : Members
-        In evaluation mode, with batch normalisation folded into the convolutions.
+        In evaluation mode, after `fold_batch_norms`.
     dim : int
         2, or 1 for the probability alone.
     """
@@ -163,10 +164,10 @@ class Encoder(nn.Module):
 def fold_batch_norms(module: nn.Module) -> nn.Module:
     """Fold the batch normalisations of each `FoldableSequential` of a module into convolutions.
 
-    Each is folded into the `Conv1d` right before it; others stay. The module must be in evaluation
-    mode. Its children are replaced in place, and it is returned; for a `FoldableSequential` itself
-    a new `Sequential` is returned. Folding is done once, before anything is compiled, so that the
-    engine and an exported file compute with the same numbers.
+    Each is folded into the `Conv1d` right before it, by `fuse_conv_bn_eval`; other batch
+    normalisations stay. The module must be in evaluation mode. Its children are replaced in place,
+    and it is returned; for a `FoldableSequential` itself a new `Sequential` is returned. The engine
+    and an exported file both compute with the folded module, so that their numbers are the same.
     """
     for name, child in module.named_children():
         setattr(module, name, fold_batch_norms(child))
@@ -182,11 +183,12 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
 
 
 def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:
-    """Return the number of features of each member, by embedding three traces of zeros.
+    """Return the number of features of each member, by a trial on three traces of zeros.
 
-    They are embedded in evaluation mode, so that no statistics change; afterwards the networks are
-    in training mode. Raises ValueError if their output is not (3, K, features), and what the
-    networks raise.
+    `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K. The trial is in
+    evaluation mode, so that no statistics change; afterwards the networks are in training mode.
+    Raises ValueError for an output without three dimensions, of another batch size, or without a
+    feature, and whatever the networks raise.
     """
     networks.eval()
     with torch.no_grad():

@@ -371,9 +371,9 @@ class RocketReducer(Reducer):
     ) -> Floats:
         """Fit the logistic heads, without checking the input, and return the held-out embedding.
 
-        `init_encoder` must have been called: kernels that were not drawn are 0, and no error is
-        raised. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. The other
-        parameters and the result, float32 (n, d), are those of `train`.
+        Call `init_encoder` first: without it all kernels are 0 and the result is meaningless,
+        without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. The
+        other parameters and the result, float32 (n, d), are those of `train`.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)

@@ -36,8 +36,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from ..decision.scripting import arrays_with_prefix, incompatible_model_error, restore, script
-from ..errors import SettingError, expect
+from ..decision.scripting import arrays_with_prefix, restore, script
+from ..errors import SettingError, StoreError, expect
 from ..records import is_number, is_whole
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, folds_of, seed_of
 from .checkpoints import load_checkpoint
@@ -418,10 +418,11 @@ class TorchReducer(Reducer):
 
     @torch.no_grad()
     def estimate_statistics(self, x: Tensor) -> None:
-        """Set the averaged members' statistics of batch normalisation from traces x (n, C', L).
+        """Estimate the running statistics of batch normalisation anew, for the averaged weights.
 
-        At most 256 of these preprocessed traces, drawn at random but the same for the same n, are
-        used. All other buffers are those of the trained members. The averaged members are in
+        As `torch.optim.swa_utils.update_bn`, from preprocessed traces x (n, C', L): at most 256 of
+        them, drawn at random but the same for the same n. No label is read, so each member may see
+        all folds. Other buffers are copied from the trained members. The averaged members are in
         evaluation mode afterwards.
         """
         members = self.averaged_members_.eval()
@@ -519,8 +520,8 @@ class TorchReducer(Reducer):
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
         They are shape, counters, loss, and tensors of preprocessor, members, averaged members and
-        optimiser, so that training can go on, and the points of one trace, by which `set_state`
-        tells another network. Raises NotFittedError before a fit.
+        optimiser, so that training can go on, and the points of a test trace, by which `set_state`
+        recognises the network. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
@@ -544,10 +545,11 @@ class TorchReducer(Reducer):
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore what `get_state` returned, and return self; the parameters must be the same.
+        """Restore what `get_state` returned, and return self.
 
-        Raises StoreError if the sizes are not those of the parameters, and if the network embeds a
-        trace at another place.
+        The constructor's parameters must be the same. Raises StoreError if the sizes are others, or
+        if the network gives other points for the test trace than when the state was taken. A state
+        without these points is not checked.
         """
         channels, samples = (int(value) for value in state["shape"])
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
@@ -570,12 +572,19 @@ class TorchReducer(Reducer):
         self.encoder_ = self._new_encoder()
         points = state.get("points")
         if points is not None and not np.allclose(points, self._embed_ramp(), atol=SAME_POINTS):
-            raise incompatible_model_error("network has the same sizes and is another one")
+            raise StoreError(
+                "Expected the network whose weights are stored, this one has weights of the same "
+                "sizes and is another one; pass the reducer that the store was written with, or "
+                "learn anew, by `dengine train --data OLD.db --store NEW.db`."
+            )
         return self
 
     @torch.inference_mode()
     def _embed_ramp(self) -> Floats:
-        """Embed a preprocessed trace that rises from -1 to 1, (1, K, d)."""
+        """Return the points (1, K, d) of a fixed trace, which tell `set_state` another network.
+
+        It is a preprocessed trace whose channels rise from -1 to 1.
+        """
         channels, samples = self.preprocessor_.channels, self.preprocessor_.samples
         ramp = torch.linspace(-1.0, 1.0, samples).expand(1, self.folds, channels, samples)
         return self.encoder_.embed(ramp).numpy()
@@ -593,8 +602,8 @@ class TorchReducer(Reducer):
         expect(is_whole(self.fit_steps, 1, 10**6), "fit_steps >= 1, an integer", self.fit_steps)
         expect(is_whole(self.batch_size, 2, 10**6), "batch_size >= 2, an integer", self.batch_size)
         expect(is_whole(self.shift, 0, 10**6), "shift >= 0 frames, an integer", self.shift)
-        numbers = "learning_rate", "weight_averaging", "weight_decay", "gain", "noise", "mixup"
-        for name in numbers:
+        not_negative = "weight_decay", "gain", "noise", "mixup"
+        for name in ("learning_rate", "weight_averaging", *not_negative):
             value = getattr(self, name)
             expect(is_number(value), f"{name}, a number", value)
         expect(self.learning_rate > 0.0, "learning_rate > 0", self.learning_rate)
@@ -602,7 +611,7 @@ class TorchReducer(Reducer):
         expect(is_path, 'checkpoint, the name of a file, or ""', self.checkpoint)
         is_share = 0.0 <= self.weight_averaging < 1.0
         expect(is_share, "weight_averaging from 0 to below 1", self.weight_averaging)
-        for name in numbers[2:]:
+        for name in not_negative:
             value = getattr(self, name)
             expect(0.0 <= value < float("inf"), f"{name} >= 0", value)
 

@@ -125,11 +125,11 @@ class UmapEncoder(nn.Module):
 
     @torch.jit.export
     def embed_frames(self, frames: Tensor) -> Tensor:
-        """Embed frames (B, F) among the references: (B, dim).
+        """Embed traces among the references: (B, F) -> (B, dim); each is a vector of F averages.
 
         A trace starts at the mean of its nearest references' points, weighted by their membership
-        strengths. Five fixed-point iterations then replace the weights of the same references by
-        the coefficients of their attraction, at the distances from where the trace is.
+        strengths. Five times, it is then moved to the mean of the same points, weighted by the
+        coefficients of attraction at its current distances.
         """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T

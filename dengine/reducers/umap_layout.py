@@ -190,9 +190,11 @@ class Edges:
 
 
 def attraction_coefficients(strengths: Tensor, squared: Tensor, a: float, b: float) -> Tensor:
-    """Compute ``strength * d^(2b - 2) / (1 + a d^(2b))`` from squared distances d^2 above 0.
+    """Compute how strongly edges pull: ``strength * d^(2b - 2) / (1 + a d^(2b))``.
 
-    Strengths and squared distances may have any shape, the same for both, which the result has.
+    The gradient of UMAP's loss has this factor times 4 a b. `squared` holds the squared distances
+    d^2, which must be above 0; it has the shape of `strengths`, and so has the result. `a` and `b`
+    are those of `find_ab_params`.
     """
     power = squared.pow(b)
     return strengths * power / (squared * (1.0 + a * power))
