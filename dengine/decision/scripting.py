@@ -80,10 +80,12 @@ def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def incompatible_model_error(defect: str) -> StoreError:
-    """Return the error for a stored model that this version of dengine cannot restore.
+    """Return the error for a stored model of another reducer, or of another version of dengine.
 
     `defect` says what does not fit, as in "ConvReducer has other sizes".
     """
     actual = f"one whose {defect}; its labels are whole"
     do = "learn from them anew, by `dengine train --data OLD.db --store NEW.db`"
-    return StoreError(f"Expected a model of this version of dengine, got {actual}: {do}.")
+    return StoreError(
+        f"Expected a model of this reducer and of this version of dengine, got {actual}: {do}."
+    )

@@ -62,8 +62,7 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
     with torch.no_grad():
         for name, value in state.items():
             weight = weights[names[name]]
-            n_copies = value.shape[0] // weight.shape[0] if value.dim() else 1
-            value.copy_(torch.cat([weight] * n_copies) if n_copies > 1 else weight)
+            value.view(-1, *weight.shape).copy_(weight)  # the same weights for each member
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:

@@ -187,14 +187,16 @@ def count_features(networks: nn.Module, count: int, channels: int, samples: int)
 
     `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K. The trial is in
     evaluation mode, so that no statistics change; afterwards the networks are in training mode.
-    Raises ValueError for an output without three dimensions, of another batch size, or without a
-    feature, and whatever the networks raise.
+    Raises ValueError for an output without three dimensions, of another batch size, without a
+    feature or not of floats, and whatever the networks raise.
     """
     networks.eval()
     with torch.no_grad():
         features = networks(torch.zeros(3, count, channels, samples))
     networks.train()
     if features.dim() != 3 or len(features) != 3 or not features.size(2):
-        shape = tuple(features.select(1, 0).shape) if features.dim() > 1 else ()
+        shape = (*features.shape[:1], *features.shape[2:])
         raise ValueError(f"for three traces it gives {shape}; flatten its output")
+    if not features.is_floating_point():
+        raise ValueError(f"it gives {features.dtype}, expected floats")
     return int(features.size(2))

@@ -416,6 +416,7 @@ def gives(output: Any) -> Any:
         (gives(lambda x: (x, x)), "got tuple"),
         (gives(lambda x: x.mean(0)), r"for three traces it gives \(2, 120\)"),
         (gives(lambda x: x[:, 0, :0]), r"it gives \(3, 0\)"),
+        (gives(lambda x: x[:, 0].long()), "it gives torch.int64, expected floats"),
         (lambda channels, samples: None, "NoneType"),
         (SmallNetwork(2, 120), "an instance of SmallNetwork.*pass its class"),
         ("SmallNetwork", "an instance of str"),
