@@ -44,15 +44,15 @@ from dengine.reducers.base import StopRule
 
 # Seconds of a core that a replay takes, for the estimate at the start.
 SECONDS = {
-    "conv": 10,
+    "conv": 11,
     "rocket": 2,
-    "umap": 4,
-    "umap-learn": 60,
+    "umap": 2,
+    "umap-learn": 18,
     "pca": 2,
     "knn": 1,
     "wskde": 2,
-    "gp": 24,
-    "minirocket": 20,
+    "gp": 7,
+    "minirocket": 9,
 }
 # How many shuffles are played; slow methods have fewer.
 N_SHUFFLES = dict.fromkeys(METHODS, 30) | {"gp": 10, "minirocket": 10, "umap-learn": 5}
