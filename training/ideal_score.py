@@ -75,11 +75,11 @@ class KnownScore(Reducer):
 
 
 def oscillation_posterior(traces: Traces) -> Floats:
-    """Return the probability that a part of `evidence_sets.oscillation` is good, (n,).
+    """Return the probabilities (n,) that parts of `evidence_sets.oscillation` are good.
 
-    Of traces (n, 1, T). By Bayes' rule, over a grid of frequencies of the resonance, with the
-    generator's own priors and Whittle's likelihood (1953): the values of the periodogram are
-    independent and exponential, with the spectrum as their means.
+    They follow from the traces (n, 1, T) by Bayes' rule, over a grid of frequencies of the
+    resonance, with the generator's own priors and Whittle's likelihood (1953), an approximation:
+    the values of the periodogram are independent and exponential, with the spectrum as means.
     """
     n_samples = traces.shape[2]
     bins = np.arange(1, n_samples // 2)
@@ -105,9 +105,10 @@ def oscillation_posterior(traces: Traces) -> Floats:
 
 
 def trained_beforehand(data: Dataset) -> Score:
-    """Train conv on all labels of a set, and return a function that looks up held-out scores.
+    """Cross-fit conv on a whole set, and return a function that looks up its traces' scores.
 
-    It raises KeyError for a trace that is not of the set.
+    A trace's score is that of the member that did not see its label. The function raises KeyError
+    for a trace that is not of the set.
     """
     traces = as_traces(data.X)
     folds = np.random.default_rng(0).permutation(len(data)) % N_FOLDS

@@ -82,10 +82,13 @@ def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
 def incompatible_model_error(defect: str) -> StoreError:
     """Return the error for a stored model of another reducer, or of another version of dengine.
 
-    `defect` says what does not fit, as in "ConvReducer has other sizes".
+    `defect` completes "a model whose", as in "encoder has other sizes".
     """
     actual = f"one whose {defect}; its labels are whole"
-    do = "learn from them anew, by `dengine train --data OLD.db --store NEW.db`"
+    do = (
+        "pass the reducer of the store, or learn from them anew, by "
+        "`dengine train --data OLD.db --store NEW.db`"
+    )
     return StoreError(
         f"Expected a model of this reducer and of this version of dengine, got {actual}: {do}."
     )

@@ -116,8 +116,8 @@ class Separate(nn.Module):
 class FoldableSequential(nn.Sequential):
     """A `Sequential` whose batch normalisations `fold_batch_norms` folds into convolutions.
 
-    Use it only where nothing calls one of its layers alone: a folded convolution gives the output
-    of the batch normalisation after it. A plain `Sequential` is not folded.
+    Use it only if its layers are never called or hooked one by one: a folded convolution already
+    gives normalised values. A plain `Sequential` is not folded.
     """
 
 
@@ -165,8 +165,8 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
     """Fold the batch normalisations of each `FoldableSequential` of a module into convolutions.
 
     Each is folded into the `Conv1d` right before it, by `fuse_conv_bn_eval`; other batch
-    normalisations stay. The module must be in evaluation mode. Its children are replaced in place,
-    and it is returned; for a `FoldableSequential` itself a new `Sequential` is returned. The engine
+    normalisations stay. The module must be in evaluation mode. It is changed in place and returned,
+    but a `FoldableSequential` is replaced by a plain `Sequential`: use the return value. The engine
     and an exported file both compute with the folded module, so that their numbers are the same.
     """
     for name, child in module.named_children():
@@ -187,8 +187,8 @@ def count_features(networks: nn.Module, count: int, channels: int, samples: int)
 
     `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K. The trial is in
     evaluation mode, so that no statistics change; afterwards the networks are in training mode.
-    Raises ValueError for an output without three dimensions, of another batch size, without a
-    feature or not of floats, and whatever the networks raise.
+    Raises ValueError if the output does not have three dimensions, a batch of 3, a feature, and
+    floats. Errors of the networks pass through.
     """
     networks.eval()
     with torch.no_grad():

@@ -36,8 +36,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from ..decision.scripting import arrays_with_prefix, restore, script
-from ..errors import SettingError, StoreError, expect
+from ..decision.scripting import arrays_with_prefix, incompatible_model_error, restore, script
+from ..errors import SettingError, expect
 from ..records import is_number, is_whole
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, folds_of, seed_of
 from .checkpoints import load_checkpoint
@@ -572,11 +572,7 @@ class TorchReducer(Reducer):
         self.encoder_ = self._new_encoder()
         points = state.get("points")
         if points is not None and not np.allclose(points, self._embed_ramp(), atol=SAME_POINTS):
-            raise StoreError(
-                "Expected the network whose weights are stored, this one has weights of the same "
-                "sizes and is another one; pass the reducer that the store was written with, or "
-                "learn anew, by `dengine train --data OLD.db --store NEW.db`."
-            )
+            raise incompatible_model_error("network has the same sizes and is another one")
         return self
 
     @torch.inference_mode()
