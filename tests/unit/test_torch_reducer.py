@@ -310,7 +310,9 @@ def test_a_reducer_that_starts_from_a_checkpoint_learns_something_else_than_from
     [
         (b"no checkpoint", "of named tensors alone"),
         (None, "cannot be read"),
-        ("other", r"of this network for traces .* has shape \(.*\), not \("),
+        (b"\x80\x02a.", "of named tensors alone"),  # a pickle whose stack is empty
+        ("other", r"of this network for traces .* has shape and type \(.*\), not \("),
+        ("float64", r"of this network for traces .*torch.float64\), not \(.*torch.float32\)"),
         ("a whole training", "of named tensors alone"),
         ("NaN", "finite weights"),
     ],
@@ -324,6 +326,8 @@ def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(
         save_checkpoint(Members(ConvNetwork, 6, 120, 1), path)
     elif content == "a whole training":
         torch.save({"epoch": 3, "model": state}, path)
+    elif content == "float64":
+        torch.save({name: value.double() for name, value in state.items()}, path)
     elif content == "NaN":
         torch.save(state | {"bias": torch.full((1, 2), float("nan"))}, path)
     elif content is not None:
