@@ -13,6 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 from ..errors import listed
@@ -437,11 +438,13 @@ def _find_delimiter(lines: Sequence[str]) -> str:
     and a header with as many. Without such cells it is the first that splits most lines, of tab,
     semicolon, bar and comma; "," if none does.
     """
-    plain = [units.COMMENT_MARK.sub("", ONE_CELL.sub("0", line)) for line in lines[:100]]
-    top = plain[: len(lines) - 1]
-    sample = [
-        units.COMMENT_MARK.sub("", ONE_CELL.sub("0", line)) for line in lines[-SAMPLED_LINES:]
-    ]
+
+    @cache
+    def plain(line: str) -> str:
+        """Return a line without a comment's mark, with 0 for a cell with delimiters in it."""
+        return units.COMMENT_MARK.sub("", ONE_CELL.sub("0", line))
+
+    sample = [plain(line) for line in lines[-SAMPLED_LINES:]]
 
     def score(delimiter: str) -> float:
         """Return how well a delimiter splits the lines, from 0 to 1."""
@@ -455,7 +458,8 @@ def _find_delimiter(lines: Sequence[str]) -> str:
         n_names = width if rows[0][-1:] != [""] else width - 1
         cells = [cell for row in rows if len(row) == width for cell in row[:SAMPLED_CELLS]]
         n_values = sum(is_value(cell) or has_unit(cell) for cell in cells)
-        headers = (without_trailing_empty(_split_line(line, delimiter)) for line in top)
+        top = lines[: min(100, len(lines) - 1)]
+        headers = (without_trailing_empty(_split_line(plain(line), delimiter)) for line in top)
         has_header = any(
             2 * sum(map(is_value, row[:SAMPLED_CELLS])) <= min(len(row), SAMPLED_CELLS)
             for row in headers

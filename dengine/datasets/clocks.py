@@ -229,8 +229,8 @@ def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
         if not places:
             raise UnreadableError(f"Expected a column {time} of times, found {listed(names)}")
         return places[0]
-    filled = [i for i in range(len(names)) if (frame.iloc[:, i].fillna("") != "").any()]
-    if places := [i for i in filled if is_time_column(names[i])]:
+    times = [i for i, name in enumerate(names) if is_time_column(name)]
+    if places := [i for i in times if (frame.iloc[:, i].fillna("") != "").any()]:
         # Of a date and a time of day, only the latter rises.
         return max(places, key=lambda i: _rising_share(head.iloc[:, i]))
     return next((i for i in range(len(names)) if _is_clock(head.iloc[:, i], names[i])), None)
