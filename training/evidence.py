@@ -72,8 +72,6 @@ SUMMARY = [
     "false_positive",
     "false_negative",
     "net_s",
-    "retrain_p50_s",
-    "retrain_max_s",
 ]
 
 

@@ -476,7 +476,7 @@ def loss_lines(rows: pd.DataFrame) -> list[str]:
 def paper_lines(replays: pd.DataFrame) -> list[str]:
     """Return the paper's tables and findings; [] if its combinations were not played."""
     rows = replays[(replays["set"] == "insertion") & replays["recipe"].isin(PAPER_REDUCERS)]
-    # Times of replays that share the cores say nothing; without them no finding speaks of them.
+    # Replays share the cores, so their times are not kept; without them no finding speaks of them.
     rows = rows.assign(retrain_max_s=math.nan)
     if rows[["alpha", "lower_bound"]].drop_duplicates().shape[0] <= len(POLICIES):
         return []

@@ -21,10 +21,12 @@ import subprocess
 import sys
 import tempfile
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 from rich.console import Console
 
 from tests.support.faults import copied
@@ -34,6 +36,7 @@ from .harness import WAIT, Outcome, Place
 from .kinds import ON_DISKS, ON_POSTGRES, ON_SQLITE, SYNC, asked_again
 
 Fault = Callable[[Outcome, Place], None]
+COLUMNS = ("store", "fault", "times", "labels", "lost", "wrong", "raised", "longest wait in ms")
 STORE, ENGINE = "dengine/store/", "dengine/engine/"
 MUTATIONS = (  # what is broken, the file, a text that stands there once, what then stands there, the row that fails
     ("nothing is synced", STORE + "journal.py", "            self._file.sync()\n", "", "A disk whose syncs fail"),
@@ -144,6 +147,19 @@ def tried(fault: Fault, place: Callable[[], Place], trials: int, console: Consol
     return outcome
 
 
+def table(rows: Sequence[Sequence[str]]) -> pd.DataFrame:
+    """Return a row for each kind of fault: how often it was injected, and what became of it."""
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def totals(kinds: pd.DataFrame) -> pd.DataFrame:
+    """Return the sums over the kinds of fault, of each store with and without those that kill."""
+    what = np.where(kinds["fault"].str.startswith("SIGKILL"), "SIGKILL", "store, disk or process")
+    counted = kinds[["times", "labels", "lost", "wrong", "raised"]].astype(int)
+    groups = counted.groupby([kinds["store"], what], sort=False)
+    return groups.sum().assign(kinds=groups.size())
+
+
 def mutated() -> bool:
     """Whether each of the `MUTATIONS` makes its row fail."""
     caught = []
@@ -206,7 +222,7 @@ def main() -> None:
     )
     parser.add_argument("--program", type=Path, help="a built dengine-cell")
     parser.add_argument("--only", default="", help="faults whose words hold this")
-    parser.add_argument("--out", type=Path, help="write the table there, as Markdown")
+    parser.add_argument("--out", type=Path, help="write the table there, as CSV")
     arguments = parser.parse_args()
     if arguments.mutations:
         sys.exit(not mutated())
@@ -214,7 +230,6 @@ def main() -> None:
         between([sys.executable, "-m", "tests.slow.faults", *sys.argv[1:]])
     logging.disable(logging.CRITICAL)  # faults are what is asked for here
     console, folder = Console(), SYNC.parent
-    columns = ("store", "fault", "times", "labels", "lost", "wrong", "raised", "longest wait")
     rows = []
     os.environ["XDG_STATE_HOME"] = str(
         folder / "state"
@@ -235,18 +250,13 @@ def main() -> None:
             console.print(f"  {seen.versions} versions were swapped in", highlight=False)
         seen.must(seen.longest < 2 * WAIT, f"a call took {seen.longest:.1f} s")
         counts = (seen.injected, seen.labels, seen.lost, seen.wrong, seen.raised)
-        rows.append(
-            (
-                where,
-                words,
-                *map(str, counts),
-                f"{1000 * seen.longest:.0f} ms" if seen.longest else "-",
-            )
-        )
-        lines = ["| " + " | ".join(row) + " |" for row in (columns, ["---"] * len(columns), *rows)]
-        print(lines[-1], flush=True)
+        longest = f"{1000 * seen.longest:.0f}" if seen.longest else ""
+        rows.append((where, words, *map(str, counts), longest))
+        print("| " + " | ".join(rows[-1]) + " |", flush=True)
         if arguments.out is not None:
-            arguments.out.write_text("\n".join([*lines, ""]), encoding="utf-8")
+            table(rows).to_csv(arguments.out, index=False)
+    if rows:
+        print(totals(table(rows)).to_string())
     shutil.rmtree(folder)
     sys.exit(not rows or any(row[4:7] != ("0", "0", "0") for row in rows))
 

@@ -19,6 +19,7 @@ from .pieces import Piece, finish
 from .replays import noise_cases, planted_cases, priced_cases
 from .report import write_report
 
+FEWEST_SEEDS = 10  # of any configuration, if as many repeats are asked for
 GARBAGE_REDUCERS = ("conv", "pca", "rocket")  # umap is slow, and has one seed
 CASES = {"planted": planted_cases, "cost": priced_cases, "noise": noise_cases}
 PARTS = ("null", "certificate", "planted", "cost", "noise", "garbage")
@@ -32,22 +33,22 @@ def make_pieces(part: str, repeats: int) -> list[Piece]:
     part : str
         A name in `PARTS`.
     repeats : int
-        Replays of a main configuration; others have a share of them.
+        Replays of a main configuration; others have a share of them, see `count_seeds`.
     """
     if part in CASES:
         return [
             Piece(part, {"case": case}, seed)
             for case in CASES[part]()
-            for seed in range(max(2, round(case.share * repeats)))
+            for seed in range(count_seeds(case.share, repeats))
         ]
     if part == "null":
-        n_seeds = max(2, repeats // 20)
+        n_seeds = count_seeds(0.05, repeats)
         settings = [{"reducer": "conv", "data": "insertion"}]
     elif part == "certificate":
-        n_seeds = max(2, repeats // 10)
+        n_seeds = count_seeds(0.1, repeats)
         settings = _combine(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))
     elif part == "garbage":
-        n_seeds = max(1, repeats // 40)
+        n_seeds = count_seeds(0.025, repeats)
         settings = _combine(reducer=GARBAGE_REDUCERS)
     else:
         raise SystemExit(f"Expected parts of {', '.join(PARTS)}, got {part}.")
@@ -55,6 +56,11 @@ def make_pieces(part: str, repeats: int) -> list[Piece]:
     if part == "garbage":
         pieces.append(Piece(part, {"reducer": "umap"}))
     return pieces
+
+
+def count_seeds(share: float, repeats: int) -> int:
+    """Return the number of seeds of a configuration that has a share of the repeats."""
+    return min(repeats, max(FEWEST_SEEDS, round(share * repeats)))
 
 
 def _combine(**axes: Iterable[Any]) -> list[dict[str, Any]]:
@@ -77,7 +83,7 @@ def main() -> None:
         "--repeats",
         type=int,
         default=200,
-        help="replays of a main configuration; others have a share",
+        help="replays of a main configuration; others have a share, or ten",
     )
     parser.add_argument(
         "--only", default=",".join(PARTS), help=f"parts to do, of {', '.join(PARTS)}"
