@@ -57,7 +57,8 @@ class RetrainingProcess(ProcessPoolExecutor):
         """Call a picklable function in the process, after earlier calls; return a future of its
         result.
 
-        Raises BrokenExecutor if the process has ended.
+        Wait for a result with arrays before the next call, which frees them. Raises BrokenExecutor
+        if the process has ended.
         """
         call = _SharedPickle((fn, args, kwargs))
         return super().submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple
@@ -103,6 +104,8 @@ class _SharedPickle:
             return pickle.loads, (pickle.dumps(self._value, 5),)
         arrays: list[pickle.PickleBuffer] = []
         pickled = pickle.dumps(self._value, 5, buffer_callback=arrays.append)
+        if not arrays:
+            return pickle.loads, (pickled,)
         descriptor = os.memfd_create("dengine")
         weakref.finalize(self, os.close, descriptor)
         with open(descriptor, "wb", closefd=False) as file:

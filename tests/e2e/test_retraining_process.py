@@ -89,6 +89,12 @@ def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_ar
     assert process.submit(divmod, 17, 5).result(300) == (3, 2)
 
 
+def test_many_calls_at_once_are_all_answered(process: RetrainingProcess) -> None:
+    assert [call.result(60) for call in [process.submit(int, i) for i in range(500)]] == [
+        *range(500)
+    ]
+
+
 def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(
     process: RetrainingProcess, data: Dataset
 ) -> None:

@@ -26,7 +26,7 @@ from .replays import judge, spend
 Row = dict[str, Any]
 FinishedPiece = tuple["Piece", list[Row]]
 # Files and folders whose source does not influence a result.
-UNRELATED = {"cli", "export", "store", "figures", "tables", "report"}
+UNRELATED = {"__main__", "cli", "export", "store", "figures", "tables", "report"}
 N_STREAMS = 100  # of the certificate, for each seed
 N_STREAM_PARTS = 2000
 
