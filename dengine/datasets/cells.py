@@ -444,6 +444,7 @@ def _find_delimiter(lines: Sequence[str]) -> str:
         """Return a line without a comment's mark, with 0 for a cell with delimiters in it."""
         return units.COMMENT_MARK.sub("", ONE_CELL.sub("0", line))
 
+    top = lines[: min(100, len(lines) - 1)]
     sample = [plain(line) for line in lines[-SAMPLED_LINES:]]
 
     def score(delimiter: str) -> float:
@@ -458,7 +459,6 @@ def _find_delimiter(lines: Sequence[str]) -> str:
         n_names = width if rows[0][-1:] != [""] else width - 1
         cells = [cell for row in rows if len(row) == width for cell in row[:SAMPLED_CELLS]]
         n_values = sum(is_value(cell) or has_unit(cell) for cell in cells)
-        top = lines[: min(100, len(lines) - 1)]
         headers = (without_trailing_empty(_split_line(plain(line), delimiter)) for line in top)
         has_header = any(
             2 * sum(map(is_value, row[:SAMPLED_CELLS])) <= min(len(row), SAMPLED_CELLS)

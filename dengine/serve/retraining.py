@@ -91,7 +91,7 @@ def _signals_blocked() -> Iterator[None]:
 
 
 class _SharedPickle:
-    """Pickles a value with its arrays in a file in memory; unpickling gives the value itself.
+    """Pickles a value, with its arrays, if any, in a file in memory; unpickling gives the value.
 
     The file exists as long as this object, which must live until the other process has read it.
     """
@@ -100,10 +100,9 @@ class _SharedPickle:
         self._value = value
 
     def __reduce__(self) -> tuple[Any, ...]:
-        if not hasattr(os, "memfd_create"):
-            return pickle.loads, (pickle.dumps(self._value, 5),)
         arrays: list[pickle.PickleBuffer] = []
-        pickled = pickle.dumps(self._value, 5, buffer_callback=arrays.append)
+        take_out = arrays.append if hasattr(os, "memfd_create") else None
+        pickled = pickle.dumps(self._value, 5, buffer_callback=take_out)
         if not arrays:
             return pickle.loads, (pickled,)
         descriptor = os.memfd_create("dengine")

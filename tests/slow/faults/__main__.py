@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -36,7 +36,7 @@ from .harness import WAIT, Outcome, Place
 from .kinds import ON_DISKS, ON_POSTGRES, ON_SQLITE, SYNC, asked_again
 
 Fault = Callable[[Outcome, Place], None]
-COLUMNS = ("store", "fault", "times", "labels", "lost", "wrong", "raised", "longest wait in ms")
+COLUMNS = ["store", "fault", "times", "labels", "lost", "wrong", "raised", "longest wait in ms"]
 STORE, ENGINE = "dengine/store/", "dengine/engine/"
 MUTATIONS = (  # what is broken, the file, a text that stands there once, what then stands there, the row that fails
     ("nothing is synced", STORE + "journal.py", "            self._file.sync()\n", "", "A disk whose syncs fail"),
@@ -147,17 +147,11 @@ def tried(fault: Fault, place: Callable[[], Place], trials: int, console: Consol
     return outcome
 
 
-def table(rows: Sequence[Sequence[str]]) -> pd.DataFrame:
-    """Return a row for each kind of fault: how often it was injected, and what became of it."""
-    return pd.DataFrame(rows, columns=list(COLUMNS))
-
-
 def totals(kinds: pd.DataFrame) -> pd.DataFrame:
-    """Return the sums over the kinds of fault, of each store with and without those that kill."""
+    """Return the sums of the counts, for each store of the kinds that kill and of all others."""
     what = np.where(kinds["fault"].str.startswith("SIGKILL"), "SIGKILL", "store, disk or process")
-    counted = kinds[["times", "labels", "lost", "wrong", "raised"]].astype(int)
-    groups = counted.groupby([kinds["store"], what], sort=False)
-    return groups.sum().assign(kinds=groups.size())
+    groups = kinds.groupby(["store", what], sort=False)
+    return groups[COLUMNS[2:7]].sum().assign(kinds=groups.size())
 
 
 def mutated() -> bool:
@@ -250,15 +244,15 @@ def main() -> None:
             console.print(f"  {seen.versions} versions were swapped in", highlight=False)
         seen.must(seen.longest < 2 * WAIT, f"a call took {seen.longest:.1f} s")
         counts = (seen.injected, seen.labels, seen.lost, seen.wrong, seen.raised)
-        longest = f"{1000 * seen.longest:.0f}" if seen.longest else ""
-        rows.append((where, words, *map(str, counts), longest))
-        print("| " + " | ".join(rows[-1]) + " |", flush=True)
+        rows.append((where, words, *counts, f"{1000 * seen.longest:.0f}" if seen.longest else ""))
+        print("| " + " | ".join(map(str, rows[-1])) + " |", flush=True)
+        kinds = pd.DataFrame(rows, columns=COLUMNS)
         if arguments.out is not None:
-            table(rows).to_csv(arguments.out, index=False)
+            kinds.to_csv(arguments.out, index=False)
     if rows:
-        print(totals(table(rows)).to_string())
+        print(totals(kinds).to_string())
     shutil.rmtree(folder)
-    sys.exit(not rows or any(row[4:7] != ("0", "0", "0") for row in rows))
+    sys.exit(not rows or any(row[4:7] != (0, 0, 0) for row in rows))
 
 
 if __name__ == "__main__":
