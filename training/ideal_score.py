@@ -105,10 +105,10 @@ def oscillation_posterior(traces: Traces) -> Floats:
 
 
 def trained_beforehand(data: Dataset) -> Score:
-    """Cross-fit conv on a whole set, and return a function that looks up its traces' scores.
+    """Cross-fit a `conv` on a whole set, and return a function that looks up scores of its traces.
 
-    A trace's score is that of the member that did not see its label. The function raises KeyError
-    for a trace that is not of the set.
+    The score of a trace is that of the one member that was trained without its label. The function
+    raises KeyError for a trace that is not in the set.
     """
     traces = as_traces(data.X)
     folds = np.random.default_rng(0).permutation(len(data)) % N_FOLDS

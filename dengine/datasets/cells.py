@@ -432,11 +432,12 @@ def _split_line(line: str, delimiter: str) -> list[str]:
 
 
 def _find_delimiter(lines: Sequence[str]) -> str:
-    """Return the delimiter that splits lines best.
+    """Return the delimiter that splits lines best, "" for lines of a single cell.
 
-    It gives the most cells that are numbers, times or empty, the same number of cells in each line,
-    and a header with as many. Without such cells it is the first that splits most lines, of tab,
-    semicolon, bar and comma; "," if none does.
+    Each of `DELIMITERS` is scored by the share of cells that are numbers, times or empty, by the
+    share of lines with the usual number of cells, and by whether a line above has as many names. If
+    all scores are 0, it is the first of tab, semicolon, bar and comma that splits most lines; ","
+    if none does.
     """
 
     @cache

@@ -216,9 +216,12 @@ def join_date_and_time(frame: pd.DataFrame) -> str:
 
 
 def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
-    """Return the position of the clock's column, by its name or else its values; None without one.
+    """Return the position of the time column; None if there is none.
 
-    time : its name, if the user stated it, or "none"; UnreadableError if there is no such column.
+    It is found by a usual name of such columns, or else by values that are times.
+
+    time : the name that the user stated, with UnreadableError if no column has it, or "none" if the
+    user stated that there is no time column.
     """
     names = [str(name) for name in frame.columns]
     if time == NO_CLOCK and time not in names:

@@ -31,15 +31,15 @@ def save_checkpoint(members: Members, path: str | Path) -> None:
 
 
 def load_checkpoint(members: Members, path: str | Path) -> None:
-    """Set the weights of every member, in place, to those of a checkpoint of a single member.
+    """Copy the weights of a checkpoint, which holds a single member, into every member, in place.
 
-    Buffers, such as the statistics of batch normalisation, are set as well.
+    Buffers, such as the statistics of batch normalisation, are copied as well.
 
     Raises
     ------
     SettingError
-        If the file cannot be read, is of another network, or has values that are not finite; the
-        members are unchanged then.
+        If the file cannot be read, has other names, shapes or types than the network, or has values
+        that are not finite. In these cases no member is changed.
     """
     weights = read_tensors(path)
     state = members.state_dict()
@@ -65,7 +65,7 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
-    """Return the dict of tensors that `torch.save` wrote to a file; no code of the file runs.
+    """Return the dict of tensors that `torch.save` wrote to a file, without running code of it.
 
     Raises SettingError if the file cannot be read, or holds anything but a dict of tensors.
     """

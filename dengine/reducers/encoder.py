@@ -165,8 +165,8 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
     """Fold the batch normalisations of each `FoldableSequential` of a module into convolutions.
 
     Each is folded into the `Conv1d` right before it, by `fuse_conv_bn_eval`; other batch
-    normalisations stay. The module must be in evaluation mode. It is changed in place and returned,
-    but a `FoldableSequential` is replaced by a plain `Sequential`: use the return value. The engine
+    normalisations stay. The module must be in evaluation mode. It is changed in place and returned.
+    A `FoldableSequential` becomes a new, plain `Sequential`, so use the return value. The engine
     and an exported file both compute with the folded module, so that their numbers are the same.
     """
     for name, child in module.named_children():
@@ -187,8 +187,8 @@ def count_features(networks: nn.Module, count: int, channels: int, samples: int)
 
     `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K. The trial is in
     evaluation mode, so that no statistics change; afterwards the networks are in training mode.
-    Raises ValueError if the output does not have three dimensions, a batch of 3, a feature, and
-    floats. Errors of the networks pass through.
+    Raises ValueError unless the output is a tensor of floats of shape (3, K, F), F at least 1; K is
+    not checked. Exceptions of the networks' `forward` are not caught.
     """
     networks.eval()
     with torch.no_grad():

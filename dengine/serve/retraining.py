@@ -54,11 +54,11 @@ class RetrainingProcess(ProcessPoolExecutor):
         (self._process,) = set(multiprocessing.active_children()) - other_processes
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Call a picklable function in the process, after earlier calls; return a future of its
-        result.
+        """Queue a call of a picklable function, which runs in the process after earlier calls.
 
-        Wait for a result with arrays before the next call, which frees them. Raises BrokenExecutor
-        if the process has ended.
+        Returns the future of its result. If the result has arrays, wait for it before you submit
+        another call, whose end frees the file from which they are read. Raises BrokenExecutor if
+        the process has ended.
         """
         call = _SharedPickle((fn, args, kwargs))
         return super().submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple
@@ -91,9 +91,10 @@ def _signals_blocked() -> Iterator[None]:
 
 
 class _SharedPickle:
-    """Pickles a value, with its arrays, if any, in a file in memory; unpickling gives the value.
+    """Pickles a value, with the data of its arrays, if any, in a file in memory (`memfd_create`).
 
-    The file exists as long as this object, which must live until the other process has read it.
+    Unpickling this object gives the value; its arrays are copies. The file exists as long as this
+    object, so keep the object until the other process has unpickled it.
     """
 
     def __init__(self, value: Any) -> None:
@@ -124,13 +125,13 @@ def _unpickle(pickled: bytes, path: str, sizes: list[int]) -> Any:
     return pickle.loads(pickled, buffers=arrays)
 
 
-_NEWEST_RESULT: list[_SharedPickle] = []  # is kept until the next call, long after it was read
+_NEWEST_RESULT: list[_SharedPickle] = []  # of the last call, until the next one ends
 
 
 def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _SharedPickle:
-    """Call a function with its arguments, in the retraining process, and return its pickled result.
+    """Call a function with its arguments, in the retraining process, and return its result.
 
-    The result is kept until the next call, so that the server's process has time to read it.
+    The result is kept until the next call ends; before that the server's process must have read it.
     """
     fn, args, kwargs = call
     _NEWEST_RESULT[:] = [_SharedPickle(fn(*args, **kwargs))]

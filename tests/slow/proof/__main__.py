@@ -59,7 +59,10 @@ def make_pieces(part: str, repeats: int) -> list[Piece]:
 
 
 def count_seeds(share: float, repeats: int) -> int:
-    """Return the number of seeds of a configuration that has a share of the repeats."""
+    """Return with how many seeds a configuration is played: a share of `repeats`, or more.
+
+    It is at least `FEWEST_SEEDS`, but never more than `repeats`.
+    """
     return min(repeats, max(FEWEST_SEEDS, round(share * repeats)))
 
 
