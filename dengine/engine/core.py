@@ -139,6 +139,8 @@ class EngineCore:
         reading: bool = False,
     ) -> None:
         torch.set_num_threads(1)
+        if executor is None and not reading:
+            template.warm_up()  # or the first retrain would wait for it
         recipe = settings.recipe
         self.store = store
         self.clock = clock
@@ -161,13 +163,11 @@ class EngineCore:
         self._maker = DecisionMaker(self.settings, store.clock)
         self._is_first_trace = True
         self._warm_up = threading.Thread(target=template.warm_up, name="dengine-warm-up")
-        if replaying:
-            template.warm_up()  # no cell waits, and the first retrain is timed without it
-        elif not reading:
+        if executor is not None:
             self._warm_up.start()
 
     def wait_until_warm(self) -> None:
-        """Wait until the first retrain can begin at once, some two seconds after the start.
+        """Wait until the first retrain can begin at once.
 
         What it imports is loaded then, what it needs of stored traces is computed, and the code
         that will decide is compiled.

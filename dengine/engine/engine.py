@@ -148,7 +148,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
         windows and shadow count then.
     executor : concurrent.futures.Executor, optional
-        Retrains while the cell goes on; None: retrain in the calling thread, between cycles.
+        Retrains while the cell goes on; None: retrain in the calling thread, between cycles. What
+        a retrain imports is loaded first then, in about a second, once in a process.
     replaying : bool
         End a retrain by steps alone, never by the clock, so that a seed repeats exactly.
     clock : callable
@@ -475,7 +476,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Returns
         -------
         iterator of Cycle
-            The first part is inserted with its first `next`, once what retrains import is loaded.
+            The first part is inserted with its first `next`, once a retrain can begin at once.
 
         Raises
         ------
@@ -488,7 +489,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Yield a record of each cycle; at the end, also after an error, write everything to disk.
 
-        The first cycle waits for the imports of a retrain, which would otherwise delay a later one.
+        The first cycle waits for what would otherwise delay the first retrain.
         From then on the garbage collector ignores the objects that exist, until the end. Raises
         NotTakenError where the disk does not take everything in time.
         """

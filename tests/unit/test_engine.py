@@ -1,6 +1,8 @@
 """The one loop: decide, report, retrain, run, open. Real reducers, real stores, real executors."""
 
 import gc
+import subprocess
+import sys
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
@@ -537,8 +539,13 @@ def test_a_second_thread_in_an_engine_is_refused(data: Dataset) -> None:
         assert deciding.result().action is Action.VERIFY
 
 
+def test_an_engine_that_retrains_itself_has_loaded_what_a_retrain_imports() -> None:
+    program = "import dengine, sys; dengine.DataEngine(); assert 'torch._dynamo' in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
 def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data: Dataset) -> None:
-    with DataEngine("conv") as engine:
+    with ThreadPoolExecutor(1) as pool, DataEngine("conv", executor=pool) as engine:
         next(engine.run(ReplayCell(data), 1))
         assert "dengine-warm-up" not in {thread.name for thread in living_threads()}
 
