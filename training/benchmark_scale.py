@@ -20,7 +20,6 @@ from rich.progress import track
 
 from dengine import Action, DataEngine, Dataset, Reason, Recipe, Source, load_dataset
 from dengine.engine.decide import verify_decision
-from dengine.engine.engine import core_of
 from dengine.folds import content_hash
 from dengine.store.records import NewLabel, StoredDecision
 
@@ -49,13 +48,6 @@ def fill_store(engine: DataEngine, data: Dataset, n: int) -> None:
         engine.store.apply_records(records)
 
 
-def open_warm(path: Path) -> DataEngine:
-    """Open the engine of a store, and wait until it can retrain, as before a cell's first part."""
-    engine = DataEngine.open(path)
-    core_of(engine).wait_until_warm()
-    return engine
-
-
 def measure_store(
     data: Dataset, recipe: Recipe, n: int, repeats: int, folder: Path
 ) -> dict[str, Any]:
@@ -63,7 +55,7 @@ def measure_store(
     path = folder / f"{n}.db"
     with DataEngine(recipe=recipe, store=path) as engine:
         fill_store(engine, data, n)
-    opening, engine = wall_time(open_warm, path)
+    opening, engine = wall_time(DataEngine.open, path)
     retrains = [wall_time(engine.retrain)[0] for _ in range(repeats)]
     decides = []
     reports = [np.nan]  # there may be none

@@ -139,7 +139,8 @@ class EngineCore:
         reading: bool = False,
     ) -> None:
         torch.set_num_threads(1)
-        if executor is None and not reading:
+        self._retrains_in_line = executor is None and not reading
+        if self._retrains_in_line:
             template.warm_up()  # or the first retrain would wait for it
         recipe = settings.recipe
         self.store = store
@@ -186,11 +187,14 @@ class EngineCore:
         """Restore what a used store holds: version, references, rule, labels and pending checks.
 
         The engine then decides bit for bit as before it was closed. It is called once, before the
-        first decision, and waits for the store without a time limit.
+        first decision, and waits for the store without a time limit. Where retrains run in line, it
+        also waits until one can begin at once.
         """
         settings = self.settings.now
         self.learner.resume(settings.recipe.policy.label_within, settings.policy_since)
         self.feedback.resume()
+        if self._retrains_in_line:
+            self.wait_until_warm()
 
     # A decision
 

@@ -566,7 +566,6 @@ def test_the_first_retrain_of_a_few_imported_labels_compiles_nothing(
 
     monkeypatch.setattr("dengine.model.neighbours.script", counting)
     with DataEngine.open(tmp_path / "e.db") as engine:
-        core_of(engine).wait_until_warm()
         assert compiled
         compiled.clear()
         assert engine.retrain().accepted
