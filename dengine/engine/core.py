@@ -187,8 +187,8 @@ class EngineCore:
         """Restore what a used store holds: version, references, rule, labels and pending checks.
 
         The engine then decides bit for bit as before it was closed. It is called once, before the
-        first decision, and waits for the store without a time limit. Where retrains run in line, it
-        also waits until one can begin at once.
+        first decision, and waits for the store without a time limit. An engine without an executor
+        also waits here until a retrain can begin at once.
         """
         settings = self.settings.now
         self.learner.resume(settings.recipe.policy.label_within, settings.policy_since)

@@ -90,9 +90,8 @@ def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_ar
 
 
 def test_many_calls_at_once_are_all_answered(process: RetrainingProcess) -> None:
-    assert [call.result(60) for call in [process.submit(int, i) for i in range(500)]] == [
-        *range(500)
-    ]
+    calls = [process.submit(int, i) for i in range(500)]
+    assert [call.result(60) for call in calls] == list(range(500))
 
 
 def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(

@@ -36,7 +36,8 @@ from .harness import WAIT, Outcome, Place
 from .kinds import ON_DISKS, ON_POSTGRES, ON_SQLITE, SYNC, asked_again
 
 Fault = Callable[[Outcome, Place], None]
-COLUMNS = ["store", "fault", "times", "labels", "lost", "wrong", "raised", "longest wait in ms"]
+COUNTS = ["times", "labels", "lost", "wrong", "raised"]
+COLUMNS = ["store", "fault", *COUNTS, "longest wait in ms"]
 STORE, ENGINE = "dengine/store/", "dengine/engine/"
 MUTATIONS = (  # what is broken, the file, a text that stands there once, what then stands there, the row that fails
     ("nothing is synced", STORE + "journal.py", "            self._file.sync()\n", "", "A disk whose syncs fail"),
@@ -151,7 +152,7 @@ def totals(kinds: pd.DataFrame) -> pd.DataFrame:
     """Return the sums of the counts, for each store of the kinds that kill and of all others."""
     what = np.where(kinds["fault"].str.startswith("SIGKILL"), "SIGKILL", "store, disk or process")
     groups = kinds.groupby(["store", what], sort=False)
-    return groups[COLUMNS[2:7]].sum().assign(kinds=groups.size())
+    return groups[COUNTS].sum().assign(kinds=groups.size())
 
 
 def mutated() -> bool:
