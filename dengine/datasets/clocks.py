@@ -218,10 +218,11 @@ def join_date_and_time(frame: pd.DataFrame) -> str:
 def place_of_clock(frame: pd.DataFrame, time: str | None = None) -> int | None:
     """Return the position of the time column; None if there is none.
 
-    It is found by a usual name of such columns, or else by values that are times.
+    Of the columns that have a usual name and are not empty, it is the one whose values rise most
+    often; without such a name, it is the first whose values are times.
 
-    time : the name that the user stated, with UnreadableError if no column has it, or "none" if the
-    user stated that there is no time column.
+    time : the name that the user stated, or "none" if the user stated that there is no time column.
+    Raises UnreadableError if no column has that name.
     """
     names = [str(name) for name in frame.columns]
     if time == NO_CLOCK and time not in names:

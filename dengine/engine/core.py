@@ -170,8 +170,8 @@ class EngineCore:
     def wait_until_warm(self) -> None:
         """Wait until the first retrain can begin at once.
 
-        What it imports is loaded then, what it needs of stored traces is computed, and the code
-        that will decide is compiled.
+        The modules that a retrain imports are loaded then. If the store has labels, what the
+        retrain needs of their traces is computed, and the code for decisions is compiled.
         """
         self._join_warm_up()
         if self.new_labels and not self.live.version:
@@ -187,8 +187,8 @@ class EngineCore:
         """Restore what a used store holds: version, references, rule, labels and pending checks.
 
         The engine then decides bit for bit as before it was closed. It is called once, before the
-        first decision, and waits for the store without a time limit. An engine without an executor
-        also waits here until a retrain can begin at once.
+        first decision, and waits for the store without a time limit. Where retrains run in the
+        calling thread, it also calls `wait_until_warm`.
         """
         settings = self.settings.now
         self.learner.resume(settings.recipe.policy.label_within, settings.policy_since)

@@ -148,9 +148,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
         windows and shadow count then.
     executor : concurrent.futures.Executor, optional
-        Retrains while the cell goes on; None: retrain in the calling thread, between cycles. The
-        first engine of a process then takes about a second longer to make, since it loads what a
-        retrain imports.
+        Where retrains run while the cell goes on. None: in the calling thread, between cycles;
+        making the first engine of a process then takes about a second longer, since it loads what
+        a retrain imports.
     replaying : bool
         End a retrain by steps alone, never by the clock, so that a seed repeats exactly.
     clock : callable

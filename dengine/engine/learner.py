@@ -269,11 +269,11 @@ class Learner:
 
     @property
     def _lacks_steps(self) -> bool:
-        """Whether the training of the newest version is incomplete, as after a large import.
+        """Whether the newest version has training steps left, as after a large import.
 
-        While it is, the engine retrains after every part. False in any of these cases: no version
-        is in use yet; the last retrain was dropped or took no step, and the next one would end in
-        the same way; or the engine shares versions with peers, which would train the same one.
+        While it has, the engine retrains without waiting for new labels. False in any of these
+        cases: no version is in use yet; the last retrain was dropped; the newest version's retrain
+        took no step; or the engine shares versions with peers, which would train the same one.
         """
         is_alone = self._peers is None and self.live.answering is not None
         if not (is_alone and self._was_accepted):

@@ -57,8 +57,8 @@ class RetrainingProcess(ProcessPoolExecutor):
         """Queue a call of a picklable function, which runs in the process after earlier calls.
 
         Returns the future of its result. If the result has arrays, wait for it before you submit
-        another call, whose end frees the file from which they are read. Raises BrokenExecutor if
-        the process has ended.
+        another call: when that call ends, the file that holds the arrays is closed. Raises
+        BrokenExecutor if the process has ended.
         """
         call = _SharedPickle((fn, args, kwargs))
         return super().submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple

@@ -149,7 +149,10 @@ def tried(fault: Fault, place: Callable[[], Place], trials: int, console: Consol
 
 
 def totals(kinds: pd.DataFrame) -> pd.DataFrame:
-    """Return the sums of the counts, for each store of the kinds that kill and of all others."""
+    """Return sums of the counts per store, over faults by SIGKILL and over the other faults.
+
+    The column `kinds` is the number of kinds of fault in each sum.
+    """
     what = np.where(kinds["fault"].str.startswith("SIGKILL"), "SIGKILL", "store, disk or process")
     groups = kinds.groupby(["store", what], sort=False)
     return groups[COUNTS].sum().assign(kinds=groups.size())
