@@ -43,6 +43,9 @@ from tests.support.command_line import dengine, document, line_of, succeed
 SAMPLES = 80
 FORCE = "actual_TCP_force[2]"
 WAIT = 60.0  # seconds, for what takes milliseconds here: a machine may be busy
+# Relative to real time. Without a limit the controller fills the recorder's buffer of 60 s of
+# packages while a model is retrained, and the oldest packages are lost, as they should be.
+SPEED = 5.0
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +138,7 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(
     parts: Dataset,
 ) -> None:
     with (
-        FakeController(RobotProgram(parts), speed=None, troubles=TROUBLES) as fake,
+        FakeController(RobotProgram(parts), speed=SPEED, troubles=TROUBLES) as fake,
         cell_of(fake) as cell,
     ):
         for part in range(16):
@@ -202,7 +205,7 @@ def test_a_recorder_cuts_several_channels_by_any_trigger_with_samples_from_befor
         {"samples": 60, "before": 20, "channels": tuple(channels)},
     )
     with (
-        FakeController(program, speed=None) as fake,
+        FakeController(program, speed=SPEED) as fake,
         RtdeRecorder(fake.host, trigger, port=fake.port, **how) as recorder,
     ):
         for _ in range(3):
@@ -244,7 +247,7 @@ def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(
 ) -> None:
     data = make_data(60, samples=SAMPLES, failures=0.4)
     with (
-        FakeController(RobotProgram(data, confirm=confirm), speed=None) as fake,
+        FakeController(RobotProgram(data, confirm=confirm), speed=SPEED) as fake,
         cell_of(fake, timeout=WAIT) as cell,  # a busy machine may be silent for seconds
     ):
         assert isinstance(cell, Cell)
@@ -369,7 +372,7 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(
 ) -> None:
     store = tmp_path / "cell.db"
     with FakeController(
-        RobotProgram(parts), speed=None, troubles=[Trouble(3, 9, "drop", 2)]
+        RobotProgram(parts), speed=SPEED, troubles=[Trouble(3, 9, "drop", 2)]
     ) as fake:
         result = document(*run_on(fake, store), "--reducer", "pca", "--cycles", 12)
         shown = line_of(*run_on(fake, store), "--cycles", 3)
@@ -393,7 +396,7 @@ def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goe
         RobotProgram((parts.X[:10], parts.y[:10])),
         tmp_path / "cell.db",
     )  # then its bin is empty
-    with FakeController(program, speed=None) as fake:
+    with FakeController(program, speed=SPEED) as fake:
         done = dengine(*run_on(fake, store), "--reducer", "pca", "--cycles", 14)
         shown = " ".join(done.output.split())
         assert done.exit_code == 1

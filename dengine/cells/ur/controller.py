@@ -275,7 +275,8 @@ class FakeController(AbstractContextManager["FakeController"]):
     port : int, default 0
         0: any free port, which the attribute `port` names.
     speed : float or None, default 1
-        Relative to real time. None: as fast as clients read.
+        Relative to real time. None: as fast as clients read, which can be faster than a recorder
+        takes packages from its buffer of 60 s; what does not fit is lost.
     troubles : iterable of Trouble
         Faults to produce.
     refuses : collection
