@@ -228,7 +228,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                     )
                 self.store.save_settings(self._core.settings.now.to_store())
                 if opened.product is not None:
-                    self._core.learner.resume(self.policy.label_within, 0)  # what its peers learned
+                    self._core.resume()  # with what its peers learned
 
     def _start(
         self, settings: EngineSettings, template: EngineModel, store: SqlStore, **options: Any

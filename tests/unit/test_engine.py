@@ -550,14 +550,17 @@ def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data: Dataset) -> No
         assert "dengine-warm-up" not in {thread.name for thread in living_threads()}
 
 
+@pytest.mark.parametrize("product", [None, "gear"])
 def test_the_first_retrain_of_a_few_imported_labels_compiles_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, product: str | None
 ) -> None:
-    """Scripting takes longer than the time budget leaves."""
+    """Scripting takes longer than the time budget leaves; so too in a new cell of a product."""
     data = load_dataset("insertion")
-    X = data.X[:60, ..., :640]  # no other test compiles for this length
+    X = data.X[:60, ..., : 650 if product else 640]  # no other test compiles for these lengths
     parts = Dataset(X, data.y[:60])
-    import_labelled(tmp_path / "e.db", parts, Recipe.load("conv"))
+    url = tmp_path / "e.db"
+    with SqlStore(url, "first", product=product) as store:
+        import_labelled(store, parts, Recipe.load("conv"))
     compiled = []
 
     def counting(module: torch.nn.Module) -> Any:
@@ -565,7 +568,8 @@ def test_the_first_retrain_of_a_few_imported_labels_compiles_nothing(
         return script(module)
 
     monkeypatch.setattr("dengine.model.neighbours.script", counting)
-    with DataEngine.open(tmp_path / "e.db") as engine:
+    store = SqlStore(url, "second" if product else "first", product=product)
+    with DataEngine.open_or_create(store, recipe=Recipe.load("conv")) as engine:
         assert compiled
         compiled.clear()
         assert engine.retrain().accepted
