@@ -305,7 +305,7 @@ def introduction_lines() -> list[str]:
     return [
         "`python training/evidence.py` played the replays and wrote this page from them. "
         "[replays.csv](replays.csv) has one row per replay, and [differences.csv](differences.csv) "
-        "has the numbers of the tables.",
+        "has the means and the paired differences.",
         "",
         "**A replay** sends the parts of one set through an engine, one after the other. The "
         "engine starts without a label. It either decides a part itself, which is a *certain* "

@@ -11,6 +11,7 @@ import argparse
 import functools
 import itertools
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ CASES = {"planted": planted_cases, "cost": priced_cases, "noise": noise_cases}
 PARTS = ("null", "certificate", "planted", "cost", "noise", "garbage")
 
 
-def make_pieces(part: str, repeats: int) -> list[Piece]:
+def make_pieces(part: str, repeats: int, reducer: str = "conv") -> list[Piece]:
     """Return all pieces of one part: for each configuration the seeds from 0 on.
 
     Parameters
@@ -34,16 +35,22 @@ def make_pieces(part: str, repeats: int) -> list[Piece]:
         A name in `PARTS`.
     repeats : int
         Replays of a main configuration; others have a share of them, see `count_seeds`.
+    reducer : str, default "conv"
+        Takes the place of "conv" in all parts but "garbage", which has its own reducers.
     """
     if part in CASES:
+        cases = [
+            replace(case, reducer=reducer) if case.reducer == "conv" else case
+            for case in CASES[part]()
+        ]
         return [
             Piece(part, {"case": case}, seed)
-            for case in CASES[part]()
+            for case in cases
             for seed in range(count_seeds(case.share, repeats))
         ]
     if part == "null":
         n_seeds = count_seeds(0.05, repeats)
-        settings = [{"reducer": "conv", "data": "insertion"}]
+        settings = [{"reducer": reducer, "data": "insertion"}]
     elif part == "certificate":
         n_seeds = count_seeds(0.1, repeats)
         settings = _combine(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))
@@ -91,10 +98,15 @@ def main() -> None:
     parser.add_argument(
         "--only", default=",".join(PARTS), help=f"parts to do, of {', '.join(PARTS)}"
     )
+    parser.add_argument(
+        "--reducer", default="conv", help="takes the place of conv, but not in garbage"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     arguments = parser.parse_args()
     parts = arguments.only.split(",")
-    pieces = [piece for part in parts for piece in make_pieces(part, arguments.repeats)]
+    pieces = [
+        piece for part in parts for piece in make_pieces(part, arguments.repeats, arguments.reducer)
+    ]
     print_now = functools.partial(print, flush=True)
     finished = finish(pieces, arguments.out, arguments.jobs, print_now)
     print(write_report(finished, arguments.docs or arguments.out))
