@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.slow.proof.__main__ import make_pieces
 from tests.slow.proof.garbage import garbage
 from tests.slow.proof.pieces import Piece, finish
 from tests.slow.proof.replays import Case, count_broken, judge
@@ -53,3 +54,12 @@ def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
     text = write_report(both, tmp_path / "docs")
     assert "Of 1 promises" in text
     assert {file.name for file in (tmp_path / "docs").iterdir()} == {"proof.csv", "proof.md"}
+
+
+def test_another_reducer_takes_the_place_of_conv_alone() -> None:
+    reducers = {
+        piece.settings["case"].reducer
+        for part in ("planted", "cost", "noise")
+        for piece in make_pieces(part, 1, "rocket")
+    }
+    assert reducers == {"rocket", "pca"}
