@@ -184,11 +184,12 @@ class EngineCore:
             self._warm_up.join()
 
     def resume(self) -> None:
-        """Restore what a used store holds: version, references, rule, labels and pending checks.
+        """Restore what the store holds: version, references, rule, labels and pending checks.
 
-        The engine then decides bit for bit as before it was closed. It is called once, before the
-        first decision, and waits for the store without a time limit. Where retrains run in the
-        calling thread, it also calls `wait_until_warm`.
+        The engine then decides bit for bit as before it was closed; in a new cell of a product, as
+        the other cells of the product. It is called once, before the first decision, and waits for
+        the store without a time limit. Where retrains run in the calling thread, it also calls
+        `wait_until_warm`.
         """
         settings = self.settings.now
         self.learner.resume(settings.recipe.policy.label_within, settings.policy_since)

@@ -550,13 +550,15 @@ def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data: Dataset) -> No
         assert "dengine-warm-up" not in {thread.name for thread in living_threads()}
 
 
-@pytest.mark.parametrize("product", [None, "gear"])
+@pytest.mark.parametrize(
+    ("product", "cell", "samples"), [(None, "first", 640), ("gear", "second", 650)]
+)
 def test_the_first_retrain_of_a_few_imported_labels_compiles_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, product: str | None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, product: str | None, cell: str, samples: int
 ) -> None:
     """Scripting takes longer than the time budget leaves; so too in a new cell of a product."""
     data = load_dataset("insertion")
-    X = data.X[:60, ..., : 650 if product else 640]  # no other test compiles for these lengths
+    X = data.X[:60, ..., :samples]  # no other test compiles for these lengths
     parts = Dataset(X, data.y[:60])
     url = tmp_path / "e.db"
     with SqlStore(url, "first", product=product) as store:
@@ -568,7 +570,7 @@ def test_the_first_retrain_of_a_few_imported_labels_compiles_nothing(
         return script(module)
 
     monkeypatch.setattr("dengine.model.neighbours.script", counting)
-    store = SqlStore(url, "second" if product else "first", product=product)
+    store = SqlStore(url, cell, product=product)
     with DataEngine.open_or_create(store, recipe=Recipe.load("conv")) as engine:
         assert compiled
         compiled.clear()

@@ -275,8 +275,8 @@ class FakeController(AbstractContextManager["FakeController"]):
     port : int, default 0
         0: any free port, which the attribute `port` names.
     speed : float or None, default 1
-        Relative to real time. None: as fast as clients read, which can be faster than a recorder
-        takes packages from its buffer of 60 s; what does not fit is lost.
+        Relative to real time. None: as fast as clients read. A recorder that falls more than
+        60 s of packages behind, as during a retrain, loses the oldest.
     troubles : iterable of Trouble
         Faults to produce.
     refuses : collection

@@ -15,6 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from dengine.recipe import RECIPES
+
 from .certificate import PROPENSITIES, STREAMS
 from .pieces import Piece, finish
 from .replays import noise_cases, planted_cases, priced_cases
@@ -99,7 +101,10 @@ def main() -> None:
         "--only", default=",".join(PARTS), help=f"parts to do, of {', '.join(PARTS)}"
     )
     parser.add_argument(
-        "--reducer", default="conv", help="takes the place of conv, but not in garbage"
+        "--reducer",
+        default="conv",
+        choices=sorted(RECIPES),
+        help="takes the place of conv, but not in garbage",
     )
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     arguments = parser.parse_args()

@@ -19,7 +19,7 @@ from dengine import Dataset
 Floats = NDArray[np.float64]
 N_SAMPLES = 60
 N_REPEATS = 5  # insertions of each part, where parts repeat
-FEW = 0.04  # share of the parts of "bad few" that are mostly bad and look nearly like the others
+FEW = 0.04  # share of the parts of "bad few" that look nearly like the others; 90 % of them fail
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
     assert {file.name for file in (tmp_path / "docs").iterdir()} == {"proof.csv", "proof.md"}
 
 
-def test_another_reducer_takes_the_place_of_conv_alone() -> None:
+def test_another_reducer_takes_the_place_of_conv_and_of_no_other() -> None:
     reducers = {
         piece.settings["case"].reducer
         for part in ("planted", "cost", "noise")
