@@ -432,13 +432,14 @@ def _split_line(line: str, delimiter: str) -> list[str]:
 
 
 def _find_delimiter(lines: Sequence[str]) -> str:
-    """Return the delimiter that splits lines best, "" for lines of a single cell.
+    """Return the delimiter that splits lines best, "" if each line is a single value.
 
-    The score of a delimiter is a product: the share of cells that are numbers, times or empty; the
-    share of lines with the most frequent number of cells; and 0.5 unless one of the top lines looks
-    like a header of that many cells. Of the scores within 2 % of the best, the first of
-    `DELIMITERS` wins. If all scores are 0, it is the first of tab, semicolon, bar and comma that
-    gives more than one cell, by the most frequent number of cells; "," if none does.
+    The score of a delimiter is the product of three factors: the share of numbers, times and empty
+    cells; the share of lines with the most frequent number of cells; and 1 if one of the top lines
+    looks like a header of that many cells, else 0.5. Of the scores within 2 % of the best, the
+    first of `DELIMITERS` wins. If all scores are 0, as for lines of a single text, it is the first
+    of tab, semicolon, vertical bar and comma for which the most frequent number of cells
+    exceeds 1; "," if there is none.
     """
 
     @cache

@@ -170,8 +170,9 @@ class EngineCore:
     def wait_until_warm(self) -> None:
         """Wait until the first retrain can begin at once.
 
-        The modules that a retrain imports are loaded then. If the store has labels, what the
-        retrain needs of their traces is computed, and the code for decisions is compiled.
+        When it returns, the modules that a retrain imports are loaded, and the features of stored
+        traces that a retrain would compute first are computed. If there are labels but no version,
+        the computation begins here, and the code for decisions is compiled where it can be.
         """
         self._join_warm_up()
         if self.new_labels and not self.live.version:
@@ -186,8 +187,8 @@ class EngineCore:
     def resume(self) -> None:
         """Restore what the store holds: version, references, rule, labels and pending checks.
 
-        The engine then decides bit for bit as before it was closed; in a new cell of a product, as
-        the other cells of the product. It is called once, before the first decision, and waits for
+        The engine then decides bit for bit as before it was closed. In a new cell it decides as the
+        other cells of its product do. It is called once, before the first decision, and waits for
         the store without a time limit. Where retrains run in the calling thread, it also calls
         `wait_until_warm`.
         """

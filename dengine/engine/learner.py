@@ -273,7 +273,7 @@ class Learner:
 
         While it has, the engine retrains without waiting for new labels. False in any of these
         cases: no version is in use yet; the last retrain was dropped; the newest version's retrain
-        took no step; or the engine shares versions with peers, which would train the same one.
+        took no step; or the engine has peers, each of which would train the same version.
         """
         is_alone = self._peers is None and self.live.answering is not None
         if not (is_alone and self._was_accepted):

@@ -187,9 +187,8 @@ def count_features(networks: nn.Module, count: int, channels: int, samples: int)
 
     `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K. The trial is in
     evaluation mode, so that no statistics change; afterwards the networks are in training mode.
-    Raises ValueError unless the output is a tensor of floats with three dimensions, of which the
-    first is 3 and the last at least 1; the second is not checked. Exceptions of the
-    networks' `forward` are not caught.
+    Raises ValueError unless the output is a tensor of floats of shape (3, any, at least 1).
+    Exceptions of the networks' `forward` are not caught.
     """
     networks.eval()
     with torch.no_grad():

@@ -57,7 +57,7 @@ class RetrainingProcess(ProcessPoolExecutor):
         """Queue a call of a picklable function, which runs in the process after earlier calls.
 
         Returns the future of its result. If the result has arrays, wait for it before you submit
-        another call: when that call ends, the file that holds the arrays is closed. Raises
+        the next call: the end of the next call closes the file that holds these arrays. Raises
         BrokenExecutor if the process has ended.
         """
         call = _SharedPickle((fn, args, kwargs))

@@ -275,8 +275,9 @@ class FakeController(AbstractContextManager["FakeController"]):
     port : int, default 0
         0: any free port, which the attribute `port` names.
     speed : float or None, default 1
-        Relative to real time. None: as fast as clients read. A recorder that falls more than
-        60 s of packages behind, as during a retrain, loses the oldest.
+        Relative to real time. None: as fast as clients read from the socket. An `RtdeStream`
+        reads in a thread of its own and buffers 60 s of packages of robot time, so if nobody takes
+        them, as during a retrain, it soon drops the oldest.
     troubles : iterable of Trouble
         Faults to produce.
     refuses : collection

@@ -38,7 +38,7 @@ def make_pieces(part: str, repeats: int, reducer: str = "conv") -> list[Piece]:
     repeats : int
         Replays of a main configuration; others have a share of them, see `count_seeds`.
     reducer : str, default "conv"
-        Takes the place of "conv" in all parts but "garbage", which has its own reducers.
+        Takes the place of "conv". "garbage" has its own reducers, "certificate" has none.
     """
     if part in CASES:
         cases = [
