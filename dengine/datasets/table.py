@@ -92,6 +92,8 @@ class Table:
         if cells.dtype.kind in "iuf":
             values = cells.astype(np.float64)
             bad = np.flatnonzero(np.isinf(values))
+        elif (plain := _plain_numbers(cells, form)) is not None:
+            return plain
         else:
             number = number_pattern(form)
             values = np.empty(len(cells))
@@ -174,6 +176,21 @@ def as_word(cell: Any) -> str:
     if isinstance(cell, float) and cell.is_integer():
         return str(int(cell))
     return str(cell).strip()
+
+
+def _plain_numbers(cells: NDArray[Any], form: TextForm) -> NDArray[np.float64] | None:
+    """Return texts as numbers if all are plain ones, without groups; None if one may not be."""
+    texts = cells.tolist()
+    if form.thousands or not all(isinstance(text, str) for text in texts):
+        return None
+    joined = "\n".join(texts)
+    if not joined.isascii() or "_" in joined or (form.decimal != "." and "." in joined):
+        return None
+    try:
+        values = np.array(joined.replace(form.decimal, ".").split("\n"), dtype=np.float64)
+    except ValueError:
+        return None
+    return values if np.isfinite(values).all() else None
 
 
 def number_pattern(form: TextForm) -> re.Pattern[str]:

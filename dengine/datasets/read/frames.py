@@ -155,3 +155,22 @@ def rows_of(table: Table) -> Iterator[Table]:
                 value = cell.tolist() if isinstance(cell, np.ndarray) else cell
                 columns |= dict(_flatten(name, value))
         yield Table(table.source, columns, [table.line(i)])
+
+
+def part_tables(arrays: Mapping[str, NDArray[Any]], n: int, source: str) -> list[Table]:
+    """Return a table for each of n parts, which arrays hold along their first axis.
+
+    An array (n, C, T) has the columns `NAME.0`, `NAME.1`, ...; one of another first axis holds for
+    all parts.
+    """
+    tables = []
+    for i in range(n):
+        columns = dict[str, NDArray[Any]]()
+        for name, x in arrays.items():
+            of_part = x[i] if x.ndim and len(x) == n else x
+            if of_part.ndim == 2:
+                columns |= {f"{name}.{c}": of_part[c] for c in range(len(of_part))}
+            else:
+                columns[name] = np.atleast_1d(of_part)
+        tables.append(Table(source, columns, []))
+    return tables

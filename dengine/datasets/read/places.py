@@ -132,7 +132,7 @@ def read_listing(base: Path, name: str, key: str, columns: Sequence[str], form: 
         else:
             delimiter = _delimiter_of(content, form, {key, *columns})
             plain = TextForm(form.encoding, delimiter)
-            table = read_text(content, name, plain, lambda _: False, {key, *columns})
+            table = read_text(content, name, plain, lambda _: False, {key, *columns}.__contains__)
         cells = {column: table.words(column) for column in {key, *columns}}
     except UnreadableError as error:
         line = f", line {error.line}" if error.line else ""
@@ -185,14 +185,14 @@ class LabelReader:
         word : of a topic, if that is the source.
         """
         source = self.source
-        words = {word} if word is not None else {*self._words(place, part)}
+        words = {word} if word is not None else {*self.words(place, part)}
         meanings = {self._meaning(text) for text in words}
         if len(meanings) > 1:
             message = f"Expected one label for {part or place.path}, got {listed(sorted(words))}"
             raise UnreadableError(message, column=source.column)
         return meanings.pop()
 
-    def _words(self, place: Place, part: str) -> Sequence[str]:
+    def words(self, place: Place, part: str) -> Sequence[str]:
         """Return the words for a recording."""
         source = self.source
         if self.listing is not None:

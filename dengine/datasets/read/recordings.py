@@ -66,7 +66,7 @@ class Reader:
             return [frames.read_parquet(content, name)]
         if form == "npz":
             return [frames.read_npz(content, name)]
-        return [read_text(content, name, text, self.is_numeric, self.word_columns)]
+        return [read_text(content, name, text, self.is_numeric, self.word_columns.__contains__)]
 
     def is_numeric(self, column: str) -> bool:
         """Return whether a column of a text file holds numbers: of a channel or a numeric clock."""
@@ -82,10 +82,11 @@ class Reader:
         description = self.description
         sources = (description.label, *description.check)
         columns = {source.column for source in sources if not source.listing}
-        columns |= {*description.part.column, *description.rows, description.order}
+        columns |= {*description.part.column, *description.rows}
+        columns |= {description.order} - {"name", "time"}
         dated = zip(description.time.column, description.time.format, strict=False)
         columns |= {column for column, form in dated if form == "iso" or "%" in form}
-        return columns - {"", "name", "time"}
+        return columns - {""}
 
     # One recording.
 
@@ -296,17 +297,7 @@ class Reader:
         if stem not in arrays:
             raise UnreadableError(f"Expected an array {first}, got {listed(arrays)}", column=first)
         n = len(np.atleast_1d(arrays[stem]))
-        tables = []
-        for i in range(n):
-            columns = dict[str, NDArray[Any]]()
-            for key, x in arrays.items():
-                of_part = x[i] if x.ndim and len(x) == n else x
-                if of_part.ndim == 2:
-                    columns |= {f"{key}.{c}": of_part[c] for c in range(len(of_part))}
-                else:
-                    columns[key] = np.atleast_1d(of_part)
-            tables.append(Table(name, columns, []))
-        yield from self.from_objects(tables, name)
+        yield from self.from_objects(frames.part_tables(arrays, n, name), name)
 
     def from_file(self, path: Path, name: str) -> Found:
         """Yield the recordings of a file, and its faults."""

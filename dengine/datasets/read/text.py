@@ -27,7 +27,7 @@ def read_text(
     source: str,
     form: TextForm,
     is_numeric: Callable[[str], bool],
-    words: Collection[str],
+    is_word: Callable[[str], bool],
 ) -> Table:
     """Return the table of a text file.
 
@@ -39,8 +39,8 @@ def read_text(
     form : TextForm
     is_numeric : callable
         Whether the cells of a column, by its name, are numbers; in a plain file they come as such.
-    words : collection of str
-        Columns whose cells are kept as they are. Of other columns, only the number of cells counts.
+    is_word : callable
+        Whether the cells of a column are kept as they are. Of others, only their number counts.
 
     Returns
     -------
@@ -67,6 +67,7 @@ def read_text(
     if not body.strip():
         raise UnreadableError("Expected rows of samples, got none", data)
     numeric = {name for name in names if is_numeric(name)}
+    words = {name for name in names if is_word(name)}
     columns = _read_plain(body, names, form, numeric, words)
     if columns is None:
         columns, lines = _read_cells(body, names, form, lines)
@@ -170,7 +171,7 @@ def _read_plain(
 
     if form.thousands or len({*names}) < len(names):
         return None
-    types: dict[str, Any] = {name: "category" for name in words if name in names}
+    types: dict[str, Any] = dict.fromkeys(words, "category")
     try:
         frame = pd.read_csv(
             io.BytesIO(body),

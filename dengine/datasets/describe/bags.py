@@ -1,0 +1,3 @@
+"""stub until merged"""
+def describe_bag(paths, stated):
+    raise NotImplementedError

@@ -1,0 +1,3 @@
+"""stub"""
+def read_bag(*a):
+    raise NotImplementedError

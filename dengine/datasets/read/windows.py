@@ -1,0 +1,3 @@
+"""stub"""
+def cut_table(*a):
+    raise NotImplementedError
