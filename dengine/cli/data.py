@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import as_options
+from ..datasets.description import Seen
 from . import options
 from .options import DataChoice, RecipeChoice, fault_lines, short_name, verb
 from .output import (
@@ -24,61 +24,121 @@ from .output import (
 )
 
 if TYPE_CHECKING:
+    from ..datasets import Dataset, Description
     from ..experiments.survey import Drift
 
 MOST_FAULTS = 10  # that are shown
+_SAVE = "Write the description, recordings.toml in a folder or FILE.toml beside a file."
 SIGNIFICANT = 0.01  # p-values below it are called drift
 
 
 @verb("dengine data insertion --out out/")
 @options.data_options(argument=True)
+@click.option("--save", is_flag=True, help=_SAVE)
+@click.option("--check", is_flag=True, help="End with exit code 1 if there is any fault.")
 @options.out_option
-def data(source: DataChoice, out: Out | None) -> None:
-    """Describe a data set, and list what is wrong with it.
+@click.pass_context
+def data(
+    context: click.Context, source: DataChoice, save: bool, check: bool, out: Out | None
+) -> None:
+    """Describe recordings, read them by that, and list what is wrong with them.
 
-    A table counts traces, labels, faults and repeats, one says how the data were read, and one
-    shows drift; --out draws the traces too.
+    DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
+    .npz, .ts or .mcap. Shown are the saved description or, without one, a proposal, in which ? is
+    what you have to state with --set; then what was read by it, and drift; --out draws the traces.
+    Look at them, and write the description with --save: every other verb reads by it.
 
-    DATA is one of: a folder of CSV files, one for each insertion, with the label in its name or in
-    a column; a wide .csv, .parquet or .jsonl file, with a row for each insertion; a long one, with
-    a row for each sample, read by --part, --time and --label; an .npz file with X (traces, samples)
-    and y (1 success, 0 failure); one long .mcap file, cut by --trigger; the file of a store, for
-    its labelled traces; or the bundled set, insertion.
+    DATA may also be what needs no description: a bundled set, the file of a store, or an .npz file
+    with X (traces, samples) and y (1 success, 0 failure).
     """
-    from ..datasets import load_dataset
+    description = source.describe(propose=True)
+    shown = "" if description is None else description.to_toml()
+    if description is not None and description.open_keys:
+        path = _save(source, description, save, context)
+        questions = "\n".join(
+            f"  {key}: {description.notes.get(key, 'not known')}" for key in description.open_keys
+        )
+        wrote = f"Wrote {path}. " if path else ""
+        text = f"{wrote}Still open, so nothing was read; state each with --set KEY=VALUE:"
+        record = {"data": source.data, "description": shown, "open": description.open_keys}
+        print_result(record, shown, text, questions)
+        context.exit(1 if check else 0)
+    from ..datasets.checks import tolerance_note
+    from ..decision.policy import Policy
     from ..experiments.figures import data_picture
     from ..experiments.survey import survey_dataset
     from ..model.neighbours import MANY_REPEATS
 
-    dataset = load_dataset(source.data, **source.options)
+    dataset = source.load(description)
     survey = survey_dataset(dataset)
+    path = None
+    if description is not None:
+        n_read = len(dataset) + dataset.unlabelled
+        seen = Seen(recordings=n_read, good=survey.good, bad=survey.bad)
+        path = _save(source, replace(description, seen=seen), save, context)
     rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in"))
     if not survey.rate_hz:
         rows.append(("rate", "unknown"))
     if not survey.unit:
         rows.append(("unit", "unknown"))
-    parts: list[Any] = [table_of_rows(survey.name, rows), *map(as_options, dataset.notes)]
-    parts.append(table_of_rows("How it was read", dataset.reading.items()))
+    rows += [("first", _trace_line(dataset, 0)), ("last", _trace_line(dataset, -1))]
+    parts: list[Any] = [shown] if shown else []
+    parts += [table_of_rows(survey.name, rows), *dataset.notes]
     if dataset.ordered:
         drifts = map(_drift_row, survey.drift)
         parts.append(table_of_rows("By tenths of the recorded order", drifts, ("", "means", "")))
     else:
         parts.append(
-            "The files are in the order of their labels, not of their recording: drift cannot be "
-            "seen."
+            "All parts of one label come first, so this is not the order of their recording: drift "
+            "cannot be seen."
         )
     if survey.near_repeats > MANY_REPEATS:
         parts.append(
             "Many traces nearly repeat another part's. If parts come twice, give their numbers "
-            "(--part)."
+            "(--set part.column=NAME)."
         )
+    if note := tolerance_note(dataset, Policy().lower_bound):
+        parts.append(note)
+    if path:
+        parts.append(f"Wrote {path}.")
+    elif description is not None and source.saved is None:
+        parts.append(
+            "Look at the traces (--out FOLDER); if they are right, write this with --save."
+        )
+    record = {"data": source.data, "description": shown, "survey": survey, "notes": dataset.notes}
     print_result(
-        {"data": source.data, "survey": survey, "notes": dataset.notes, "reading": dataset.reading},
+        record,
         *parts,
         *fault_lines(dataset, MOST_FAULTS),
         out=out,
         make_files=lambda: {"data.png": data_picture(dataset, survey.name)},
     )
+    if check and dataset.faults:
+        context.exit(1)
+
+
+def _save(
+    source: DataChoice, description: "Description", save: bool, context: click.Context
+) -> Path | None:
+    """Write the description if `--save` asks for it, and return its path; else None.
+
+    It replaces another one only with `--force`.
+    """
+    from ..datasets.loading import saved_description
+
+    if not save:
+        return None
+    path = source.description or saved_description(source.data)
+    return description.save(path, bool(context.params.get("force")))
+
+
+def _trace_line(dataset: "Dataset", i: int) -> str:
+    """Return a trace in words: its source, its label, and its first and last samples."""
+    trace = dataset.X[i] if dataset.X.ndim == 2 else dataset.X[i, 0]
+    samples = [f"{value:.4g}" for value in (*trace[:3], *trace[-2:])]
+    source = "" if dataset.source is None else f"{dataset.source[i]}, "
+    label = "good" if dataset.y[i] else "bad"
+    return f"{source}{label}: {', '.join(samples[:3])}, ..., {', '.join(samples[3:])}"
 
 
 def _drift_row(drift: "Drift") -> tuple[str, str, str]:
@@ -161,14 +221,15 @@ def train(
     and a version answers, nothing is trained. If the new version is not used, the exit code is 1.
     Ctrl-C keeps what was imported; the same command continues there.
     """
-    from ..datasets.importing import import_labelled, stored_form
+    from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine, core_of
     from ..experiments.tables import retrain_line
     from ..store.opening import LONG_WAIT
 
-    # The form of the store's earlier traces holds where no other one was asked for.
-    earlier_form = stored_form(store, source.data)
-    dataset = replace(source, options={**earlier_form, **source.options}).load()
+    description = source.describe()
+    if description is not None:
+        description = in_form_of(store, description)
+    dataset = source.load(description)
     recipe = choice.load_if_given()
     try:
         with interruptible_steps(f"importing {dataset.name}", len(dataset)) as count:

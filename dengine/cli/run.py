@@ -87,7 +87,7 @@ _SHADOW = "Verify every part; what the model would have done is only recorded."
     help=_CELL,
 )
 @click.option("--host", metavar="HOST[:PORT]", help="The robot's address, for --cell ur.")
-@options.data_options()
+@options.data_options(live=True)
 @options.scenario_option
 @options.check_option
 @click.option("--cycles", type=options.COUNT, default=300, show_default=True, help=_CYCLES)
@@ -237,7 +237,7 @@ def _make_simulated_cell(
     parameters = CellParameters(verify_s=check_seconds)
     cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles, parameters=parameters)
     name = f"simulated cell, {scenario}"
-    return CellToDrive(cell, name, options.trace_spec_from(source.options))
+    return CellToDrive(cell, name, options.trace_spec_from({**source.options, **source.live}))
 
 
 def _make_replay_cell(
@@ -291,11 +291,12 @@ def _make_robot_cell(source: DataChoice, host: str | None, **others: Any) -> Cel
         raise SettingError(
             "Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none."
         )
-    settings = options.recorder_settings(source.options)
-    settings |= options.drop_none(trigger=source.options.get("trigger"))
+    stated = {**source.options, **source.live}
+    settings = options.recorder_settings(stated)
+    settings |= options.drop_none(trigger=stated.get("trigger"))
     name, port = host_and_port(host)
     cell = UrCell(name, port=port, **settings)
-    form = {key: source.options[key] for key in ("unit", "fit") if key in source.options}
+    form = {key: stated[key] for key in ("unit", "fit") if key in stated}
     return CellToDrive(cell, f"robot at {host}", replace(cell.recorder.spec, **form))
 
 

@@ -134,8 +134,7 @@ def serve(
                     f"Expected a new file to keep the demonstration in, {store} exists; choose "
                     f"another file."
                 )
-            form = {name: value for name, value in trace_options.items() if name != "channel"}
-            data = load_dataset("insertion", **form)
+            data = load_dataset("insertion", samples=trace_options.get("samples"))
             settings["beside"] = [partial(playing, data=data, speed=speed, seed=seed or 0)]
             settings["deadline"] = max(settings["deadline"], DEMO_DEADLINE)
             recipe = recipe or Recipe.load("conv").with_policy(**POLICY)

@@ -44,7 +44,9 @@ def without_repeats(fitted: Sequence[Fitted]) -> tuple[list[Fitted], list[Fault]
         for i in group[1:]:
             is_other = fitted[i][0].part != first.part
             part = f" of another part, {first.part}" if is_other else ""
-            faults[i] = f"Expected other samples than those of {first.source}{part}, it repeats them"
+            faults[i] = (
+                f"Expected other samples than those of {first.source}{part}, it repeats them"
+            )
     kept = [item for i, item in enumerate(fitted) if i not in faults]
     return kept, [Fault(fitted[i][0].source, 0, text) for i, text in sorted(faults.items())]
 

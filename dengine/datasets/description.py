@@ -17,7 +17,7 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import DataError, expect, instead, listed, shortened
+from ..errors import DataError, expect, instead, listed
 from ..files import write_output
 
 UNKNOWN = "?"
@@ -31,7 +31,9 @@ PLACES = ("same", "first", "last")  # of a label in a recording's rows
 MOST_LINE = 100  # characters of a line of the file with its comment
 
 
-def setting(default: Any, doc: str, choices: tuple[str, ...] = (), may_be_text: bool = False) -> Any:
+def setting(
+    default: Any, doc: str, choices: tuple[str, ...] = (), may_be_text: bool = False
+) -> Any:
     """Return a dataclass field for one key, with its sentence and what it may be."""
     about = {"doc": doc, "choices": choices, "may_be_text": may_be_text}
     return field(default=default, metadata=about)
@@ -59,7 +61,9 @@ class TextForm:
     missing: tuple[str, ...] = setting(
         (), "Words that stand for a lost sample, which is read as NaN; other words are faults."
     )
-    drop: tuple[str, ...] = setting((), "Beginnings of the lines below the header that are left out.")
+    drop: tuple[str, ...] = setting(
+        (), "Beginnings of the lines below the header that are left out."
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +80,8 @@ class Clock:
     """When the samples were taken: `[time]`."""
 
     column: tuple[str, ...] = setting(
-        (), "Column of times, or several whose times are added: a date, a time of day, milliseconds."
+        (),
+        "Column of times, or several whose times are added: a date, a time of day, milliseconds.",
     )
     format: tuple[str, ...] = setting(
         ("s",),
@@ -84,10 +89,16 @@ class Clock:
         "signs like those of Python's strptime.",
     )
     zone: str = setting("", "Time zone of dates that state none, like `Europe/Berlin`; empty: UTC.")
-    rate_hz: float = setting(0.0, "Sampling rate in hertz, which the times must agree with; 0: unknown.")
-    wrap: float = setting(0.0, "Value at which a counter of times begins again at 0; 0: it never does.")
+    rate_hz: float = setting(
+        0.0, "Sampling rate in hertz, which the times must agree with; 0: unknown."
+    )
+    wrap: float = setting(
+        0.0, "Value at which a counter of times begins again at 0; 0: it never does."
+    )
     gap: float = setting(1.5, "Longest step from one sample to the next, in usual steps; 0: any.")
-    sort: bool = setting(False, "Whether the samples of a part are put in the order of their times.")
+    sort: bool = setting(
+        False, "Whether the samples of a part are put in the order of their times."
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +106,9 @@ class Channel:
     """One channel of the traces: `COLUMN = "UNIT"` in `[channels]`, or a table of these keys."""
 
     column: str
-    unit: str = setting("", "Unit of the traces; samples whose own unit is stated are converted to it.")
+    unit: str = setting(
+        "", "Unit of the traces; samples whose own unit is stated are converted to it."
+    )
     factor: float = setting(1.0, "Number by which the samples are multiplied.")
     limit: float = setting(0.0, "Range of the sensor, in the unit of the traces; 0: not known.")
 
@@ -105,7 +118,9 @@ class PartSource:
     """Where the number of a part stands: `[part]`. Without it each recording is of another part."""
 
     column: tuple[str, ...] = setting((), "Column, or columns that tell the part together.")
-    path: str = setting("", "Regular expression, whose one group is found in the path without suffix.")
+    path: str = setting(
+        "", "Regular expression, whose one group is found in the path without suffix."
+    )
     line: str = setting("", "Beginning of a line above the header, in front of the part's number.")
 
 
@@ -114,7 +129,9 @@ class LabelSource:
     """Where the label of a part stands, and its words: `[label]`. Other words are faults."""
 
     column: str = setting("", "Column, or array, with the label.")
-    path: str = setting("", "Regular expression, whose one group is found in the path without suffix.")
+    path: str = setting(
+        "", "Regular expression, whose one group is found in the path without suffix."
+    )
     line: str = setting("", "Beginning of a line above the header, in front of the label.")
     topic: str = setting("", "Topic of a bag whose next message is the label.")
     listing: str = setting("", "File beside the recordings that lists the labels, in its `column`.")
@@ -122,14 +139,18 @@ class LabelSource:
     at: str = setting("same", "Which row has the label, if it changes within a recording.", PLACES)
     good: tuple[str, ...] = setting((), "Words for a good part.")
     bad: tuple[str, ...] = setting((), "Words for a bad part.")
-    unchecked: tuple[str, ...] = setting((), "Words for a part that was not checked: it is left out.")
+    unchecked: tuple[str, ...] = setting(
+        (), "Words for a part that was not checked: it is left out."
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Windows:
     """How one long recording is cut into parts: `[windows]`."""
 
-    trigger: str = setting("", "Condition that begins a part, like `register=1@/phase` or `contact=5`.")
+    trigger: str = setting(
+        "", "Condition that begins a part, like `register=1@/phase` or `contact=5`."
+    )
     listing: str = setting("", "File beside the recordings with a row for each part.")
     key: str = setting("", "Column of the listing with the part's number.")
     start: str = setting("", "Column of the listing with the time at which the part began.")
@@ -277,7 +298,11 @@ class Description:
             table = values.get(name, {})
             if name == "check":
                 for i, source in enumerate(self.check):
-                    lines += ["", "[[check]]", *self._lines(values["check"][i], None, f"check.{i}.")]
+                    lines += [
+                        "",
+                        "[[check]]",
+                        *self._lines(values["check"][i], None, f"check.{i}."),
+                    ]
             elif name == "rows":
                 for column in table:
                     lines += ["", f"[rows.{_toml_key(column)}]"]
@@ -285,7 +310,9 @@ class Description:
             elif name == "channels" and not table:
                 lines += ["", "[channels]", *self._lines({UNKNOWN: ""}, None, "channels.")]
             else:
-                section = self._lines(table, None if name not in SECTIONS else KEYS[name], f"{name}.")
+                section = self._lines(
+                    table, None if name not in SECTIONS else KEYS[name], f"{name}."
+                )
                 lines += ["", f"[{name}]", *section] if section else []
         return "\n".join(lines) + "\n"
 
@@ -367,7 +394,10 @@ ORDER = (
     *("part", "label", "check", "windows", "traces", "seen"),
 )
 # Keys of which one states where something stands, and the others are cleared.
-SOURCES = {"label": ("column", "path", "line", "topic", "listing"), "part": ("column", "path", "line")}
+SOURCES = {
+    "label": ("column", "path", "line", "topic", "listing"),
+    "part": ("column", "path", "line"),
+}
 
 
 def _checked_fields(section: type, values: Any, where: str) -> dict[str, Any]:

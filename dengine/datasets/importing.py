@@ -12,7 +12,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,7 +38,8 @@ from ..store.opening import LONG_WAIT, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
-from .loading import holds_table
+from .description import Description
+from .loading import description_of, own_reader
 
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
@@ -49,32 +49,27 @@ CHUNK = 500  # traces committed together
 RATE_TOLERANCE = 0.02  # relative error of rates that are measured from timestamps
 
 
-def stored_form(store: "StoreLike", source: Any) -> dict[str, Any]:
-    """Return the options `samples` and `fit` by which recordings get the form of those in a store.
+def in_form_of(store: "StoreLike", description: Description) -> Description:
+    """Return a description by which recordings get the form of the traces in a store.
 
-    Without them files that are added would change the median length to which all are padded: all
-    would come out changed, and count again. `fit` is None if the store's is strict. The dict is
-    empty for a new store, and for other sources than folders and tables. The store is read, and
-    closed if it was given by its address.
+    Otherwise all would count again if they came out in another length. For a new store it is
+    returned as it is. The store is read, and closed if it was given by its address.
     """
-    if not isinstance(source, str | os.PathLike):
-        return {}
-    path = Path(source)
-    if not (path.is_dir() or (path.is_file() and holds_table(path))):
-        return {}
     try:
         with opening(store, must_exist=True) as opened:
             trace_spec = stored_trace_spec(opened.settings())
             if opened is not store:
                 opened.close()
     except StoreError:
-        return {}  # a new store; any other error comes again when it is opened to be written
+        return (
+            description  # a new store; any other error comes again when it is opened to be written
+        )
     if trace_spec is None:
-        return {}
-    return {
-        "samples": trace_spec.samples,
-        "fit": None if trace_spec.fit == "strict" else trace_spec.fit,
-    }
+        return description
+    stated: dict[str, Any] = {"traces.samples": trace_spec.samples}
+    if trace_spec.fit != "strict":
+        stated["traces.lengths"] = trace_spec.fit
+    return description.with_values(stated)
 
 
 def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
@@ -149,7 +144,7 @@ def import_labelled(
     store : path, URL or store
         A new store, which is created, or a used one. A store object stays open.
     dataset : object
-        Anything `load_dataset` takes.
+        Anything `load_dataset` takes. Described recordings get the form of the store's traces.
     recipe, seed : optional
         Of a new store's engine, by default conv and 0. A used store has its own; others are a
         SettingError.
@@ -167,7 +162,10 @@ def import_labelled(
     TraceError
         If the traces do not agree with those of the store.
     """
-    data = load_dataset(dataset, **stored_form(store, dataset))
+    description = None
+    if own_reader(dataset) is None:
+        description = in_form_of(store, description_of(dataset, None))
+    data = load_dataset(dataset, description)
     engine = DataEngine.open_or_create(
         store, seed, wait=LONG_WAIT, recipe=recipe, allow_import=allow_import
     )

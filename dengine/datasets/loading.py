@@ -1,21 +1,22 @@
 """`load_dataset`, which reads what is ours as it is, and everything else by a description."""
 
+import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import DataError, listed
+from ..errors import DataError
 from ..files import is_database, read_archive, read_errors
 from ..records import stored_trace_spec
-from ..traces import as_traces
 from .dataset import OWN, Dataset, expect_data, make_dataset
 from .describe import describe
 from .description import FOLDER_FILE, Description
+from .read.files import find_files
 from .read.recordings import read_recordings
 
 BUNDLED = {"insertion": "insertion.npz"}
@@ -64,11 +65,12 @@ def load_dataset(
     names = tuple(channels.split(",") if isinstance(channels, str) else channels or ())
     names = tuple(name.strip() for name in names)
     expect_data(samples is None or samples >= 1, "1 or more samples", samples)
-    data = None if description is not None else _read_own(source)
-    if data is not None:
+    read = None if description is not None else own_reader(source)
+    if read is not None:
+        data = read()
         data = data.select(names) if names else data
         return data.cut(samples) if samples else data
-    stated = _description_of(source, description)
+    stated = description_of(source, description)
     if names:
         stated = stated.with_channels(names)
     whole = stated.traces.samples
@@ -86,7 +88,7 @@ def saved_description(source: str | os.PathLike[str]) -> Path:
     return path / FOLDER_FILE if path.is_dir() else path.with_name(f"{path.name}.toml")
 
 
-def _description_of(source: Any, description: Any) -> Description:
+def description_of(source: Any, description: Any) -> Description:
     """Return the description that is stated, or saved; raise DataError without one."""
     if isinstance(description, Description):
         return description
@@ -107,6 +109,12 @@ def _description_of(source: Any, description: Any) -> Description:
     raise DataError(missing_text(path, describe(path)))
 
 
+def count_files(source: str, description: Description | None) -> int:
+    """Return how many files of a source are read."""
+    path = Path(source)
+    return len(find_files(path, description)) if description is not None and path.exists() else 1
+
+
 def missing_text(path: Path, proposal: Description) -> str:
     """Return the message for recordings without a description: what is open, and what to type."""
     command = f"dengine data {path} --save"
@@ -118,42 +126,67 @@ def missing_text(path: Path, proposal: Description) -> str:
     return f"{text} Still open:{questions}" if questions else text
 
 
-def _read_own(source: Any) -> Dataset | None:
-    """Return a data set that needs no description; None for a source that needs one."""
+def own_reader(source: Any) -> Callable[[], Dataset] | None:
+    """Return what reads a source without a description; None for a source that needs one.
+
+    Raises DataError for a source of an unknown type.
+    """
     if isinstance(source, Dataset):
-        return source
+        return lambda: source
     if isinstance(source, tuple) and len(source) == 2:
-        return make_dataset(*source)
+        return lambda: make_dataset(*source)
     if hasattr(source, "columns"):
-        return _from_own_frame(source, "table")
+        return partial(_from_own_frame, source, "table") if _is_own_frame(source.attrs) else None
     if not isinstance(source, str | os.PathLike):
         wanted = "a name, a path, a Dataset, a DataFrame or a pair (X, y)"
         raise DataError(f"Expected {wanted}, got {type(source).__name__}.")
     if str(source) in BUNDLED:
         path = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
-        return _read_npz(path, str(source))
+        return partial(_read_npz, path, str(source))
     path = Path(source)
     if not path.is_file() or saved_description(path).is_file():
         return None
     if is_database(path):
-        return _read_store(path)
-    if path.suffix.lower() == ".npz":
-        return _read_npz(path, path.stem)
-    if path.suffix.lower() == ".parquet":
-        with read_errors(path, "a Parquet file", "pyarrow", "files"):
-            import pandas as pd
-            from pyarrow.parquet import read_schema
-
-            is_own = OWN.encode() in (read_schema(path).metadata or {}).get(b"PANDAS_ATTRS", b"")
-            return _from_own_frame(pd.read_parquet(path), path.stem) if is_own else None
+        return partial(_read_store, path)
+    if path.suffix.lower() == ".npz" and _is_own_archive(path):
+        return partial(_read_npz, path, path.stem)
+    if path.suffix.lower() == ".parquet" and _is_own_table(path):
+        return partial(_read_own_table, path)
     return None
 
 
-def _from_own_frame(frame: Any, name: str) -> Dataset | None:
-    """Return the data set of a table that `Dataset.to_frame` made; None for another table."""
-    about = dict(getattr(frame, "attrs", {}).get(OWN, {}))
-    if not about:
-        return None
+def _is_own_frame(attrs: Mapping[Any, Any]) -> bool:
+    """Return whether the metadata of a DataFrame is that of `Dataset.to_frame`."""
+    return OWN in attrs
+
+
+def _is_own_archive(path: Path) -> bool:
+    """Return whether an archive has X, and labels y of 1 and 0."""
+    arrays, names = read_archive(path, ("y",))
+    labels = arrays.get("y", np.array(["none"]))
+    return "X" in names and labels.dtype.kind in "iufb" and bool(np.isin(labels, (0, 1)).all())
+
+
+def _is_own_table(path: Path) -> bool:
+    """Return whether a Parquet file was written of a table that `Dataset.to_frame` made."""
+    with read_errors(path, "a Parquet file", "pyarrow", "files"):
+        from pyarrow.parquet import read_schema
+
+        metadata = read_schema(path).metadata or {}
+        about = json.loads(metadata.get(b"PANDAS_ATTRS", b"{}"))
+        return _is_own_frame(about)
+
+
+def _read_own_table(path: Path) -> Dataset:
+    """Return the data set of a Parquet file of ours."""
+    import pandas as pd
+
+    return _from_own_frame(pd.read_parquet(path), path.stem)
+
+
+def _from_own_frame(frame: Any, name: str) -> Dataset:
+    """Return the data set of a table that `Dataset.to_frame` made."""
+    about = dict(frame.attrs[OWN])
     columns = [column for column in frame.columns if column not in ("label", "part", "cause")]
     n_channels = about.pop("n_channels")
     X = frame[columns].to_numpy(np.float32)
@@ -163,15 +196,12 @@ def _from_own_frame(frame: Any, name: str) -> Dataset | None:
     return make_dataset(X, frame["label"].to_numpy(), name=name, **about)
 
 
-def _read_npz(path: Path, name: str) -> Dataset | None:
-    """Return the data set of an archive with X and labels y of 1 and 0; None for another one.
+def _read_npz(path: Path, name: str) -> Dataset:
+    """Return the data set of an archive with X and labels y of 1 and 0.
 
     X is multiplied by the number `scale` if there is one.
     """
     arrays, _ = read_archive(path, ("X", "y", *ABOUT))
-    labels = arrays.get("y", np.array(["none"]))
-    if "X" not in arrays or labels.dtype.kind not in "iufb" or not np.isin(labels, (0, 1)).all():
-        return None
     X = arrays["X"]
     with read_errors(path, "an .npz file of plain arrays"):
         if "scale" in arrays:
@@ -180,7 +210,7 @@ def _read_npz(path: Path, name: str) -> Dataset | None:
         about["rate_hz"] = float(arrays["rate_hz"]) if "rate_hz" in arrays else None
         about["unit"] = ", ".join(map(str, np.atleast_1d(arrays.get("unit", "")).tolist()))
         about["channels"] = tuple(map(str, arrays.get("channels", ())))
-        return make_dataset(X, labels, name=name, **about)
+        return make_dataset(X, arrays["y"], name=name, **about)
 
 
 def _read_store(path: Path) -> Dataset:

@@ -21,10 +21,23 @@ from .layout import Material, describe_material
 # The format of files with each suffix; `.gz` may stand behind it.
 SUFFIXES = {
     **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn"), "text"),
-    **{".json": "json", ".jsonl": "jsonl", ".ndjson": "jsonl", ".parquet": "parquet", ".pq": "parquet"},
-    **{".npz": "npz", ".ts": "ts", ".mcap": "mcap", ".db3": "mcap"},
+    ".json": "json",
+    ".jsonl": "jsonl",
+    ".ndjson": "jsonl",
+    ".parquet": "parquet",
+    ".pq": "parquet",
+    ".npz": "npz",
+    ".ts": "ts",
+    ".mcap": "mcap",
+    ".db3": "mcap",
 }
-PAGES = ("readme", "license", "licence", "notes", "changelog")  # texts that describe, by their stems
+PAGES = (
+    "readme",
+    "license",
+    "licence",
+    "notes",
+    "changelog",
+)  # texts that describe, by their stems
 
 
 def describe(source: Any, stated: Mapping[str, Any] | None = None) -> Description:
@@ -64,7 +77,9 @@ def describe(source: Any, stated: Mapping[str, Any] | None = None) -> Descriptio
         groups = {key: names for key, names in groups.items() if names}
     if not groups:
         wanted = f"files of recordings, {', '.join(SUFFIXES)}"
-        raise DataError(f"Expected {wanted}, found none in {root}; see recordings that are not read.")
+        raise DataError(
+            f"Expected {wanted}, found none in {root}; see recordings that are not read."
+        )
     notes: dict[str, str] = {}
     largest = max(groups, key=lambda key: len(groups[key]))
     others = [name for key, names in groups.items() if key != largest for name in names]
@@ -112,7 +127,10 @@ def suffix_of(name: str) -> str:
 
 def pattern_of(names: Sequence[str]) -> str:
     """Return the pattern of files of one suffix."""
-    endings = Counter("".join(Path(name).suffixes[-2:] if name.lower().endswith(".gz") else Path(name).suffix) for name in names)
+    endings = Counter(
+        "".join(Path(name).suffixes[-2:] if name.lower().endswith(".gz") else Path(name).suffix)
+        for name in names
+    )
     ending = endings.most_common(1)[0][0]
     is_deep = any("/" in name for name in names)
     pattern = f"**/*{ending}" if is_deep else f"*{ending}"

@@ -1,3 +1,5 @@
 """stub until merged"""
+
+
 def describe_bag(paths, stated):
     raise NotImplementedError

@@ -30,7 +30,9 @@ FORMS = (
 # Seconds since 1970 of the years 2000 to 2050.
 YEARS = (946_684_800, 2_524_608_000)
 EXCEL_DAYS = (36_526, 54_789)  # the same years
-UNIT_IN_NAME = re.compile(r"(?:[\[(/_ ]|in )\s*((?:[\d.]+ ?)?(?:s|ms|us|µs|ns|min|h|sec))\s*[\])]?$")
+UNIT_IN_NAME = re.compile(
+    r"(?:[\[(/_ ]|in )\s*((?:[\d.]+ ?)?(?:s|ms|us|µs|ns|min|h|sec))\s*[\])]?$"
+)
 MILLIS = re.compile(r"^milli|^ms$", re.IGNORECASE)
 GAP = 1.5
 RATE_ROUNDING = 0.005
@@ -64,9 +66,11 @@ def describe_clock(
             notes["time.rate_hz"] = "unknown, for no clock was found; state it if you know it"
         return {}, others
     formats = stated.get("time.format")
-    formats = [*np.atleast_1d(formats)] if formats else [
-        form_of(views, name, form, notes) for name in columns
-    ]
+    formats = (
+        [*np.atleast_1d(formats)]
+        if formats
+        else [form_of(views, name, form, notes) for name in columns]
+    )
     values: dict[str, Any] = {"time.column": columns, "time.format": formats}
     if UNKNOWN not in formats:
         clock = Clock(column=tuple(columns), format=tuple(formats))
@@ -86,7 +90,11 @@ def choose_columns(
             return [first, second]
     dates = [name for name in named if _text_form(views, name) not in ("", None)]
     numbers = [name for name in named if name not in dates and _is_rising(views, name, form)]
-    whole = [name for name in dates if _has_time(_text_form(views, name)) and _has_date(_text_form(views, name))]
+    whole = [
+        name
+        for name in dates
+        if _has_time(_text_form(views, name)) and _has_date(_text_form(views, name))
+    ]
     days = [name for name in dates if not _has_time(_text_form(views, name))]
     of_day = [name for name in dates if name not in (*whole, *days)]
     if whole[:1] or of_day[:1]:
@@ -132,7 +140,9 @@ def _text_forms(views: Sequence[Table], name: str) -> list[str]:
         return [ISO]
     if cells[0].dtype.kind != "O":
         return []
-    texts = pd.Series(np.concatenate([column[:20] for column in cells[:20]])).astype(str).str.strip()
+    texts = (
+        pd.Series(np.concatenate([column[:20] for column in cells[:20]])).astype(str).str.strip()
+    )
     if not texts.str.contains(r"^\d+[:\-./T]\d+[:\-./T]\d", regex=True).all():
         return []
     texts = texts.str.replace(",", ".", regex=False)
@@ -185,9 +195,7 @@ def _is_even(views: Sequence[Table], name: str, form: TextForm) -> bool:
     return True
 
 
-def form_of(
-    views: Sequence[Table], name: str, form: TextForm, notes: dict[str, str]
-) -> str:
+def form_of(views: Sequence[Table], name: str, form: TextForm, notes: dict[str, str]) -> str:
     """Return the unit or form of a column of times; `?` where several fit."""
     forms = _text_forms(views, name)
     if forms:
@@ -250,8 +258,12 @@ def describe_rate(
     values: dict[str, Any] = {}
     n_back = sum(bool((steps < 0).any()) for steps in all_steps)
     if n_back > FEW * len(all_steps) and not clock.wrap:
-        notes["time.wrap"] = f"times fall in {n_back} of {len(all_steps)} recordings: does the counter"
-        notes["time.wrap"] += " begin again (state time.wrap), or are rows in another order (time.sort)?"
+        notes["time.wrap"] = (
+            f"times fall in {n_back} of {len(all_steps)} recordings: does the counter"
+        )
+        notes["time.wrap"] += (
+            " begin again (state time.wrap), or are rows in another order (time.sort)?"
+        )
         values["time.wrap"] = UNKNOWN
     forward = [steps[steps >= 0] for steps in all_steps]
     usual = float(np.median([np.median(steps) for steps in forward if len(steps)]))

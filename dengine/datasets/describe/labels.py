@@ -14,11 +14,10 @@ from typing import Any
 from ...errors import listed
 from ..description import UNKNOWN, LabelSource, TextForm
 from ..read.files import read_file
-from ..read.places import Place, joined, line_word, read_listing, without_suffix
 from ..read.frames import read_objects, read_parquet
+from ..read.places import Place, joined, line_word, read_listing, without_suffix
 from ..read.text import read_text
 from ..table import Table, UnreadableError
-from .text_form import look
 
 GOOD = ("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "io", "accepted", "合格")
 BAD = (
@@ -33,8 +32,12 @@ VERDICT_NAME = re.compile(
     r"|target|y|status|bewertung|urteil|accept(ed)?|resultat|judg?e?ment|eval(uation)?|判定|label_\w+)"
     r"([^a-z]|$)|(?i:result|verdict|ergebnis)"
 )
-BAD_NAME = re.compile(r"(?i)(^|[^a-z])(fail(ed|ure)?|defect\w*|nok|nio|bad|anomaly|scrap|reject(ed)?)([^a-z]|$)")
-GOOD_NAME = re.compile(r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y|i\.o\.)([^a-z]|$)")
+BAD_NAME = re.compile(
+    r"(?i)(^|[^a-z])(fail(ed|ure)?|defect\w*|nok|nio|bad|anomaly|scrap|reject(ed)?)([^a-z]|$)"
+)
+GOOD_NAME = re.compile(
+    r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y|i\.o\.)([^a-z]|$)"
+)
 MOST_WORDS = 12
 CHUNK = 200  # files of names that a note quotes
 
@@ -93,7 +96,9 @@ def meaning(words: Iterable[str], name: str = "") -> tuple[list[str], list[str],
     """
     words = [*words]
     lower = {word.lower() for word in words}
-    good = [w for w in words if w.lower() in GOOD and (NEEDS_OTHER.get(w.lower(), w.lower()) in lower)]
+    good = [
+        w for w in words if w.lower() in GOOD and (NEEDS_OTHER.get(w.lower(), w.lower()) in lower)
+    ]
     bad = [w for w in words if w.lower() in BAD]
     is_flag = lower <= {*YES, *NO, *UNCHECKED}
     if is_flag and name:
@@ -199,7 +204,11 @@ def listing_table(path: Path, form: TextForm) -> Table | None:
 
 
 def in_listings(
-    base: Path, files: Sequence[str], places: Mapping[str, Place], parts: Mapping[str, str], form: TextForm
+    base: Path,
+    files: Sequence[str],
+    places: Mapping[str, Place],
+    parts: Mapping[str, str],
+    form: TextForm,
 ) -> list[Candidate]:
     """Return the candidates in files that list the recordings, by file or by part.
 
@@ -265,7 +274,9 @@ def choose(
     if known:
         best, *others = known
         key = [*best.source][0]
-        notes[f"label.{key}"] = best.title.partition(" (")[2].rstrip(")") + f", over {n:,} recordings"
+        notes[f"label.{key}"] = (
+            best.title.partition(" (")[2].rstrip(")") + f", over {n:,} recordings"
+        )
         return best.values(), [_source(other) for other in others]
     if len(candidates) == 1:
         (only,) = candidates

@@ -38,8 +38,12 @@ QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 COUNTER_NAME = re.compile(r"(?i)^(index|row|sample|n|i|punkt|point|count|nr|no|line)s?$")
 LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
 FORCES = (
-    re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|z[^a-z]*(force|kraft)|force_2$"),
-    re.compile(r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|couple|effort|last\b|力|荷重"),
+    re.compile(
+        r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|z[^a-z]*(force|kraft)|force_2$"
+    ),
+    re.compile(
+        r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|couple|effort|last\b|力|荷重"
+    ),
     re.compile(r"(?i)^f\b|^value$"),
 )
 
@@ -111,8 +115,14 @@ def build(values: Mapping[str, Any], roles: "Roles", notes: Mapping[str, str]) -
             nested[section] = value
     nested["channels"] = roles.channels
     nested["rows"] = roles.rows
-    nested["ignored"] = {name: unit for name, unit in roles.ignored.items() if name not in roles.channels}
-    stated = {name: value for name, value in values.items() if name.partition(".")[0] in ("channels", "rows")}
+    nested["ignored"] = {
+        name: unit for name, unit in roles.ignored.items() if name not in roles.channels
+    }
+    stated = {
+        name: value
+        for name, value in values.items()
+        if name.partition(".")[0] in ("channels", "rows")
+    }
     description = Description.from_dict({k: v for k, v in nested.items() if v not in ({}, None)})
     checks = tuple(roles.checks)
     return Description(
@@ -151,13 +161,16 @@ def read_texts(material: Material, stated: Mapping[str, Any]) -> None:
     heads = Counter(tuple(tables[0].columns) for tables in material.tables if tables)
     usual_head = heads.most_common(1)[0][0] if heads else ()
     material.tables = [
-        tables if tables and tuple(tables[0].columns) == usual_head else [] for tables in material.tables
+        tables if tables and tuple(tables[0].columns) == usual_head else []
+        for tables in material.tables
     ]
 
 
 def _text_form(values: Mapping[str, Any]) -> TextForm:
     """Return the form to look at cells with, where `?` is replaced by what is usual."""
-    known = {key.partition(".")[2]: value for key, value in values.items() if key.startswith("text.")}
+    known = {
+        key.partition(".")[2]: value for key, value in values.items() if key.startswith("text.")
+    }
     known = {key: value for key, value in known.items() if value != UNKNOWN}
     for name in ("names", "missing", "drop"):
         if name in known:
@@ -269,7 +282,11 @@ def _has_lists(table: Table) -> bool:
 
 def _changes(table: Table, columns: Any) -> bool:
     """Return whether the words of columns change within a table."""
-    return any(len({*table.words(name)}) > 1 for name in np.atleast_1d(columns).tolist() if name in table.columns)
+    return any(
+        len({*table.words(name)}) > 1
+        for name in np.atleast_1d(columns).tolist()
+        if name in table.columns
+    )
 
 
 def run_columns(material: Material) -> list[str]:
@@ -352,7 +369,9 @@ def views_of(material: Material, layout: str, stated: Mapping[str, Any]) -> dict
             table = tables[0] if len(tables) == 1 else frames_joined(tables)
             views |= _views_of_parts(table, material, stated)
         elif layout == "files" or len(tables) > 1:
-            views |= {f"{source}#{i}" if len(tables) > 1 else source: t for i, t in enumerate(tables)}
+            views |= {
+                f"{source}#{i}" if len(tables) > 1 else source: t for i, t in enumerate(tables)
+            }
         elif layout == "wide" and _has_lists(tables[0]):
             views |= {f"{source}#{i}": row for i, row in enumerate(frames.rows_of(tables[0]))}
         else:
@@ -360,7 +379,9 @@ def views_of(material: Material, layout: str, stated: Mapping[str, Any]) -> dict
     return views
 
 
-def _views_of_parts(table: Table, material: Material, stated: Mapping[str, Any]) -> dict[str, Table]:
+def _views_of_parts(
+    table: Table, material: Material, stated: Mapping[str, Any]
+) -> dict[str, Table]:
     """Return a table for each part of a long table, and name its column."""
     columns = stated.get("part.column")
     if columns is None:
@@ -371,7 +392,9 @@ def _views_of_parts(table: Table, material: Material, stated: Mapping[str, Any])
             if len(good) > 1:
                 material.notes["part.column"] = f"one of {listed(good)}"
         else:
-            text = f"one of {listed(good)}" if good else f"one, or several, of {listed(table.columns)}"
+            text = (
+                f"one of {listed(good)}" if good else f"one, or several, of {listed(table.columns)}"
+            )
             material.notes["part.column"] = f"which column tells the parts apart? {text}"
             columns = UNKNOWN
     material.values["part.column"] = columns
@@ -466,11 +489,17 @@ class Roles:
                 for key, value in self.stated.items()
                 if key.startswith("rows.") and key[5:].rpartition(".")[0] == name
             }
-            is_clock = CLOCK_NAME.search(name) or name in np.atleast_1d(self.stated.get("time.column", []))
+            is_clock = CLOCK_NAME.search(name) or name in np.atleast_1d(
+                self.stated.get("time.column", [])
+            )
             if name in taken or (is_clock and not given):
                 continue
             columns = [t.columns[name] for t in self.views.values() if name in t.columns]
-            if columns[0].dtype.kind not in "OUSb" and not given and not QUALIFIER_NAME.search(name):
+            if (
+                columns[0].dtype.kind not in "OUSb"
+                and not given
+                and not QUALIFIER_NAME.search(name)
+            ):
                 continue
             sets = [{*t.words(name).tolist()} for t in self.views.values() if name in t.columns]
             words = sorted(set().union(*sets))
@@ -504,7 +533,9 @@ class Roles:
 
         If those to keep are stated, the others are dropped, else they are kept.
         """
-        result = {key: [str(w) for w in np.atleast_1d(value).tolist()] for key, value in given.items()}
+        result = {
+            key: [str(w) for w in np.atleast_1d(value).tolist()] for key, value in given.items()
+        }
         named = {word for some in result.values() for word in some}
         others = [word for word in words if word not in named]
         if others and ANY not in named:
@@ -596,7 +627,13 @@ class Roles:
         """Return the candidates for the label, those in files that list it first."""
         parts = dict[str, str]()
         source = Description.from_dict(
-            {"part": {k[5:]: v for k, v in self.material.values.items() if k.startswith("part.") and v != UNKNOWN}}
+            {
+                "part": {
+                    k[5:]: v
+                    for k, v in self.material.values.items()
+                    if k.startswith("part.") and v != UNKNOWN
+                }
+            }
         ).part
         source = self._stated_part(source)
         for name, place in places.items():
@@ -608,9 +645,15 @@ class Roles:
         read = in_tables
         if self.layout == "files" and all("#" not in name for name in self.views):
             read = self.views
-        columns = [name for name in self.first.columns if name not in taken and name not in self.rows]
+        columns = [
+            name for name in self.first.columns if name not in taken and name not in self.rows
+        ]
         if self.layout == "wide":
-            columns = [c for c in columns if not any(c in names for names in numbered_columns(self.first).values())]
+            columns = [
+                c
+                for c in columns
+                if not any(c in names for names in numbered_columns(self.first).values())
+            ]
         others = [name for name in self.material.others if not name.endswith(".toml")]
         result = labels.in_listings(self.material.base, others, places, parts, self.material.form)
         if self.layout in ("files", "columns"):
@@ -626,20 +669,43 @@ class Roles:
         return Description.from_dict({"part": stated}).part if stated else source
 
     def _stated_label(
-        self, stated: Mapping[str, Any], candidates: Sequence[labels.Candidate], places: Mapping[str, Place]
+        self,
+        stated: Mapping[str, Any],
+        candidates: Sequence[labels.Candidate],
+        places: Mapping[str, Place],
     ) -> dict[str, Any]:
         """Return the keys of `[label]` for a source that the user stated, with its words."""
-        same = [c for c in candidates if all(c.source.get(k, v) == v for k, v in stated.items() if k in ("column", "path", "line", "listing", "key"))]
-        same = [c for c in same if {"path", "listing", "line"} & {*stated} == {"path", "listing", "line"} & {*c.source}]
+        same = [
+            c
+            for c in candidates
+            if all(
+                c.source.get(k, v) == v
+                for k, v in stated.items()
+                if k in ("column", "path", "line", "listing", "key")
+            )
+        ]
+        same = [
+            c
+            for c in same
+            if {"path", "listing", "line"} & {*stated} == {"path", "listing", "line"} & {*c.source}
+        ]
         if same and same[0].is_known:
             return {**same[0].values(), **stated}
-        source = {k: str(v) for k, v in stated.items() if k in ("column", "path", "line", "listing", "key", "at")}
+        source = {
+            k: str(v)
+            for k, v in stated.items()
+            if k in ("column", "path", "line", "listing", "key", "at")
+        }
         words = {**self._words_of(source, places)}
         name = stated.get("column") or stated.get("line") or ""
-        candidate = labels.Candidate(source, words, *labels.meaning(sorted({*words.values()}), name))
+        candidate = labels.Candidate(
+            source, words, *labels.meaning(sorted({*words.values()}), name)
+        )
         found = {**candidate.values(), **stated}
         if "good" in stated and "bad" not in stated and UNKNOWN in found["bad"]:
-            rest = sorted({*words.values()} - {*np.atleast_1d(stated["good"]).tolist(), *candidate.unchecked})
+            rest = sorted(
+                {*words.values()} - {*np.atleast_1d(stated["good"]).tolist(), *candidate.unchecked}
+            )
             found["bad"] = rest if len(rest) == 1 else [UNKNOWN]
         for key in ("good", "bad"):
             if UNKNOWN in found[key]:
@@ -655,11 +721,18 @@ class Roles:
         listing = None
         if label.listing and label.key and label.column:
             form = self.material.form
-            listing = read_listing(self.material.base, label.listing, label.key, [label.column], form)
+            listing = read_listing(
+                self.material.base, label.listing, label.key, [label.column], form
+            )
         reader = LabelReader(label, listing, set())
         words = dict[str, str]()
         for name, place in places.items():
-            if label.column and not label.listing and name not in self.views and self.layout == "files":
+            if (
+                label.column
+                and not label.listing
+                and name not in self.views
+                and self.layout == "files"
+            ):
                 continue
             try:
                 part = part_of(self._stated_part(Description.from_dict({}).part), place)
@@ -674,7 +747,11 @@ class Roles:
         for name in self.first.columns:
             if name in taken or self.first.columns[name].dtype.kind == "f":
                 continue
-            sets = [{*table.words(name).tolist()} for table in self.views.values() if name in table.columns]
+            sets = [
+                {*table.words(name).tolist()}
+                for table in self.views.values()
+                if name in table.columns
+            ]
             words = set().union(*sets)
             if 1 < len(words) <= FEW_WORDS and (max(map(len, sets)) == 1 or len(sets) == 1):
                 hints.append(name)
@@ -684,7 +761,9 @@ class Roles:
 
     def find_channels(self, taken: set[str], is_matrix: bool) -> None:
         """Choose the channel that is named or measured like a force, `?` among several."""
-        stated = {key[9:]: value for key, value in self.stated.items() if key.startswith("channels.")}
+        stated = {
+            key[9:]: value for key, value in self.stated.items() if key.startswith("channels.")
+        }
         units = self.numeric_units(taken, is_matrix)
         self.ignored |= units
         if stated:
@@ -703,13 +782,17 @@ class Roles:
                 self.material.notes[f"channels.{name}"] = f"others: {listed(others)}"
         else:
             text = ", ".join(f"{name} [{unit}]" if unit else name for name, unit in units.items())
-            self.material.notes["channels"] = f"one or several of: {text}" if units else "no column of numbers changes"
+            self.material.notes["channels"] = (
+                f"one or several of: {text}" if units else "no column of numbers changes"
+            )
             self.material.notes["channels.?"] = self.material.notes["channels"]
 
     def numeric_units(self, taken: set[str], is_matrix: bool) -> dict[str, str]:
         """Return the unit of each column of numbers that may be a channel."""
         if is_matrix:
-            return {pattern: unit_in(pattern.rstrip(ANY)) for pattern in numbered_columns(self.first)}
+            return {
+                pattern: unit_in(pattern.rstrip(ANY)) for pattern in numbered_columns(self.first)
+            }
         if self.layout == "columns":
             clock = {*self.material.values.get("time.column", [])}
             names = [name for name in self.first.columns if name not in clock]
@@ -754,11 +837,18 @@ class Roles:
             n_empty += words.count("")
             changes |= len({*numbers}) > 1
         n_odd = odd.total()
-        if not changes or n_odd > 0.9 * n or any(word.lower() not in LOST for word in [w for w, k in odd.items() if k > 0.01 * n]):
+        if (
+            not changes
+            or n_odd > 0.9 * n
+            or any(word.lower() not in LOST for word in [w for w, k in odd.items() if k > 0.01 * n])
+        ):
             return False
         if n_empty > SPARSE * n:
             self.sparse = {*getattr(self, "sparse", set()), name}
-        self.odd = {**getattr(self, "odd", {}), name: [word for word in odd if word.lower() in LOST]}
+        self.odd = {
+            **getattr(self, "odd", {}),
+            name: [word for word in odd if word.lower() in LOST],
+        }
         return True
 
     def find_lengths(self, is_matrix: bool) -> None:
@@ -786,9 +876,13 @@ class Roles:
         n_usual = counts[usual]
         if n_usual >= 0.9 * len(lengths) and "traces.lengths" not in self.stated and how == "pad":
             values["traces.lengths"] = "strict"
-            notes["traces.lengths"] = f"{len(lengths) - n_usual} of {len(lengths)} have another length: faults"
+            notes["traces.lengths"] = (
+                f"{len(lengths) - n_usual} of {len(lengths)} have another length: faults"
+            )
         elif how == "pad":
-            notes["traces.lengths"] = f"{min(lengths)} to {max(lengths)} samples; or cut, pad-all, resample"
+            notes["traces.lengths"] = (
+                f"{min(lengths)} to {max(lengths)} samples; or cut, pad-all, resample"
+            )
         values["traces.samples"] = min(lengths) if how == "cut" else usual
 
     def _lengths(self, is_matrix: bool) -> list[int]:
@@ -821,7 +915,9 @@ class Roles:
         values, notes = self.material.values, self.material.notes
         forms = [*np.atleast_1d(values.get("time.format", [])).tolist()]
         note = notes.get("time.format", "")
-        is_dated = any(form == "iso" or "%Y" in form for form in forms) and "prove neither" not in note
+        is_dated = (
+            any(form == "iso" or "%Y" in form for form in forms) and "prove neither" not in note
+        )
         if is_dated or "since 1970" in note:
             values["order"] = "time"
 
@@ -839,7 +935,9 @@ class Roles:
                 if name not in roles and name not in self.ignored and name not in in_groups:
                     self.ignored[name] = ""
         used = {values.get("label.listing"), *(check.listing for check in self.checks)}
-        exclude = sorted({name for name in self.material.others if name not in used}, key=natural_key)
+        exclude = sorted(
+            {name for name in self.material.others if name not in used}, key=natural_key
+        )
         if exclude and self.material.kind == "text":
             values["exclude"] = exclude
             notes["exclude"] = "files of another form, which are not read"
@@ -865,5 +963,7 @@ def likely_channels(units: Mapping[str, str]) -> list[str]:
         found = [name for name in units if pattern.search(name)]
         if found:
             return found
-    found = [n for n, unit in units.items() if (q := quantity_of(unit)) and q[0] in ("force", "torque")]
+    found = [
+        n for n, unit in units.items() if (q := quantity_of(unit)) and q[0] in ("force", "torque")
+    ]
     return found or [name for name in units if FORCES[2].search(name)]

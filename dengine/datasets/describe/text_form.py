@@ -23,7 +23,9 @@ NUMBER = re.compile(
 )
 MOST_LINES = 400  # of a file that are looked at
 MOST_NAMES = 40  # columns without a header that get a name each
-UNIT_WORDS = re.compile(r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|s|ms|us|ns|min|h)[\])]?")
+UNIT_WORDS = re.compile(
+    r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|s|ms|us|ns|min|h)[\])]?"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,12 +153,18 @@ def describe_form(looks: Sequence[Look], notes: dict[str, str]) -> dict[str, Any
         line = usual.lines[header - 1]
         first = split_line(line, usual.delimiter)[0]
         notes["text.header"] = "it stands at another line in each file"
-        header, units, data = line[: line.index(first) + len(first)], units and units - header, data - header
+        header, units, data = (
+            line[: line.index(first) + len(first)],
+            units and units - header,
+            data - header,
+        )
     values |= {"text.header": header, "text.units": units, "text.data": data}
     names = _missing_names(usual)
     if names:
         values["text.names"] = names
-        notes["text.names"] = "no header names each column" if usual.header else "there is no header"
+        notes["text.names"] = (
+            "no header names each column" if usual.header else "there is no header"
+        )
     cells = {cell.strip() for one in looks for row in one.rows() for cell in row}
     numbers = {cell for cell in cells if NUMBER.fullmatch(cell)}
     values |= marks(numbers, usual.delimiter, notes)
@@ -184,7 +192,9 @@ def marks(cells: Iterable[str], delimiter: str, notes: dict[str, str]) -> dict[s
     cells = [*cells]
     seen = {mark: [cell for cell in cells if mark in cell] for mark in ".,"}
     proof = {mark: sum(map(_is_decimal(mark), seen[mark])) for mark in ".,"}
-    blank = next((m for m in "'’\u202f\xa0 " if any(re.search(rf"\d\{m}\d{{3}}", c) for c in cells)), "")
+    blank = next(
+        (m for m in "'’\u202f\xa0 " if any(re.search(rf"\d\{m}\d{{3}}", c) for c in cells)), ""
+    )
     for decimal, other in (".,", ",."):
         groups = any(cell.count(other) > 1 for cell in seen[other])
         if (proof[decimal] and proof[decimal] > 20 * proof[other]) or (groups and not proof[other]):

@@ -1,3 +1,5 @@
 """stub"""
+
+
 def read_bag(*a):
     raise NotImplementedError

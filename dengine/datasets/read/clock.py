@@ -12,8 +12,15 @@ from ..description import Clock, TextForm
 from ..table import Recording, Table, UnreadableError
 
 UNITS = {
-    **{"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
-    **{"min": 60.0, "h": 3600.0, "d": 86400.0},
+    "s": 1.0,
+    "sec": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "µs": 1e-6,
+    "ns": 1e-9,
+    "min": 60.0,
+    "h": 3600.0,
+    "d": 86400.0,
 }
 ISO = "iso"
 DAY = 86400.0
@@ -94,9 +101,7 @@ def _is_whole(cell: object) -> bool:
     return len(text) < 19 and text.isascii() and text.lstrip("-").isdigit()
 
 
-def _dates(
-    table: Table, name: str, unit: str, clock: Clock
-) -> tuple[NDArray[np.float64], float]:
+def _dates(table: Table, name: str, unit: str, clock: Clock) -> tuple[NDArray[np.float64], float]:
     """Return the times of a column of dates or times of day; a time of day may pass midnight."""
     import pandas as pd
 
@@ -156,7 +161,9 @@ def check_steps(recording: Recording, clock: Clock) -> None:
         raise UnreadableError(message, _line(recording.lines, i), name)
     rate = len(steps) / float(seconds[-1] - seconds[0])
     if clock.rate_hz and abs(rate - clock.rate_hz) > RATE_TOLERANCE * clock.rate_hz:
-        message = f"Expected {clock.rate_hz:g} Hz as time.rate_hz says, its times give {rate:.5g} Hz"
+        message = (
+            f"Expected {clock.rate_hz:g} Hz as time.rate_hz says, its times give {rate:.5g} Hz"
+        )
         raise UnreadableError(message, column=name)
 
 

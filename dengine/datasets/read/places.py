@@ -111,7 +111,9 @@ class Listing:
         raise UnreadableError(f"Expected {part or name} in {self.name}, it is not listed")
 
 
-def read_listing(base: Path, name: str, key: str, columns: Sequence[str], form: TextForm) -> Listing:
+def read_listing(
+    base: Path, name: str, key: str, columns: Sequence[str], form: TextForm
+) -> Listing:
     """Read a listing beside the recordings.
 
     A text file is parted by the one of `, ; tab |` that parts its header into these columns.

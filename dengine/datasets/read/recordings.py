@@ -316,7 +316,7 @@ class Reader:
         description = self.description
         if description.windows.trigger or description.windows.listing:
             yield from windows.cut_table(self, joined_if_several(tables, name), name)
-        elif description.layout == "files" or len(tables) > 1 and description.layout == "wide":
+        elif description.layout == "files" or (len(tables) > 1 and description.layout == "wide"):
             yield from self.from_objects(tables, name)
         elif description.layout == "long":
             yield from self.from_long(joined_if_several(tables, name), name)
@@ -363,9 +363,7 @@ def _matcher(column: str) -> re.Pattern[str]:
     return re.compile(".*".join(map(re.escape, column.split(ANY))))
 
 
-def _is_among(
-    words: NDArray[Any], some: Sequence[str], known: Iterable[str]
-) -> NDArray[np.bool_]:
+def _is_among(words: NDArray[Any], some: Sequence[str], known: Iterable[str]) -> NDArray[np.bool_]:
     """Return which words are among some, where `*` stands for all that are not known."""
     result = np.isin(words, [*some])
     return result | ~np.isin(words, [*known]) if ANY in some else result

@@ -140,7 +140,9 @@ def _names(top: Sequence[str], header: int, body: bytes, form: TextForm) -> list
     if form.names:
         names = list(form.names)
     elif 0 < header <= len(top):
-        line = COMMENT.sub("", top[header - 1].strip() if form.delimiter == BLANK else top[header - 1])
+        line = COMMENT.sub(
+            "", top[header - 1].strip() if form.delimiter == BLANK else top[header - 1]
+        )
         return header_names(split_line(line, form.delimiter))
     else:
         raise UnreadableError("Expected a header, or text.names; got neither", header)
@@ -155,7 +157,9 @@ def _names(top: Sequence[str], header: int, body: bytes, form: TextForm) -> list
 def _without_dropped(body: bytes, first: int, form: TextForm) -> tuple[bytes, list[int]]:
     """Return the lines that do not begin with what is dropped, and their numbers."""
     drop = tuple(text.encode() for text in form.drop)
-    kept = [(i, line) for i, line in enumerate(body.split(b"\n"), first) if not line.startswith(drop)]
+    kept = [
+        (i, line) for i, line in enumerate(body.split(b"\n"), first) if not line.startswith(drop)
+    ]
     return b"\n".join(line for _, line in kept), [i for i, _ in kept]
 
 

@@ -1,3 +1,5 @@
 """stub"""
+
+
 def cut_table(*a):
     raise NotImplementedError
