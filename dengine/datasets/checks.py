@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import percent
+from ..errors import listed, percent
 from ..folds import content_hash
 from .dataset import Dataset, Fault
 from .table import Recording
@@ -49,6 +49,17 @@ def without_repeats(fitted: Sequence[Fitted]) -> tuple[list[Fitted], list[Fault]
             )
     kept = [item for i, item in enumerate(fitted) if i not in faults]
     return kept, [Fault(fitted[i][0].source, 0, text) for i, text in sorted(faults.items())]
+
+
+def finished_notes(traces: NDArray[np.float32], sources: Sequence[str]) -> list[str]:
+    """Return a note on the traces (n, C, T) in which samples are lost, if there are any."""
+    is_lost = ~np.isfinite(traces.reshape(len(traces), -1))
+    rows = np.flatnonzero(is_lost.any(axis=1))
+    if not len(rows):
+        return []
+    names = listed(sources[row] for row in rows)
+    text = f"{int(is_lost.sum())} samples are lost, in {len(rows)} of {len(traces)} recordings"
+    return [f"{text}: {names}."]
 
 
 def tolerance_note(data: Dataset, lower_bound: float) -> str:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ..errors import DataError, listed, shortened
 from .description import TextForm
 
-ANY = "*"  # in place of a word: any that is not named
 # A minus sign that typographers use, which Excel writes in some languages.
 MINUS = str.maketrans({"−": "-"})
 
@@ -167,6 +166,16 @@ class Recording:
     label: int | None = None
     order: str = ""
     lines: Sequence[int] = ()
+
+    def sort(self) -> None:
+        """Put the samples in the order of their times, in place."""
+        if self.seconds is None:
+            return
+        order = np.argsort(self.seconds, kind="stable")
+        self.lines = np.asarray(self.lines)[order].tolist() if len(self.lines) else ()
+        self.start += float(self.seconds[order[0]])
+        self.seconds = self.seconds[order] - self.seconds[order[0]]
+        self.samples = self.samples[:, order]
 
 
 def as_word(cell: Any) -> str:

@@ -7,19 +7,20 @@ list of objects the columns of their keys.
 
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import shortened
+from ...errors import listed, shortened
 from ...files import read_archive, read_errors
 from ..description import TextForm
 from ..table import Table, UnreadableError
 from .text import to_utf8
 
 MOST_CHANNELS = 16  # a list of so few lists has a channel in each, a longer one a sample
+Columns = dict[str, NDArray[Any]]
 
 
 def read_objects(content: bytes, source: str, form: TextForm) -> list[Table]:
@@ -27,65 +28,62 @@ def read_objects(content: bytes, source: str, form: TextForm) -> list[Table]:
     text = to_utf8(content, form.encoding).decode()
     try:
         found = json.loads(text)
-        objects = found if isinstance(found, list) else [found]
-        lines = [0] * len(objects)
-    except json.JSONDecodeError as whole:
-        objects, lines = [], []
-        for number, line in enumerate(text.split("\n"), 1):
-            try:
-                objects += [json.loads(line)] if line.strip() else []
-                lines += [number] if line.strip() else []
-            except json.JSONDecodeError as error:
-                first = number == 1
-                place = whole.lineno if first else number
-                why = whole.msg if first else error.msg
-                raise UnreadableError(f"Expected JSON: {why}", place) from error
-    except RecursionError as error:
-        raise UnreadableError("Expected JSON that is nested less deeply") from error
-    tables = []
-    for line, value in zip(lines, objects, strict=True):
+        rows = [(0, value) for value in (found if isinstance(found, list) else [found])]
+    except (json.JSONDecodeError, RecursionError):
+        rows = [(i, _parse(line, i)) for i, line in enumerate(text.split("\n"), 1) if line.strip()]
+    for line, value in rows:
         if not isinstance(value, Mapping):
             raise UnreadableError(f"Expected an object of JSON, got {shortened(value)}", line)
-        tables.append(Table(source, dict(_flatten("", value)), [line]))
-    return tables
+    return [Table(source, columns_of("", value), [line]) for line, value in rows]
 
 
-def _flatten(prefix: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the columns of a nested object, each with its cells; a scalar is a column of one."""
-    if isinstance(value, Mapping):
-        for name, item in value.items():
-            yield from _flatten(f"{prefix}.{name}" if prefix else str(name), item)
-    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-        for name in value[0]:
-            cells = [item.get(name) if isinstance(item, Mapping) else None for item in value]
-            yield from _flatten(f"{prefix}.{name}", cells)
-    elif isinstance(value, list) and value and isinstance(value[0], list):
-        by_channel = len(value) <= MOST_CHANNELS
-        n = len(value) if by_channel else len(value[0])
-        for i in range(n):
-            cells = value[i] if by_channel else [row[i] if i < len(row) else None for row in value]
-            yield f"{prefix}.{i}", _cells(cells)
-    else:
-        yield prefix, _cells(value if isinstance(value, list) else [value])
-
-
-def _cells(values: Any) -> NDArray[Any]:
-    """Return values as an array (n,) of numbers if all are numbers, else of objects."""
+def _parse(line: str, number: int) -> Any:
+    """Return the object in a line of JSON; raise UnreadableError for another text."""
     try:
-        cells = np.asarray(values)
-    except (ValueError, OverflowError):
-        cells = np.empty(0)
-    if cells.ndim == 1 and cells.dtype.kind in "iufM" and len(cells) == len(values):
-        return cells
+        return json.loads(line)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise UnreadableError(f"Expected JSON: {error}", number) from error
+
+
+def columns_of(prefix: str, value: Any) -> Columns:
+    """Return the columns of a nested object, each with its cells; a scalar is a column of one."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        items = value.items()
+        pairs = [(f"{prefix}.{name}" if prefix else str(name), item) for name, item in items]
+    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+        pairs = [(f"{prefix}.{name}", [item.get(name) for item in value]) for name in value[0]]
+    elif isinstance(value, list) and value and isinstance(value[0], list | np.ndarray):
+        rows = value if len(value) <= MOST_CHANNELS else list(zip(*value, strict=False))
+        pairs = [(f"{prefix}.{i}", list(row)) for i, row in enumerate(rows)]
+    else:
+        return {prefix: as_cells(value if isinstance(value, list) else [value])}
+    return {key: cells for name, item in pairs for key, cells in columns_of(name, item).items()}
+
+
+def as_cells(values: Sequence[Any]) -> NDArray[Any]:
+    """Return values as an array (n,) of numbers if all are numbers, else of objects."""
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        return np.array(values, dtype=None if all(abs(v) < 2**62 for v in values) else np.float64)
     cells = np.empty(len(values), dtype=object)
     cells[:] = values
     return cells
 
 
+def join(tables: Sequence[Table]) -> Table:
+    """Return one table of tables with a row each, in the columns of the first."""
+    first = tables[0]
+    columns = {
+        name: as_cells([t.columns[name][0] if name in t.columns else None for t in tables])
+        for name in first.columns
+    }
+    return Table(first.source, columns, [table.line(0) for table in tables])
+
+
 def read_frame(frame: Any, source: str) -> Table:
     """Return the table of a DataFrame, whose index is a column if it has a name."""
-    if frame.index.name is not None:
-        frame = frame.reset_index()
+    frame = frame.reset_index() if frame.index.name is not None else frame
     columns = {str(name): frame[name].to_numpy() for name in frame.columns}
     columns = {name: c.astype(object) if c.dtype.kind in "US" else c for name, c in columns.items()}
     return Table(source, columns, range(1, len(frame) + 1))
@@ -105,72 +103,58 @@ def read_npz(content: bytes, source: str) -> Table:
     An array (C, n), or (n, C) with C < n, has the columns `NAME.0`, `NAME.1`, ...
     """
     arrays, _ = read_archive(content, name=source)
-    columns = dict[str, NDArray[Any]]()
+    columns: Columns = {}
     for name, x in arrays.items():
-        x = np.atleast_1d(np.squeeze(x))
-        if x.ndim == 1:
-            columns[name] = x
-            continue
-        if x.ndim > 2:
-            continue
-        channels = x if x.shape[0] <= x.shape[1] else x.T
-        columns |= {f"{name}.{i}": channel for i, channel in enumerate(channels)}
+        columns |= _array_columns(name, np.squeeze(x))
     return Table(source, columns, [])
+
+
+def _array_columns(name: str, x: NDArray[Any]) -> Columns:
+    """Return the columns of an array of one part, a scalar, (n,), (C, n) or (n, C)."""
+    if x.ndim < 2:
+        return {name: np.atleast_1d(x)}
+    return {f"{name}.{i}": row for i, row in enumerate(x if len(x) <= x.shape[1] else x.T)}
+
+
+def part_tables(content: bytes, source: str, channel: str = "") -> list[Table]:
+    """Return a table for each part of an archive whose arrays hold all parts.
+
+    Parts are the first axis of the channel's array, or of the largest without one. Arrays of
+    another first axis hold for all parts.
+    """
+    arrays, _ = read_archive(content, name=source)
+    stem = channel if channel in arrays else channel.rpartition(".")[0]
+    if not channel:
+        stem = max(arrays, key=lambda name: arrays[name].size, default="")
+    if stem not in arrays or not arrays[stem].ndim:
+        raise UnreadableError(f"Expected an array {channel}, got {listed(arrays)}", column=channel)
+    n = len(arrays[stem])
+    tables = []
+    for i in range(n):
+        columns: Columns = {}
+        for name, x in arrays.items():
+            columns |= _array_columns(name, x[i] if x.ndim and len(x) == n else x)
+        tables.append(Table(source, columns, []))
+    return tables
 
 
 def read_ts(content: bytes, source: str, form: TextForm) -> list[Table]:
     """Return a table for each series of a `.ts` file of the UCR archive.
 
-    Channels are the columns `0`, `1`, ..., the class is the column `class`. `?` is a lost sample.
+    Channels are the columns `0`, `1`, ..., the class is the column `class`.
 
     References
     ----------
     Middlehurst et al. (2024), aeon: a Python toolkit for learning from time series, JMLR 25(289).
     """
-    tables = []
-    begun = False
-    for number, line in enumerate(to_utf8(content, form.encoding).decode().split("\n"), 1):
-        if not begun or not line.strip():
-            begun = begun or line.strip().lower() == "@data"
-            continue
-        *channels, label = line.strip().split(":")
-        columns = {"class": np.array([label], dtype=object)}
-        for i, channel in enumerate(channels):
-            columns[str(i)] = np.array([cell.strip() for cell in channel.split(",")], dtype=object)
-        tables.append(Table(source, columns, [number]))
-    if not tables:
+    lines = to_utf8(content, form.encoding).decode().split("\n")
+    begin = next((i for i, line in enumerate(lines, 1) if line.strip().lower() == "@data"), 0)
+    if not begin:
         raise UnreadableError("Expected series below a line @data, got none")
-    return tables
-
-
-def rows_of(table: Table) -> Iterator[Table]:
-    """Yield a table for each row of a table whose cells may be lists or objects."""
-    for i in range(len(table.lines)):
-        cells = {name: column[i] for name, column in table.columns.items()}
-        columns = dict[str, NDArray[Any]]()
-        for name, cell in cells.items():
-            if isinstance(cell, np.ndarray) and cell.dtype.kind != "O":
-                columns[name] = cell
-            else:
-                value = cell.tolist() if isinstance(cell, np.ndarray) else cell
-                columns |= dict(_flatten(name, value))
-        yield Table(table.source, columns, [table.line(i)])
-
-
-def part_tables(arrays: Mapping[str, NDArray[Any]], n: int, source: str) -> list[Table]:
-    """Return a table for each of n parts, which arrays hold along their first axis.
-
-    An array (n, C, T) has the columns `NAME.0`, `NAME.1`, ...; one of another first axis holds for
-    all parts.
-    """
     tables = []
-    for i in range(n):
-        columns = dict[str, NDArray[Any]]()
-        for name, x in arrays.items():
-            of_part = x[i] if x.ndim and len(x) == n else x
-            if of_part.ndim == 2:
-                columns |= {f"{name}.{c}": of_part[c] for c in range(len(of_part))}
-            else:
-                columns[name] = np.atleast_1d(of_part)
-        tables.append(Table(source, columns, []))
+    for number, line in enumerate(lines[begin:], begin + 1):
+        *channels, label = line.strip().split(":")
+        if channels:
+            cells = {str(i): as_cells(text.split(",")) for i, text in enumerate(channels)}
+            tables.append(Table(source, cells | {"class": as_cells([label])}, [number]))
     return tables
