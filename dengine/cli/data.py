@@ -3,6 +3,7 @@ which imports one into a store and trains an engine on it.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from .output import (
 
 if TYPE_CHECKING:
     from ..datasets import Dataset, Description
-    from ..experiments.survey import Drift
+    from ..experiments.survey import Drift, Survey
 
 MOST_FAULTS = 10  # that are shown
 _SAVE = "Write the description, recordings.toml in a folder or FILE.toml beside a file."
@@ -51,70 +52,79 @@ def data(
     DATA may also be what needs no description: a bundled set, the file of a store, or an .npz file
     with X (traces, samples) and y (1 success, 0 failure).
     """
-    description = source.describe(propose=True)
-    shown = "" if description is None else description.to_toml()
-    if description is not None and description.open_keys:
-        path = _save(source, description, save, context)
-        questions = "\n".join(
-            f"  {key}: {description.notes.get(key, 'not known')}" for key in description.open_keys
-        )
-        wrote = f"Wrote {path}. " if path else ""
-        text = f"{wrote}Still open, so nothing was read; state each with --set KEY=VALUE:"
-        record = {"data": source.data, "description": shown, "open": description.open_keys}
-        print_result(record, shown, text, questions)
-        context.exit(1 if check else 0)
-    from ..datasets.checks import tolerance_note
-    from ..decision.policy import Policy
     from ..experiments.figures import data_picture
     from ..experiments.survey import survey_dataset
-    from ..model.neighbours import MANY_REPEATS
 
+    description = source.describe(propose=True)
+    if description is not None and description.open_keys:
+        _print_open_keys(source, description, _save(source, description, save, context))
+        context.exit(int(check))
     dataset = source.load(description)
     survey = survey_dataset(dataset)
     path = None
+    shown = ""
     if description is not None:
         n_read = len(dataset) + dataset.unlabelled
         seen = Seen(recordings=n_read, good=survey.good, bad=survey.bad)
         path = _save(source, replace(description, seen=seen), save, context)
-    rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in"))
-    if not survey.rate_hz:
-        rows.append(("rate", "unknown"))
-    if not survey.unit:
-        rows.append(("unit", "unknown"))
-    rows += [("first", _trace_line(dataset, 0)), ("last", _trace_line(dataset, -1))]
-    parts: list[Any] = [shown] if shown else []
-    parts += [table_of_rows(survey.name, rows), *dataset.notes]
-    if dataset.ordered:
-        drifts = map(_drift_row, survey.drift)
-        parts.append(table_of_rows("By tenths of the recorded order", drifts, ("", "means", "")))
-    else:
-        parts.append(
-            "All parts of one label come first, so this is not the order of their recording: drift "
-            "cannot be seen."
-        )
-    if survey.near_repeats > MANY_REPEATS:
-        parts.append(
-            "Many traces nearly repeat another part's. If parts come twice, give their numbers "
-            "(--set part.column=NAME)."
-        )
-    if note := tolerance_note(dataset, Policy().lower_bound):
-        parts.append(note)
-    if path:
-        parts.append(f"Wrote {path}.")
-    elif description is not None and source.saved is None:
-        parts.append(
-            "Look at the traces (--out FOLDER); if they are right, write this with --save."
-        )
-    record = {"data": source.data, "description": shown, "survey": survey, "notes": dataset.notes}
+        shown = description.to_toml()
+    is_new = description is not None and source.saved is None
+    do = "Look at the traces (--out FOLDER); if they are right, write the description with --save."
+    last_line = f"Wrote {path}." if path else do if is_new else ""
     print_result(
-        record,
-        *parts,
+        {"data": source.data, "description": shown, "survey": survey, "notes": dataset.notes},
+        *filter(None, [shown, *_survey_parts(dataset, survey), last_line]),
         *fault_lines(dataset, MOST_FAULTS),
         out=out,
         make_files=lambda: {"data.png": data_picture(dataset, survey.name)},
     )
     if check and dataset.faults:
         context.exit(1)
+
+
+def _print_open_keys(source: DataChoice, description: "Description", path: Path | None) -> None:
+    """Print a description with `?` in it, and what is to be stated.
+
+    path : the file to which it was written, if it was.
+    """
+    notes = description.notes
+    questions = [f"- {key}: {notes.get(key, 'not known')}" for key in description.open_keys]
+    record = {"data": source.data, "description": description.to_toml()}
+    print_result(
+        {**record, "open": description.open_keys},
+        description.to_toml(),
+        f"Wrote {path}." if path else "",
+        "Still open, so nothing was read; state each with --set KEY=VALUE:",
+        *questions,
+    )
+
+
+def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
+    """Yield tables and sentences on what was read."""
+    from ..datasets.checks import tolerance_note
+    from ..decision.policy import Policy
+    from ..model.neighbours import MANY_REPEATS
+
+    rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in"))
+    rows += [] if survey.rate_hz else [("rate", "unknown")]
+    rows += [] if survey.unit else [("unit", "unknown")]
+    rows += [("first", _trace_line(dataset, 0)), ("last", _trace_line(dataset, -1))]
+    yield table_of_rows(survey.name, rows)
+    yield from dataset.notes
+    if dataset.ordered:
+        drifts = map(_drift_row, survey.drift)
+        yield table_of_rows("By tenths of the recorded order", drifts, ("", "means", ""))
+    else:
+        yield (
+            "All parts of one label come first, so this is not the order of their recording: drift "
+            "cannot be seen."
+        )
+    if survey.near_repeats > MANY_REPEATS:
+        yield (
+            "Many traces nearly repeat another part's. If parts come twice, give their numbers "
+            "(--set part.column=NAME)."
+        )
+    yield tolerance_note(dataset, Policy().lower_bound)
 
 
 def _save(
