@@ -484,8 +484,8 @@ _DESCRIPTION = (
     "What the recordings are.  [default: recordings.toml in a folder, FILE.toml beside a file]"
 )
 _SET = (
-    "State a key of the description for this command, like label.column=verdict; the value is TOML, "
-    "or a text. `dengine data` shows the keys."
+    "State a key of the description for this command, like label.column=verdict; the value is "
+    "TOML, or a text. `dengine data` shows the keys."
 )
 _HERTZ = "Samples per second of live traces."
 _UNIT = "Unit of live traces, one for all channels or kN,mm."

@@ -27,8 +27,14 @@ TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
 SUFFIXES = {
     **dict.fromkeys(TEXTS, "text"),
-    ".json": "json", ".jsonl": "jsonl", ".ndjson": "jsonl", ".parquet": "parquet",
-    ".npz": "npz", ".ts": "ts", ".mcap": "mcap", ".db3": "mcap",
+    ".json": "json",
+    ".jsonl": "jsonl",
+    ".ndjson": "jsonl",
+    ".parquet": "parquet",
+    ".npz": "npz",
+    ".ts": "ts",
+    ".mcap": "mcap",
+    ".db3": "mcap",
 }
 PAGES = (
     "readme",

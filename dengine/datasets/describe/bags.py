@@ -1,5 +1,140 @@
-"""stub until merged"""
+"""Propose how a ROS 2 bag is cut into parts, and where their labels are."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import DataError, listed
+from ..description import UNKNOWN, Description, LabelSource
+from ..read.bags import LOG_TIME, STAMP, read_messages
+from ..read.places import listing_table
+from . import labels
+from .clock import round_rate
+from .columns import likely_channels
+
+MOST_MESSAGES = 50_000
+SECONDS = 2.0  # of a part, if nothing else is known
+UNITS = {"force": "N", "torque": "Nm"}
 
 
-def describe_bag(paths, stated):
-    raise NotImplementedError
+def describe_bag(paths: Sequence[Path], stated: Mapping[str, Any]) -> Description:
+    """Return the proposed description of a bag.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Its files, in their order.
+    stated : mapping
+        Keys that are known.
+
+    Raises
+    ------
+    DataError
+        If no message can be read.
+    """
+    notes: dict[str, str] = {}
+    times: dict[str, list[int]] = {}
+    fields: dict[str, str] = {}
+    words: dict[str, list[str]] = {}
+    is_stamped = True
+    for topic, _, logged, message in islice(read_messages(paths[0], None, []), MOST_MESSAGES):
+        times.setdefault(topic, []).append(logged)
+        if hasattr(message, "data"):
+            words.setdefault(topic, []).append(str(message.data))
+        else:
+            fields |= dict(_fields(message, topic)) if len(times[topic]) == 1 else {}
+            is_stamped &= hasattr(message, "header") and message.header.stamp.sec > 0
+    units = {name: unit for name, unit in fields.items() if len(times[name.partition(".")[0]]) > 2}
+    best = likely_channels(units)
+    channels = {best[0]: units[best[0]]} if len(best) == 1 else {}
+    if not channels:
+        notes |= {"channels": f"one or several of {listed(units)}", f"channels.{UNKNOWN}": ""}
+    values: dict[str, Any] = {"format": "mcap", "layout": "mcap"}
+    topic = next(iter(stated.get("channels", channels) or units), "").partition(".")[0]
+    steps = np.diff(times.get(topic, [0])) / 1e9
+    rate = round_rate(1 / float(np.median(steps))) if len(steps) and np.median(steps) > 0 else 0.0
+    column = STAMP if is_stamped else LOG_TIME
+    values |= {"time.column": column, "time.format": "ns", "time.rate_hz": rate}
+    values["traces.samples"] = round(SECONDS * rate)
+    notes["traces.samples"] = f"{SECONDS:g} s from where a part begins"
+    values |= _windows(paths[0].parent, words, stated, notes)
+    ignored = {name: unit for name, unit in units.items() if name not in channels}
+    start = Description.from_dict({"channels": channels, "ignored": ignored})
+    own = {key: value for key, value in stated.items() if key not in ("files",)}
+    description = start.with_values({**values, **own, "files": stated.get("files", paths[0].name)})
+    return description.__class__(
+        **{f: getattr(description, f) for f in description.__dataclass_fields__ if f != "notes"},
+        notes=notes,
+    )
+
+
+def _fields(message: Any, path: str) -> Iterator[tuple[str, str]]:
+    """Yield the fields of a message that hold numbers, `TOPIC.FIELD`, with their units."""
+    for name in getattr(message, "__slots__", ()):
+        value = getattr(message, name)
+        if hasattr(value, "__slots__") and name != "header":
+            yield from _fields(value, f"{path}.{name}")
+        elif isinstance(value, int | float):
+            yield f"{path}.{name}", UNITS.get(path.rpartition(".")[2], "")
+
+
+def _windows(
+    base: Path, words: Mapping[str, Sequence[str]], stated: Mapping[str, Any], notes: dict[str, str]
+) -> dict[str, Any]:
+    """Return the keys of `[windows]` and `[label]`: a listing, or a trigger and a topic."""
+    for path in sorted(base.glob("*.csv")):
+        values = _listing(path)
+        if values and not any(key.startswith("windows.trigger") for key in stated):
+            notes["windows.listing"] = "its columns say when each part began and ended"
+            return values
+    verdicts = {}
+    for topic, cells in words.items():
+        source = labels.with_meanings(LabelSource(topic=topic, column=topic), cells)
+        is_known = (source.good or source.bad) and UNKNOWN not in source.good + source.bad
+        verdicts |= {topic: source} if is_known and len({*cells}) < labels.MOST_WORDS else {}
+    signals = [t for t, cells in words.items() if t not in verdicts and len({*cells}) == 2]
+    values: dict[str, Any] = {}
+    for key, found in (("label.topic", [*verdicts]), ("windows.trigger", signals)):
+        counts = "; ".join(
+            f"{topic} ({labels.counts_of(words[topic])})" for topic in found or words
+        )
+        notes[key] = counts if len(found) == 1 else f"one of {counts}"
+        values[key] = found[0] if len(found) == 1 else UNKNOWN
+    if len(verdicts) == 1:
+        (source,) = verdicts.values()
+        values |= {"label.good": source.good, "label.bad": source.bad}
+    if len(signals) == 1:
+        value = max({*words[signals[0]]})
+        values["windows.trigger"] = f"register={value}@{signals[0]}"
+    return values
+
+
+def _listing(path: Path) -> dict[str, Any]:
+    """Return the keys for a file with windows and labels; none if it is no such listing."""
+    form = Description().text
+    try:
+        table = listing_table(path, (), form)
+    except DataError:
+        return {}
+    names = {name.lower(): name for name in table.columns}
+    start = next((names[name] for name in ("start", "begin", "beginn", "von") if name in names), "")
+    end = next((names[name] for name in ("end", "ende", "stop", "bis") if name in names), "")
+    views = {str(i): table.take(slice(i, i + 1)) for i in range(len(table.lines))}
+    others = [name for name in table.columns if name not in (start, end)]
+    sources = labels.column_sources(views, others)
+    keys = [name for name in others if len({*table.words(name)}) == len(table.lines)]
+    if not (start and end and sources and keys):
+        return {}
+    source = labels.with_meanings(sources[0], table.words(sources[0].column))
+    is_number = all(cell.replace(".", "", 1).isdigit() for cell in table.words(start))
+    windows = {"listing": path.name, "key": keys[0], "start": start, "end": end}
+    windows["format"] = "s" if is_number else "iso"
+    label = {"listing": path.name, "key": keys[0], "column": source.column}
+    label |= {"good": source.good, "bad": source.bad}
+    pairs = [(f"windows.{k}", v) for k, v in windows.items()] + [
+        (f"label.{k}", v) for k, v in label.items()
+    ]
+    return {**dict(pairs), "traces.lengths": "pad"}

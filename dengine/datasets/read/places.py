@@ -154,16 +154,15 @@ class LabelReader:
             return [place.group(self.source.path)]
         if self.source.line:
             return [place.line_word(self.source.line)]
-        return [place.table.one_word(self.source.column, self.source.at)]
+        column = self.source.column or self.source.topic
+        return [place.table.one_word(column, self.source.at)]
 
-    def label(self, place: Place, part: str, word: str | None = None) -> int | None:
+    def label(self, place: Place, part: str) -> int | None:
         """Return 1 for good, 0 for bad, None for not checked.
 
         Raises UnreadableError if there is no label, several, or a word of unknown meaning.
-
-        word : of a topic, if that is the source.
         """
-        words = self.words(place, part) if word is None else [word]
+        words = self.words(place, part)
         meanings = {self.meaning(text) for text in words}
         if len(meanings) > 1:
             message = f"Expected one label for {part or place.path}, got {listed(sorted(words))}"

@@ -25,7 +25,7 @@ from . import bags, frames, windows
 from .clock import check_steps, times_of
 from .files import find_files, natural_key, read_file
 from .places import LabelReader, Place, part_of, read_labels
-from .split import split, tables_of
+from .split import Parts, split, tables_of
 
 FRAME = "table"  # what a DataFrame is called in messages
 WORDS = {1: "good", 0: "bad", None: "not checked"}
@@ -110,15 +110,16 @@ class Reader:
             raise UnreadableError(str(error), 0, channel.column) from error
         return values * (factor * channel.factor)
 
-    def name(self, recording: Recording, place: Place, word: str | None = None) -> None:
+    def name(self, recording: Recording, place: Place) -> None:
         """Set the part, the label and the word for the order of a recording.
 
-        Raises UnreadableError if one is missing, or the sources of its label disagree.
-
-        word : of the label, if it is known.
+        Raises UnreadableError if one is missing, or the sources of its label disagree. A part of a
+        long recording has the key of its window, if no number is stated.
         """
-        recording.part = recording.part or part_of(self.description.part, place)
-        recording.label = self.label.label(place, recording.part, word)
+        recording.part = part_of(self.description.part, place)
+        if not recording.part and "window" in place.table.columns:
+            recording.part = place.table.one_word("window")
+        recording.label = self.label.label(place, recording.part)
         for other in self.checks:
             label = other.label(place, recording.part)
             if label != recording.label:
@@ -169,41 +170,38 @@ def read_recordings(
     recordings: list[Recording] = []
     faults: list[Fault] = []
     notes: list[str] = []
+    files = find_files(source, description) if is_path else []
     if description.layout == "mcap":
-        for item in bags.read_bag(reader, find_files(source, description), base, notes):
-            (faults if isinstance(item, Fault) else recordings).append(item)  # type: ignore[arg-type]
-    for path, name in (
-        find_files(source, description) if is_path and description.layout != "mcap" else ()
-    ):
+        _add(reader, bags.split_bag(files, description, base, notes, faults), recordings, faults)
+        files = []
+    for path, name in files:
         try:
-            _read_tables(
-                reader, tables_of(read_file(path), name, description), name, recordings, faults
-            )
+            tables = tables_of(read_file(path), name, description)
+            _add(reader, split_all(tables, name, description, base, faults), recordings, faults)
         except DataError as error:
             faults.append(fault_of(error, name))
         if progress is not None:
             progress(1)
     if not is_path:
-        _read_tables(reader, [frames.read_frame(source, FRAME)], FRAME, recordings, faults)
+        tables = [frames.read_frame(source, FRAME)]
+        _add(reader, split(tables, FRAME, description, faults), recordings, faults)
     notes += [note for label in labels if (note := label.unused_note())]
     name = FRAME if not is_path else source.name if source.is_dir() else source.stem
     return to_dataset(recordings, faults, description, name, notes)
 
 
-def _read_tables(
-    reader: Reader,
-    tables: Sequence[Table],
-    name: str,
-    recordings: list[Recording],
-    faults: list[Fault],
-) -> None:
-    """Put the recordings of a file's tables, and the faults among them, into two lists."""
-    description = reader.description
+def split_all(
+    tables: Sequence[Table], name: str, description: Description, base: Path, faults: list[Fault]
+) -> Parts:
+    """Return the parts of a file, which may be one long recording."""
     if description.windows.trigger or description.windows.listing:
-        for item in windows.cut_table(reader, tables[0], name):
-            (faults if isinstance(item, Fault) else recordings).append(item)  # type: ignore[arg-type]
-        return
-    for source, path, table in split(tables, name, description, faults):
+        return windows.cut(tables[0], name, description, base, faults)
+    return split(tables, name, description, faults)
+
+
+def _add(reader: Reader, parts: Parts, recordings: list[Recording], faults: list[Fault]) -> None:
+    """Add the recordings of parts, and the faults among them, to two lists."""
+    for source, path, table in parts:
         try:
             recordings.append(reader.recording(table, path, source))
         except UnreadableError as error:
