@@ -388,8 +388,8 @@ def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) 
     )
 
 
-FAILING = """status missing.db; replay --data missing.npz; replay --recipe missing.toml --data DATA; data DATA --label ((
-replay --data DATA --cycles 5000; replay --data DATA --part serial; simulate --n 1 --out x.npz --scenario missing
+FAILING = """status missing.db; replay --data missing.npz; replay --recipe missing.toml --data DATA; data DATA --set traces.samples=x
+replay --data DATA --cycles 5000; replay --data DATA --channel FX; simulate --n 1 --out x.npz --scenario missing
 run --cell replay --data DATA --store e.db --reducer nowhere:Nothing"""
 
 
