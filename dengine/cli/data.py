@@ -64,8 +64,8 @@ def data(
     path = None
     shown = ""
     if description is not None:
-        n_read = len(dataset) + dataset.unlabelled
-        seen = Seen(recordings=n_read, good=survey.good, bad=survey.bad)
+        n_found = len(dataset) + dataset.unlabelled + len(dataset.faults)
+        seen = Seen(recordings=n_found, good=survey.good, bad=survey.bad)
         path = _save(source, replace(description, seen=seen), save, context)
         shown = description.to_toml()
     is_new = description is not None and source.saved is None

@@ -16,8 +16,10 @@ from training.make_recordings import write_plants, write_recordings
 
 
 def shown(*words: object) -> str:
-    """Return what a command prints, its lines joined."""
-    return " ".join(well(*words).stdout.split())
+    """Return what a command prints that must succeed, its lines joined."""
+    result = dengine(*words)
+    assert result.exit_code == 0, result.output
+    return " ".join(result.stdout.split())
 
 
 @pytest.fixture
@@ -43,7 +45,7 @@ def test_a_proposal_is_shown_read_and_drawn_but_written_only_when_asked(
     assert "write the description with --save" in text
     assert (tmp_path / "out" / "data.png").stat().st_size > 10_000
     assert not (folder / "recordings.toml").exists()
-    well("data", folder, "--set", "channels.FZ_Base=N", "--save")
+    shown("data", folder, "--set", "channels.FZ_Base=N", "--save")
     saved = Description.load(folder / "recordings.toml")
     data = load_dataset(folder)
     assert (saved.channels[0].unit, saved.seen.recordings) == ("N", len(data))
@@ -60,7 +62,7 @@ def test_every_other_verb_asks_for_the_description_and_then_reads_by_it(
     refused = dengine(*words)
     assert refused.exit_code == 1
     assert f"dengine data {folder} --save" in refused.stderr
-    well("data", folder, "--save")
+    shown("data", folder, "--save")
     assert document(*words)["rows"][0]["cycles"] == 30
     assert document(*words, "--samples", 400)["rows"][0]["cycles"] == 30
     other = dengine(*words, "--set", "label.good=yes")
@@ -89,7 +91,7 @@ def test_open_keys_are_listed_with_their_candidates_and_a_check_fails(tmp_path: 
 
 
 def test_a_check_ends_with_1_if_there_is_a_fault_and_names_it(folder: Path) -> None:
-    well("data", folder, "--save")
+    shown("data", folder, "--save")
     result = dengine("data", folder, "--check", "--json")
     assert result.exit_code == 1
     faults = load_dataset(folder).faults
