@@ -18,8 +18,8 @@ from ..errors import StoreError
 from .code import remember_code
 
 _SCRIPTING = threading.Lock()
-# Attributes of every module, in which torch keeps parameters, submodules and hooks.
-INTERNAL = {name for name in vars(nn.Module()) if name.startswith("_")}
+# Attributes in which torch keeps parameters, submodules and hooks; scripting adds the last.
+INTERNAL = {*vars(nn.Module()), "__overloads__"} - {"training"}
 
 
 def script(module: nn.Module) -> Any:

@@ -309,7 +309,7 @@ def test_traces_too_small_for_their_unit_raise_an_alarm_that_says_so(
 ) -> None:
     X, y = toy_traces(60)
     tiny = np.abs(X) * amplitude if amplitude < 0.0 else X * amplitude
-    engine = DataEngine(reducer=reducer, replaying=True, retrain_every=50)
+    engine = DataEngine(reducer=reducer, replaying=True, retrain_every=20)
     for x, good in zip(tiny.astype(np.float32), y, strict=True):
         engine.report(engine.decide(x).id, bool(good))
     assert engine.version == 0
