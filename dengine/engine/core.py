@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
 from ..history.status import Status, retrain_fault
-from ..model.base import EngineModel, Exportable
+from ..model.base import N_EXAMPLES, EngineModel, Exportable
 from ..records import Action, Decision, Reason, RetrainReport, TraceSpec, as_id, as_success
 from ..store.outbox import CLOSE_SECONDS, Outbox
 from ..store.records import StoredDecision
@@ -549,6 +549,7 @@ class EngineCore:
             windows=policy.limits,
             model_version=self.live.version,
             recipe=settings.recipe.to_toml(),
+            examples=self.live.window.snapshot().traces[-N_EXAMPLES:],
             note=self.outbox.record_event,
         )
 

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import NotTakenError, StoreError
+from ..errors import NotTakenError, StoreError, expect
 from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
 from ..model.base import EngineModel, Model
@@ -208,6 +208,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         settings = EngineSettings(choose_recipe(reducer, recipe, given), seed, trace=trace)
         # Before a store is made: a wrong setting leaves none behind.
         settings, template = settings.with_template(model)
+        n_traces = template.min_traces
+        window = f"a window of at least {n_traces} labelled traces, on which it trains first"
+        expect(settings.recipe.window >= n_traces, window, settings.recipe.window)
         with opening(store) as opened:
             if settings.trace is None:
                 settings = replace(settings, trace=read_peers_trace_spec(opened))

@@ -335,7 +335,8 @@ class Learner:
         self.labels.begin_retrain()
 
     def _advance(self, to_the_end: bool) -> None:
-        """Bring the candidate further: catch up on labels, store it, catch up again, swap it in.
+        """Bring the candidate further: check it, catch up on labels, store it, catch up again, swap
+        it in.
 
         It takes one step, or all steps with `to_the_end`; without a candidate none. A candidate
         that cannot be stored is dropped. One that is stored waits for a later call where the newest
@@ -371,6 +372,8 @@ class Learner:
         `PATIENCE` steps did not bring. Raises StoreError where it cannot be stored.
         """
         if candidate.storing is None:
+            if not candidate.check(np.inf if to_the_end else STEP):
+                return False
             if not candidate.catch_up(self._window, np.inf if to_the_end else STEP):
                 return False
             if self._waits_for_labels(candidate, to_the_end):

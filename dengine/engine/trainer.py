@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..decision.scripting import reason_of
 from ..errors import DengineError, SettingError
 from ..model.base import EngineModel
 from ..reducers.base import StopRule
@@ -327,7 +328,7 @@ class Retrainer:
         training_raised = future.done() and not isinstance(error, BrokenExecutor)
         log.error("a retrain in the executor failed: %s", error, exc_info=training_raised)
         if training_raised:
-            return _dropped(error)
+            return f"dropped: {reason_of(error)}"
         self.executor = None
         future.cancel()
         failure = f"{type(error).__name__}: {error}"
@@ -367,15 +368,7 @@ def train_candidate(
     except DengineError as error:
         reason = f"dropped: {error}"
     except Exception as error:  # no exception inside a model reaches the cell
-        reason = _dropped(error)
+        reason = f"dropped: {reason_of(error)}"
     end = clock()
     last_seconds = 0.0 if stop.last_step is None else end - stop.last_step
     return Trained(model, reason, n_steps, end - begin, last_seconds, seq=data.seq)
-
-
-def _dropped(error: Exception) -> str:
-    """Return the reason of a training that raised: "dropped: ", the error's type and its first
-    line.
-    """
-    lines = str(error).splitlines() or [""]
-    return f"dropped: {type(error).__name__}: {lines[0]}"
