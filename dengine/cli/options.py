@@ -461,10 +461,10 @@ _TIME = (
     "The column of times: of recordings, or of a long table, which has a row for each sample and "
     "needs --part too."
 )
-_HERTZ = "Samples per second.  [default: from the timestamps; live: 500]"
+_HERTZ = "Samples per second.  [default: from the timestamps; of a robot: 500; live: unknown]"
 _UNIT = (
     "Unit of the samples; those that are in another one, kN for N, are converted.  "
-    "[default: the header's, else N]"
+    "[default: the header's, else N; live: unknown]"
 )
 _COLUMNS = "The names of the columns of text files without a header, as in time,fx,fz or c0..c99."
 _DECIMAL = "The decimal mark in text files, . or ,  [default: detected in each file]"
@@ -551,10 +551,16 @@ def data_options(default: str | None = "insertion", argument: bool = False) -> O
     return bundle_options("source", _data_choice, {"data": data} | DATA)
 
 
-def recorder_settings(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of the options in `TRACE` that a robot's recorder takes, under its names."""
+def recorder_settings(options: Mapping[str, Any]) -> tuple[dict[str, Any], TraceSpec]:
+    """Return those of the options in `TRACE` that a robot's recorder takes, under its names, and
+    the contract of what it records.
+    """
+    from ..cells.ur.recorder import spec_of_recording
+
     names = {"samples": "samples", "rate_hz": "rate_hz", "channel": "channels"}
-    return {name: options[option] for option, name in names.items() if option in options}
+    settings = {name: options[option] for option, name in names.items() if option in options}
+    form = {name: options[name] for name in ("unit", "fit") if name in options}
+    return settings, replace(spec_of_recording(**settings), **form)
 
 
 def trace_spec_from(options: Mapping[str, Any]) -> TraceSpec | None:

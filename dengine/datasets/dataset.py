@@ -97,7 +97,7 @@ class Dataset:
         For people.
     rate_hz : float, optional
         Sampling rate in hertz. None: unknown.
-    unit : str, default "N"
+    unit : str, default ""
         Unit of the samples, one for all channels or "kN, mm", one for each; "" if it is unknown.
     cause : array of str, shape (n,), optional
         Why a part failed.
@@ -132,7 +132,7 @@ class Dataset:
     y: NDArray[np.int8]
     name: str = "data"
     rate_hz: float | None = None
-    unit: str = "N"
+    unit: str = ""
     cause: NDArray[np.str_] | None = None
     part: NDArray[np.str_] | None = None
     faults: tuple[Fault, ...] = ()
@@ -164,18 +164,16 @@ class Dataset:
     def spec(self) -> TraceSpec:
         """The `TraceSpec` of live traces of the same shape, for `DataEngine(trace=data.spec)`.
 
-        If the rate is unknown, it is the default of `TraceSpec`: state `rate_hz` before times
-        matter. An unknown unit is called "units".
+        Its rate and units are unknown where those of the data set are.
         """
-        n_channels = 1 if self.X.ndim == 2 else self.X.shape[1]
-        spec = TraceSpec(
+        return TraceSpec(
             self.X.shape[-1],
-            channels=n_channels,
-            unit=", ".join(unit.strip() or "units" for unit in self.unit.split(",")),
+            self.rate_hz,
+            channels=1 if self.X.ndim == 2 else self.X.shape[1],
+            unit=self.unit,
             fit=self.fit,
             columns=self.channels,
         )
-        return spec if self.rate_hz is None else replace(spec, rate_hz=self.rate_hz)
 
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each trace.

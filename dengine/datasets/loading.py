@@ -353,7 +353,7 @@ def _read_store(path: Path, name: str, options: LoadOptions) -> Dataset:
         part=part,
         name=name,
         rate_hz=spec.rate_hz,
-        unit=spec.unit,
+        unit=spec.unit if isinstance(spec.unit, str) else ", ".join(spec.unit or ()),
         channels=tuple(spec.columns),
         fit=spec.fit,
     )

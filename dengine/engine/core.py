@@ -370,22 +370,27 @@ class EngineCore:
     def set_trace_spec(self, spec: TraceSpec, inferred: bool = False) -> TraceSpec:
         """Set the trace contract (shape, rate and unit of all traces) and return the one in force.
 
-        One that is set already stays and is returned. Where the cell shares a product with others,
-        a contract that these have set is taken in place of `spec`, unless it cannot be read.
-        `inferred` says that `spec` comes from a first trace. The settings are saved in the store;
-        where that fails, they are saved with a later trace. Raises SettingError where the force
-        limits do not fit the contract.
+        One that is set already stays, completed by what `spec` states and it does not. Where the
+        cell shares a product with others, a contract that these have set is taken in place of
+        `spec`, unless it cannot be read. `inferred` says that `spec` comes from a first trace. The
+        settings are saved in the store; where that fails, they are saved with a later trace. Raises
+        SettingError where the force limits do not fit the contract, and StoreError for an engine
+        that is closed, only reads, or is in use by another thread.
         """
-        if self.settings.now.trace is not None:
-            return self.settings.now.trace
-        try:
-            if self.store.product is not None:
-                spec = self.outbox.call_store(lambda: read_peers_trace_spec(self.store)) or spec
-        except StoreError:  # the cell's own first trace stands
-            log.exception("the product's contract of traces cannot be had")
-        settings = replace(self.settings.now, trace=spec, inferred=inferred)
-        self.settings.change(settings)
-        self.settings.save()
+        self.outbox.check_usable()
+        with self.exclusive:
+            present = self.settings.now
+            agreed = present.trace
+            try:
+                if agreed is None and self.store.product is not None:
+                    agreed = self.outbox.call_store(lambda: read_peers_trace_spec(self.store))
+            except StoreError:  # the cell's own first trace stands
+                log.exception("the product's contract of traces cannot be had")
+            spec = spec if agreed is None else agreed.completed(spec)
+            if spec != present.trace:
+                inferred = inferred or present.inferred
+                self.settings.change(replace(present, trace=spec, inferred=inferred))
+                self.settings.save()
         return spec
 
     def _check_trace(self, trace: ArrayLike) -> NDArray[np.float32]:

@@ -27,6 +27,7 @@ from ..store.records import (
     nothing_to_correct,
     unknown_decision,
 )
+from ..traces import check_rate
 from .core import EngineCore
 from .settings import BASELINE_SETTINGS, EvidenceWindow
 
@@ -237,15 +238,17 @@ class Corrections:
         Raises
         ------
         SettingError
-            For what is no policy, for force limits that the traces cannot hold, for a guarantee
-            whose class cannot be imported or made, and, of a model that was handed in, for anything
-            but audit_rate, stops, label_within, windows and shadow.
+            For what is no policy, for force limits that the traces cannot hold, or in seconds at an
+            unknown rate, for a guarantee whose class cannot be imported or made, and, of a model
+            that was handed in, for anything but audit_rate, stops, label_within, windows and
+            shadow.
         StoreError
             Where the store does not answer.
         """
         example = "for example Policy(alpha=0.05, lower_bound=0.95)"
         expect(isinstance(policy, Policy), "a Policy", policy, example)
         present = self._core.settings.now
+        check_rate(policy.windows, present.trace)
         old_values = present.recipe.policy.to_values()
         new_values = policy.to_values()
         changes = {name: value for name, value in new_values.items() if value != old_values[name]}

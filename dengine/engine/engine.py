@@ -50,10 +50,12 @@ from ..representation import to_html
 from ..store.opening import LONG_WAIT, opening
 from ..store.outbox import Outbox
 from ..store.records import StoredDecision
+from ..traces import check_rate
 from .core import EngineCore
 from .corrections import Changed, Corrections
 from .settings import (
     EngineSettings,
+    agreed_trace_spec,
     check_model_settings,
     choose_recipe,
     fill_from_peers,
@@ -133,7 +135,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     policy : Policy, optional
         The error level alpha, the lower bound, and what else the user decides.
     trace : TraceSpec, optional
-        The contract of traces; None: the first sound trace sets it.
+        The contract of traces; None: the first sound trace sets it, and does not tell rate and
+        unit.
     radius, folds, retrain_every, budget : optional
         As in `Recipe`; None: the recipe decides, or the reducer.
     store : str, path or SqlStore, optional
@@ -169,7 +172,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     Raises
     ------
     SettingError
-        For settings that are out of range or contradict each other.
+        For settings that are out of range or contradict each other, and for force limits in
+        seconds while the rate of the traces is unknown.
     StoreError
         For a used store.
     """
@@ -240,8 +244,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         The options are executor, replaying, clock, on_safe_mode and reading. It sets `store`,
         `seed`, and `resumed` to False. From now on the store is closed when the engine is
-        garbage-collected.
+        garbage-collected. Raises SettingError for force limits in seconds at an unknown rate.
         """
+        check_rate(settings.recipe.policy.windows, settings.trace)
         self.store = store
         self.seed = settings.seed
         self.resumed = False
@@ -267,6 +272,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         *,
         reducer: Any = None,
         model: Model | None = None,
+        trace: TraceSpec | None = None,
         wait: float | None = None,
         allow_import: bool | Collection[str] = False,
         **options: Any,
@@ -278,6 +284,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         url : str, path or SqlStore
         reducer, model : object, optional
             The same object again, where the engine had one of yours that the store cannot name.
+        trace : TraceSpec, optional
+            The stored contract of traces, to state its rate, units or columns where they are
+            unknown.
         wait : float, optional
             Seconds that a call waits for the database, as `SqlStore` takes it.
         allow_import : bool or collection of str
@@ -297,19 +306,22 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             Where the store does not exist or is not used, or another engine owns the cell.
         SettingError
-            Where an object is missing or another than before, or a model is not needed.
+            Where an object is missing or another than before, a model is not needed, or `trace`
+            contradicts the stored contract.
         ImportRefusedError
             A SettingError, where a class would have to be imported that is not allowed.
         """
         engine = cls.__new__(cls)
         with opening(url, must_exist=True, wait=wait) as store:
             name = str(url) if isinstance(url, str | os.PathLike) else "the store"
-            settings = EngineSettings.from_store(
-                store.settings(), name, reducer, model, allow_import
-            )
+            stored = EngineSettings.from_store(store.settings(), name, reducer, model, allow_import)
+            settings = replace(stored, trace=agreed_trace_spec(store, trace))
+            settings.check_request({"trace": trace})
             engine._start(*settings.with_template(model), store, **options)
             with engine._closed_on_failure():
                 engine._core.resume()
+                if settings.trace != stored.trace and not options.get("reading"):
+                    engine._core.settings.save()
         engine.resumed = True
         return engine
 
@@ -364,6 +376,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 )
             names = ("model", "executor", "replaying", "clock", "on_safe_mode")
             options = {name: settings.pop(name) for name in names if name in settings}
+            options["trace"] = settings.get("trace")
             recipe = settings.get("recipe")
             reducer = settings.get("reducer")
             if reducer is None and isinstance(recipe, Recipe):
@@ -467,9 +480,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         In each cycle the cell inserts a part, the engine decides, and the cell verifies it, lets it
         go on or rejects it; a known outcome is reported, and retrains happen between cycles. When
-        the iteration ends, also by an error of the cell, everything known is written. Python's
-        garbage collector works between decisions, and only on objects that are newer than the first
-        cycle (`gc.freeze`).
+        the iteration ends, also by an error of the cell, everything known is written. What the
+        engine does not know of its traces is taken from a `TraceSpec` in the cell's attribute
+        `spec`, if there is one. Python's garbage collector works between decisions, and only on
+        objects that are newer than the first cycle (`gc.freeze`).
 
         Parameters
         ----------
@@ -485,7 +499,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         SettingError
-            Before the first part, for a cell that lacks one of its four methods.
+            Before the first part, for a cell that lacks one of its four methods, or whose `spec`
+            cannot hold the force limits.
         """
         check_cell(cell)
         return self._run(cell, cycles)
@@ -498,6 +513,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         NotTakenError where the disk does not take everything in time.
         """
         self._core.wait_until_warm()
+        spec = getattr(cell, "spec", None)
+        if isinstance(spec, TraceSpec):
+            self._core.set_trace_spec(spec)
         with ExitStack() as ending:
             ending.callback(self.flush, LONG_WAIT if self.store.wait is not None else None)
             ending.enter_context(frozen_objects())

@@ -22,7 +22,7 @@ from tests.support.command_line import dengine, document, line_of
 def used(make_data, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store with 60 labels and two versions."""
     path = tmp_path_factory.mktemp("used") / "engine.db"
-    import_labelled(path, make_data(60), "pca", 0)
+    import_labelled(path, replace(make_data(60), rate_hz=500.0), "pca", 0)
     with DataEngine.open(path) as engine:
         engine.retrain()
         engine.retrain()

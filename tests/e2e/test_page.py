@@ -485,6 +485,19 @@ def test_what_is_said_of_several_channels_is_said_by_their_names(
         )
 
 
+def test_the_axis_is_in_samples_and_no_unit_is_shown_while_these_are_unknown(
+    browser: Browser, tmp_path: Path, stream: Dataset
+) -> None:
+    file = tmp_path / "cell.db"
+    with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
+        played(service, stream, 40)
+        opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
+        caption = page.locator("#trace figcaption")
+        expect(caption).to_contain_text(
+            re.compile(rf"Trace over {stream.X.shape[-1]} samples, from [−\d.]+ to [\d.]+\. ")
+        )
+
+
 def test_each_channel_is_drawn_in_its_own_unit_and_is_no_force_for_being_drawn(
     browser: Browser, tmp_path: Path, stream: Dataset
 ) -> None:

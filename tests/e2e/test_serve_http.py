@@ -316,7 +316,7 @@ def test_a_rejected_part_that_was_found_good_is_reported_corrected_and_explained
 ) -> None:
     with serving() as (_, client):
         client.post("/decide", json={"trace": stream.X[0].tolist(), "request": "first"})
-        client.post("/policy", json={"windows": ["0:0:1000000::reject"], "author": "Kim"})
+        client.post("/policy", json={"windows": ["-1e9:1e9:1e6::along=0:reject"], "author": "Kim"})
         decided = client.post(
             "/decide", json={"trace": stream.X[1].tolist(), "request": "r", "part": "R1"}
         ).json()
@@ -346,6 +346,19 @@ def test_a_rejected_part_that_was_found_good_is_reported_corrected_and_explained
             )
 
 
+def test_limits_in_seconds_are_refused_in_one_sentence_while_the_rate_is_unknown(
+    stream: Dataset,
+) -> None:
+    with serving() as (service, client):
+        client.post("/decide", json={"trace": stream.X[0].tolist(), "request": "first"})
+        trace = client.get("/status").json()["trace"]
+        assert (trace["rate_hz"], trace["unit"]) == (None, None)
+        asked = {"windows": ["0.01:0.02:-5:"], "author": "Kim"}
+        problem = must_be_problem(client.post("/policy", json=asked), 422)
+        assert "start the engine with --samples ..., --rate-hz ... first" in problem["detail"]
+        assert service.core.settings.now.recipe.policy.windows == ()
+
+
 def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
     stream: Dataset,
 ) -> None:
@@ -357,7 +370,7 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
             ("correct", {"id": "wrong-0", "success": False}),
             ("forget", {"ids": ["wrong-1", "wrong-2"], "reason": "a dirty sensor"}),
             ("policy", {"alpha": 0.2, "audit_rate": 0.1}),
-            ("policy", {"windows": ["0.01:0.02:-5:"]}),
+            ("policy", {"windows": ["-100:100:-5::along=0"]}),
             ("policy", {"shadow": True}),
         ):
             changed = client.post(f"/{path}", json=asked | {"author": " Kim  Lee "}).json()

@@ -41,7 +41,7 @@ def test_a_stated_unit_converts_samples_whose_own_unit_is_known_and_is_refused_w
     assert archive.notes[0] == "channel 1 is converted from kN to N, times 1000."
     np.testing.assert_array_equal(load_dataset(archive, unit="kN").X, X)
     with pytest.raises(DataError, match=r"Expected data in mm, its unit is N; leave unit out"):
-        load_dataset(make_dataset(X, y), unit="mm")
+        load_dataset(make_dataset(X, y, unit="N"), unit="mm")
     for source in ((X, y), saved(X=X, y=y)):  # nothing says what these are in
         unknown = load_dataset(source, unit="kN")
         np.testing.assert_array_equal(unknown.X, X)
@@ -50,7 +50,7 @@ def test_a_stated_unit_converts_samples_whose_own_unit_is_known_and_is_refused_w
     converted = load_dataset(pair, unit="N, m")
     np.testing.assert_allclose(converted.X[0, :, 1], [1000.0, 0.001])
     np.testing.assert_allclose(load_dataset(pair, channel="s", unit="m").X[0], X[0] / 1000)
-    data = make_data(20, samples=40)
+    data = replace(make_data(20, samples=40), unit="N")
     with DataEngine(reducer="pca", store=tmp_path / "engine.db", trace=data.spec) as engine:
         for trace, label in zip(data.X, data.y, strict=True):
             engine.report(engine.decide(trace).id, success=bool(label))

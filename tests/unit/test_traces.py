@@ -1,7 +1,7 @@
 """Where a trace enters: shapes and types are the caller's, faults are the world's."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,12 @@ from dengine import (
     Dataset,
     DengineError,
     Reason,
+    ReplayCell,
+    SimulatedCell,
     TraceError,
     TraceSpec,
     export_torchscript,
+    load_dataset,
     load_exported,
 )
 from dengine.decision.scripting import script
@@ -53,6 +56,9 @@ def reason_of(x: np.ndarray, limit: float | None = None, compiled: bool = False)
         (("N", "N"), 2, "N", ("N", "N")),
         (("N",), 1, "N", ("N",)),
         ("mixed units", 3, "mixed units", ("mixed units",) * 3),
+        *((unknown, 2, None, ("", "")) for unknown in (None, "", " ", ("", ""), ", ")),
+        ("N, ", 2, ("N", ""), ("N", "")),
+        ("", 1, None, ("",)),
     ],
 )
 def test_each_channel_has_a_unit(
@@ -79,6 +85,31 @@ def test_every_real_dtype_is_cast_to_float32(dtype: str) -> None:
     assert result.flags.c_contiguous
     np.testing.assert_array_equal(result[0], x.astype(np.float32))
     assert as_trace(x.reshape(50, 2), TraceSpec(2, channels=50)).shape == (50, 2)  # it is agreed on
+
+
+def test_what_nobody_stated_of_a_trace_is_unknown(make_data) -> None:
+    data = make_data(2)
+    with DataEngine("pca") as engine:
+        engine.decide(data.X[0])
+        assert (engine.trace.rate_hz, engine.trace.unit) == (None, None)
+        assert (engine.status().trace, engine.trace) == (TraceSpec(100), TraceSpec(100))
+    unstated = Dataset(data.X, data.y).spec
+    assert (unstated.rate_hz, unstated.unit) == (None, None)
+    for bundled in (load_dataset("insertion").spec, SimulatedCell.spec):
+        assert bundled == TraceSpec(1000, rate_hz=500.0, unit="N")
+
+
+def test_a_cell_that_knows_its_traces_states_what_the_engine_does_not_know(make_data) -> None:
+    data = replace(make_data(3), rate_hz=250.0, unit="kN")
+    for stated, trace in (
+        (None, TraceSpec(100, 250.0, unit="kN")),
+        (TraceSpec(100, unit="N"), TraceSpec(100, 250.0, unit="N")),
+        (TraceSpec(100, 500.0, fit="pad"), TraceSpec(100, 500.0, unit="kN", fit="pad")),
+        (TraceSpec(50, fit="resample"), TraceSpec(50, fit="resample")),  # another rate
+    ):
+        with DataEngine("pca", trace=stated) as engine:
+            assert len(list(engine.run(ReplayCell(data), 2))) == 2
+            assert engine.trace == trace
 
 
 AGREED = TraceSpec(samples=100, channels=6)
@@ -109,8 +140,13 @@ def test_a_contract_that_no_trace_can_keep_is_refused(message: str) -> None:
         ),
         (
             np.ones(998),
-            TraceSpec(1000),
+            TraceSpec(1000, rate_hz=500.0),
             r"^Expected 1000 samples, got 998; resample the trace to 500 Hz x 2 s, or .*fit='pad'\)\.$",
+        ),
+        (
+            np.ones(998),
+            TraceSpec(1000),
+            r"^Expected 1000 samples, got 998; resample the trace to 1000 samples, or .*fit='pad'\)\.$",
         ),
         (np.ones(100), AGREED, r"Expected 6 channel\(s\), got 1; pass \(channels, samples\)"),
         *(
