@@ -33,7 +33,7 @@ from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
 from .resume import add_labels_since, refit
 from .settings import EvidenceWindow
-from .trainer import HUNG, Clock, Retrainer, Trained, TrainedOn, TrainingWindow
+from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 
 log = logging.getLogger("dengine")
 STEP = 0.0005  # seconds of catching up in one step: a label or two
@@ -88,6 +88,7 @@ class Learner:
         self._report: RetrainReport | None = None  # of the newest retrain, until it is taken
         self._was_accepted = True  # the last retrain
         self._precomputed: Future[None] | None = None  # what the next retrain begins with
+        self._is_requested = False  # a training is to begin as soon as it can
 
     def resume(self, label_within: int, policy_since: int) -> None:
         """Restore window, version, rule and counts from the store, bit for bit, when an engine
@@ -161,9 +162,9 @@ class Learner:
         for.
 
         The remedy, a rebuild of the rule and perhaps a correction, is left to a later call while
-        the store lacks records or has a fault. A correction first finishes a retrain under way, or
-        gives it up after `HUNG` seconds, and retrains a model that cannot change its references.
-        Where the store fails meanwhile, that is logged, and a later call tries again.
+        the store lacks records or has a fault. A correction first ends a retrain under way, as
+        `end_training` does, and retrains a model that cannot change its references. Where the store
+        fails meanwhile, that is logged, and a later call tries again.
         """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -176,7 +177,7 @@ class Learner:
             return
         try:
             if remedy is Remedy.CORRECT:
-                self.collect(HUNG)  # what is being trained does not have the correction
+                self.end_training()  # what is being trained does not have the correction
                 self.apply_corrections()
             else:
                 self.live.rebuild_rule()
@@ -206,13 +207,12 @@ class Learner:
     def retrain(self) -> RetrainReport:
         """Train a version in this thread, let it answer, and return the report.
 
-        A retrain under way in the executor is finished first, or given up after `HUNG` seconds;
-        then news of peers is taken in. A version that fails or cannot be stored is dropped, and the
+        A retrain under way in the executor is ended first, and news of peers is taken in. A version that fails or cannot be stored is dropped, and the
         report says so. A version that is stored, while labels that came since cannot be, answers at
         a later call; its report is returned all the same. Raises StoreError where the labels before
         it cannot be stored.
         """
-        self.collect(HUNG)
+        self.end_training()
         self.store_labels()
         begin = self._clock()
         self._begin_retrain()
@@ -228,14 +228,20 @@ class Learner:
         """Begin to train in the executor and return None.
 
         A training under way comes a step further, and a new one begins only if that ended it.
-        Before a new one, labels are stored, and news of peers is taken in. Without an executor that
-        takes work, retrain in this thread and return the report. Raises StoreError where the labels
-        before it cannot be stored.
+        Before a new one, labels are stored, and news of peers is taken in. While the executor works
+        on a training that was discarded, or what a retrain begins with is computed, it begins
+        later, by `retrain_if_due`. Without an executor that takes work, retrain in this thread and
+        return the report. Raises StoreError where the labels before it cannot be stored.
         """
         self.collect()
-        if self.is_busy:
+        if self._is_at_work:
             return None
         if self._retrainer.executor is not None:
+            precomputed = self._precomputed
+            is_preparing = precomputed is not None and not precomputed.done()
+            if is_preparing or self._retrainer.is_occupied:
+                self._is_requested = True
+                return None
             self.store_labels()
             self._begin_retrain()
             if self._retrainer.start(self.live.newest):
@@ -245,7 +251,8 @@ class Learner:
     def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
         """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
-        There must be as many labels as the model's `min_traces`. News of peers is taken in first,
+        There must be as many labels as the model's `min_traces`, unless it was asked for and could
+        not begin then. News of peers is taken in first,
         so another version may answer even if none is trained here. With `once` a version that lacks
         steps is not trained on until the report of its last retrain was taken. Returns the report
         of a retrain in this thread; else None: none is due, the store is away, a training or its
@@ -255,17 +262,13 @@ class Learner:
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
         n_labels = max(self.labels.new_labels, len(self._window))
         has_enough = n_labels >= self.live.newest.min_traces
-        if not (is_due and has_enough) and not lacks_steps:
+        if not (is_due and has_enough) and not lacks_steps and not self._is_requested:
             return None
         try:
             self.store_labels()
         except StoreError:  # logged by the outbox; the labels wait in its journal
             return None
-        precomputed = self._precomputed
-        is_preparing = precomputed is not None and not precomputed.done()
-        if self._outbox.fault or (self._retrainer.executor is not None and is_preparing):
-            return None
-        return self.start_retrain()
+        return None if self._outbox.fault else self.start_retrain()
 
     @property
     def _lacks_steps(self) -> bool:
@@ -287,9 +290,29 @@ class Learner:
         return self._candidate is not None
 
     @property
-    def is_busy(self) -> bool:
+    def _is_at_work(self) -> bool:
         """Whether a training is under way in the executor, or its version is being swapped in."""
         return self._retrainer.future is not None or self.is_swapping
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a retrain is under way, or waits until it can begin."""
+        return self._is_at_work or self._is_requested
+
+    def end_training(self) -> None:
+        """End what is under way without waiting for a training, before a change that it lacks.
+
+        A version that is trained answers, or is dropped. A training that is not done is discarded,
+        and another begins as soon as it can, after the change.
+        """
+        self.collect(to_the_end=True)
+        self._discard_training()
+
+    def _discard_training(self) -> None:
+        """Discard a training that is under way in the executor, and ask for another one."""
+        if self._retrainer.discard():
+            log.info("a training was discarded for a change; another one begins")
+            self._is_requested = True
 
     def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
         """Take a training's outcome from the executor, and bring its version closer to answering.
@@ -298,10 +321,9 @@ class Learner:
         swap it in. With `to_the_end`, with `wait` above 0, and always where cells share a product,
         it does all steps of a training that is done, and blocks for the store. `wait` is also how
         many seconds to wait for a training that is not done; then that is given up, as is one that
-        takes longer than `HUNG` seconds. Nothing happens while one is not done, or where there is
-        none.
+        hangs. Nothing happens while one is not done, or where there is none.
         """
-        if self._retrainer.future is None and self._candidate is None:
+        if not self._is_at_work:
             return
         # Versions and corrections of peers must not come in between two steps.
         to_the_end = to_the_end or wait > 0.0 or self._peers is not None
@@ -333,6 +355,7 @@ class Learner:
         self.wait_until_precomputed()
         self._take_in_all_news()
         self.labels.begin_retrain()
+        self._is_requested = False
 
     def _advance(self, to_the_end: bool) -> None:
         """Bring the candidate further: catch up on labels, store it, catch up again, swap it in.
@@ -507,6 +530,7 @@ class Learner:
             peers.take_over(version)
         peers.take_in(news)
         if news.correction > self.live.corrected_to:
+            self._discard_training()  # it does not have the corrections
             try:
                 self.apply_corrections(may_retrain=False)
             except StoreError as error:  # asked for again with the next news
@@ -519,13 +543,13 @@ class Learner:
     # What people put right
 
     def bring_up_to_date(self) -> None:
-        """Finish what is under way before a person's change: a retrain, labels, news of peers.
+        """Finish what is under way before a person's change: labels and news of peers.
 
-        A retrain that takes longer than `HUNG` seconds is given up; of the news at most `ROUNDS`
-        times `MOST` labels are taken in. Raises StoreError where the store is away, or where labels
+        A training is ended, as `end_training` does; of the news at most `ROUNDS` times `MOST`
+        labels are taken in. Raises StoreError where the store is away, or where labels
         of peers before one of this cell's are missing.
         """
-        self.collect(HUNG)
+        self.end_training()
         self.store_labels()
         self._take_in_all_news()
         if self._peers is not None and (self._peers.is_lost or self._has_gaps):
