@@ -247,6 +247,15 @@ class Decision:
         return self.propensity if self.action is Action.VERIFY else 0.0
 
 
+TRAINED = "accepted"  # begins the reason of a version that was trained and answers
+REPEATS = "traces nearly repeat another"  # in a note of a retrain's reason
+REPEATS_MEANING = (
+    "If parts come twice, under two numbers or none, a label counts as two independent trials, and "
+    "too many parts are certain: give a part the same number each time it comes. A process may "
+    "also repeat that well with distinct parts; decisions stay as they are."
+)
+
+
 @dataclass(frozen=True, slots=True)
 class RetrainReport:
     """One retrain, from taking the data to the new version answering.

@@ -1,5 +1,5 @@
 """The verbs that change, check or copy a store by hand: `report`, `correct`, `forget`, `rollback`,
-`policy`, `retrain`, `verify`, `backup` and `import-labels`.
+`release`, `policy`, `retrain`, `verify`, `backup` and `import-labels`.
 
 Those up to `retrain` change a store's engine, or show its policy; `verify` checks the store's
 history, `backup` copies it, and `import-labels` takes the labels of an exported cell.
@@ -160,11 +160,19 @@ def forget(
 @store_options
 @click.argument("version", metavar="VERSION", type=int)
 def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
-    """Use an earlier model version again, as a new version.
+    """Use an earlier model version again, as a new version, and pin it.
 
-    Labels that came since are among its references, and corrections count.
+    Labels that came since are among its references, and corrections count. No automatic retrain
+    replaces a pinned version, until `dengine release` or `dengine retrain`.
     """
     _change_and_print(store, author, allow_import, lambda engine: engine.rollback(version, author))
+
+
+@verb("dengine release engine.db")
+@store_options
+def release(store: str, author: str, allow_import: bool) -> None:
+    """Let retrains replace a version again that was rolled back to."""
+    _change_and_print(store, author, allow_import, lambda engine: engine.release(author))
 
 
 @verb("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
@@ -204,7 +212,7 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 @verb("dengine retrain engine.db")
 @store_options
 def retrain(store: str, author: str, allow_import: bool) -> None:
-    """Train now, on the store's labels as they count.
+    """Train now, on the store's labels as they count; the new version replaces a pinned one, too.
 
     An event records it. A candidate that fails its gate is dropped, the previous version stays in
     use, and the exit code is 1.

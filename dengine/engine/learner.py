@@ -28,10 +28,10 @@ from ..store.records import Change, StoredDecision, without_rule
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import MOST, ROUNDS, Peers
-from .guard import GuardedModel
+from .guard import GuardedModel, logged_failure
 from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
-from .resume import add_labels_since, refit
+from .resume import add_labels_since, find_clean_start, refit
 from .settings import EvidenceWindow
 from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 
@@ -89,6 +89,10 @@ class Learner:
         self._was_accepted = True  # the last retrain
         self._precomputed: Future[None] | None = None  # what the next retrain begins with
         self._is_requested = False  # a training is to begin as soon as it can
+        self._by_hand = False  # a person asked for the newest training, so that it ends a pin
+        # What the next training starts from, and the answering version and correction that it is
+        # for.
+        self._start: tuple[tuple[int, int], EngineModel, str] | None = None
 
     def resume(self, label_within: int, policy_since: int) -> None:
         """Restore window, version, rule and counts from the store, bit for bit, when an engine
@@ -125,14 +129,15 @@ class Learner:
     def precompute(self) -> None:
         """Start a thread that computes what the next retrain begins with; do not wait for it.
 
-        The result is kept in the newest model. While an earlier one has not been waited for,
-        nothing is started. There must be labels.
+        The result is kept in the model that the next training starts from. While an earlier one has
+        not been waited for, nothing is started. There must be labels.
         """
         if self._precomputed is not None:
             return
         labelled = self._window.snapshot()
+        start = self._choose_start()
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
-        model = GuardedModel(self.live.newest)
+        model = GuardedModel(start)
         self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)
         pool.shutdown(wait=False)
 
@@ -204,19 +209,21 @@ class Learner:
 
     # A retrain
 
-    def retrain(self) -> RetrainReport:
+    def retrain(self, by_hand: bool = True) -> RetrainReport:
         """Train a version in this thread, let it answer, and return the report.
 
-        A retrain under way in the executor is ended first, and news of peers is taken in. A version that fails or cannot be stored is dropped, and the
-        report says so. A version that is stored, while labels that came since cannot be, answers at
-        a later call; its report is returned all the same. Raises StoreError where the labels before
-        it cannot be stored.
+        With `by_hand` a person asked for it, so that it may replace a pinned version.
+
+        A retrain under way in the executor is ended first, and news of peers is taken in. A version
+        that fails or cannot be stored is dropped, and the report says so. A version that is stored,
+        while labels that came since cannot be, answers at a later call; its report is returned all
+        the same. Raises StoreError where the labels before it cannot be stored.
         """
         self.end_training()
         self.store_labels()
         begin = self._clock()
-        self._begin_retrain()
-        trained = self._retrainer.train(self.live.newest, begin)
+        self._begin_retrain(by_hand)
+        trained = self._retrainer.train(self._choose_start(), begin)
         candidate = self._as_candidate_of(trained)
         self._candidate = candidate
         self._report = None
@@ -224,8 +231,8 @@ class Learner:
         # A version that is stored may still wait for labels that came since.
         return self._report or candidate.report
 
-    def start_retrain(self) -> RetrainReport | None:
-        """Begin to train in the executor and return None.
+    def start_retrain(self, by_hand: bool = True) -> RetrainReport | None:
+        """Begin to train in the executor and return None; `by_hand` is as for `retrain`.
 
         A training under way comes a step further, and a new one begins only if that ended it.
         Before a new one, labels are stored, and news of peers is taken in. While the executor works
@@ -241,24 +248,29 @@ class Learner:
             is_preparing = precomputed is not None and not precomputed.done()
             if is_preparing or self._retrainer.is_occupied:
                 self._is_requested = True
+                self._by_hand = by_hand
                 return None
             self.store_labels()
-            self._begin_retrain()
-            if self._retrainer.start(self.live.newest):
+            self._begin_retrain(by_hand)
+            if self._retrainer.start(self._choose_start()):
                 return None
-        return self.retrain()
+        return self.retrain(by_hand)
 
     def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
         """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
         There must be as many labels as the model's `min_traces`, unless it was asked for and could
         not begin then. News of peers is taken in first,
-        so another version may answer even if none is trained here. With `once` a version that lacks
+        so another version may answer even if none is trained here. A pinned version stays, unless a
+        person asked for the retrain. With `once` a version that lacks
         steps is not trained on until the report of its last retrain was taken. Returns the report
         of a retrain in this thread; else None: none is due, the store is away, a training or its
         preparation is under way, or it was begun in the executor.
         """
         is_due = self._is_due_after_news(recipe.retrain_every)
+        by_hand = self._is_requested and self._by_hand
+        if self.live.pinned and not by_hand:
+            return None
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
         n_labels = max(self.labels.new_labels, len(self._window))
         has_enough = n_labels >= self.live.newest.min_traces
@@ -268,7 +280,7 @@ class Learner:
             self.store_labels()
         except StoreError:  # logged by the outbox; the labels wait in its journal
             return None
-        return None if self._outbox.fault else self.start_retrain()
+        return None if self._outbox.fault else self.start_retrain(by_hand)
 
     @property
     def _lacks_steps(self) -> bool:
@@ -337,7 +349,25 @@ class Learner:
         """Return the outcome of a training as a candidate that takes over the answering model's
         rule.
         """
+        note = self._start[2] if self._start is not None else ""
+        if note and trained.model is not None:
+            trained = replace(trained, reason=f"{trained.reason}; {note}")
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
+
+    def _choose_start(self) -> EngineModel:
+        """Return the model that the next training starts from, as `find_clean_start` does.
+
+        It is searched for once for an answering version and the corrections that it has. Where the
+        store fails meanwhile, that is logged, and the training starts from initial weights.
+        """
+        live = self.live
+        key = (live.version, live.corrected_to)
+        if self._start is None or self._start[0] != key:
+            start = live.template, "from initial weights"
+            with logged_failure("weights before the forgotten labels cannot be searched for"):
+                start = find_clean_start(self._store, live.template, live.newest, live.trained_on)
+            self._start = key, *start
+        return self._start[1]
 
     def wait_until_precomputed(self) -> None:
         """Wait until what the next retrain needs of the stored labels' traces is computed.
@@ -348,7 +378,7 @@ class Learner:
             self._precomputed.result()
             self._precomputed = None
 
-    def _begin_retrain(self) -> None:
+    def _begin_retrain(self, by_hand: bool) -> None:
         """Prepare for a training: wait for what is computed in advance, take in the peers' news if
         the store answers, and count new labels from zero.
         """
@@ -356,6 +386,7 @@ class Learner:
         self._take_in_all_news()
         self.labels.begin_retrain()
         self._is_requested = False
+        self._by_hand = by_hand
 
     def _advance(self, to_the_end: bool) -> None:
         """Bring the candidate further: catch up on labels, store it, catch up again, swap it in.
@@ -399,6 +430,8 @@ class Learner:
             if self._waits_for_labels(candidate, to_the_end):
                 return False
             self.store_labels()
+            if self._peers is not None and not self._by_hand and self._peers.has_pinned():
+                raise StoreError("a peer rolled back to an earlier version meanwhile")
             candidate.catch_up(self._window)
             candidate.begin_storing(self._begin_storing(candidate), self._outbox.limit)
         if candidate.storing is None or (not to_the_end and candidate.may_go_on_storing()):
@@ -565,8 +598,10 @@ class Learner:
     def apply_corrections(self, may_retrain: bool = True) -> None:
         """Apply the store's newest corrections to window, references, count of new labels and rule.
 
-        A model that cannot change a reference is retrained, if `may_retrain`: only the cell that
-        corrected does so. Raises StoreError where the store is away.
+        A model that cannot change a reference is retrained, or a pinned one fitted again, if
+        `may_retrain`: only the cell that corrected does so. Where labels were forgotten, what the
+        next training starts from is prepared in a thread. Raises StoreError where the store is
+        away.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         last = self.labels.last_to_read
@@ -574,12 +609,41 @@ class Learner:
         is_done = self.live.apply_corrections()
         self.labels.recount(self._counts_from)
         self.live.rebuild_rule()
-        if may_retrain and not is_done:
-            self.retrain()
+        self._prepare_start()
+        if is_done or not may_retrain:
+            return
+        if self.live.pinned:
+            version = self.live.version
+            text = f"version {version} is fitted again, to labels as they count now"
+            was_requested = self._is_requested
+            self.roll_back(version, Change("rollback", text))
+            self._is_requested = was_requested
+        else:
+            self.retrain(by_hand=False)
+
+    def _prepare_start(self) -> None:
+        """Compute in advance for the next training, where it does not start from what answers."""
+        if self._choose_start() is self.live.newest or not len(self._window):
+            return
+        if self._precomputed is not None and self._precomputed.done():
+            self._precomputed = None  # it was for another model
+        self.precompute()
+
+    def release(self, event: Change) -> None:
+        """Let retrains replace a pinned version again, and store that as a new version, with
+        `event`.
+
+        Raises StoreError where it cannot be stored: then nothing changes.
+        """
+        live = self.live
+        if live.answering is not None and live.trained_on is not None:
+            trained_on = replace(live.trained_on, pinned=0)
+            reason = "released, the same model"
+            self._store_and_swap_in(event, live.answering, trained_on, reason, 0.0)
 
     def roll_back(self, number: int, event: Change) -> None:
-        """Let the earlier version `number` answer again, as a new version, and store it with
-        `event`.
+        """Let the earlier version `number` answer again, as a new version, pin it, and store it
+        with `event`.
 
         Later labels, up to the window's capacity, become its references, and the present rule goes
         on. Afterwards news of peers is taken in, and new labels count from zero. Raises StoreError
@@ -604,10 +668,13 @@ class Learner:
         model.set_state(state)
         GuardedModel(model).prepare(self.live.newest)
         add_labels_since(model, self._store, version, self._window)
-        trained_on = replace(trained_on, counts_from=self._window.newest_seq)
+        trained_on = replace(trained_on, counts_from=self._window.newest_seq, pinned=number)
         reason = f"rolled back to version {number}"
         self._store_and_swap_in(event, model, trained_on, reason, self._clock() - begin)
-        self._begin_retrain()
+        self._is_requested = False  # also by hand: it was before
+        self._take_in_all_news()
+        self.labels.begin_retrain()
+        self._prepare_start()
 
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
         """Go on under another policy, as a new version of the same model, and store it with

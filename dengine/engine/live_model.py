@@ -90,6 +90,11 @@ class LiveModel:
         return self.answering or self.template
 
     @property
+    def pinned(self) -> int:
+        """Number of the version that a rollback pinned, and that answers; 0: none."""
+        return 0 if self.trained_on is None else self.trained_on.pinned
+
+    @property
     def next_version(self) -> int:
         """Number of the next version."""
         return self.newest_version + 1

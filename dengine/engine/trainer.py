@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..errors import DengineError, SettingError
 from ..model.base import EngineModel
+from ..records import TRAINED
 from ..reducers.base import StopRule
 from ..store.records import LabelledTraces
 
@@ -143,27 +144,40 @@ class TrainedOn:
         Number of the newest correction that they had.
     counts_from : int
         Number of the newest label that the next retrain does not wait for.
+    pinned : int
+        Number of the earlier version that answers again by a rollback, and that no automatic
+        retrain replaces; 0: the version is not pinned.
     """
 
     seq: NDArray[np.int64]
     corrected_to: int
     counts_from: int
+    pinned: int = 0
+
+    def has_seen(self, seq: int) -> bool:
+        """Return whether the weights may have learned from the label of this number.
+
+        They have if it is among these labels, or older than all of them: an earlier version had it.
+        """
+        return bool(len(self.seq)) and (seq < self.seq[0] or seq in self.seq)
 
     def to_state(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays "trained_on", "trained_as" and "counts_from", for the store.
+        """Return the arrays "trained_on", "trained_as", "counts_from" and "pinned", for the store.
 
-        `from_state` reads them.
+        `from_state` reads them. "pinned" is there only where it is not 0.
         """
-        return {
+        state = {
             "trained_on": self.seq,
             "trained_as": np.array(self.corrected_to),
             "counts_from": np.array(self.counts_from),
         }
+        return state | ({"pinned": np.array(self.pinned)} if self.pinned else {})
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
         """Return the record that `to_state` turned into arrays."""
-        return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]))
+        pinned = int(state.get("pinned", 0))
+        return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]), pinned)
 
 
 @dataclass(frozen=True)
@@ -437,7 +451,7 @@ def train_candidate(
             reason = f"dropped: {defect}"
         else:
             model = successor
-            remarks = ("accepted", report.note, LATE if stop.late else "")
+            remarks = (TRAINED, report.note, LATE if stop.late else "")
             reason = "; ".join(filter(None, remarks))
     except DengineError as error:
         reason = f"dropped: {error}"

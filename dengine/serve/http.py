@@ -139,6 +139,7 @@ class HttpApi:
             Operation("POST", "/correct", self.correct, "Changed"),
             Operation("POST", "/forget", self.forget, "Changed"),
             Operation("POST", "/rollback", self.rollback, "Changed"),
+            Operation("POST", "/release", self.release, "Changed"),
             Operation("POST", "/policy", self.policy, "Changed", policy),
             Operation("POST", "/retrain", self.retrain, "Changed"),
             Operation("POST", "/export", self.export, "application/zip"),
@@ -256,8 +257,14 @@ class HttpApi:
         version: Annotated[int, Meta(description="Its number, as /versions lists it.")],
         author: Author = "",
     ) -> Json:
-        """Let an earlier version of the model decide again, as a new version."""
+        """Let an earlier version of the model decide again, as a new version, and pin it: no
+        automatic retrain replaces it, until /release or /retrain.
+        """
         return await self._change(author, lambda engine, by: engine.rollback(version, by))
+
+    async def release(self, author: Author = "") -> Json:
+        """Let retrains replace a pinned version again."""
+        return await self._change(author, lambda engine, by: engine.release(by))
 
     async def policy(self, author: Author = "", **changes: Any) -> Json:
         """Change settings of the policy, from the next decision on; shadow verifies every part.
@@ -269,7 +276,8 @@ class HttpApi:
         )
 
     async def retrain(self, author: Author = "") -> Json:
-        """Begin a retrain, which is an event, and do not wait for its end.
+        """Begin a retrain, which is an event, and do not wait for its end; it replaces a pinned
+        version, too.
 
         If one is under way, the response says so, and nothing is begun or recorded.
         """
