@@ -116,7 +116,8 @@ class TraceSpec:
     fit : {"strict", "cut", "pad", "resample"}, default "strict"
         What happens to a trace of another length, see `traces.fit_length`. strict: TraceError. cut:
         a longer one loses its end. pad: like cut, and a shorter one repeats its last sample.
-        resample: linear interpolation. A trace that cannot be fitted becomes NaN and is verified.
+        resample: linear interpolation. Half to twice the length can be padded or resampled; any
+        other length is a TraceError.
     columns : tuple of str, default ()
         Names of the channels, by which the columns of a DataFrame are selected.
 

@@ -203,8 +203,9 @@ class HttpApi:
     ) -> Json:
         """Report the outcome of a part. The label is on disk when the response comes.
 
-        The same report twice is no error, a different one is 409, but for a line stop after a
-        confirmation. With an author, or a token that has a name, a new label is an event, too.
+        The same report twice is no error, a different one is 409; but `false` for an accepted part
+        that counts as good is a late line stop, and corrects that. With an author, or a token that
+        has a name, a new label is an event, too.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
