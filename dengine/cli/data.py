@@ -69,8 +69,7 @@ def data(source: DataChoice, out: Out | None) -> None:
             "seen."
         )
     if survey.near_repeats > MANY_REPEATS:
-        n_repeats = f"{survey.near_repeats} of the newest {survey.looked_at}"
-        parts.append(f"{n_repeats} {REPEATS}. {REPEATS_MEANING}")
+        parts.append(f"{survey.near_repeats} {REPEATS}. {REPEATS_MEANING}")
     print_result(
         {"data": source.data, "survey": survey, "notes": dataset.notes, "reading": dataset.reading},
         *parts,

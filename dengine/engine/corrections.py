@@ -161,15 +161,10 @@ class Corrections:
         changes = {id_: {"was": label, "now": None} for id_, label in labels.items()}
         data = {"decisions": changes, "reason": reason}
         live = self._core.live
-        trained_on = live.trained_on
-        is_released = (
-            trained_on is not None
-            and live.pinned > 0
-            and any(
-                trained_on.has_seen(stored.label_seq)
-                for stored in decisions
-                if stored.success is not None and stored.label_seq and not stored.quarantined
-            )
+        is_released = live.pinned > 0 and any(
+            live.trained_on.has_seen(stored.label_seq)
+            for stored in decisions
+            if stored.label_seq and stored.success is not None and not stored.quarantined
         )
         if is_released:
             text += f"; version {live.version}, which learned from this, is pinned no more"

@@ -113,18 +113,9 @@ class Learner:
         self.live.resume(version, newest_version, label_within, policy_since)
         if self.live.answering is not None or len(labelled.seq) >= IMPORTED:
             self.precompute()
-        self.labels.resume(self._counts_from)
+        self.labels.resume(self.live.trained_on.counts_from)
         if self._peers is not None:
             self._peers.resume()
-
-    @property
-    def _counts_from(self) -> int:
-        """Number of the newest label that the next retrain does not wait for.
-
-        0 before the first retrain.
-        """
-        trained_on = self.live.trained_on
-        return 0 if trained_on is None else trained_on.counts_from
 
     def precompute(self) -> None:
         """Start a thread that computes what the next retrain begins with; do not wait for it.
@@ -451,7 +442,7 @@ class Learner:
         report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
         state = None
-        if candidate.model is not None and candidate.trained_on is not None:
+        if candidate.model is not None:
             state = self._state_of(candidate.model, candidate.trained_on)
         return self._outbox.submit(lambda: self._store.put_version(report, newest_seq, state))
 
@@ -607,7 +598,7 @@ class Learner:
         last = self.labels.last_to_read
         self._window.refill(self._store.labelled(self._window.capacity, last=last))
         is_done = self.live.apply_corrections()
-        self.labels.recount(self._counts_from)
+        self.labels.recount(self.live.trained_on.counts_from)
         self.live.rebuild_rule()
         self._prepare_start()
         if is_done or not may_retrain:
@@ -635,11 +626,9 @@ class Learner:
 
         Raises StoreError where it cannot be stored: then nothing changes.
         """
-        live = self.live
-        if live.answering is not None and live.trained_on is not None:
-            trained_on = replace(live.trained_on, pinned=0)
-            reason = "released, the same model"
-            self._store_and_swap_in(event, live.answering, trained_on, reason, 0.0)
+        trained_on = replace(self.live.trained_on, pinned=0)
+        reason = "released, the same model"
+        self._store_and_swap_in(event, self.live.newest, trained_on, reason, 0.0)
 
     def roll_back(self, number: int, event: Change) -> None:
         """Let the earlier version `number` answer again, as a new version, pin it, and store it
@@ -690,7 +679,7 @@ class Learner:
         model = live.answering
         if policy is not None:
             template, model = live.with_policy(policy, evidence)
-        if model is None or live.trained_on is None:
+        if model is None:
             self._store.apply_change(event)
         else:
             self._store_and_swap_in(

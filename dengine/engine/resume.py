@@ -70,7 +70,7 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
 
 
 def find_clean_start(
-    store: SqlStore, template: EngineModel, newest: EngineModel, trained_on: TrainedOn | None
+    store: SqlStore, template: EngineModel, newest: EngineModel, trained_on: TrainedOn
 ) -> tuple[EngineModel, str]:
     """Return a model to train on from that never saw a label which is forgotten now, and a note.
 
@@ -79,8 +79,6 @@ def find_clean_start(
     weights; the note says so. A model that begins anew with each training stays. Raises StoreError
     where the store cannot be read.
     """
-    if trained_on is None or not newest.keeps_references:
-        return newest, ""
     corrections = {correction.seq: correction for correction in store.corrections()}
 
     def is_clean(trained_on: TrainedOn) -> bool:
@@ -92,7 +90,7 @@ def find_clean_start(
             for correction in corrections.values()
         )
 
-    if is_clean(trained_on):
+    if is_clean(trained_on) or not newest.keeps_references:
         return newest, ""
     for number in [stored.report.version for stored in store.versions() if stored.kept][::-1]:
         with suppress(StoreError):  # of a damaged version

@@ -134,7 +134,7 @@ class TrainingWindow:
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """The labels that a version was trained on.
+    """The labels that a version was trained on; by default none, before the first version.
 
     Attributes
     ----------
@@ -149,9 +149,9 @@ class TrainedOn:
         retrain replaces; 0: the version is not pinned.
     """
 
-    seq: NDArray[np.int64]
-    corrected_to: int
-    counts_from: int
+    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    corrected_to: int = 0
+    counts_from: int = 0
     pinned: int = 0
 
     def has_seen(self, seq: int) -> bool:
