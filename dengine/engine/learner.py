@@ -613,12 +613,17 @@ class Learner:
             self.retrain(by_hand=False)
 
     def _prepare_start(self) -> None:
-        """Compute in advance for the next training, where it does not start from what answers."""
+        """Compute in advance for the next training, where it does not start from what answers.
+
+        Where that is in this thread, wait for it now, so that the retrain keeps its budget.
+        """
         if self._choose_start() is self.live.newest or not len(self._window):
             return
         if self._precomputed is not None and self._precomputed.done():
             self._precomputed = None  # it was for another model
         self.precompute()
+        if self._retrainer.executor is None:
+            self.wait_until_precomputed()
 
     def release(self, event: Change) -> None:
         """Let retrains replace a pinned version again, and store that as a new version, with
