@@ -160,10 +160,10 @@ def forget(
 @store_options
 @click.argument("version", metavar="VERSION", type=int)
 def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
-    """Use an earlier model version again, as a new version, and pin it.
+    """Use an earlier model version again, as a new version.
 
-    Labels that came since are among its references, and corrections count. No automatic retrain
-    replaces a pinned version, until `dengine release` or `dengine retrain`.
+    Labels that came since are among its references, and corrections count. It is pinned: no
+    automatic retrain replaces it, until `dengine release` or `dengine retrain`.
     """
     _change_and_print(store, author, allow_import, lambda engine: engine.rollback(version, author))
 
@@ -171,7 +171,7 @@ def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
 @verb("dengine release engine.db")
 @store_options
 def release(store: str, author: str, allow_import: bool) -> None:
-    """Let retrains replace a version again that was rolled back to."""
+    """Let retrains replace a pinned version again."""
     _change_and_print(store, author, allow_import, lambda engine: engine.release(author))
 
 
@@ -212,10 +212,10 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 @verb("dengine retrain engine.db")
 @store_options
 def retrain(store: str, author: str, allow_import: bool) -> None:
-    """Train now, on the store's labels as they count; the new version replaces a pinned one, too.
+    """Train now, on the store's labels as they count.
 
-    An event records it. A candidate that fails its gate is dropped, the previous version stays in
-    use, and the exit code is 1.
+    An event records it. The new version replaces a pinned one, too. A candidate that fails its gate
+    is dropped, the previous version stays in use, and the exit code is 1.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line

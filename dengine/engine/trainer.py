@@ -164,14 +164,14 @@ class TrainedOn:
     def to_state(self) -> dict[str, NDArray[Any]]:
         """Return the arrays "trained_on", "trained_as", "counts_from" and "pinned", for the store.
 
-        `from_state` reads them. "pinned" is there only where it is not 0.
+        `from_state` reads them.
         """
-        state = {
+        return {
             "trained_on": self.seq,
             "trained_as": np.array(self.corrected_to),
             "counts_from": np.array(self.counts_from),
+            "pinned": np.array(self.pinned),
         }
-        return state | ({"pinned": np.array(self.pinned)} if self.pinned else {})
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
@@ -316,12 +316,9 @@ class Retrainer:
         executor = self.executor
         if executor is None or self._left is not None:
             return False
-        if self._is_restarted and isinstance(executor, RestartableExecutor):
-            if not executor.ready.done():
-                return False
-            if executor.ready.exception() is not None:
-                self._replace_executor()
-                return False
+        is_starting = isinstance(executor, RestartableExecutor) and not executor.ready.done()
+        if is_starting and self._is_restarted:
+            return False
         data = self.window.snapshot()
         if not self._submitted:
             log.info("the first retrain begins, on %d labels", len(data.seq))
