@@ -251,16 +251,16 @@ class Learner:
         """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
         There must be as many labels as the model's `min_traces`, unless it was asked for and could
-        not begin then. News of peers is taken in first,
-        so another version may answer even if none is trained here. A pinned version stays, unless a
-        person asked for the retrain. With `once` a version that lacks
-        steps is not trained on until the report of its last retrain was taken. Returns the report
-        of a retrain in this thread; else None: none is due, the store is away, a training or its
-        preparation is under way, or it was begun in the executor.
+        not begin then. News of peers is taken in first, so another version may answer even if none
+        is trained here. A pinned version stays, unless a person asked for the retrain. With `once`
+        a version that lacks steps is not trained on until the report of its last retrain was taken.
+        Returns the report of a retrain in this thread; else None: none is due, the store is away, a
+        training or its preparation is under way, or it was begun in the executor.
         """
         is_due = self._is_due_after_news(recipe.retrain_every)
         by_hand = self._is_requested and self._by_hand
         if self.live.pinned and not by_hand:
+            self._is_requested = False
             return None
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
         n_labels = max(self.labels.new_labels, len(self._window))
@@ -470,6 +470,7 @@ class Learner:
         self._was_accepted = candidate.model is not None
         self._note_outcome(candidate.report)
         if candidate.model is not None:
+            self._start = None  # lets go of the previous model
             # An update of the rule may have failed since the candidate took it over.
             GuardedModel(candidate.model).prepare(self.live.newest)
             self.live.swap_in(candidate.model, candidate.report.version, candidate.trained_on)
