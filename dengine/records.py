@@ -119,7 +119,8 @@ class TraceSpec:
     fit : {"strict", "cut", "pad", "resample"}, default "strict"
         What happens to a trace of another length, see `traces.fit_length`. strict: TraceError. cut:
         a longer one loses its end. pad: like cut, and a shorter one repeats its last sample.
-        resample: linear interpolation. A trace that cannot be fitted becomes NaN and is verified.
+        resample: linear interpolation. Half to twice the length can be padded or resampled; any
+        other length is a TraceError.
     columns : tuple of str, default ()
         Names of the channels, by which the columns of a DataFrame are selected.
 
@@ -271,6 +272,15 @@ class Decision:
         0 if the part was accepted or rejected: its label, if one comes, was not asked for.
         """
         return self.propensity if self.action is Action.VERIFY else 0.0
+
+
+TRAINED = "accepted"  # begins the reason of a version that was trained and answers
+REPEATS = "traces nearly repeat another"  # in a note of a retrain's reason
+REPEATS_MEANING = (
+    "If parts come twice, under two numbers or none, a label counts as two independent trials, and "
+    "too many parts are certain: give a part the same number each time it comes. A process may "
+    "also repeat that well with distinct parts; decisions stay as they are."
+)
 
 
 @dataclass(frozen=True, slots=True)

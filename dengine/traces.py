@@ -152,7 +152,7 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     ----------
     x : Tensor of float32, shape (..., T)
     samples : int
-        The length to return.
+        The length to return; `can_fit_length` must be True.
     fit : int
         Position in `FITS` of "cut", "pad" or "resample". The first two keep each sample's time from
         the start: both drop what is too much at the end, and pad repeats the last sample. resample
@@ -161,17 +161,10 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     Returns
     -------
     Tensor of float32, shape (..., samples)
-        If `can_fit_length` is False, the trace is cut or padded with NaN, and at least its last
-        sample is NaN, so that `TraceGate` finds it.
     """
-    length = x.size(-1)
-    last = length - 1
-    can_fit = can_fit_length(length, samples, fit)
-    if fit != 3 or not can_fit:
-        result = x.index_select(-1, torch.arange(samples).clamp(max=last))
-        if not can_fit:
-            result[..., min(length, samples - 1) :].fill_(float("nan"))
-        return result
+    last = x.size(-1) - 1
+    if fit != 3:
+        return x.index_select(-1, torch.arange(samples).clamp(max=last))
     position = torch.arange(samples, dtype=torch.float64) * (last / max(samples - 1, 1))
     left = position.floor().to(torch.int64).clamp(max=last)
     low = x.index_select(-1, left).to(torch.float64)
@@ -269,8 +262,8 @@ def _as_real(values: ArrayLike) -> NDArray[np.float32]:
 def _match_spec(x: NDArray[np.float32], trace_spec: TraceSpec) -> NDArray[np.float32]:
     """Return traces (..., C, T) fitted to the number of samples of a `TraceSpec`.
 
-    Traces of that length are returned as they are; others are fitted as `trace_spec.fit` says, or
-    raise TraceError if that is "strict". Another number of channels raises TraceError.
+    Traces of that length are returned as they are; others are fitted as `trace_spec.fit` says.
+    Raises TraceError for a length that cannot be fitted so, and for another number of channels.
     """
     channels, samples = x.shape[-2:]
     if channels != trace_spec.channels:
@@ -287,6 +280,11 @@ def _match_spec(x: NDArray[np.float32], trace_spec: TraceSpec) -> NDArray[np.flo
         new = f"TraceSpec(samples={trace_spec.samples}, fit='pad')"
         do = f"resample the trace to {form}, or start a new store with {new}"
         raise TraceError(f"Expected {trace_spec.samples} samples, got {samples}; {do}.")
+    if not can_fit_length(samples, trace_spec.samples, FITS.index(trace_spec.fit)):
+        n = trace_spec.samples
+        wanted = f"at least {n}" if trace_spec.fit == "cut" else f"{-(-n // 2)} to {2 * n}"
+        do = f"{trace_spec.fit} fits no other length: record a whole insertion, and nothing else"
+        raise TraceError(f"Expected {wanted} samples, got {samples}; {do}.")
     tensor = torch.from_numpy(np.array(x, order="C"))
     return np.asarray(fit_length(tensor, trace_spec.samples, FITS.index(trace_spec.fit)))
 

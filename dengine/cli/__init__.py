@@ -30,6 +30,7 @@ from .store import (
     forget,
     import_labels,
     policy,
+    release,
     report,
     retrain,
     rollback,
@@ -102,6 +103,6 @@ def main() -> None:
 
 for command in (
     *(data, replay, compare, costs, train, run, serve, simulate, status, history, explain, verify),
-    *(report, correct, forget, rollback, policy, retrain, backup, export, import_labels),
+    *(report, correct, forget, rollback, release, policy, retrain, backup, export, import_labels),
 ):
     main.add_command(command)

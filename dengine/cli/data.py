@@ -49,6 +49,7 @@ def data(source: DataChoice, out: Out | None) -> None:
     from ..experiments.figures import data_picture
     from ..experiments.survey import survey_dataset
     from ..model.neighbours import MANY_REPEATS
+    from ..records import REPEATS, REPEATS_MEANING
 
     dataset = load_dataset(source.data, **source.options)
     survey = survey_dataset(dataset)
@@ -68,10 +69,7 @@ def data(source: DataChoice, out: Out | None) -> None:
             "seen."
         )
     if survey.near_repeats > MANY_REPEATS:
-        parts.append(
-            "Many traces nearly repeat another part's. If parts come twice, give their numbers "
-            "(--part)."
-        )
+        parts.append(f"{survey.near_repeats} {REPEATS}. {REPEATS_MEANING}")
     print_result(
         {"data": source.data, "survey": survey, "notes": dataset.notes, "reading": dataset.reading},
         *parts,

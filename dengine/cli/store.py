@@ -1,5 +1,5 @@
 """The verbs that change, check or copy a store by hand: `report`, `correct`, `forget`, `rollback`,
-`policy`, `retrain`, `verify`, `backup` and `import-labels`.
+`release`, `policy`, `retrain`, `verify`, `backup` and `import-labels`.
 
 Those up to `retrain` change a store's engine, or show its policy; `verify` checks the store's
 history, `backup` copies it, and `import-labels` takes the labels of an exported cell.
@@ -162,9 +162,17 @@ def forget(
 def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
     """Use an earlier model version again, as a new version.
 
-    Labels that came since are among its references, and corrections count.
+    Labels that came since are among its references, and corrections count. It is pinned: no
+    automatic retrain replaces it, until `dengine release` or `dengine retrain`.
     """
     _change_and_print(store, author, allow_import, lambda engine: engine.rollback(version, author))
+
+
+@verb("dengine release engine.db")
+@store_options
+def release(store: str, author: str, allow_import: bool) -> None:
+    """Let retrains replace a pinned version again."""
+    _change_and_print(store, author, allow_import, lambda engine: engine.release(author))
 
 
 @verb("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
@@ -206,8 +214,8 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels as they count.
 
-    An event records it. A candidate that fails its gate is dropped, the previous version stays in
-    use, and the exit code is 1.
+    An event records it. The new version replaces a pinned one, too. A candidate that fails its gate
+    is dropped, the previous version stays in use, and the exit code is 1.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line

@@ -47,7 +47,7 @@ class Candidate:
     model : EngineModel or None
         None where the version is dropped: then only the report is stored.
     report : RetrainReport
-    trained_on : TrainedOn or None
+    trained_on : TrainedOn
         Set by `complete_report`.
     storing : Future or None
         The commit of the version, once it has begun; it returns the version's number in the store.
@@ -60,7 +60,7 @@ class Candidate:
         self.report = RetrainReport(
             version, 0.0, len(trained.seq), trained.n_steps, False, trained.reason
         )
-        self.trained_on: TrainedOn | None = None
+        self.trained_on = TrainedOn()
         self.storing: Future[int] | None = None
         self._clock = clock
         self._seq = trained.seq

@@ -559,7 +559,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     # Learning
 
     def retrain(self) -> RetrainReport:
-        """Retrain now, in this thread, and return the report.
+        """Retrain now, in this thread, and return the report; the new version is not pinned.
 
         It first waits for the imports that began with the engine, some two seconds after its start.
         A version that fails, or cannot be stored, is dropped: the report has `accepted` False then.
@@ -579,8 +579,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._corrections.forget(*decision_ids, author=author, reason=reason)
 
     def rollback(self, version: int, author: str = "") -> Changed:
-        """Let an earlier version answer again, as a new version; see `Corrections.rollback`."""
+        """Let an earlier version answer again until `release`; see `Corrections.rollback`."""
         return self._corrections.rollback(version, author)
+
+    def release(self, author: str = "") -> Changed:
+        """Let retrains replace a pinned version again; see `Corrections.release`."""
+        return self._corrections.release(author)
 
     # Policy
 

@@ -49,7 +49,7 @@ from ..decision.scripting import (
 from ..errors import ExportError, StoreError, expect, listed
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, describe_estimator
-from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
+from ..records import ACTIONS, REASONS, REPEATS, Reason, TraceSpec, as_success
 from ..reducers import class_default, make_reducer
 from ..reducers.base import (
     SAME_POINTS,
@@ -965,6 +965,6 @@ def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
         return ""
     n_compared = min(len(traces), NEWEST)
     return (
-        f"{n_repeats} of the newest {n_compared} traces nearly repeat another: "
+        f"{n_repeats} of the newest {n_compared} {REPEATS}: "
         "if parts come twice, give their numbers (part=)"
     )

@@ -240,6 +240,7 @@ def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell, tmp_path:
         page.wait_for_timeout(500)
     expect(page.locator("#result")).to_have_text(begun)
     confirmed(page, "Roll back")
+    confirmed(page, "Release the version")
     page.get_by_role("button", name="Export").click()
     with page.expect_download() as download:
         page.get_by_role("button", name="Do it").click()
@@ -249,7 +250,7 @@ def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell, tmp_path:
     with demo.store() as store:
         done = {event.kind for event in store.events(20) if event.author == "Robin"}
         trace = store.get_decision(store.decisions(HistoryFilter(), 1)[0].decision.id).trace
-    assert done == {"retrain", "rollback", "export"}
+    assert done == {"retrain", "rollback", "release", "export"}
     assert load_exported(tmp_path / "model.ts").decide(trace).action in Action
 
 

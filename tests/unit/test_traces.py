@@ -1,6 +1,7 @@
 """Where a trace enters: shapes and types are the caller's, faults are the world's."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,9 @@ from dengine import (
     load_exported,
 )
 from dengine.decision.scripting import script
-from dengine.engine.engine import core_of
 from dengine.errors import SettingError
 from dengine.records import FITS, stored_trace_spec
-from dengine.traces import REASONS, TraceGate, as_trace, can_fit_length, fit_length, spec_of
+from dengine.traces import REASONS, TraceGate, as_trace, can_fit_length, spec_of
 from tests.support.driving import learn
 
 NO_TRACES = (np.float32(3.0), np.zeros((2, 3, 4)), np.zeros(0), np.zeros((1, 0)), np.zeros((0, 5)))
@@ -237,19 +237,17 @@ def test_resample_is_linear_interpolation_over_the_whole(
     seed=st.integers(0, 99),
 )
 @settings(max_examples=150, deadline=None)
-def test_what_cannot_honestly_be_fitted_is_not_finite_and_nothing_else_is(
+def test_what_cannot_honestly_be_fitted_is_refused_and_nothing_else_is(
     have, samples: int, fit: int, seed: int
 ) -> None:
-    x = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, have)).astype(np.float32))
-    result = fit_length(x, samples, fit)
-    assert result.shape == (2, samples)
-    assert bool(result.isfinite().all()) == can_fit_length(have, samples, fit)
+    x = np.random.default_rng(seed).normal(size=(2, have)).astype(np.float32)
+    spec = TraceSpec(samples, channels=2, fit=FITS[fit])
     honest = have >= samples if fit == 1 else samples <= 2 * have <= 4 * samples
     assert can_fit_length(have, samples, fit) == honest
-    if not honest:  # it keeps what there is
-        kept = min(have, samples - 1)
-        assert torch.equal(result[:, :kept], x[:, :kept])
-        assert result[:, kept:].isnan().all()
+    with nullcontext() if honest else pytest.raises(TraceError, match=f"samples, got {have}; "):
+        fitted = as_trace(x, spec)
+        assert fitted.shape == (2, samples)
+        assert np.isfinite(fitted).all()
 
 
 def other_lengths(data: Dataset) -> list[np.ndarray]:
@@ -275,6 +273,13 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(
     decided = []
     assert exported.trace == engine.trace
     for x in other_lengths(make_data(130, samples=SAMPLES, seed=7)):
+        if not can_fit_length(len(x), SAMPLES, FITS.index(fit)):
+            for decide in (engine.decide, exported.decide):
+                with pytest.raises(TraceError, match=f"got {len(x)}"):
+                    decide(x)
+            with pytest.raises(torch.jit.Error, match="Expected one trace of 1 x 100 samples"):
+                exported.module.decide(torch.from_numpy(x))
+            continue
         ours = engine.decide(x)
         theirs = exported.decide(x)
         raw = exported.module.decide(
@@ -295,19 +300,8 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(
             np.testing.assert_array_equal(raw[6].numpy(), theirs.embedding)
         decided.append((x, ours))
     for x, decision in decided:
-        lost = not can_fit_length(len(x), SAMPLES, FITS.index(fit)) or np.isnan(x[:SAMPLES]).any()
-        assert (decision.reason is Reason.NOT_FINITE) == lost
+        assert (decision.reason is Reason.NOT_FINITE) == np.isnan(x[:SAMPLES]).any()
     assert {decision.action for _, decision in decided} >= {Action.VERIFY, Action.ACCEPT}
-    lost = engine.decide(np.linspace(0, 9, 30))
-    labels = core_of(engine).new_labels
-    engine.report(lost.id, True)
-    kept = engine.store.get_decision(lost.id)  # and never learned from
-    assert (lost.reason, kept.quarantined, core_of(engine).new_labels) == (
-        Reason.NOT_FINITE,
-        True,
-        labels,
-    )
-    np.testing.assert_array_equal(kept.trace[0, :30], np.linspace(0, 9, 30, dtype=np.float32))
 
 
 def recording(samples: int = 60) -> pd.DataFrame:
