@@ -241,24 +241,39 @@ _EXPECT = (
 )
 
 
+_ACKNOWLEDGE = "First end the alarms about lost data. They stay in the event log."
+
+
 @verb("dengine verify engine.db")
 @click.argument("store", metavar="STORE")
 @click.option("--cell", metavar="ID", help=_CELL)
 @click.option("--expect", metavar="DIGEST", help=_EXPECT)
+@click.option("--acknowledge", is_flag=True, help=_ACKNOWLEDGE)
+@author_option
 @click.pass_context
-def verify(context: click.Context, store: str, cell: str | None, expect: str | None) -> None:
+def verify(
+    context: click.Context,
+    store: str,
+    cell: str | None,
+    expect: str | None,
+    acknowledge: bool,
+    author: str,
+) -> None:
     """Check that a store's history is what was written.
 
     Every row is compared with its checksum, and every entry of the ledger with its rows. What was
-    changed, is missing or was never chained is listed, with exit code 1. Nothing is written, and
-    engines may run meanwhile.
+    changed, is missing or was never chained is listed, with exit code 1, and so is data that was
+    lost. Nothing is written but for --acknowledge, and engines may run meanwhile.
     """
-    from ..store.verification import verify_history
+    from ..store.verification import acknowledge_losses, verify_history
 
+    losses = acknowledge_losses(store, cell, author) if acknowledge else []
     with progress_bar("rows", None) as advance:
         report = verify_history(store, cell, expect, advance)
     record = {"store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults}
-    print_result(record, *_verification_lines(report))
+    record |= {"acknowledged": losses} if acknowledge else {}
+    acknowledged = [f"Acknowledged: {event.text}" for event in losses]
+    print_result(record, *acknowledged, *_verification_lines(report))
     if not report.ok:
         context.exit(1)
 

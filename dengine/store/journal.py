@@ -7,10 +7,14 @@ verification read it.
 
 Each record has its length, its CRC-32, and a digest over itself and the record before, so that a
 changed record and a missing one are both noticed. The header names the process that owns the cell,
-the offset up to which the store holds the records, and the newest entry of the cell's ledger that
-the store held: a store that was cut off or restored from an older copy lacks that entry. A small
-file beside the journal, its head, repeats the entry, for the case that the journal was lost
-together with the store.
+the records that the store holds (their number, and the offset up to which they stand), and the
+newest entry of the cell's ledger that the store held: a store that was cut off or restored from an
+older copy lacks that entry.
+
+A small file beside the journal, its head, repeats the entry, and names the newest synced record
+(number and digest). It is written before a record is acknowledged: a journal that lacks the record
+has lost its end. The head is synced later than the journal, by the thread that drains: after a
+power failure it may be older than the journal, never newer.
 """
 
 import hashlib
@@ -20,18 +24,21 @@ import re
 import socket
 import struct
 import sys
+import threading
 import urllib.parse
 import urllib.request
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 from ..errors import StoreError, instead
 from ..records import Decision
-from .owned_file import OwnedFile, open_plain
+from .owned_file import OwnedFile, open_plain, sync
 from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
 # Length of a record's JSON text, before it; the samples of a trace or point follow it.
@@ -39,10 +46,12 @@ LENGTH = struct.Struct("<I")
 # Bytes: 1,800 traces of 1000 samples, or 2.5 hours of a cell that verifies every part.
 RESERVE = 8 << 20
 HEADER = 256  # bytes of the header; the first record begins there
+HEAD = 512  # bytes of the head
 MAGIC = b"dengine journal 2\n"
 MARK = b"\x89rec"  # where a record begins, to find the next one behind a damaged length
 IGNORES_CASE = sys.platform in ("win32", "darwin")  # of names in its usual file systems
 FRAME = struct.Struct("<4sII16s")  # before a record: mark, length, CRC-32, digest
+DAMAGES = (ValueError, LookupError, TypeError)  # of reading a damaged header or head
 
 Record = StoredDecision | NewLabel | Event
 
@@ -81,6 +90,37 @@ def decode_record(blob: bytes) -> Record:
         return from_row(Event, row)
 
 
+@dataclass(frozen=True, slots=True)
+class Head:
+    """The content of the small file beside a journal; by default that of an earlier release.
+
+    Attributes
+    ----------
+    newest : (int, str) or None
+        Number and digest of the newest ledger entry of the store.
+    drained : int
+        Offset up to which the store holds the records.
+    n_drained : int
+        Number of the last record that the store holds: 1, 2, ... in a journal.
+    drained_time : float
+        When that was written, in seconds since 1970.
+    n_synced : int
+        Number of the newest record that is synced in the journal.
+    digest : str
+        Of that record, hexadecimal.
+    time : float
+        When it was written.
+    """
+
+    newest: tuple[int, str] | None
+    drained: int = HEADER
+    n_drained: int = 0
+    drained_time: float = 0.0
+    n_synced: int = 0
+    digest: str = ""
+    time: float = 0.0
+
+
 class Journal:
     """An open journal file. One thread appends; any thread may read.
 
@@ -99,16 +139,21 @@ class Journal:
     end : int
         Offset behind the last record, in bytes.
     drained_to : int
-        Offset up to which the store holds the records; set by the outbox.
+        Offset up to which the store holds the records; see `mark_drained`.
     newest_entry : (int, str) or None
         Number and digest of the newest ledger entry that the header names; None: no entry yet.
-    head_entry : (int, str) or None
-        The same as the head beside the journal has it.
+    head : Head or None
+        The head beside the journal, as it was at the opening; None if it is missing or damaged.
     dropped : int
-        Bytes of an unfinished record at the end, left by a killed process and cut off. That record
-        was never acknowledged.
+        Bytes of unfinished records at the end, left by a killed process and cut off. Those records
+        were never acknowledged.
+    missing : int
+        Records up to the one that the head names that are neither here nor in the store.
+    missing_since : float
+        When the record before the first missing one was written, in seconds since 1970.
     damaged : int
-        Records that are missing or not as they were written. The others are read all the same.
+        Places where a record is missing or not as it was written. The others are read all the same.
+        Behind the record that the head names, such a place counts as `dropped`.
 
     Raises
     ------
@@ -122,10 +167,16 @@ class Journal:
         self.drained_to = HEADER
         self.end = HEADER
         self.dropped = 0
+        self.missing = 0
+        self.missing_since = 0.0
         self.damaged = 0
         self.newest_entry: tuple[int, str] | None = None
-        self.head_entry = _read_head(path)
+        self.head = _read_head(path)
+        self._n_drained = self._n_synced = 0
+        self._drained_time = self._time = 0.0
         self._digest = bytes(16)
+        # Guards what header and head hold: two threads write them.
+        self._describing = threading.RLock()
         self._owning = owning
         self._file = _open_file(path, owning)
         try:
@@ -143,16 +194,30 @@ class Journal:
         """Whether the store holds all records."""
         return self.drained_to >= self.end
 
-    def append(self, records: Sequence[bytes]) -> list[int]:
+    @property
+    def loss(self) -> str:
+        """What was found damaged or missing at the opening, in words; "" if nothing was."""
+        if self.missing and self.head is not None:
+            return describe_loss(self.missing, self.missing_since, self.head.time)
+        if self.damaged:
+            return (
+                f"the journal was not as it was written in {self.damaged} places, which were left "
+                "out."
+            )
+        return ""
+
+    def append(self, records: Sequence[bytes], time: float) -> list[int]:
         """Append encoded records behind the last one, and return when they are synced to the disk.
 
-        If it fails, the journal's end stays where it was, and the same records can be appended
-        again.
+        The head then names the newest of them. If it fails, the journal's end stays where it was,
+        and the same records can be appended again.
 
         Parameters
         ----------
         records : sequence of bytes
             As `encode_record` returns them.
+        time : float
+            The present time, in seconds since 1970.
 
         Returns
         -------
@@ -181,9 +246,43 @@ class Journal:
                 f"The journal {self.path} was deleted, moved or replaced while it was open; "
                 "leave it."
             )
-        self.end += len(framed)
-        self._digest = digest
+        with self._describing:
+            self.end += len(framed)
+            self._n_synced += len(records)
+            self._time = time
+            self._digest = digest
+            self._write_head()
         return offsets
+
+    def sync(self) -> None:
+        """Sync the file; before `clear`, so that no disk keeps the cut and not the header.
+
+        Raise StoreError if the disk fails.
+        """
+        with _os_errors(self.path):
+            self._file.sync()
+
+    def sync_head(self) -> None:
+        """Sync the head to the disk, which may take as long as a sync of the journal.
+
+        A failure is ignored: after a power failure the head is then older than the journal.
+        """
+        with suppress(OSError):
+            descriptor = open_plain(head_path(self.path), os.O_WRONLY)
+            try:
+                sync(descriptor)
+            finally:
+                os.close(descriptor)
+
+    def mark_drained(self, end: int, n: int, time: float) -> None:
+        """Note that the store has taken `n` more records, the last of which ends at offset `end`.
+
+        `time` is when that record was written. `save_newest_entry` writes it to the disk.
+        """
+        with self._describing:
+            self.drained_to = end
+            self._n_drained = min(self._n_drained + n, self._n_synced)
+            self._drained_time = time
 
     def read(self, offset: int) -> bytes:
         """Return the encoded record at an offset that `append` returned.
@@ -217,31 +316,47 @@ class Journal:
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
     def save_newest_entry(self, newest: tuple[int, str] | None) -> None:
-        """Write the newest ledger entry and `drained_to` to the header, the entry also to the head.
+        """Write the newest ledger entry and `drained_to` to the header and to the head.
 
         Set `newest_entry`. Nothing is synced: an older header is harmless, since the store ignores
         a record that it is given twice. Raise StoreError if the header cannot be written; a failure
-        of the head is ignored. None leaves the head as it is.
+        of the head is ignored.
         """
-        self.newest_entry = newest
-        with _os_errors(self.path):
+        with self._describing, _os_errors(self.path):
+            self.newest_entry = newest
             self._file.write(self._header(), 0)
-        if newest is None:
-            return
-        path = head_path(self.path)
+            self._write_head()
+
+    def _write_head(self) -> None:
+        """Write the head as this journal now is, without a sync; a failure is ignored."""
+        head = Head(
+            self.newest_entry,
+            self.drained_to,
+            self._n_drained,
+            self._drained_time,
+            self._n_synced,
+            self._digest.hex(),
+            self._time,
+        )
+        content = _pack_fields(asdict(head)).ljust(HEAD)
         # An older head is harmless.
-        with suppress(OSError), os.fdopen(open_plain(path, os.O_WRONLY | os.O_CREAT), "wb") as head:
-            head.write(json.dumps(newest).ljust(HEADER).encode())
+        with suppress(OSError):
+            descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
+            try:
+                os.write(descriptor, content)
+            finally:
+                os.close(descriptor)
 
     def clear(self) -> None:
         """Remove all records, drained or not; the caller has made sure that the store holds them.
 
-        The file is cut off behind its header, which frees the reserved space: call `reserve`
-        afterwards. Raise StoreError if the file cannot be written.
+        The file is cut off behind its header, which frees the reserved space: call `sync` before
+        and `reserve` afterwards. Raise StoreError if the file cannot be written.
         """
-        with _os_errors(self.path):
+        with self._describing, _os_errors(self.path):
             self._file.truncate(HEADER)
             self.drained_to = HEADER
+            self._n_drained = self._n_synced
             self.end = HEADER
             self._digest = bytes(16)
             self.damaged = 0
@@ -284,20 +399,22 @@ class Journal:
         """
         if self._owning and not self._file.closed:
             with _os_errors(self.path):
+                self._file.sync()  # the header, or a disk might keep the cut without it
                 self._file.truncate(HEADER if self.is_drained else self.end)
         self._file.close()
 
     def _header(self) -> bytes:
         """Return the header, HEADER bytes: MAGIC, then JSON, padded with zeros.
 
-        The JSON has this process as the owner, `drained_to` and `newest_entry`.
+        The JSON has this process as the owner, the drained records and `newest_entry`.
         """
         fields = {
-            "owner": describe_process()[:80],
+            "owner": describe_process()[:64],
             "drained": self.drained_to,
             "newest": self.newest_entry,
+            "n_drained": self._n_drained,
         }
-        return (MAGIC + json.dumps(fields).encode()).ljust(HEADER, b"\0")
+        return (MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0")
 
     def _write_header_and_reserve(self) -> None:
         """Write the header, and reserve disk space for records."""
@@ -305,39 +422,72 @@ class Journal:
         self.reserve()
 
     def _scan(self) -> None:
-        """Read the header and all undrained records, and set the attributes that describe them.
+        """Read header, head and all undrained records, and set the attributes that describe them.
 
-        These are `drained_to`, `newest_entry`, `end`, `dropped`, `damaged` and the digest of the
-        last record. With a damaged header all records count as undrained. Nothing is written. Raise
-        StoreError if the file is no journal.
+        These are the ends and numbers of the drained and the synced records, the digest of the
+        last one, `newest_entry`, `dropped`, `missing`, `missing_since` and `damaged`. With a
+        damaged header all records count as undrained. Nothing is written. Raise StoreError if the
+        file is no journal.
         """
-        size = self._file.size
-        if size == 0:
-            return
-        header = self._file.read(HEADER, 0)
-        if not header.startswith(MAGIC):
-            raise StoreError(
-                f"Expected a journal of dengine, found another file: {self.path}; move it away."
-            )
-        try:
-            self.drained_to, self.newest_entry, _ = _parse_header(header)
-        except (ValueError, KeyError, TypeError):  # all of it is drained again, which is harmless
-            self.damaged += 1
-        # The first record is not checked: those before it may be gone.
+        head = self.head or Head(None)
+        self._n_drained = head.n_drained
+        counted_from = head.drained
+        if self._file.size:
+            header = self._file.read(HEADER, 0)
+            if not header.startswith(MAGIC):
+                raise StoreError(
+                    f"Expected a journal of dengine, found another file: {self.path}; move it away."
+                )
+            try:
+                self.drained_to, self.newest_entry, n_drained, _ = _parse_header(header)
+                counted_from = self.drained_to
+                if n_drained is None:  # an earlier release wrote the header, and no numbers
+                    head = Head(head.newest)
+                self._n_drained = n_drained or 0
+            except DAMAGES:  # all is drained again, which is harmless
+                self.damaged += 1
+        self.end = max(self._file.size, HEADER)
+        self.drained_to = min(max(self.drained_to, HEADER), self.end)
+        digests = self._scan_records(head, counted_from)
+        n_known = max(head.n_drained, self._n_drained + len(digests))
+        if head.n_synced > self._n_drained:
+            self.missing = max(head.n_synced - n_known, bytes.fromhex(head.digest) not in digests)
+        self._n_synced = max(head.n_synced, n_known)
+        self._time = head.time
+
+    def _scan_records(self, head: Head, counted_from: int) -> set[bytes]:
+        """Read all undrained records; return the digests of those from offset `counted_from` on.
+
+        Set `end`, `dropped`, `damaged`, `missing_since` and the digest of the last record. Damage
+        behind the newest record that was acknowledged, which `head` names, counts as dropped.
+        """
+        digests: set[bytes] = set()
+        newest = bytes.fromhex(head.digest)
+        is_acknowledged = not newest or head.n_synced > self._n_drained
+        # The first record's digest is not checked: those before it may be gone.
         previous: bytes | None = None
-        self.drained_to = min(max(self.drained_to, HEADER), size)
+        intact: bytes | None = None  # the last record before any damage
         begin = self.drained_to
-        self.end = size
         for offset, end, record in self.undrained_records():
             digest: bytes = FRAME.unpack(self._file.read(FRAME.size, offset))[3]
             follows = previous is None or digest == _chain_digest(previous, record)
-            self.damaged += offset > begin or not follows
+            if is_acknowledged:
+                self.damaged += offset > begin or not follows
+            else:
+                self.dropped += offset - begin
+            if offset >= counted_from:
+                digests.add(digest)
+            if not self.damaged:
+                intact = record
+            is_acknowledged &= digest != newest
             previous = digest
             begin = end
-        rest = self._file.read(size - begin, begin)
+        rest = self._file.read(self.end - begin, begin)
         self.end = begin
-        self.dropped = len(rest.rstrip(b"\0"))
+        self.dropped += len(rest.rstrip(b"\0"))
         self._digest = previous or bytes(16)
+        self.missing_since = decode_record(intact).time if intact else head.drained_time
+        return digests
 
     def _read_record(self, offset: int) -> bytes | None:
         """Return the encoded record at an offset, without its frame.
@@ -382,8 +532,8 @@ def _open_file(path: Path, owning: bool = True) -> OwnedFile:
         except BlockingIOError as error:
             try:
                 with path.open("rb") as file:
-                    owner = _parse_header(file.read(HEADER))[2]
-            except (OSError, ValueError, KeyError, TypeError):
+                    owner = _parse_header(file.read(HEADER))[3]
+            except (OSError, *DAMAGES):
                 owner = "another engine"
             raise owned_error(owner, str(path)) from error
 
@@ -433,13 +583,38 @@ def head_path(journal: Path) -> Path:
     return journal.with_name(f"{journal.name}.head")
 
 
+def describe_loss(n: int, since: float, until: float) -> str:
+    """Return in words that a journal lacks `n` records, written between two times, since 1970."""
+    first = f"after {datetime.fromtimestamp(since, UTC):%Y-%m-%d %H:%M:%S} and " if since else ""
+    return (
+        f"{n} records (decisions, labels or events) that were on disk are missing from the "
+        f"journal, written {first}up to {datetime.fromtimestamp(until, UTC):%Y-%m-%d %H:%M:%S} UTC."
+    )
+
+
+def find_loss(path: Path) -> str:
+    """Return in words which synced records a journal lacks, before an engine opens it; "" if none.
+
+    Nothing is locked or changed. Raise StoreError if the file cannot be read or is no journal.
+    """
+    if path.exists():
+        journal = Journal(path, owning=False)
+        journal.close()
+        return journal.loss
+    head = _read_head(path)
+    if head is None or head.n_synced == head.n_drained:
+        return ""
+    return describe_loss(head.n_synced - head.n_drained, head.drained_time, head.time)
+
+
 def read_newest_entries(path: Path) -> set[tuple[int, str]]:
     """Return the ledger entries (number, digest) that a journal's header and its head name.
 
     They are none, one or two; a file that is missing or damaged names none.
     """
-    entries = {_read_head(path)}
-    with suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as file:
+    head = _read_head(path)
+    entries = {None if head is None else head.newest}
+    with suppress(OSError, *DAMAGES), path.open("rb") as file:
         entries.add(_parse_header(file.read(HEADER))[1])
     return {entry for entry in entries if entry is not None}
 
@@ -464,26 +639,49 @@ def read_undrained(path: Path) -> list[Record]:
     ]
 
 
-def _read_head(journal: Path) -> tuple[int, str] | None:
-    """Return number and digest of the ledger entry in the head, the small file beside a journal.
-
-    None if the head is missing or damaged, or names no entry.
-    """
-    with suppress(OSError, ValueError, TypeError):
-        number, digest = json.loads(head_path(journal).read_bytes())
-        return int(number), str(digest)
+def _read_head(journal: Path) -> Head | None:
+    """Return the content of the head beside a journal; None if it is missing or damaged."""
+    with suppress(OSError, *DAMAGES):
+        fields = _unpack_fields(head_path(journal).read_bytes())
+        return Head(**fields | {"newest": _parse_entry(fields["newest"])})
     return None
 
 
-def _parse_header(header: bytes) -> tuple[int, tuple[int, str] | None, str]:
-    """Return the fields of a header: drained offset, newest ledger entry or None, owner.
+def _parse_header(header: bytes) -> tuple[int, tuple[int, str] | None, int | None, str]:
+    """Return the fields of a header: drained offset, newest ledger entry or None, number, owner.
 
-    Raise ValueError, KeyError or TypeError for a damaged header.
+    The number is that of the last drained record, None in the header of an earlier release. For a
+    damaged header an error of DAMAGES is raised.
     """
-    fields = json.loads(header[len(MAGIC) :].rstrip(b"\0"))
-    newest = fields["newest"]
-    entry = None if newest is None else (int(newest[0]), str(newest[1]))
-    return int(fields["drained"]), entry, str(fields["owner"])
+    fields = _unpack_fields(header[len(MAGIC) :])
+    newest = _parse_entry(fields["newest"])
+    return int(fields["drained"]), newest, fields.get("n_drained"), str(fields["owner"])
+
+
+def _parse_entry(entry: Any) -> tuple[int, str] | None:
+    """Return a ledger entry of a header or head as number and digest, or None."""
+    return None if entry is None else (int(entry[0]), str(entry[1]))
+
+
+def _pack_fields(fields: dict[str, Any]) -> bytes:
+    """Return fields as JSON that ends with their CRC-32, for `_unpack_fields`."""
+    crc = zlib.crc32(json.dumps(fields).encode())
+    return json.dumps(fields | {"crc": crc}, separators=(",", ":")).encode()
+
+
+def _unpack_fields(content: bytes) -> dict[str, Any]:
+    """Return the fields of a header or head; those of earlier releases have no CRC-32.
+
+    An error of DAMAGES is raised if they are damaged.
+    """
+    fields = json.loads(content.rstrip(b"\0 "))
+    if isinstance(fields, list):
+        return {"newest": fields}
+    if "n_drained" in fields or "crc" in fields:
+        crc = fields.pop("crc")
+        if zlib.crc32(json.dumps(fields).encode()) != crc:
+            raise ValueError("the checksum differs")
+    return dict(fields)
 
 
 def forked_error(pid: int, name: str) -> StoreError:

@@ -10,7 +10,7 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -39,6 +39,12 @@ SAFE_MODE_BEGAN = "safe mode"
 SAFE_MODE_ENDED = "safe mode ended"
 POLICY_CHANGED = "policy"  # its data holds the old and the new policy
 SHADOW_CHANGED = "shadow"  # likewise
+DATA_LOST = "lost"  # an alarm until the next event ACKNOWLEDGED
+ACKNOWLEDGED = "acknowledged"
+LOSS_REMEDY = (
+    "Report the outcomes of that time again, then end this alarm: dengine verify STORE "
+    "--acknowledge."
+)
 T = TypeVar("T")
 NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
 # The first label and a second one that replaces it: silence confirmed the part, then it stopped the
@@ -360,6 +366,20 @@ class Event:
     author: str = ""
 
     when = property(_when)
+
+
+def open_losses(events: Iterable[Event]) -> list[Event]:
+    """Return those of a cell's events, oldest first, that say that data was lost.
+
+    Those before the newest acknowledgement are left out.
+    """
+    losses: list[Event] = []
+    for event in events:
+        if event.kind == ACKNOWLEDGED:
+            losses.clear()
+        elif event.kind == DATA_LOST:
+            losses.append(event)
+    return losses
 
 
 @dataclass(frozen=True, slots=True)

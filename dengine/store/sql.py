@@ -44,6 +44,7 @@ from .queries import (
     training_query,
 )
 from .records import (
+    ACKNOWLEDGED,
     CHUNK,
     FORGOTTEN,
     KEEP,
@@ -68,6 +69,7 @@ from .records import (
     from_row,
     keeps_state,
     nothing_to_correct,
+    open_losses,
     overdue_outcomes,
     read_decision,
     to_npz,
@@ -903,6 +905,29 @@ class SqlStore(AbstractContextManager["SqlStore"]):
                 self.put_event("damaged", text)
             except StoreError as error:  # a store that can only be read is read all the same
                 log.warning("%s (%s)", text, error)
+
+    def acknowledge_losses(self, author: str = "") -> list[Event]:
+        """End the alarm about lost data by an event of kind "acknowledged".
+
+        Parameters
+        ----------
+        author : str
+
+        Returns
+        -------
+        list of Event
+            What was acknowledged, oldest first; [] if there was no alarm: then nothing is written.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
+        losses = open_losses(self.events())
+        if losses:
+            numbers = ", ".join(str(event.number) for event in losses)
+            self.put_event(ACKNOWLEDGED, f"lost data, events {numbers}", author=author)
+        return losses
 
     def events(self, limit: int | None = None) -> list[Event]:
         """Return the newest events of the cell, oldest first.

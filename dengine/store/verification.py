@@ -25,7 +25,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from .connections import reading, run_integrity_check
-from .journal import journal_path, read_newest_entries, read_undrained
+from .journal import find_loss, journal_path, read_newest_entries, read_undrained
 from .ledger import (
     START,
     check_key,
@@ -36,8 +36,29 @@ from .ledger import (
     rows_digest,
     state_sum,
 )
-from .records import CHUNK
-from .schema import CHAINED, DECISION, LABEL, LEDGER, METADATA, SCHEMA_KEY, SETTING, TRACE, VERSION
+from .records import (
+    ACKNOWLEDGED,
+    CHUNK,
+    DATA_LOST,
+    LOSS_REMEDY,
+    Event,
+    columns,
+    from_row,
+    open_losses,
+)
+from .schema import (
+    CHAINED,
+    DECISION,
+    EVENT,
+    LABEL,
+    LEDGER,
+    METADATA,
+    SCHEMA_KEY,
+    SETTING,
+    TRACE,
+    VERSION,
+)
+from .sql import SqlStore
 
 # The column of each chained table that, with the cell, identifies a row.
 KEY = {
@@ -126,8 +147,9 @@ def verify_history(
     """Check every row of a store's history; nothing is written, and engines may run meanwhile.
 
     What is wrong is returned as faults, not raised: a row that was changed, added or removed, a
-    damaged SQLite file, a ledger entry that a cell's journal names and the store lacks, and an
-    `expect` that no entry has. Takes about 80 bytes of memory per row.
+    damaged SQLite file, a ledger entry that a cell's journal names and the store lacks, lost data
+    that nobody has acknowledged, and an `expect` that no entry has. Takes about 80 bytes of memory
+    per row.
 
     Parameters
     ----------
@@ -162,6 +184,7 @@ def verify_history(
         journals = {name: journal_path(connection.engine.url, name) for name in names}
         journal_entries = {name: read_newest_entries(path) for name, path in journals.items()}
         waiting = {name: _count_undrained(path) for name, path in journals.items()}
+        losses = {name: _find_loss(path) for name, path in journals.items()}
     with reading(str(url)) as connection:  # a later snapshot: it has what the journals knew
         pages = run_integrity_check(connection) if connection.dialect.name == "sqlite" else []
         faults = [HistoryFault("", "file", "", finding) for finding in pages]
@@ -169,6 +192,9 @@ def verify_history(
         for check in checks:
             check_key(connection, check.cell_id, check.key)
             faults += check.run()
+            if loss := losses[check.cell_id]:
+                problem = f"is damaged: {loss} The next engine records that as an alarm"
+                faults.append(HistoryFault(check.cell_id, "journal", "", problem))
             missing = [
                 number
                 for number, digest in journal_entries[check.cell_id]
@@ -208,6 +234,51 @@ def _count_undrained(journal: Path) -> int | None:
     with suppress(StoreError):  # it is damaged, or another user's
         return len(read_undrained(journal)) if journal.exists() else None
     return None
+
+
+def _find_loss(journal: Path) -> str:
+    """Return in words which synced records a journal lacks; "" if none, or if it cannot be read.
+
+    It is read twice, since a running engine may empty it meanwhile.
+    """
+    loss = ""
+    for _ in range(2):
+        with suppress(StoreError):
+            loss = find_loss(journal)
+        if not loss:
+            break
+    return loss
+
+
+def acknowledge_losses(url: str, cell_id: str | None = None, author: str = "") -> list[Event]:
+    """End the alarms about lost data in a store; engines may run meanwhile.
+
+    Parameters
+    ----------
+    url : str
+        A file or URL.
+    cell_id : str or None
+        The cell; None: all cells.
+    author : str
+        Who acknowledges, for the record.
+
+    Returns
+    -------
+    list of Event
+        What was acknowledged; the events stay.
+
+    Raises
+    ------
+    StoreError
+        For what is no store, for an unknown cell, and if the store cannot be written.
+    """
+    with reading(str(url)) as connection:
+        names = _selected_cells(connection, cell_id)
+    losses: list[Event] = []
+    for name in names:
+        with SqlStore(str(url), name) as store:
+            losses += store.acknowledge_losses(author)
+    return losses
 
 
 def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
@@ -276,6 +347,7 @@ class CellCheck:
         ]
         faults += self._catch_database_errors(LEDGER.name, self._check_ledger())
         faults += self._catch_database_errors(SETTING.name, self._check_settings())
+        faults += self._catch_database_errors(EVENT.name, self._check_losses())
         if not self._is_unreadable:  # else everything that cannot be read would be missing
             for table, required in REQUIRED:
                 faults += self._catch_database_errors(
@@ -398,6 +470,16 @@ class CellCheck:
             yield self._fault(
                 SETTING.name, SCHEMA_KEY, "is missing: no engine has opened this cell"
             )
+
+    def _check_losses(self) -> Iterator[HistoryFault]:
+        """Yield a fault for each event that says that data was lost and is not acknowledged."""
+        query = sa.select(*(EVENT.c[name] for name in columns(Event)))
+        query = query.where(
+            EVENT.c.cell_id == self.cell_id, EVENT.c.kind.in_((DATA_LOST, ACKNOWLEDGED))
+        )
+        rows = self.connection.execute(query.order_by(EVENT.c.number))
+        for event in open_losses(from_row(Event, dict(row._mapping)) for row in rows):
+            yield self._fault(EVENT.name, event.number, f"says: {event.text} {LOSS_REMEDY}")
 
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
         """Yield a fault for each row of a table whose row of the required table is missing."""

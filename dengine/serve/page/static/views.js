@@ -34,7 +34,7 @@ export function warnings(status) {
   if (status.store_fault) texts.push(`The store cannot be written: ${status.store_fault}`);
   if (status.safe_mode) texts.push(`Safe mode: every part is verified until fresh evidence keeps the tolerance (${status.safe_mode})`);
   if (status.shadow) texts.push("Shadow mode: every part is verified, and the model only predicts");
-  if (status.alarm && !status.store_fault && !status.safe_mode) texts.unshift(status.alarm); // else the alarm has the same text
+  if (status.alarm && (status.loss || !status.safe_mode) && !status.store_fault) texts.unshift(status.alarm); // else the alarm has the same text
   return texts.map((text) => el("p", { class: "banner" }, icon("shield"), el("span", {}, text)));
 }
 
@@ -319,6 +319,7 @@ async function actions(get, _, status) {
     block("shadow", act.shadow(!status.shadow)), block("report", act.reportPart),
     block("rollback", act.rollback(choices), !back.length, "There is no earlier version."),
     block("policy", act.policy(status.recipe.policy)), block("retrain", act.retrain),
+    block("acknowledge", act.acknowledge, !status.loss, "No loss of data is known."),
     block("export", act.exported, status.version === 0, "There is no model yet."));
   return { title: "Actions", elements: [el("h1", {}, "Actions"), small("Each asks for confirmation and your name, which goes into the event log. Labels are corrected on the page of the part."), blocks] };
 }
