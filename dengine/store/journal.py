@@ -30,7 +30,7 @@ import urllib.request
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import blake2b
 from pathlib import Path
@@ -329,16 +329,16 @@ class Journal:
 
     def _write_head(self) -> None:
         """Write the head as this journal now is, without a sync; a failure is ignored."""
-        head = Head(
-            self.newest_entry,
-            self.drained_to,
-            self._n_drained,
-            self._drained_time,
-            self._n_synced,
-            self._digest.hex(),
-            self._time,
-        )
-        content = _pack_fields(asdict(head)).ljust(HEAD)
+        fields = {
+            "newest": self.newest_entry,
+            "drained": self.drained_to,
+            "n_drained": self._n_drained,
+            "drained_time": self._drained_time,
+            "n_synced": self._n_synced,
+            "digest": self._digest.hex(),
+            "time": self._time,
+        }
+        content = _pack_fields(fields).ljust(HEAD)
         # An older head is harmless.
         with suppress(OSError):
             descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
@@ -394,11 +394,10 @@ class Journal:
         """Cut off the reserved space, and the records if all are drained; close, unlock the file.
 
         The file stays with its header, for the next engine to compare with the ledger. A journal
-        that was opened for reading is only closed. Raise StoreError, and leave it open, if the cut
-        fails.
+        that was opened for reading is only closed, and so is one whose disk fails.
         """
         if self._owning and not self._file.closed:
-            with _os_errors(self.path):
+            with suppress(OSError):
                 self._file.sync()  # the header, or a disk might keep the cut without it
                 self._file.truncate(HEADER if self.is_drained else self.end)
         self._file.close()
@@ -409,7 +408,7 @@ class Journal:
         The JSON has this process as the owner, the drained records and `newest_entry`.
         """
         fields = {
-            "owner": describe_process()[:64],
+            "owner": describe_process()[:60],
             "drained": self.drained_to,
             "newest": self.newest_entry,
             "n_drained": self._n_drained,
@@ -665,8 +664,8 @@ def _parse_entry(entry: Any) -> tuple[int, str] | None:
 
 def _pack_fields(fields: dict[str, Any]) -> bytes:
     """Return fields as JSON that ends with their CRC-32, for `_unpack_fields`."""
-    crc = zlib.crc32(json.dumps(fields).encode())
-    return json.dumps(fields | {"crc": crc}, separators=(",", ":")).encode()
+    text = json.dumps(fields).encode()
+    return b'%s, "crc": %d}' % (text[:-1], zlib.crc32(text))
 
 
 def _unpack_fields(content: bytes) -> dict[str, Any]:

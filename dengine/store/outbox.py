@@ -793,20 +793,20 @@ class Outbox:
     def close(self) -> None:
         """Drain, stop the threads, close store and journal, within seconds unless `patient`.
 
-        What the store does not take stays in the journal, and the next engine drains it. A second
-        call does nothing, nor does one in a forked process.
-
-        Raises
-        ------
-        NotTakenError
-            If the journal cannot be written; then nothing is closed.
+        What the store does not take stays in the journal, and the next engine drains it. What the
+        disk does not take is given up, and an error is logged: whoever waited for that was told so.
+        A second call does nothing, nor does one in a forked process.
         """
         if not self.is_usable:
             return
-        self.flush()
+        try:
+            self.flush()
+        except NotTakenError as error:
+            log.error("closed without the newest records, which no report acknowledged: %s", error)
         with self._changed:
             self._changed.wait_for(
-                lambda: self.is_drained or bool(self._store_error), CLOSE_SECONDS
+                lambda: self.is_drained or bool(self._journal_fault or self._store_error),
+                CLOSE_SECONDS,
             )
             self._closed = True
             self._changed.notify_all()
