@@ -241,7 +241,7 @@ _EXPECT = (
 )
 
 
-_ACKNOWLEDGE = "First end the alarms about lost data. They stay in the event log."
+_ACKNOWLEDGE = "End the alarms about lost data. They stay in the event log."
 
 
 @verb("dengine verify engine.db")
@@ -265,15 +265,18 @@ def verify(
     changed, is missing or was never chained is listed, with exit code 1, and so is data that was
     lost. Nothing is written but for --acknowledge, and engines may run meanwhile.
     """
-    from ..store.verification import acknowledge_losses, verify_history
+    from ..store.sql import SqlStore
+    from ..store.verification import verify_history
 
-    losses = acknowledge_losses(store, cell, author) if acknowledge else []
     with progress_bar("rows", None) as advance:
         report = verify_history(store, cell, expect, advance)
+        for item in report.cells if acknowledge else ():
+            with SqlStore(store, item.cell_id) as opened:
+                opened.acknowledge_losses(author)
+        if acknowledge:
+            report = verify_history(store, cell, expect, advance)
     record = {"store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults}
-    record |= {"acknowledged": losses} if acknowledge else {}
-    acknowledged = [f"Acknowledged: {event.text}" for event in losses]
-    print_result(record, *acknowledged, *_verification_lines(report))
+    print_result(record, *_verification_lines(report))
     if not report.ok:
         context.exit(1)
 

@@ -141,7 +141,6 @@ class HttpApi:
             Operation("POST", "/rollback", self.rollback, "Changed"),
             Operation("POST", "/policy", self.policy, "Changed", policy),
             Operation("POST", "/retrain", self.retrain, "Changed"),
-            Operation("POST", "/acknowledge", self.acknowledge, "Changed"),
             Operation("POST", "/export", self.export, "application/zip"),
             Operation("GET", "/status", self.status, "Status"),
             Operation("GET", "/decisions", self.decisions, "Decisions", filter_),
@@ -287,18 +286,6 @@ class HttpApi:
             return Changed("retrain", "The retrain has begun.", event.number, engine.version)
 
         return await self._change(author, begin)
-
-    async def acknowledge(self, author: Author = "") -> Json:
-        """End the alarm about lost data, which is an event; without one nothing is changed."""
-
-        def acknowledge(engine: DataEngine, by: str) -> Changed:
-            """Acknowledge the losses, and return what changed."""
-            losses = engine.store.acknowledge_losses(by)
-            event = engine.store.events(1)[-1].number if losses else None
-            text = f"{len(losses)} alarms about lost data are acknowledged."
-            return Changed("acknowledge", text, event, engine.version)
-
-        return await self._change(author, acknowledge)
 
     async def export(self, author: Author = "") -> Response:
         """Download the model that decides now: a TorchScript file and its checksum, in a zip.

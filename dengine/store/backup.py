@@ -84,7 +84,7 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
         cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Journals first: a record that leaves its journal meanwhile is in the store by then.
-    waiting = {cell: read_undrained(path) for cell, path in paths.items() if path.exists()}
+    waiting = {cell: read_undrained(path)[0] for cell, path in paths.items() if path.exists()}
     with output_file(out) as partial:
         try:
             with instead(

@@ -45,8 +45,7 @@ from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pac
 LENGTH = struct.Struct("<I")
 # Bytes: 1,800 traces of 1000 samples, or 2.5 hours of a cell that verifies every part.
 RESERVE = 8 << 20
-HEADER = 256  # bytes of the header; the first record begins there
-HEAD = 512  # bytes of the head
+HEADER = 256  # bytes of the header, and of the head; the first record begins there
 MAGIC = b"dengine journal 2\n"
 MARK = b"\x89rec"  # where a record begins, to find the next one behind a damaged length
 IGNORES_CASE = sys.platform in ("win32", "darwin")  # of names in its usual file systems
@@ -98,24 +97,18 @@ class Head:
     ----------
     newest : (int, str) or None
         Number and digest of the newest ledger entry of the store.
-    drained : int
-        Offset up to which the store holds the records.
     n_drained : int
         Number of the last record that the store holds: 1, 2, ... in a journal.
-    drained_time : float
-        When that was written, in seconds since 1970.
     n_synced : int
         Number of the newest record that is synced in the journal.
     digest : str
         Of that record, hexadecimal.
     time : float
-        When it was written.
+        When it was written, in seconds since 1970.
     """
 
     newest: tuple[int, str] | None
-    drained: int = HEADER
     n_drained: int = 0
-    drained_time: float = 0.0
     n_synced: int = 0
     digest: str = ""
     time: float = 0.0
@@ -138,22 +131,19 @@ class Journal:
     ----------
     end : int
         Offset behind the last record, in bytes.
-    drained_to : int
-        Offset up to which the store holds the records; see `mark_drained`.
+    drained_to, n_drained : int
+        Offset up to which the store holds the records, and number of the last of these: 1, 2, ...;
+        set by the outbox.
     newest_entry : (int, str) or None
         Number and digest of the newest ledger entry that the header names; None: no entry yet.
-    head : Head or None
-        The head beside the journal, as it was at the opening; None if it is missing or damaged.
+    head : Head
+        The head beside the journal, as it was at the opening; empty if it is missing or damaged.
     dropped : int
-        Bytes of unfinished records at the end, left by a killed process and cut off. Those records
-        were never acknowledged.
-    missing : int
-        Records up to the one that the head names that are neither here nor in the store.
-    missing_since : float
-        When the record before the first missing one was written, in seconds since 1970.
-    damaged : int
-        Places where a record is missing or not as it was written. The others are read all the same.
-        Behind the record that the head names, such a place counts as `dropped`.
+        Bytes of an unfinished record at the end, left by a killed process and cut off. That record
+        was never acknowledged.
+    loss : str
+        Which acknowledged records are missing or not as they were written, in words; "" if none is.
+        The others are read all the same.
 
     Raises
     ------
@@ -167,13 +157,12 @@ class Journal:
         self.drained_to = HEADER
         self.end = HEADER
         self.dropped = 0
-        self.missing = 0
-        self.missing_since = 0.0
-        self.damaged = 0
+        self.loss = ""
         self.newest_entry: tuple[int, str] | None = None
-        self.head = _read_head(path)
-        self._n_drained = self._n_synced = 0
-        self._drained_time = self._time = 0.0
+        self.head = _read_head(path) or Head(None)
+        self.n_drained = 0
+        self._n_synced = 0
+        self._time = 0.0
         self._digest = bytes(16)
         # Guards what header and head hold: two threads write them.
         self._describing = threading.RLock()
@@ -193,18 +182,6 @@ class Journal:
     def is_drained(self) -> bool:
         """Whether the store holds all records."""
         return self.drained_to >= self.end
-
-    @property
-    def loss(self) -> str:
-        """What was found damaged or missing at the opening, in words; "" if nothing was."""
-        if self.missing and self.head is not None:
-            return describe_loss(self.missing, self.missing_since, self.head.time)
-        if self.damaged:
-            return (
-                f"the journal was not as it was written in {self.damaged} places, which were left "
-                "out."
-            )
-        return ""
 
     def append(self, records: Sequence[bytes], time: float) -> list[int]:
         """Append encoded records behind the last one, and return when they are synced to the disk.
@@ -254,35 +231,14 @@ class Journal:
             self._write_head()
         return offsets
 
-    def sync(self) -> None:
-        """Sync the file; before `clear`, so that no disk keeps the cut and not the header.
-
-        Raise StoreError if the disk fails.
-        """
-        with _os_errors(self.path):
-            self._file.sync()
-
     def sync_head(self) -> None:
         """Sync the head to the disk, which may take as long as a sync of the journal.
 
         A failure is ignored: after a power failure the head is then older than the journal.
         """
-        with suppress(OSError):
-            descriptor = open_plain(head_path(self.path), os.O_WRONLY)
-            try:
-                sync(descriptor)
-            finally:
-                os.close(descriptor)
-
-    def mark_drained(self, end: int, n: int, time: float) -> None:
-        """Note that the store has taken `n` more records, the last of which ends at offset `end`.
-
-        `time` is when that record was written. `save_newest_entry` writes it to the disk.
-        """
-        with self._describing:
-            self.drained_to = end
-            self._n_drained = min(self._n_drained + n, self._n_synced)
-            self._drained_time = time
+        head = head_path(self.path)
+        with suppress(OSError), os.fdopen(open_plain(head, os.O_WRONLY), "wb") as file:
+            sync(file.fileno())
 
     def read(self, offset: int) -> bytes:
         """Return the encoded record at an offset that `append` returned.
@@ -331,35 +287,29 @@ class Journal:
         """Write the head as this journal now is, without a sync; a failure is ignored."""
         fields = {
             "newest": self.newest_entry,
-            "drained": self.drained_to,
-            "n_drained": self._n_drained,
-            "drained_time": self._drained_time,
+            "n_drained": self.n_drained,
             "n_synced": self._n_synced,
             "digest": self._digest.hex(),
             "time": self._time,
         }
-        content = _pack_fields(fields).ljust(HEAD)
+        path = head_path(self.path)
         # An older head is harmless.
-        with suppress(OSError):
-            descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
-            try:
-                os.write(descriptor, content)
-            finally:
-                os.close(descriptor)
+        with suppress(OSError), os.fdopen(open_plain(path, os.O_WRONLY | os.O_CREAT), "wb") as head:
+            head.write(_pack_fields(fields).ljust(HEADER))
 
     def clear(self) -> None:
         """Remove all records, drained or not; the caller has made sure that the store holds them.
 
-        The file is cut off behind its header, which frees the reserved space: call `sync` before
-        and `reserve` afterwards. Raise StoreError if the file cannot be written.
+        The file is cut off behind its header, which frees the reserved space: call `reserve`
+        afterwards, and also before, so that no disk keeps the cut without the header. Raise
+        StoreError if the file cannot be written.
         """
         with self._describing, _os_errors(self.path):
             self._file.truncate(HEADER)
             self.drained_to = HEADER
-            self._n_drained = self._n_synced
+            self.n_drained = self._n_synced
             self.end = HEADER
             self._digest = bytes(16)
-            self.damaged = 0
             self._file.write(self._header(), 0)
 
     def reserve(self) -> None:
@@ -411,7 +361,7 @@ class Journal:
             "owner": describe_process()[:60],
             "drained": self.drained_to,
             "newest": self.newest_entry,
-            "n_drained": self._n_drained,
+            "n_drained": self.n_drained,
         }
         return (MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0")
 
@@ -423,14 +373,12 @@ class Journal:
     def _scan(self) -> None:
         """Read header, head and all undrained records, and set the attributes that describe them.
 
-        These are the ends and numbers of the drained and the synced records, the digest of the
-        last one, `newest_entry`, `dropped`, `missing`, `missing_since` and `damaged`. With a
-        damaged header all records count as undrained. Nothing is written. Raise StoreError if the
-        file is no journal.
+        With a damaged header all records count as undrained. Nothing is written. Raise StoreError
+        if the file is no journal.
         """
-        head = self.head or Head(None)
-        self._n_drained = head.n_drained
-        counted_from = head.drained
+        head = self.head
+        self.n_drained = head.n_drained
+        damaged = 0
         if self._file.size:
             header = self._file.read(HEADER, 0)
             if not header.startswith(MAGIC):
@@ -438,55 +386,46 @@ class Journal:
                     f"Expected a journal of dengine, found another file: {self.path}; move it away."
                 )
             try:
-                self.drained_to, self.newest_entry, n_drained, _ = _parse_header(header)
-                counted_from = self.drained_to
-                if n_drained is None:  # an earlier release wrote the header, and no numbers
-                    head = Head(head.newest)
-                self._n_drained = n_drained or 0
-            except DAMAGES:  # all is drained again, which is harmless
-                self.damaged += 1
+                fields = _parse_header(header)
+                self.drained_to = int(fields["drained"])
+                self.newest_entry = fields["newest"]
+                self.n_drained = fields["n_drained"]
+            except DAMAGES:  # all of it is drained again, which is harmless
+                damaged = 1
+                head = Head(None)
         self.end = max(self._file.size, HEADER)
         self.drained_to = min(max(self.drained_to, HEADER), self.end)
-        digests = self._scan_records(head, counted_from)
-        n_known = max(head.n_drained, self._n_drained + len(digests))
-        if head.n_synced > self._n_drained:
-            self.missing = max(head.n_synced - n_known, bytes.fromhex(head.digest) not in digests)
-        self._n_synced = max(head.n_synced, n_known)
-        self._time = head.time
-
-    def _scan_records(self, head: Head, counted_from: int) -> set[bytes]:
-        """Read all undrained records; return the digests of those from offset `counted_from` on.
-
-        Set `end`, `dropped`, `damaged`, `missing_since` and the digest of the last record. Damage
-        behind the newest record that was acknowledged, which `head` names, counts as dropped.
-        """
-        digests: set[bytes] = set()
+        # Behind the record that the head names nothing was acknowledged.
         newest = bytes.fromhex(head.digest)
-        is_acknowledged = not newest or head.n_synced > self._n_drained
+        is_acknowledged = not newest or head.n_synced > self.n_drained
         # The first record's digest is not checked: those before it may be gone.
         previous: bytes | None = None
-        intact: bytes | None = None  # the last record before any damage
         begin = self.drained_to
+        digests: set[bytes] = set()
         for offset, end, record in self.undrained_records():
             digest: bytes = FRAME.unpack(self._file.read(FRAME.size, offset))[3]
             follows = previous is None or digest == _chain_digest(previous, record)
-            if is_acknowledged:
-                self.damaged += offset > begin or not follows
-            else:
-                self.dropped += offset - begin
-            if offset >= counted_from:
-                digests.add(digest)
-            if not self.damaged:
-                intact = record
+            damaged += is_acknowledged and (offset > begin or not follows)
             is_acknowledged &= digest != newest
+            digests.add(digest)
             previous = digest
             begin = end
         rest = self._file.read(self.end - begin, begin)
         self.end = begin
-        self.dropped += len(rest.rstrip(b"\0"))
+        self.dropped = len(rest.rstrip(b"\0"))
         self._digest = previous or bytes(16)
-        self.missing_since = decode_record(intact).time if intact else head.drained_time
-        return digests
+        n_known = self.n_drained + len(digests)
+        self._n_synced = max(head.n_synced, n_known)
+        if head.n_synced > self.n_drained and (n_known < head.n_synced or newest not in digests):
+            self.loss = (
+                f"{max(1, head.n_synced - n_known)} records (decisions, labels or events) are "
+                "missing from the journal, though they were on disk; the newest is of "
+                f"{datetime.fromtimestamp(head.time, UTC):%Y-%m-%d %H:%M:%S} UTC."
+            )
+        elif damaged:
+            self.loss = (
+                f"the journal was not as it was written in {damaged} places, which were left out."
+            )
 
     def _read_record(self, offset: int) -> bytes | None:
         """Return the encoded record at an offset, without its frame.
@@ -531,7 +470,7 @@ def _open_file(path: Path, owning: bool = True) -> OwnedFile:
         except BlockingIOError as error:
             try:
                 with path.open("rb") as file:
-                    owner = _parse_header(file.read(HEADER))[3]
+                    owner = _parse_header(file.read(HEADER))["owner"]
             except (OSError, *DAMAGES):
                 owner = "another engine"
             raise owned_error(owner, str(path)) from error
@@ -582,48 +521,24 @@ def head_path(journal: Path) -> Path:
     return journal.with_name(f"{journal.name}.head")
 
 
-def describe_loss(n: int, since: float, until: float) -> str:
-    """Return in words that a journal lacks `n` records, written between two times, since 1970."""
-    first = f"after {datetime.fromtimestamp(since, UTC):%Y-%m-%d %H:%M:%S} and " if since else ""
-    return (
-        f"{n} records (decisions, labels or events) that were on disk are missing from the "
-        f"journal, written {first}up to {datetime.fromtimestamp(until, UTC):%Y-%m-%d %H:%M:%S} UTC."
-    )
-
-
-def find_loss(path: Path) -> str:
-    """Return in words which synced records a journal lacks, before an engine opens it; "" if none.
-
-    Nothing is locked or changed. Raise StoreError if the file cannot be read or is no journal.
-    """
-    if path.exists():
-        journal = Journal(path, owning=False)
-        journal.close()
-        return journal.loss
-    head = _read_head(path)
-    if head is None or head.n_synced == head.n_drained:
-        return ""
-    return describe_loss(head.n_synced - head.n_drained, head.drained_time, head.time)
-
-
 def read_newest_entries(path: Path) -> set[tuple[int, str]]:
     """Return the ledger entries (number, digest) that a journal's header and its head name.
 
     They are none, one or two; a file that is missing or damaged names none.
     """
-    head = _read_head(path)
-    entries = {None if head is None else head.newest}
+    entries = {(_read_head(path) or Head(None)).newest}
     with suppress(OSError, *DAMAGES), path.open("rb") as file:
-        entries.add(_parse_header(file.read(HEADER))[1])
+        entries.add(_parse_header(file.read(HEADER))["newest"])
     return {entry for entry in entries if entry is not None}
 
 
-def read_undrained(path: Path) -> list[Record]:
-    """Return the records of a journal that its store has not taken, oldest first, whoever owns it.
+def read_undrained(path: Path) -> tuple[list[Record], str]:
+    """Return the records of a journal that its store has not taken, and what it lost, in words.
 
-    If several decisions share an id, only the last is returned. Damaged records are left out.
-    Nothing is locked or changed. Raise StoreError if the file cannot be read or is no journal, and
-    for a record that another release of dengine wrote.
+    The records are oldest first, whoever owns the journal; of several decisions with one id only
+    the last is returned, and damaged records are left out. The loss is `Journal.loss`. Nothing is
+    locked or changed. Raise StoreError if the file cannot be read or is no journal, and for a
+    record that another release of dengine wrote.
     """
     journal = Journal(path, owning=False)
     try:
@@ -631,35 +546,24 @@ def read_undrained(path: Path) -> list[Record]:
     finally:
         journal.close()
     last = {record.decision.id: record for record in records if isinstance(record, StoredDecision)}
-    return [
+    newest = [
         record
         for record in records
         if not isinstance(record, StoredDecision) or last[record.decision.id] is record
     ]
+    return newest, journal.loss
 
 
 def _read_head(journal: Path) -> Head | None:
     """Return the content of the head beside a journal; None if it is missing or damaged."""
     with suppress(OSError, *DAMAGES):
-        fields = _unpack_fields(head_path(journal).read_bytes())
-        return Head(**fields | {"newest": _parse_entry(fields["newest"])})
+        return Head(**_unpack_fields(head_path(journal).read_bytes()))
     return None
 
 
-def _parse_header(header: bytes) -> tuple[int, tuple[int, str] | None, int | None, str]:
-    """Return the fields of a header: drained offset, newest ledger entry or None, number, owner.
-
-    The number is that of the last drained record, None in the header of an earlier release. For a
-    damaged header an error of DAMAGES is raised.
-    """
-    fields = _unpack_fields(header[len(MAGIC) :])
-    newest = _parse_entry(fields["newest"])
-    return int(fields["drained"]), newest, fields.get("n_drained"), str(fields["owner"])
-
-
-def _parse_entry(entry: Any) -> tuple[int, str] | None:
-    """Return a ledger entry of a header or head as number and digest, or None."""
-    return None if entry is None else (int(entry[0]), str(entry[1]))
+def _parse_header(header: bytes) -> dict[str, Any]:
+    """Return the fields of a header by name; for a damaged one an error of DAMAGES is raised."""
+    return {"n_drained": 0} | _unpack_fields(header[len(MAGIC) :])
 
 
 def _pack_fields(fields: dict[str, Any]) -> bytes:
@@ -675,11 +579,13 @@ def _unpack_fields(content: bytes) -> dict[str, Any]:
     """
     fields = json.loads(content.rstrip(b"\0 "))
     if isinstance(fields, list):
-        return {"newest": fields}
-    if "n_drained" in fields or "crc" in fields:
+        fields = {"newest": fields}
+    elif fields.keys() != {"owner", "drained", "newest"}:
         crc = fields.pop("crc")
         if zlib.crc32(json.dumps(fields).encode()) != crc:
             raise ValueError("the checksum differs")
+    number, digest = fields["newest"] or (0, "")
+    fields["newest"] = (int(number), str(digest)) if digest else None
     return dict(fields)
 
 

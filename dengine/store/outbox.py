@@ -39,6 +39,7 @@ from .journal import (
     forked_error,
 )
 from .records import DATA_LOST, LOSS_REMEDY, Event, NewLabel, StoredDecision, as_text
+from .views import HistoryFilter
 
 if TYPE_CHECKING:
     from .sql import SqlStore
@@ -196,6 +197,9 @@ class Outbox:
         """
         try:
             self._compare_with_ledger(journal)  # before anything is drained
+            since = "The store held no decision before them."
+            for item in self.store.decisions(HistoryFilter(), limit=1):
+                since = f"They came after decision {item.decision.id} of {item.when:%F %T} UTC."
             for offset, end, blob in journal.undrained_records():
                 record = decode_record(blob)
                 self._appended += 1
@@ -206,15 +210,15 @@ class Outbox:
                 self._mark_synced(record, offset, end)
             while not self.is_drained:
                 self._drain_chunk(journal)
-            if loss := journal.loss:
-                self._log_event(DATA_LOST, loss)
+            if journal.loss:
+                self._log_event(DATA_LOST, f"{journal.loss} {since}")
             elif journal.dropped:
                 self._log_event(
                     "journal",
                     f"{journal.dropped} bytes at its end were dropped: a process was killed as it "
                     "wrote them",
                 )
-            journal.sync()
+            journal.reserve()
             journal.clear()
             journal.reserve()
             self.n_decisions = self.store.n_decisions()
@@ -252,8 +256,9 @@ class Outbox:
         and the journal is set to be drained from its beginning. An event is also stored if the
         journal or its head is new though the store is not.
         """
-        of_head = None if journal.head is None else journal.head.newest
-        entries = [entry for entry in (journal.newest_entry, of_head) if entry is not None]
+        entries = [
+            entry for entry in (journal.newest_entry, journal.head.newest) if entry is not None
+        ]
         database = self.store.database
         if missing := [entry for entry in entries if not database.has_entry(*entry)]:
             self._log_event(
@@ -867,7 +872,7 @@ class Outbox:
                 self._changed.notify_all()
                 is_drained = self._changed.wait_for(lambda: journal.is_drained, BATCH_SECONDS)
             if is_drained:  # syncs without the lock: a disk that hangs would hang the cell
-                journal.sync()
+                journal.reserve()
                 with self._changed:
                     journal.clear()
                 journal.reserve()
@@ -978,8 +983,8 @@ class Outbox:
                 f"memory; decisions that are lost: {listed(filter(None, damaged)) or 'none'}.",
             )
         with self._changed:
-            time_ = max((record.time for record in records), default=0.0)
-            journal.mark_drained(chunk[-1][1], len(chunk), time_)
+            journal.drained_to = chunk[-1][1]
+            journal.n_drained += len(chunk)
             self._save_newest_entry()
             self._remove_drained(records, numbers)
             for _ in chunk:

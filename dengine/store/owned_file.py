@@ -77,9 +77,7 @@ def open_plain(path: Path, flags: int) -> int:
     return os.open(path, flags | no_follow | binary, 0o600)
 
 
-def sync(descriptor: int) -> None:
-    """Return once what was written to an open file is on the disk; OSError if the disk fails."""
-    getattr(os, "fdatasync", os.fsync)(descriptor)  # not every system has the quicker one
+sync = getattr(os, "fdatasync", os.fsync)  # not every system has the quicker one
 
 
 class OwnedFile:

@@ -368,12 +368,12 @@ class Event:
     when = property(_when)
 
 
-def open_losses(events: Iterable[Event]) -> list[Event]:
+def open_losses(events: Iterable[Any]) -> list[Any]:
     """Return those of a cell's events, oldest first, that say that data was lost.
 
-    Those before the newest acknowledgement are left out.
+    Those before the newest acknowledgement are left out. Rows of the table may be given as well.
     """
-    losses: list[Event] = []
+    losses: list[Any] = []
     for event in events:
         if event.kind == ACKNOWLEDGED:
             losses.clear()

@@ -17,7 +17,6 @@ from .records import OF_DECISION, Correction, Event, NewLabel, StoredDecision, c
 SCHEMA = "1"
 # Keys of rows of `setting` that the store itself keeps.
 SCHEMA_KEY = "schema_version"  # for every cell
-VERSION_KEY = "dengine"  # of the engine's settings: the version that wrote them
 PRODUCT_KEY = "product"  # for every cell that shares what it learns
 # For every cell whose ledger is keyed: a tag by which the key is recognized.
 LEDGER_KEY = "ledger_key"
@@ -214,31 +213,17 @@ def check_schema(connection: sa.Connection, name: str) -> None:
         else set()
         for table in inspector.get_table_names()
     }
-    schemas: set[str] = set()
-    missing: list[str] = []
     if tables.get(SETTING.name) != set(SETTING.c.keys()):
         description = (
             f"tables of another program: {', '.join(sorted(tables))}" if tables else "no tables"
         )
     else:
         # The one query over all cells.
-        query = sa.select(SETTING.c.key, SETTING.c.value).distinct()
-        rows = connection.execute(query.where(SETTING.c.key.in_((SCHEMA_KEY, VERSION_KEY)))).all()
-        schemas = {row.value for row in rows if row.key == SCHEMA_KEY}
-        written_by = {row.value for row in rows if row.key == VERSION_KEY}
-        missing = [
-            f"{table.name}.{column.name}"
-            for table in METADATA.tables.values()
-            for column in table.c
-            if column not in ADDED and column.name not in tables.get(table.name, ())
-        ]
-        description = (
-            f"schema {', '.join(sorted(schemas)) or 'unknown'} of dengine "
-            f"{', '.join(sorted(written_by)) or 'unknown'}"
+        query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()
+        description = "schema " + (
+            ", ".join(sorted(connection.execute(query).scalars())) or "unknown"
         )
-        if missing:
-            description += f" without the columns {', '.join(missing)}"
-    if schemas != {SCHEMA} or missing:
+    if description != f"schema {SCHEMA}":
         do = "open it with the dengine that wrote it, or name a new file or database"
         if not tables:
             do = (
@@ -248,3 +233,12 @@ def check_schema(connection: sa.Connection, name: str) -> None:
         raise StoreError(
             f"Expected a dengine store of schema {SCHEMA}, found {description} in {name}; {do}."
         )
+    for table in METADATA.tables.values():
+        expected = {column.name for column in table.c if column not in ADDED}
+        if missing := expected - tables.get(table.name, set()):
+            query = sa.select(SETTING.c.value).where(SETTING.c.key == "dengine").distinct()
+            versions = ", ".join(connection.execute(query).scalars()) or "unknown"
+            raise StoreError(
+                f"Expected columns {sorted(missing)} of {table.name} in {name}, found a store of "
+                f"dengine {versions}, which lacks them; open it with that dengine."
+            )

@@ -906,28 +906,20 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             except StoreError as error:  # a store that can only be read is read all the same
                 log.warning("%s (%s)", text, error)
 
-    def acknowledge_losses(self, author: str = "") -> list[Event]:
-        """End the alarm about lost data by an event of kind "acknowledged".
+    def acknowledge_losses(self, author: str = "") -> None:
+        """End the alarm about lost data by an event; without an alarm nothing is written.
 
         Parameters
         ----------
         author : str
-
-        Returns
-        -------
-        list of Event
-            What was acknowledged, oldest first; [] if there was no alarm: then nothing is written.
 
         Raises
         ------
         StoreError
             If the database fails.
         """
-        losses = open_losses(self.events())
-        if losses:
-            numbers = ", ".join(str(event.number) for event in losses)
-            self.put_event(ACKNOWLEDGED, f"lost data, events {numbers}", author=author)
-        return losses
+        if losses := open_losses(self.events()):
+            self.put_event(ACKNOWLEDGED, f"{len(losses)} losses of data", author=author)
 
     def events(self, limit: int | None = None) -> list[Event]:
         """Return the newest events of the cell, oldest first.

@@ -25,7 +25,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from .connections import reading, run_integrity_check
-from .journal import find_loss, journal_path, read_newest_entries, read_undrained
+from .journal import journal_path, read_newest_entries, read_undrained
 from .ledger import (
     START,
     check_key,
@@ -36,16 +36,7 @@ from .ledger import (
     rows_digest,
     state_sum,
 )
-from .records import (
-    ACKNOWLEDGED,
-    CHUNK,
-    DATA_LOST,
-    LOSS_REMEDY,
-    Event,
-    columns,
-    from_row,
-    open_losses,
-)
+from .records import CHUNK, LOSS_REMEDY, open_losses
 from .schema import (
     CHAINED,
     DECISION,
@@ -58,7 +49,6 @@ from .schema import (
     TRACE,
     VERSION,
 )
-from .sql import SqlStore
 
 # The column of each chained table that, with the cell, identifies a row.
 KEY = {
@@ -183,8 +173,7 @@ def verify_history(
         names = _selected_cells(connection, cell_id)
         journals = {name: journal_path(connection.engine.url, name) for name in names}
         journal_entries = {name: read_newest_entries(path) for name, path in journals.items()}
-        waiting = {name: _count_undrained(path) for name, path in journals.items()}
-        losses = {name: _find_loss(path) for name, path in journals.items()}
+        inspected = {name: _inspect_journal(path) for name, path in journals.items()}
     with reading(str(url)) as connection:  # a later snapshot: it has what the journals knew
         pages = run_integrity_check(connection) if connection.dialect.name == "sqlite" else []
         faults = [HistoryFault("", "file", "", finding) for finding in pages]
@@ -192,7 +181,7 @@ def verify_history(
         for check in checks:
             check_key(connection, check.cell_id, check.key)
             faults += check.run()
-            if loss := losses[check.cell_id]:
+            if loss := inspected[check.cell_id][1]:
                 problem = f"is damaged: {loss} The next engine records that as an alarm"
                 faults.append(HistoryFault(check.cell_id, "journal", "", problem))
             missing = [
@@ -219,66 +208,24 @@ def verify_history(
             entries=len(check.digests),
             rows=check.rows,
             digest="".join(check.digests[-1:]),
-            waiting=waiting[check.cell_id],
+            waiting=inspected[check.cell_id][0],
         )
         for check in checks
     ]
     return HistoryReport(tuple(cells), tuple(faults))
 
 
-def _count_undrained(journal: Path) -> int | None:
-    """Return the number of records in a journal that its store has not taken.
+def _inspect_journal(path: Path) -> tuple[int | None, str]:
+    """Return the number of records in a journal that its store has not taken, and what it lost.
 
-    None if there is no journal, or it cannot be read.
+    None and "" if there is no journal, or it cannot be read.
     """
     with suppress(StoreError):  # it is damaged, or another user's
-        return len(read_undrained(journal)) if journal.exists() else None
-    return None
-
-
-def _find_loss(journal: Path) -> str:
-    """Return in words which synced records a journal lacks; "" if none, or if it cannot be read.
-
-    It is read twice, since a running engine may empty it meanwhile.
-    """
-    loss = ""
-    for _ in range(2):
-        with suppress(StoreError):
-            loss = find_loss(journal)
-        if not loss:
-            break
-    return loss
-
-
-def acknowledge_losses(url: str, cell_id: str | None = None, author: str = "") -> list[Event]:
-    """End the alarms about lost data in a store; engines may run meanwhile.
-
-    Parameters
-    ----------
-    url : str
-        A file or URL.
-    cell_id : str or None
-        The cell; None: all cells.
-    author : str
-        Who acknowledges, for the record.
-
-    Returns
-    -------
-    list of Event
-        What was acknowledged; the events stay.
-
-    Raises
-    ------
-    StoreError
-        For what is no store, for an unknown cell, and if the store cannot be written.
-    """
-    with reading(str(url)) as connection:
-        names = _selected_cells(connection, cell_id)
-    losses: list[Event] = []
-    for name in names:
-        with SqlStore(str(url), name) as store:
-            losses += store.acknowledge_losses(author)
-    return losses
+        if path.exists():
+            records, loss = read_undrained(path)
+            # Read again, since a running engine may have emptied it meanwhile.
+            return len(records), loss and read_undrained(path)[1]
+    return None, ""
 
 
 def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
@@ -473,12 +420,8 @@ class CellCheck:
 
     def _check_losses(self) -> Iterator[HistoryFault]:
         """Yield a fault for each event that says that data was lost and is not acknowledged."""
-        query = sa.select(*(EVENT.c[name] for name in columns(Event)))
-        query = query.where(
-            EVENT.c.cell_id == self.cell_id, EVENT.c.kind.in_((DATA_LOST, ACKNOWLEDGED))
-        )
-        rows = self.connection.execute(query.order_by(EVENT.c.number))
-        for event in open_losses(from_row(Event, dict(row._mapping)) for row in rows):
+        query = sa.select(EVENT).where(EVENT.c.cell_id == self.cell_id).order_by(EVENT.c.number)
+        for event in open_losses(self.connection.execute(query)):
             yield self._fault(EVENT.name, event.number, f"says: {event.text} {LOSS_REMEDY}")
 
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:

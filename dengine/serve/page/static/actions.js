@@ -126,7 +126,6 @@ export const rollback = (versions) => ({
 });
 
 export const retrain = { title: "Retrain now", explanation: "The model is trained on all labels so far.", path: "retrain" };
-export const acknowledge = { title: "Acknowledge lost data", explanation: "The alarm ends. What was lost stays in the event log.", path: "acknowledge" };
 export const exported = { title: "Export", explanation: "The model that decides now, as a TorchScript file for a controller, with its checksum.", path: "export" };
 
 export const correct = (id, success) => ({

@@ -319,7 +319,6 @@ async function actions(get, _, status) {
     block("shadow", act.shadow(!status.shadow)), block("report", act.reportPart),
     block("rollback", act.rollback(choices), !back.length, "There is no earlier version."),
     block("policy", act.policy(status.recipe.policy)), block("retrain", act.retrain),
-    block("acknowledge", act.acknowledge, !status.loss, "No loss of data is known."),
     block("export", act.exported, status.version === 0, "There is no model yet."));
   return { title: "Actions", elements: [el("h1", {}, "Actions"), small("Each asks for confirmation and your name, which goes into the event log. Labels are corrected on the page of the part."), blocks] };
 }
