@@ -31,6 +31,7 @@ from .store import (
     import_labels,
     policy,
     report,
+    restore,
     retrain,
     rollback,
     verify,
@@ -102,6 +103,6 @@ def main() -> None:
 
 for command in (
     *(data, replay, compare, costs, train, run, serve, simulate, status, history, explain, verify),
-    *(report, correct, forget, rollback, policy, retrain, backup, export, import_labels),
+    *(report, correct, forget, rollback, policy, retrain, backup, restore, export, import_labels),
 ):
     main.add_command(command)

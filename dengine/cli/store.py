@@ -1,8 +1,9 @@
 """The verbs that change, check or copy a store by hand: `report`, `correct`, `forget`, `rollback`,
-`policy`, `retrain`, `verify`, `backup` and `import-labels`.
+`policy`, `retrain`, `verify`, `backup`, `restore` and `import-labels`.
 
 Those up to `retrain` change a store's engine, or show its policy; `verify` checks the store's
-history, `backup` copies it, and `import-labels` takes the labels of an exported cell.
+history, `backup` copies it, `restore` puts a copy in place, and `import-labels` takes the labels of
+an exported cell.
 """
 
 from __future__ import annotations
@@ -339,6 +340,32 @@ def backup(store: str, out: Path) -> None:
     ]
     lines.append(f"Check it: dengine verify {out}")
     print_result({"store": store, "out": out} | asdict(report), *lines)
+
+
+@verb("dengine restore backup.db --store restored.db")
+@click.argument("copy", metavar="COPY")
+@click.option(
+    "--store",
+    metavar="FILE",
+    required=True,
+    type=options.FILE,
+    help="Where the engine looks for its store; a file that does not exist yet.",
+)
+def restore(copy: str, store: Path) -> None:
+    """Put a backup in the place of a store.
+
+    COPY is what `dengine backup` wrote, on this or another machine. It is checked first. Beside the
+    store each cell gets a journal that knows its newest entry; one that is there stays, and the
+    first engine takes from it what the copy lacks.
+    """
+    from ..store.backup import restore_store
+
+    cells = restore_store(copy, store)
+    print_result(
+        {"copy": copy, "store": store, "cells": cells},
+        f"{store}: cells {', '.join(cell.cell_id for cell in cells)}, as they were written.",
+        f"Check it: dengine verify {store}",
+    )
 
 
 _ANY_MODEL = "Accept a journal of a model that is not recorded as an export of this store."

@@ -271,7 +271,8 @@ class Outbox:
             self._log_event(
                 "journal",
                 f"the journal {journal.path}, or its head beside it, is new here, and the store is "
-                "not: whether the store was cut off, or labels are elsewhere, is unknown",
+                "not: whether the store was cut off, or labels are elsewhere, is unknown; bring "
+                "the old files here, or copy a store by `dengine backup` and `dengine restore`.",
             )
 
     def check_integrity(self, since: int | None = None) -> None:
