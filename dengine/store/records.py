@@ -645,14 +645,18 @@ def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
 
 
 def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
-    """Return arrays as the bytes of an npz file, uncompressed; unlike `np.savez` it takes any name.
+    """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name.
 
-    Raise ValueError for an array of Python objects.
+    Integers are compressed, of which a state repeats many; weights hardly get smaller. Raise
+    ValueError for an array of Python objects.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in state.items():
-            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+            info = zipfile.ZipInfo(f"{name}.npy")
+            if values.dtype.kind in "iu":
+                info.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(info, "w", force_zip64=True) as member:
                 np.save(member, values, allow_pickle=False)
     return buffer.getvalue()
 

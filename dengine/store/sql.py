@@ -745,7 +745,6 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         if self.product is not None and row["accepted"]:  # a peer's may have been stored before
             lock(connection, PRODUCT, self.product)
             number = max(number, self._scope.newest_version(connection) + 1)
-        self.database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         if row["accepted"]:
             with_state = connection.execute(
                 self._accepted_query().where(VERSION.c.state.is_not(None))
@@ -758,6 +757,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             if dropped:
                 is_dropped = self._scope.shared(VERSION.c.cell_id) & VERSION.c.retrain.in_(dropped)
                 connection.execute(sa.update(VERSION).where(is_dropped).values(state=None))
+        # Afterwards, so that the new state takes the room of those.
+        self.database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         return number
 
     def _accepted_query(self) -> sa.Select[Any]:
