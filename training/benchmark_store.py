@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from dengine import Action, DataEngine, Policy, load_dataset
+from dengine import Action, DataEngine, Policy, SqlStore, load_dataset
 
 
 def run_cell(file: Path, data: str, reducer: str, parts: int, seed: int) -> int:
@@ -30,7 +30,9 @@ def run_cell(file: Path, data: str, reducer: str, parts: int, seed: int) -> int:
         [rng.permutation(len(dataset)) for _ in range(-(-parts // len(dataset)))]
     )
     n_bytes = 0
-    with DataEngine(reducer, policy=Policy(alpha=0.1, lower_bound=0.9), store=str(file)) as engine:
+    policy = Policy(alpha=0.1, lower_bound=0.9)
+    store = SqlStore(str(file), wait=60.0)  # a busy disk changes no figure
+    with DataEngine(reducer, policy=policy, store=store) as engine:
         for number, i in enumerate(order[:parts]):
             trace = (dataset.X[i] + rng.normal(0.0, noise, dataset.X[i].shape)).astype(np.float32)
             decision = engine.decide(trace, part=number)

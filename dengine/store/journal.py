@@ -580,10 +580,9 @@ def _unpack_fields(content: bytes) -> dict[str, Any]:
     fields = json.loads(content.rstrip(b"\0 "))
     if isinstance(fields, list):
         fields = {"newest": fields}
-    elif fields.keys() != {"owner", "drained", "newest"}:
-        crc = fields.pop("crc")
-        if zlib.crc32(json.dumps(fields).encode()) != crc:
-            raise ValueError("the checksum differs")
+    crc = fields.pop("crc", None)
+    if crc not in (None, zlib.crc32(json.dumps(fields).encode())):
+        raise ValueError("the checksum differs")
     number, digest = fields["newest"] or (0, "")
     fields["newest"] = (int(number), str(digest)) if digest else None
     return dict(fields)
