@@ -525,8 +525,8 @@ class EngineCore:
         """Finish or give up a retrain under way within `CLOSE_SECONDS`, write everything, close the
         store.
 
-        A second call does nothing. Raises NotTakenError, and closes nothing, where the journal
-        cannot be written, and StoreError while another thread uses the engine.
+        A second call does nothing. What the journal cannot take is given up. Raises StoreError
+        while another thread uses the engine.
         """
         with self.exclusive:
             if self.outbox.is_usable:

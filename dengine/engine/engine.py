@@ -19,7 +19,7 @@ import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -389,8 +389,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer is dropped. A second call does nothing. Raises StoreError where
-        the journal did not take everything; close again when the disk is well.
+        A retrain that takes longer is dropped. A second call does nothing. What the disk does not
+        take is given up, and an error is logged; no report on it was acknowledged. Raises
+        StoreError while another thread uses the engine.
         """
         self._core.close()
 
@@ -654,8 +655,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
         """Flush, and return how the engine is doing; arguments and errors as of
         `history.status.status`.
+
+        Where the disk does not take everything, `store_fault` says why, and the counts lack it.
         """
-        self.flush()
+        with suppress(NotTakenError):
+            self.flush()
         return self._core.complete_status(status(self.store, last, watching))
 
     def history(self, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:

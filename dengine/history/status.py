@@ -35,12 +35,14 @@ from ..records import (
 )
 from ..representation import to_html
 from ..store.records import (
+    LOSS_REMEDY,
     SAFE_MODE_BEGAN,
     SAFE_MODE_ENDED,
     Event,
     Outcomes,
     StoredDecision,
     StoredVersion,
+    open_losses,
 )
 from ..store.views import HistoryFilter, Stretch, Tally
 
@@ -203,6 +205,8 @@ class Status:
         The newest, oldest first.
     watch : Watch or None
         None if nothing is watched, or it was not asked for.
+    loss : str
+        What data was lost and what to do, until somebody acknowledges it; "" if nothing was.
     store_fault : str
         Of a running engine: what is wrong with the store; "" if nothing is.
     retraining : bool
@@ -238,6 +242,7 @@ class Status:
     retrains: tuple[StoredVersion, ...]
     events: tuple[Event, ...]
     watch: Watch | None
+    loss: str = ""
     store_fault: str = ""
     retraining: bool = False
     store_lag: float = 0.0
@@ -259,9 +264,9 @@ class Status:
     def alarm(self) -> str:
         """What somebody should look at, in a sentence, of several the most urgent; "" if nothing.
 
-        In this order: the store, safe mode, bad accepts, good rejects, dropped retrains, traces
-        that nearly repeat another, shadow mode's errors, novel traces, parts outside limits, errors
-        of the model. Of the decisions only the newest count.
+        In this order: the store, lost data, safe mode, bad accepts, good rejects, dropped retrains,
+        traces that nearly repeat another, shadow mode's errors, novel traces, parts outside limits,
+        errors of the model. Of the decisions only the newest count.
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -280,6 +285,7 @@ class Status:
         repeats = next((note.partition(":")[0] for note in notes if REPEATS in note), "")
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
+            (self.loss, self.loss),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
             (
                 accepts.verdict == "broken",
@@ -368,6 +374,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     counts = store.status(tally)
     outcomes = tally.outcomes
     events = store.events()
+    losses = [event.text for event in open_losses(events)]
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
     retrains = store.versions(cell_only=True)
     last_seq = retrains[-1].last_seq if retrains else 0
@@ -397,6 +404,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         retrains=tuple(retrains),
         events=tuple(events[-N_EVENTS:]),
         watch=read_watch(store, recipe) if watching else None,
+        loss=" ".join(["Data was lost:", *losses, LOSS_REMEDY]) if losses else "",
         **{name: counts[name] for name in COUNTED},
     )
 

@@ -14,7 +14,7 @@ import click
 import numpy as np
 import pytest
 
-from dengine import DataEngine, load_dataset
+from dengine import DataEngine, backup_store, load_dataset
 from dengine.cli import main
 from dengine.cli.output import INTERRUPTED
 from dengine.datasets import importing
@@ -97,8 +97,8 @@ def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What examples name: a trained engine.db of the bundled set, and cell.csv, a journal of two of
-    its traces.
+    """What examples name: a trained engine.db of the bundled set, backup.db, its copy, and cell.csv,
+    a journal of two of its traces.
     """
     folder = tmp_path_factory.mktemp("examples")
     succeed("train", "--data", "insertion", "--store", folder / "engine.db", "--reducer", "pca")
@@ -108,6 +108,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for i in range(2)
     ]
     (folder / "cell.csv").write_bytes(cell_journal(*lines))
+    backup_store(folder / "engine.db", folder / "backup.db")
     return folder
 
 

@@ -35,7 +35,7 @@ export function warnings(status) {
   if (status.safe_mode) texts.push(`Safe mode: every part is verified until fresh evidence keeps the tolerance (${status.safe_mode})`);
   if (status.shadow) texts.push("Shadow mode: every part is verified, and the model only predicts");
   if (status.pinned) texts.push(`Version ${status.pinned} was rolled back to, and no automatic retrain replaces it until it is released`);
-  if (status.alarm && !status.store_fault && !status.safe_mode) texts.unshift(status.alarm); // else the alarm has the same text
+  if (status.alarm && (status.loss || !status.safe_mode) && !status.store_fault) texts.unshift(status.alarm); // else the alarm has the same text
   return texts.map((text) => el("p", { class: "banner" }, icon("shield"), el("span", {}, text)));
 }
 
